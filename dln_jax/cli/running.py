@@ -167,7 +167,7 @@ def with_compilation_cache(arguments: type) -> Any:
 def interrupted(command: str, given: Any, folder: Path | None = None) -> str:
     """Message after an interrupt: how to resume the run, or that its folder is incomplete.
 
-    A command can resume if its arguments have `resume`.
+    A command can resume if its arguments have `resume`, unless they also have `continues` and it is false.
     """
     if folder is None:
         return "interrupted"

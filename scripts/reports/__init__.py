@@ -1,3 +1,3 @@
-"""What the reports measure."""
+"""Measurements behind the reports."""
 
 __all__ = []

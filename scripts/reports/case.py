@@ -1,4 +1,4 @@
-"""Cases: what a report measures, by name, and the one loop that measures them and keeps what has been measured."""
+"""Cases, the named measurements of a report, and the loop that measures them and stores the results."""
 
 import math
 import reprlib
@@ -18,29 +18,29 @@ REMEDY = "restore the file, or delete it to measure everything again"
 
 
 class Findings(NamedTuple):
-    """What was measured: the rows of a report, and the curves that a figure draws of them."""
+    """Results of a case: rows of a report, and curves for a figure."""
 
     rows: list[Row]
     curves: dict[str, Any] = {}  # noqa: RUF012  never written to
 
 
 class Case(NamedTuple):
-    """A measurement: its name, what measures it, what must come of it, and how it is drawn."""
+    """A measurement: its name, its function, the quantities it must return, and its figure."""
 
     name: str
     """Stable, lower case."""
     measure: Callable[[], Findings]
     quantities: Mapping[str, Collection[str]] = {}
-    """By case of the rows, the quantities that there must be of it; what is stored is held against them."""
+    """Required quantities by case of the rows; stored results are checked against them."""
     draw: Callable[[dict[str, Any]], Figure] | None = None
-    """A figure of the curves."""
+    """Draws the curves."""
 
 
 class Done(NamedTuple):
-    """A case that has been measured, while others are to come."""
+    """A measured case, for the progress report."""
 
     place: str
-    """Its number and how many there are, as "3/14"."""
+    """Number of the case and number of cases, such as "3/14"."""
     case: Case
     findings: Findings
     seconds: float
@@ -53,10 +53,10 @@ def measure(
     folder: Path | None = None,
     resume: bool = False,
 ) -> dict[str, Findings]:
-    """Measures the cases one after the other, and tells `report` of each.
+    """Measures the cases one after the other and calls `report` after every case.
 
-    Returns the findings by name, in the order of the cases. The jobs.json of a `folder` keeps what is there after each
-    case; of rows that is case, quantity and value. With `resume`, what it has is not measured again.
+    Returns the findings by name, in the order of the cases. After every case, jobs.json in `folder` stores all findings
+    so far (of rows: case, quantity and value). With `resume`, stored cases are not measured again.
     """
     found = stored_findings(folder, cases) if folder and resume else {}
     for number, case in enumerate(cases, start=1):
@@ -74,7 +74,7 @@ def measure(
 
 
 def measure_and_publish(folder: Path, cases: Sequence[Case], *, figures: bool = True, **facts: Any) -> None:
-    """Measures cases with a line and a figure of each, and publishes all rows with `facts` among the conditions."""
+    """Measures cases, prints a line and draws a figure per case, and publishes all rows with `facts` as conditions."""
 
     def say(done: Done) -> None:
         bound = [row.passed for row in done.findings.rows if row.passed is not None]
@@ -87,12 +87,12 @@ def measure_and_publish(folder: Path, cases: Sequence[Case], *, figures: bool = 
 
 
 def rows_in(found: Mapping[str, Findings]) -> list[Row]:
-    """All rows of what was measured."""
+    """All rows of the findings."""
     return [row for findings in found.values() for row in findings.rows]
 
 
 def say_numbers(*shown: str) -> Callable[[Done], None]:
-    """What prints, for `measure`, a line of the most telling numbers of each case of the rows."""
+    """Returns a `report` for `measure` that prints the `shown` quantities, one line per case of the rows."""
 
     def report(done: Done) -> None:
         for case, numbers in by_case(done.findings.rows).items():
@@ -103,7 +103,7 @@ def say_numbers(*shown: str) -> Callable[[Done], None]:
 
 
 def named(cases: Sequence[Case], *names: str) -> list[Case]:
-    """Some of the cases, by their names; `InputError` for one that there is not."""
+    """Selects cases by name; `InputError` for an unknown name."""
     known = {case.name: case for case in cases}
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"case '{unknown[0]}' is unknown; choose from {', '.join(known)}")
@@ -111,7 +111,7 @@ def named(cases: Sequence[Case], *names: str) -> list[Case]:
 
 
 def draw(folder: Path, case: Case, findings: Findings) -> None:
-    """Writes the figure of a case, if it has one, under the last part of its name."""
+    """Writes the figure of a case, if it has one, as a PNG file named by the last part of the case's name."""
     if case.draw is not None and findings.curves:
         write_figure(folder / f"{case.name.split('/')[-1]}.png", case.draw(findings.curves))
 
@@ -125,15 +125,15 @@ def by_case(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def rows_of(case: str, numbers: Mapping[str, float]) -> list[Row]:
-    """Numbers by quantity as bare rows, of which a table says later what they are compared with."""
+    """Converts numbers by quantity to rows without unit, reference or bound, which a table adds later."""
     return [Row(case, quantity, value) for quantity, value in numbers.items()]
 
 
 def stored_findings(folder: Path, cases: Sequence[Case]) -> dict[str, Findings]:
-    """What a folder's jobs.json has of some cases, none where there is no file; what JSON cannot say is NaN.
+    """Reads the findings of these cases from a folder's jobs.json; empty if there is no file. Null values become NaN.
 
     Raises:
-        InputError: the file is damaged, or another release has written it.
+        InputError: the file is damaged, or another release wrote it.
     """
     path, known = folder / JOBS, {case.name: case for case in cases}
     found = {}

@@ -1,7 +1,7 @@
-"""What is to be done with encoders' q and motors' tau before a robot is identified: ways to equations, side by side.
+"""Ways to prepare noisy encoder and torque data for the identification of a robot, compared.
 
-Each way makes of a noisy log the equations of a linear fit of the same tree with friction; errors are those of torques
-along other motions, whose states and torques are exact.
+All ways derive the equations of a linear fit, of the same tree with friction, from a noisy log. Errors are torque
+errors along other motions with exact states and torques.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,8 +32,8 @@ WAYS = (
     "momentum-twice-the-cutoff",
     "energy",
 )
-"""Rates by differences; q filtered at the cut-off that its spectra ask for, tau as it is; tau filtered like q; and the
-weak forms, which read no accelerations."""
+"""Rates by differences; q filtered at the cut-off chosen from its spectra, with raw tau; tau filtered like q; and weak
+forms, which need no accelerations."""
 
 
 def encoder_rows(
@@ -48,18 +48,18 @@ def encoder_rows(
     ways: Sequence[str] = WAYS,
     say: Callable[[str], None] | None = None,
 ) -> list[Row]:
-    """Median and worst nMSE, mean over joints, of each way over parts of the data, each with noise of its own.
+    """Median and worst nMSE, averaged over joints, of the ways over parts of the data with independent noise.
 
     Args:
-        tree: with the robot's frames.
+        tree: tree with the robot's frames.
         exact: motions with exact q, qd, qdd and tau, to which noise is added.
-        test: other motions, exact.
-        noise_q: standard deviation of the encoders' noise, rad or m.
-        noise_tau: of the torques', N m or N.
-        parts: trajectories that are fitted together.
-        velocity_scale: of dry friction in the model.
-        ways: of `WAYS`.
-        say: is told of each error.
+        test: other exact motions.
+        noise_q: standard deviation of the encoder noise, rad or m.
+        noise_tau: standard deviations of the torque noise, N m or N.
+        parts: groups of trajectories that are fitted together.
+        velocity_scale: velocity scale of dry friction in the model.
+        ways: names from `WAYS`.
+        say: called with a line per error.
     """
     model = make_rigid_tree(tree, friction=True, velocity_scale=velocity_scale)
     with jax.enable_x64(True):
@@ -118,13 +118,13 @@ def _differences(log: Trajectories, times: int, trajectory: int) -> np.ndarray:
 
 
 def cutoff_rows(exact: Trajectories, *, noises: Sequence[float], every: int = 1, tried: int = 30) -> list[Row]:
-    """How good accelerations are at the cut-off that is chosen, at the best of a grid, and by central differences.
+    """Errors of accelerations at the chosen cut-off, at the best cut-off of a grid, and by central differences.
 
     Args:
         exact: motions with exact q and qdd at equal steps.
         noises: standard deviations of encoders, rad or m.
-        every: every so manyth sample is in the log.
-        tried: cut-offs of the grid.
+        every: stride of the samples kept in the log.
+        tried: number of cut-offs in the grid.
     """
     rows = []
     kept = np.concatenate([np.flatnonzero(exact.trajectory == k)[::every] for k in np.unique(exact.trajectory)])

@@ -1,8 +1,7 @@
-"""What designed motions are worth: errors of identified parameters after them and after random ones of equal length.
+"""Benefit of designed motions: errors of identified parameters, compared with random motions of equal length.
 
-One motion each, of the same period and samples, the same noise drawn for both, and the same least squares. An error is
-that of a base parameter in units of the deviation that it has on average after random motions, so that no parameter's
-unit counts more than another's.
+Both motions have the same period, samples and noise, and the same least-squares fit. Errors of base parameters are
+relative to their average standard deviation after random motions, so that units do not matter.
 """
 
 from collections.abc import Sequence
@@ -16,10 +15,10 @@ from dln_jax.identification.excitation.task import Task
 
 
 class Comparison(NamedTuple):
-    """Errors [S seeds] of designed over random motions, each a root of mean squares over parameters."""
+    """Ratios of errors after designed and random motions by seed [S]; errors are root mean squares over parameters."""
 
     ratios: Float[np.ndarray, " S"]
-    """Below one: designed motions are better."""
+    """Values below one favour designed motions."""
     median: float
     worst: float
 
@@ -27,17 +26,17 @@ class Comparison(NamedTuple):
 def compare(
     task: Task, designed: Sequence[Design], drawn: Sequence[Design], *, samples: int = 500, seeds: int = 50
 ) -> Comparison:
-    """Least squares after each pair of a designed and a random motion in turn, with new noise for each seed.
+    """Compares least-squares errors after designed and random motions, pair by pair, with new noise for every seed.
 
     Args:
-        task: whose `noise` are the deviations.
-        designed: by a criterion.
-        drawn: random ones within the same limits.
-        samples: of each motion, equally spaced over its period.
-        seeds: of the noise.
+        task: task whose `noise` holds the standard deviations.
+        designed: motions optimised for a criterion.
+        drawn: random motions within the same limits.
+        samples: number of equally spaced samples in a motion's period.
+        seeds: number of seeds for the noise.
     """
     errors = [_solver(task, designs, samples) for designs in (designed, drawn)]
-    # Deviations of each parameter after random motions, on average over them.
+    # Standard deviations of the parameters after random motions, averaged over the motions.
     scale = np.sqrt(np.mean([np.sum(inverse**2, axis=1) for inverse in errors[1]], axis=0))
     found = []
     for seed in range(seeds):
@@ -49,7 +48,7 @@ def compare(
 
 
 def _solver(task: Task, designs: Sequence[Design], samples: int) -> list[np.ndarray]:
-    """For each motion the matrix [B, N d] that turns noise, over its deviation, into errors of parameters."""
+    """Matrices [B, N d], one per motion, that map normalised noise to errors of parameters."""
     functions = functions_at(task, task.period * np.arange(samples) / samples)
     inverses = []
     for design in designs:
@@ -57,7 +56,7 @@ def _solver(task: Task, designs: Sequence[Design], samples: int) -> list[np.ndar
         chunks = np.array_split(np.arange(samples), -(-samples // task.steps))
         rows = []
         for chunk in chunks:
-            # All chunks are one program: the last is filled up.
+            # The last chunk is padded, so that all chunks share one compiled program.
             filled = np.resize(chunk, task.steps)
             Phi = np.asarray(task.samples(*(each[filled] for each in at))[0])[: len(chunk)]
             rows.append(Phi[..., task.columns] / task.noise[:, None])

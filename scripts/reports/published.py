@@ -9,16 +9,16 @@ class Published(NamedTuple):
 
     source: str
     values: Mapping[str, Mapping[str, float]]
-    """By case, then by quantity."""
+    """Numbers by case and quantity."""
 
 
 def published(table: Published, case: str, quantity: str) -> float | None:
-    """One number of a table; `None` where it has none."""
+    """One number of a table; `None` if it is not published."""
     return table.values.get(case, {}).get(quantity)
 
 
 def _of_the_arm(torque: str, rows: Mapping[str, tuple[float, ...]]) -> dict[str, dict[str, float]]:
-    """Torque and prediction time, and between them in three columns the parts of the torque."""
+    """Names the columns of rows: torque, optionally its three parts, and prediction time."""
     parts = ("inertial_mse", "coriolis_mse", "gravity_mse")
     return {
         case: dict(zip((torque, *parts, "vpt_seconds") if len(row) > 2 else (torque, "vpt_seconds"), row, strict=True))

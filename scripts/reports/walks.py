@@ -1,4 +1,4 @@
-"""Which files of the library a run enters, and from which it enters each: how much a reader has to follow."""
+"""Files of the library that a run enters, and the files that call them: how much a reader has to follow."""
 
 import sys
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import dln_jax
 
 ROOT = Path(dln_jax.__file__).parent
 BODIES = ("<module>", "<genexpr>", "<listcomp>", "<dictcomp>", "<setcomp>")
-"""Code that is entered by no call that a reader sees: imports and comprehensions."""
+"""Code that is entered without a visible call: imports and comprehensions."""
 
 
 class Walk(NamedTuple):

@@ -56,7 +56,7 @@ LARGEST_SIZE = 10.0
 """Length, m, above which a mesh is probably in millimetres."""
 ALL = "all"
 GALLERY = (0, 3, 2, 1, 4)
-"""Order of the scenes in the combined figure."""
+"""Order of the scenes in the combined picture."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Prepared(NamedTuple):
 
 
 def main(given: Arguments) -> None:
-    """Simulates one scene into the run folder, or all scenes into subfolders with a combined figure."""
+    """Simulates one scene into the run folder, or all scenes into subfolders with a combined picture."""
     several = given.scene == ALL
     prepared = [prepare(dataclasses.replace(given, scene=name)) for name in (EXAMPLES if several else [given.scene])]
     with run_folder(given.out, "simulate") as folder:
@@ -136,7 +136,7 @@ def prepare(given: Arguments) -> Prepared:
 
 
 def simulate(prepared: Prepared, folder: Path) -> Moments:
-    """Simulates one scene, writes its folder and returns its figure."""
+    """Simulates one scene, writes its folder and returns its picture."""
     given, example, _, dt, steps = prepared
     write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh

@@ -1,8 +1,8 @@
-"""Torque errors on unseen letters: against the number of training letters, and at other speeds than the trained one.
+"""Torque errors on unseen letters, against the number of training letters and at other speeds than in training.
 
 The offline experiments of Lutter, Ritter and Peters (2019, arXiv:1907.04490). All models are fitted to the same samples
-of the same letters by the same number of iterations, and selected by the same held-out samples. A letter at s times its
-speed is the motion (q, s qd, s² qdd), and its torque is the exact plant's.
+of the same letters with the same number of iterations, and selected by the same held-out samples. A letter at s times
+its speed is the motion (q, s qd, s² qdd), with the torque of the exact plant.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,20 +29,20 @@ from scripts.reports.figures.letters import error_lines
 COUNTS, SPEEDS = (1, 2, 3, 5, 8), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
 ZERO, OUTSIDE = "torque_mean_square", "share_outside_training"
 THINNED = 2
-"""Every second sample is fitted, 12.5 a second; all samples of test letters are judged."""
+"""Every second sample is fitted, 12.5 per second; all samples of the test letters are evaluated."""
 
 _exact = jax.jit(jax.vmap(partial(closed_form.inverse_dynamics, two_link_arm().closed_form)))
 
 
 class Effort(NamedTuple):
-    """How much is measured, and with how many iterations."""
+    """Numbers of splits, seeds and iterations."""
 
     splits: int = 3
-    """Sets of test letters: the published one first."""
+    """Number of sets of test letters; the published set comes first."""
     seeds: int = 2
-    """Of each split; a seed draws the initial parameters and the order of the training letters."""
+    """Number of seeds per split; a seed sets the initial parameters and the order of the training letters."""
     rounds: int = 8
-    """Of five iterations of Levenberg-Marquardt."""
+    """Number of rounds of five Levenberg-Marquardt iterations."""
 
 
 QUICK = Effort(splits=1, seeds=1, rounds=2)
@@ -58,18 +58,18 @@ class Fit(NamedTuple):
 
 
 Settings = Mapping[str, tuple[int, float]]
-"""By name, a number of training letters and a speed."""
+"""Number of training letters and speed, by name."""
 
 
 def against_letters(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
-    """Errors against the number of training letters; `name` is that of the data, `test` the first test letters."""
+    """Errors against the number of training letters; `name` names the data, `test` is the first set of test letters."""
     most = _training_letters(data, test)
     counts = {f"{count}-letters": (count, 1.0) for count in (*(each for each in COUNTS if each < most), most)}
     return _case(f"{name}/letters", data, test, counts, quick, "training letters")
 
 
 def at_speeds(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
-    """Errors at other speeds of the test letters, likewise, with all other letters for training."""
+    """Errors at other speeds of the test letters, after training on all other letters; arguments as above."""
     speeds = {f"speed-{speed:g}": (_training_letters(data, test), speed) for speed in SPEEDS}
     return _case(f"{name}/speeds", data, test, speeds, quick, "speed of the test letters, times their own")
 
@@ -90,7 +90,7 @@ def _case(name: str, data: Trajectories, test: Sequence[str], settings: Settings
 
 
 def test_sets(data: Trajectories, test: Sequence[str], splits: int) -> list[list[str]]:
-    """The given test letters, then groups of as many, in which no letter is twice."""
+    """The test letters, then disjoint groups of the same size."""
     parts = max(2, len(np.unique(data.trajectory)) // len(test))
     groups = [group[: len(test)] for group in partition_labels(data, parts) if set(group) != set(test)]
     return [list(test), *groups][:splits]
@@ -99,7 +99,7 @@ def test_sets(data: Trajectories, test: Sequence[str], splits: int) -> list[list
 def measure(
     name: str, data: Trajectories, splits: Sequence[Sequence[str]], effort: Effort, settings: Settings
 ) -> Findings:
-    """Test errors of every rival in each setting, over splits and seeds."""
+    """Test errors of all rivals in all settings: median and worst over splits and seeds."""
     known, runs = rivals(rounds=effort.rounds), []
     for test in splits:
         for seed in range(effort.seeds):
@@ -123,7 +123,7 @@ def measure(
 def one_run(
     known: Mapping[str, Rival], data: Trajectories, test: Sequence[str], seed: int, settings: Settings
 ) -> dict[str, dict[str, float]]:
-    """By setting: the torque MSE of each rival, the mean square of the torque, and the share outside the training."""
+    """Torque MSE of the rivals, mean square of the torque, and share of out-of-distribution samples, by setting."""
     held_out, fits = select(data, label_indices(data, test)), {}
     found: dict[str, dict[str, float]] = {}
     for setting, (count, speed) in settings.items():
@@ -139,7 +139,7 @@ def one_run(
 
 
 def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, seed: int) -> Fit:
-    """A rival fitted to `count` letters that are no test; fewer letters are the first of more."""
+    """Fits a rival to `count` letters outside the test. A seed draws one order: smaller sets are subsets of larger."""
     letters = np.setdiff1d(np.unique(data.trajectory), label_indices(data, test))
     chosen = np.random.default_rng([seed, 1]).permutation(letters)[:count].tolist()
     thin = every(data, THINNED)
@@ -153,12 +153,12 @@ def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, se
 
 
 def states(data: Trajectories) -> Float[np.ndarray, "N n"]:
-    """(q, qd, qdd) of each sample."""
+    """The states (q, qd, qdd) of all samples."""
     return np.hstack([data.q, data.qd, data.qdd])
 
 
 def faster(data: Trajectories, speed: float) -> Trajectories:
-    """The same paths at a multiple of their speed, with the torques of the exact plant."""
+    """The same paths at `speed` times their speed, with the torques of the exact plant."""
     q, qd, qdd = data.q, speed * data.qd, speed**2 * data.qdd
     return data._replace(
         t=data.t / speed, qd=qd, qdd=qdd, tau=np.asarray(_exact(q, qd, qdd)), p=None, pd=None,
@@ -172,6 +172,6 @@ def torque_mse(rival: Rival, parameters: Parameters, data: Trajectories) -> floa
 
 
 def share_outside(fit: Fit, data: Trajectories) -> float:
-    """Share of the samples of which an angle, a rate or an acceleration is beyond all that was fitted."""
+    """Share of samples with an angle, a rate or an acceleration outside the fitted range."""
     now = states(data)
     return float(np.mean(((now < fit.low) | (now > fit.high)).any(axis=1)))

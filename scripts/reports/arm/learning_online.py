@@ -1,11 +1,11 @@
-"""The arm learns its own dynamics while it writes: torques by the model that is being learned, and PD beside it.
+"""An arm learns its own dynamics while it writes: feed-forward torques by the current model, plus PD feedback.
 
 The online experiment of Lutter, Ritter and Peters (2019, arXiv:1907.04490), on the exact two-link arm:
 
     tau_k = f(q*, qd*, qdd*; theta_i) + P (q* - q_k) + D (qd* - qd_k)      held for 1 ms, within +-25 and +-15 N m
 
-The parameters theta_0 are random. After each letter they are fitted to all samples recorded so far. No letter is
-written twice, so each error is that of a motion that the model has not seen.
+The parameters theta_0 are random. After every letter they are fitted to all samples recorded so far. No letter is
+written twice, so all errors are those of unseen motions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,23 +43,23 @@ from scripts.reports.case import Case, Findings
 from scripts.reports.figures.letters import written_letters
 
 GAINS = Gains(np.array([60.0, 30.0]), np.array([12.0, 5.0]))
-"""N m/rad and N m s/rad."""
+"""P in N m/rad and D in N m s/rad."""
 LIMITS = np.array([25.0, 15.0])
-"""N m."""
+"""Torque limits, N m."""
 CUTOFF = 50.0
-"""Hz, of the low-pass behind differences of noisy readings."""
+"""Cut-off of the low-pass after differences of noisy readings, Hz."""
 LOST = 1.0
-"""rad: a joint that is farther off is lost, and the run of that letter ends there."""
+"""Tracking error of a joint, rad, above which the letter counts as lost; its run is cut off there."""
 
 
 class Condition(NamedTuple):
-    """Under what the arm writes."""
+    """Conditions under which the arm writes."""
 
     speed: float = 1.0
     gains: float = 1.0
-    """Factor on P; its square root is that on D."""
+    """Factor on P; D is multiplied by its square root."""
     encoder_noise: float = 0.0
-    """rad, standard deviation: with it, rates are differences of readings behind a low-pass."""
+    """Standard deviation of the encoders, rad; if positive, rates are low-passed differences of readings."""
 
 
 CONDITIONS = {
@@ -71,13 +71,13 @@ CONDITIONS = {
 
 
 class Effort(NamedTuple):
-    """How much is measured."""
+    """Numbers of letters, seeds and iterations, and the conditions."""
 
     letters: int = 8
     seeds: int = 3
-    """Of initial parameters and of the order of letters."""
+    """Number of seeds for initial parameters and the order of letters."""
     rounds: int = 4
-    """Of five iterations of Levenberg-Marquardt, after each letter."""
+    """Number of rounds of five Levenberg-Marquardt iterations after every letter."""
     conditions: tuple[str, ...] = tuple(CONDITIONS)
 
 
@@ -85,22 +85,22 @@ QUICK = Effort(letters=2, seeds=1, rounds=1, conditions=("nominal",))
 
 
 class Written(NamedTuple):
-    """One letter as it was written."""
+    """Result of writing one letter."""
 
     joint_error: float
-    """rad, root mean square over samples of the norm over joints; infinite for a letter that was lost."""
+    """Root mean square over samples of the norm over joints, rad; infinite for a lost letter."""
     tip_error: float
-    """m, root mean square."""
+    """Root mean square error of the tip, m; infinite for a lost letter."""
     saturated: float
-    """Share of the samples at a torque limit."""
+    """Share of samples at a torque limit."""
     path: np.ndarray
-    """Tip [N, 2], m, up to where it was lost."""
+    """Positions of the tip [N, 2], m, until the letter was lost."""
     wanted: np.ndarray
-    """Tip of the whole letter, m."""
+    """Reference of the tip for the whole letter, m."""
 
 
 def cases(name: str, data: Trajectories, *, quick: bool = False) -> list[Case]:
-    """One case for each condition."""
+    """One case per condition."""
     effort = QUICK if quick else Effort()
     found = []
     for condition in effort.conditions:
@@ -113,7 +113,7 @@ Law = Callable[[Parameters, Gains], Tracker]
 
 
 def laws(learners: Mapping[str, Rival]) -> dict[str, Law]:
-    """Control laws by name, of parameters and gains; those that learn nothing do not use the parameters."""
+    """Control laws by name, as functions of parameters and gains; laws that do not learn ignore the parameters."""
     exact = dynamics(two_link_arm().closed_form)
     return {
         "feedback-alone": lambda _, gains: partial(feedback, gains),
@@ -127,7 +127,7 @@ def _by_model(model: Model, parameters: Parameters, gains: Gains) -> Tracker:
 
 
 def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Findings:
-    """Tracking errors letter by letter: median and worst over seeds, of which a lost letter's is infinite."""
+    """Tracking errors by letter: median and worst over seeds; the error of a lost letter is infinite."""
     learners, under = rivals(rounds=effort.rounds), CONDITIONS[condition]
     written: dict[str, list[list[Written]]] = {}
     motions = [drawn_letters(data, effort.letters, seed, under.speed) for seed in range(effort.seeds)]
@@ -149,14 +149,14 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
 def written_by(
     drive: Callable, learner: Rival | None, motions: Sequence[Motion], seed: int, places: int
 ) -> list[Written]:
-    """The letters one after the other, with a refit after each; without a learner nothing is learned."""
+    """Writes the letters one after the other and refits the learner, if any, after every letter."""
     start, refit = ((), lambda parameters, _: parameters) if learner is None else (learner.start(seed), learner.refit)
     replay = empty_replay(places, 2)
     return [visit.outcome for visit in learn_online(motions, drive, refit, start, replay)]
 
 
 def rows_of(case: str, runs: Sequence[Sequence[Written]]) -> list[Row]:
-    """Errors of the first letter, the second and the last, and of all letters how many were lost or saturated."""
+    """Errors of the first, second and last letter, the number of lost letters, and the share of saturated samples."""
     rows = []
     for place, name in {0: "first", 1: "second", len(runs[0]) - 1: "last"}.items():
         for quantity, unit in {"joint_error": "rad", "tip_error": "m"}.items():
@@ -175,18 +175,18 @@ class Driven(NamedTuple):
 
     run: Run
     qdd: Any
-    """rad/s² at the start of each sample [N, 2]."""
+    """Accelerations at the start of the samples [N, 2], rad/s²."""
     tip: Any
-    """m, of the arm and of the reference [N, 2]."""
+    """Tip of the arm, and below that of the reference [N, 2], m."""
     wanted_tip: Any
 
 
 Loop = Callable[[Parameters, Reference, Array], Driven]
-"""(parameters, reference, key of the noise) -> the run along it."""
+"""(parameters, reference, random key of the noise) -> the run along the reference."""
 
 
 def closed_loop(law: Law, condition: Condition) -> Loop:
-    """The exact arm under a law, compiled: all parameters and letters share the program."""
+    """The exact arm under a control law, as one compiled program for all parameters and letters."""
     gains = Gains(condition.gains * GAINS.proportional, condition.gains**0.5 * GAINS.derivative)
     noisy = condition.encoder_noise > 0
     hardware = Hardware(-LIMITS, LIMITS, encoder_noise=condition.encoder_noise, sees_rates=not noisy)
@@ -209,7 +209,7 @@ def closed_loop(law: Law, condition: Condition) -> Loop:
 
 
 def write(loop: Loop, condition: Condition, parameters: Parameters, motion: Motion) -> tuple[Written, tuple]:
-    """One letter, and what is recorded of it: exact states, or readings of the encoders behind a filter."""
+    """Writes one letter; returns the result and the recording: exact states, or filtered encoder readings."""
     driven = jax.tree.map(np.asarray, loop(parameters, motion.reference, jax.random.key(motion.samples)))
     run, off = driven.run, driven.run.x[:-1, :2] - motion.reference.q
     lost = np.flatnonzero(~(np.abs(off[: motion.samples]).max(axis=1) <= LOST))
@@ -226,7 +226,7 @@ def write(loop: Loop, condition: Condition, parameters: Parameters, motion: Moti
 
 
 def _filtered(t: np.ndarray, q: np.ndarray, tau: np.ndarray, step: int) -> tuple[np.ndarray, ...]:
-    """What `data.encoders.smooth` makes of readings; nothing of less than half a second."""
+    """Filters encoder readings with `data.encoders.smooth`; returns no samples for less than half a second."""
     if len(t) < RATE / 2:
         return (np.zeros((0, 2)),) * 4
     log = from_arrays({"t": t, "q": q, "tau": tau, "trajectory": np.zeros(len(t), int)})

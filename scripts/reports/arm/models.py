@@ -1,4 +1,4 @@
-"""One model of the arm's table: trained, measured on the test, and timed."""
+"""Training, test errors and timing of one model in the table of the arm."""
 
 from typing import Any
 
@@ -32,9 +32,9 @@ from dln_jax.zoo.run import compiled
 
 TRIGONOMETRIC = "trigonometric"
 TORQUE_NOISE = 0.05
-"""N m, standard deviation, of the trigonometric model's second fit."""
+"""Standard deviation of the torque noise in the trigonometric model's second fit, N m."""
 TARGETS = (1.35e-5, 1e-8, 1e-9, 1e-10)
-"""Test errors in (N m)² whose times are measured; the first is the published code's after 108 s."""
+"""Test errors in (N m)² to which training is timed; the published code reaches the first after 108 s."""
 
 
 WIDTHS = {
@@ -42,30 +42,30 @@ WIDTHS = {
     **{"feed-forward": 16},
 }
 DEPTH, STEPS = 2, 150
-"""Of these networks, of tanh, and until Gauss-Newton levels off; all chosen by validation errors."""
+"""Hidden layers of these tanh networks, and Gauss-Newton steps until the error levels off; chosen by validation."""
 
 Curve = dict[str, list[float]]
-"""Test torque "errors" against "seconds" of training, per seed, compilation included; empty where there are none."""
+"""Test torque "errors" against "seconds" of training per seed, including compilation; empty if not recorded."""
 Measured = tuple[dict[str, float], Curve]
 
 
 def whole_circle() -> Trajectories:
-    """Random states of the arm over the whole circle, most of them far from every letter; torques in closed form.
+    """Random states of the arm over the whole circle, most of them far from all letters; torques in closed form.
 
-    Rates and accelerations are those of the letters, in 1/s and 1/s².
+    Rates and accelerations lie in the range of the letters, in 1/s and 1/s².
     """
     bounds = {"position_bound": np.pi, "rate_bound": 2.0, "acceleration_bound": 8.0}
     return generators.uniform(two_link_arm(), samples=1_000, seed=1, **bounds)
 
 
 def described(kind: str, data: Trajectories, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
-    """The description of a model of the arm; networks get their size, others have none."""
+    """The description of a model of the arm; `keywords` set the size of networks and are ignored for linear models."""
     size: dict[str, Any] = {} if CATALOGUE[kind].properties.linear else {"activation": "tanh", **keywords}
     return describe_for(kind, data, two_link_arm().needs, precision=precision, **size)
 
 
 def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5.0, dt: float = 0.02) -> float:
-    """How long a motion without torque stays within the training angles: median over the test's first states, in s."""
+    """Median time, s, that a torque-free motion from the first state of a test letter stays in the training angles."""
     _, first = np.unique(sets.test.trajectory, return_index=True)
     t = np.arange(0.0, duration, dt)
     q, _ = generators.rollouts(scene, sets.test.q[first], sets.test.qd[first], t)
@@ -74,9 +74,9 @@ def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5
 
 
 def measure_plant(scene: Scene, sets: Split) -> Measured:
-    """What the true plant reaches on the test: the ceiling of every rollout, and what recorded momenta are wrong by.
+    """Results of the true plant on the test: the best possible rollouts, and the error of the recorded momenta.
 
-    The mean square of the torques over the whole circle is what a model that answers zero would be wrong by.
+    The mean square of the torques over the whole circle is the error of a model that predicts zero.
     """
     return {
         **on_the_test(scene.energies, sets, H=legendre(scene.lagrangian)),
@@ -86,14 +86,14 @@ def measure_plant(scene: Scene, sets: Split) -> Measured:
 
 
 def linear_fit(data: Trajectories) -> tuple[LinearFit, Driven]:
-    """The fit of the trigonometric model, and its energies."""
+    """Fits the trigonometric model; returns the fit and the model's energies."""
     model = build(described(TRIGONOMETRIC, data))
     fitted = fit_linear(model, data)
     return fitted, model.energies(fitted.parameters)
 
 
 def measure_trigonometric(sets: Split) -> Measured:
-    """The linear fit, and the same with noise on the training torques."""
+    """Measures the linear fit, without and with noise on the training torques."""
     fitted, energies = linear_fit(sets.train)
     noise = TORQUE_NOISE * np.random.default_rng(0).standard_normal(sets.train.tau.shape)
     _, noisy = linear_fit(sets.train._replace(tau=sets.train.tau + noise))
@@ -112,7 +112,7 @@ def measure_trigonometric(sets: Split) -> Measured:
 
 
 def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
-    """Gauss-Newton on several seeds in one program; medians over them, and the spread of the torque error."""
+    """Trains several seeds in one program by Gauss-Newton; medians over seeds, and the spread of the torque error."""
     training, energies = trained(kind, sets, seeds=seeds, steps=steps)
     systems = [compiled(dynamics(each), jnp.float64) for each in energies]
     of_seeds = [
@@ -135,7 +135,7 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
 
 
 def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[Training, list[Driven]]:
-    """Gauss-Newton on several seeds in one program, and the energies of each."""
+    """Trains several seeds in one program by Gauss-Newton; returns the training and the energies per seed."""
     model, optimiser = prepared(kind, sets, steps=steps)
     objective = objective_of(kind, sets.train)
     training = fit(problem(model, sets, objective, seeds=tuple(range(seeds))), optimiser)
@@ -144,7 +144,7 @@ def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[T
 
 
 def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
-    """Test torque errors of one more split, trained as the published one: median and largest over seeds."""
+    """Test torque errors of a further split, trained as the published split: median and largest over seeds."""
     if kind == TRIGONOMETRIC:
         energies = [linear_fit(sets.train)[1]]
     else:
@@ -154,7 +154,7 @@ def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
 
 
 def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
-    """One seed of the published protocol."""
+    """Measures one seed of the published protocol."""
     training, energies = by_published_protocol(kind, sets, steps=steps)
     system = compiled(dynamics(energies), jnp.float32)
     numbers = {**on_the_test(energies, sets, jnp.float32), **costs(training, system, sets, jnp.float32)}
@@ -164,7 +164,7 @@ def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
 def by_published_protocol(
     kind: str, sets: Split, *, steps: int, seed: int = 0, report: Report = silent
 ) -> tuple[Training, Driven]:
-    """Two layers of 64, Adam, batch 512, float32; and the energies."""
+    """Trains by the published protocol: two layers of 64, Adam, batch 512, float32. Returns training and energies."""
     model = build(described(kind, sets.train, precision="f32", width=64, depth=2))
     task = problem(model, sets, objective_of(kind, sets.train), seeds=seed)
     training = fit(task, Adam(steps=steps), report=report)
@@ -172,9 +172,9 @@ def by_published_protocol(
 
 
 def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measured:
-    """Structured models trained one by one: seconds to test errors, compilation included, medians over seeds.
+    """Trains structured models one by one: seconds to the target test errors, medians over seeds.
 
-    Also the cost of ten seeds in one program in units of a single run, compilation included.
+    Also the cost of ten seeds in one program relative to a single run. All times include compilation.
     """
     model, optimiser = prepared("structured-delan", sets, steps=steps)
     times: dict[float, list[float]] = {target: [] for target in TARGETS}
@@ -201,13 +201,13 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
 def prepared(
     kind: str, sets: Split, *, steps: int | None, width: int | None = None, depth: int = DEPTH
 ) -> tuple[Model, GaussNewton]:
-    """The model of a kind, and its optimiser."""
+    """A model of this kind and its Gauss-Newton optimiser."""
     model = build(described(kind, sets.train, width=width or WIDTHS[kind], depth=depth))
     return model, GaussNewton(steps=steps or STEPS)
 
 
 def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float], seeds: int) -> Curve:
-    """The path of the test error; its end alone for models that are not fitted to torques."""
+    """The test error during training; only its final value for models that are not fitted to torques."""
     if objective_of(kind, sets.train) is not TORQUE:
         return end_of(numbers)
     seconds = [(training.compile_seconds + at.seconds) / seeds for at in training.history]
@@ -216,12 +216,12 @@ def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float],
 
 
 def end_of(numbers: dict[str, float]) -> Curve:
-    """A path of which only the end is known."""
+    """A curve with only the final error."""
     return {"seconds": [numbers["train_seconds"]], "errors": [max(numbers["torque_mse"], 1e-32)]}
 
 
 def on_the_test(energies: Driven, sets: Split, dtype=jnp.float64, *, H: Hamiltonian | None = None) -> dict[str, float]:
-    """Errors, and how long motions are predicted; `H` as for `predictions`."""
+    """Test errors and valid prediction times; `H` as for `predictions`."""
     predicted = predictions(energies, sets.test, dtype, H=H)
     return {**errors(predicted, sets.test), **rollout_metrics(dynamics(energies), sets.test, dtype=dtype)}
 
@@ -235,7 +235,7 @@ def torque_mse(dynamics: Dynamics | PlainDynamics, data: Trajectories) -> float:
 def costs(
     training: Training, system: Dynamics | PlainDynamics, sets: Split, dtype=jnp.float64, *, seeds: int = 1
 ) -> dict[str, float]:
-    """Seconds, parameters and one call, per seed."""
+    """Training time, number of parameters and time of one call, per seed."""
     return {
         "compile_seconds": training.compile_seconds,
         "train_seconds": (training.compile_seconds + training.train_seconds) / seeds,
@@ -245,6 +245,6 @@ def costs(
 
 
 def latency(system: Dynamics | PlainDynamics, sets: Split, dtype=jnp.float64, *, calls: int = 2000) -> Latency:
-    """Of one inverse-dynamics call."""
+    """Latency of one inverse-dynamics call."""
     states = list(zip(*(jnp.asarray(a[:400], dtype) for a in sets.test[1:4]), strict=True))
     return one_step(system.inverse_dynamics, states, calls=calls)

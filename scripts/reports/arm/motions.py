@@ -1,4 +1,4 @@
-"""Letters as motions that an arm is to follow at the rate of its controller, at any speed."""
+"""Letters as reference motions at the controller's rate, at any speed."""
 
 from typing import NamedTuple
 
@@ -10,23 +10,23 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 
 RATE = 1000.0
-"""Hz, of the controller."""
+"""Rate of the controller, Hz."""
 RECORDED = 25.0
-"""Hz, of the samples that are learned from, times the speed."""
+"""Rate of the training samples at normal speed, Hz; it is multiplied by the speed."""
 
 
 class Motion(NamedTuple):
-    """A letter as the controller is given it."""
+    """A letter as a reference for the controller."""
 
     label: str
     reference: Reference
-    """At the controller's rate; the arm stands still behind the letter, so that all letters have one length."""
+    """Reference at the controller's rate, padded with rest so that all letters have the same length."""
     samples: int
-    """Of the letter itself."""
+    """Number of samples of the letter without padding."""
 
 
 def drawn_letters(data: Trajectories, count: int, seed: int, speed: float) -> list[Motion]:
-    """Different letters in an order that the seed draws."""
+    """Distinct letters in a random order set by the seed."""
     letters = np.unique(data.trajectory).tolist()
     longest = max(len(reference(select(data, [index]), speed).q) for index in letters)
     order = np.random.default_rng([seed, 2]).permutation(letters)[:count].tolist()
@@ -40,7 +40,7 @@ def drawn_letters(data: Trajectories, count: int, seed: int, speed: float) -> li
 
 
 def reference(letter: Trajectories, speed: float = 1.0) -> Reference:
-    """A cubic spline through the angles of a letter, and its derivatives, at the controller's rate."""
+    """A cubic spline through the angles of a letter with its derivatives, at the controller's rate."""
     seconds = letter.t - letter.t[0]
     spline = CubicSpline(seconds, letter.q)
     t = speed * np.arange(int(seconds[-1] / speed * RATE) + 1) / RATE
@@ -48,7 +48,7 @@ def reference(letter: Trajectories, speed: float = 1.0) -> Reference:
 
 
 def capacity(data: Trajectories, letters: int) -> int:
-    """Places for the recordings of any so many letters: one program for all conditions and seeds."""
+    """Samples that the longest `letters` letters need, so that one compiled program fits all conditions and seeds."""
     starts = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
     seconds = np.maximum.reduceat(data.t, starts) - np.minimum.reduceat(data.t, starts)
     return int(np.sort(np.ceil(RECORDED * seconds) + 1)[-letters:].sum())

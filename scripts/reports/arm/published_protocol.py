@@ -1,6 +1,6 @@
-"""The structured DeLaN by the published protocol, beside the published implementation, and mechanics beside textbooks.
+"""The structured DeLaN by the published protocol against the published code, and mechanics against textbook formulas.
 
-64x64 tanh, batch 512, 20,000 steps, float32; and the generic mechanics against the closed form of the arm in float64.
+64x64 tanh, batch 512, 20,000 steps, float32. The generic mechanics is compared with the arm's closed form in float64.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ BOUNDS = {
 
 
 def cases(name: str, sets: Sequence[Split], *, steps: int) -> list[Case]:
-    """The textbook, and a training for each split, whose number is the seed; `name` is that of the data."""
+    """The textbook comparison, and one training per split, seeded by the split's index; `name` names the data."""
     names = [f"{KIND}/{name}/seed-{seed}" for seed in range(len(sets))]
     return [
         Case(f"textbook/{two_link_arm().name}", partial(textbook, two_link_arm())),
@@ -45,7 +45,7 @@ def cases(name: str, sets: Sequence[Split], *, steps: int) -> list[Case]:
 
 
 def trained(case: str, sets: Split, *, seed: int, steps: int) -> Findings:
-    """Trains one seed and measures everything that the published table has."""
+    """Trains one seed and measures all quantities of the published table."""
     with progress(steps) as show:
         report = lambda at: show(min(int(at.step), steps), f"{case}  loss {at.loss:.2e}")  # noqa: E731
         training, energies = by_published_protocol(KIND, sets, steps=steps, seed=seed, report=report)
@@ -61,14 +61,14 @@ def trained(case: str, sets: Split, *, seed: int, steps: int) -> Findings:
 
 
 def beside(row: Row) -> Row:
-    """A number beside the published one, of the same protocol or the same code, and what it is to reach."""
+    """Adds unit, published reference (of the protocol, else of the published code) and bound to a row."""
     of_protocol = published(ARM, f"{KIND}/characters", row.quantity)
     reference = published(PUBLISHED_CODE, KIND, row.quantity) if of_protocol is None else of_protocol
     return row._replace(unit=unit_of(row.quantity, ARM_UNITS), reference=reference, bound=BOUNDS.get(row.quantity))
 
 
 def textbook(scene: Scene, *, states: int = 1000) -> Findings:
-    """Largest error of the generic Lagrangian mechanics in float64, relative to the largest value."""
+    """Largest error of the generic Lagrangian mechanics in float64, relative to the largest magnitude."""
     q, qd, qdd, tau = np.random.default_rng(0).uniform(-np.pi, np.pi, (4, states, scene.needs.degrees_of_freedom))
     generic = dynamics(scene.energies)
     pairs = {

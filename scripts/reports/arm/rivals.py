@@ -1,4 +1,4 @@
-"""The models that the first DeLaN paper compares, in sizes and units that are stated before any data are seen."""
+"""The models compared in the first DeLaN paper, with sizes and scales fixed in advance of the data."""
 
 import functools
 from collections.abc import Callable
@@ -18,27 +18,27 @@ from dln_jax.scenes.two_link_arm import two_link_arm
 from scripts.reports.arm.models import WIDTHS
 
 RATE, ACCELERATION, TORQUE = 0.5, 2.0, 2.0
-"""Typical sizes of a letter's motion in rad/s, rad/s² and N m, by which networks are scaled whatever the data."""
+"""Typical magnitudes of a letter's motion in rad/s, rad/s² and N m; they scale the networks for all data."""
 IDENTIFIED = "identified-arm"
 
 
 class Rival(NamedTuple):
-    """A model and how it is fitted; the functions are compiled once for all cases of a report."""
+    """A model and its fit; the functions are compiled once for all cases of a report."""
 
     model: Model
     refit: Refit
     start: Callable[[int], Parameters]
-    """Seed -> parameters before any data."""
+    """Seed -> initial parameters."""
     torques: Callable[[Parameters, Any, Any, Any], Array]
     """(parameters, q, qd, qdd [N, d]) -> tau [N, d]."""
 
 
 @functools.cache
 def rivals(*, rounds: int) -> dict[str, Rival]:
-    """The models by name; networks are fitted by `rounds` of five iterations of Levenberg-Marquardt.
+    """The models by name; networks are fitted by `rounds` of five Levenberg-Marquardt iterations.
 
-    The identified arm is a planar chain of two links, of which inertias, weights and the friction of both joints are
-    unknown: 12 parameters by linear least squares.
+    The identified arm is a planar chain of two links with unknown inertias, weights and joint friction: 12 parameters
+    by linear least squares.
     """
     needs = two_link_arm().needs
     width = {name: {"width": WIDTHS[name], "dtype": jnp.float64} for name in WIDTHS}
@@ -66,10 +66,10 @@ def _rival(model: Model, refit: Refit) -> Rival:
 
 
 def _inverse_side(parameters: Parameters) -> Parameters:
-    """Without the network of the forward dynamics, which nothing here fits or uses."""
+    """Drops the network of the forward dynamics, which is not used here."""
     return {name: each for name, each in parameters.items() if name.startswith("inverse")}
 
 
 def size(rival: Rival) -> int:
-    """How many parameters are fitted."""
+    """Number of fitted parameters."""
     return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(rival.model.init, jax.random.key(0))))

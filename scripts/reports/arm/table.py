@@ -1,6 +1,6 @@
-"""The table of the arm: every model on both published data sets and on further splits of the letters.
+"""The table of the arm: all models on both published data sets and on further splits of the letters.
 
-Each number stands beside the published one, and structured models beside the true plant's prediction time.
+Numbers are compared with published ones, and structured models also with the true plant's valid prediction time.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,10 +38,10 @@ MODELS = (*WIDTHS, TRIGONOMETRIC)
 LAGRANGIAN = "structured-delan"
 STRUCTURED = (LAGRANGIAN, "structured-hnn")
 STRUCTURED_FACTOR = 100.0
-"""By how much the structured models are to beat their published rows."""
+"""Factor by which structured models must beat the published errors."""
 FROM_MOMENTA, WHOLE_CIRCLE = "torque_from_momenta_mse", "whole_circle_torque_mse"
 VPT_SHARE = 0.98
-"""Of the true plant's valid prediction time, that a structured model is to reach."""
+"""Share of the true plant's valid prediction time that a structured model must reach."""
 ARM_UNITS = {**UNITS, "forward_mse": "1/s^4", "power_mse": "W^2", "mse": "N^2 m^2"}
 BOUNDS = {
     "structured-delan/characters/gauss-newton": {
@@ -50,21 +50,21 @@ BOUNDS = {
     },
     "trigonometric/characters": {"torque_mse": 1e-20, "train_seconds": 1.0, "noisy_torque_mse": 5e-5},
 }
-"""Figures to reach that do not follow from published ones or from the plant's."""
+"""Bounds that do not follow from published numbers or from the plant's."""
 
 
 def letters(path: Path | None) -> Trajectories:
-    """What the arm writes."""
+    """The letters of the arm, embedded or from a file."""
     return _of_the_arm(path, default_data(two_link_arm()) if path is None else schema.load(path))
 
 
 def published_split(written: Trajectories) -> Split:
-    """Letters with the published ones as the test."""
+    """Splits the letters with the published test letters as the test set."""
     return split(written, test=CHARACTERS_TEST)
 
 
 def states(path: Path | None, *, samples: int = 3_000, validation: int = 300) -> Split:
-    """Random states of the arm for training, the published free swings for the test."""
+    """Random states of the arm for training, and the published free swings for the test."""
     data = _of_the_arm(path, generators.uniform(two_link_arm(), samples=samples) if path is None else schema.load(path))
     present = np.random.default_rng(0).permutation(np.unique(data.trajectory))
     held_out = present[: min(validation, max(1, len(present) // 10))]
@@ -78,7 +78,7 @@ def _of_the_arm(path: Path | None, data: Trajectories) -> Trajectories:
 
 
 def data_sets(data: Path | None, uniform: Path | None, splits: int) -> tuple[dict[str, Split], list[Split]]:
-    """Both published data sets, and further splits of the letters, each letter in one of their tests."""
+    """Both published data sets, and further splits of the letters, whose test sets partition the letters."""
     written = letters(data)
     tests = partition_labels(written, splits) if splits else []
     sets = {"characters": published_split(written), "uniform": states(uniform)}
@@ -95,11 +95,11 @@ def cases(
     adam_steps: int = 20_000,
     timed_seeds: int = 5,
 ) -> list[Case]:
-    """What the table measures on data sets (default: the embedded ones) and further splits, both as by `data_sets`.
+    """Cases of the table on data sets (default: the embedded ones) and further splits, both from `data_sets`.
 
-    `seeds` of each model are trained in one program; of each split, `split_seeds` of the structured Lagrangian and one
-    of the others. `timed_seeds` structured models are trained one by one. `adam_steps` are those on the letters. With
-    0, the last two are left out; by default `steps` of Gauss-Newton are each model's own.
+    One program trains `seeds` of a model. A further split trains `split_seeds` of the structured Lagrangian and one of
+    the other models. `timed_seeds` structured models are trained one by one; `adam_steps` is the number of Adam steps
+    on the letters; 0 leaves out either. `steps` of Gauss-Newton default to `STEPS`.
     """
     sets = data_sets(None, None, 0)[0] if sets is None else sets
     costs = ("train_seconds", "parameters", "one_step_p50_us")
@@ -134,14 +134,14 @@ def _case(name: str, measure: Callable[[], Measured], quantities: Sequence[str] 
 
 
 def table_rows(found: Mapping[str, Findings]) -> list[Row]:
-    """All numbers, with the published values and the figures to reach, and what each model comes to over the splits."""
+    """All numbers with their published values and bounds, and summaries of the models over the splits."""
     numbers = by_case([row for findings in found.values() for row in findings.rows])
     numbers |= {f"{kind}/characters/splits": each for kind in MODELS if (each := over_splits(kind, numbers))}
     return [_beside(row, numbers) for case in numbers for row in rows_of(case, numbers[case])]
 
 
 def over_splits(kind: str, numbers: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    """Median over the further splits of the test torque error, and the error of the worst single run."""
+    """Median test torque error over the further splits, and the error of the worst single run."""
     parts = [each for case, each in numbers.items() if case.startswith(f"{kind}/characters/split-")]
     if not parts:
         return {}
@@ -152,10 +152,10 @@ def over_splits(kind: str, numbers: Mapping[str, Mapping[str, float]]) -> dict[s
 
 
 def _beside(row: Row, numbers: Mapping[str, Mapping[str, float]]) -> Row:
-    """A number beside the published one, and what it is to reach: that of the same kind, or of the plant."""
+    """Adds unit, published reference and bound to a row; bounds come from published numbers or from the plant."""
     kind, dataset = row.case.split("/")[:2]
     reference = published(ARM, row.case, row.quantity)
-    # Torques from recorded momenta are no better than the record, whatever the model; the sound ones are.
+    # Published torques from recorded momenta are limited by the record; their error bounds ours instead.
     of_momenta = published(ARM, row.case, FROM_MOMENTA) if row.quantity == "torque_mse" else None
     bound = reference if of_momenta is None else of_momenta
     if row.quantity == "vpt_seconds":
@@ -172,7 +172,7 @@ def _beside(row: Row, numbers: Mapping[str, Mapping[str, float]]) -> Row:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The published table's columns, ours beside the published numbers, and what each model costs."""
+    """Markdown table with the published columns, our numbers beside the published ones, and the models' costs."""
     found = by_case(rows)
     parts = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse", "vpt_seconds")
     columns = [*(("characters", quantity) for quantity in parts), ("uniform", "torque_mse"), ("uniform", "vpt_seconds")]
@@ -198,6 +198,6 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def figure(found: Mapping[str, Findings]) -> Figure:
-    """Error against training time."""
+    """Figure of error against training time."""
     curves = {case: each.curves for case, each in found.items() if each.curves}
     return error_against_time({case: (each["seconds"], each["errors"]) for case, each in curves.items()})

@@ -44,7 +44,7 @@ class Arguments(Resumable):
 
 
 def main(given: Arguments) -> None:
-    """Measures what has not been measured yet, prints and writes."""
+    """Measures the cases that are not stored yet, prints the table and writes it."""
     require_positive_if_given(given, ("seeds", "split_seeds", "steps"))
     for name in ("splits", "adam_steps", "timed_seeds"):
         if getattr(given, name) < 0:
@@ -75,5 +75,5 @@ def main(given: Arguments) -> None:
 
 
 def _late(case: Case) -> bool:
-    """What is most likely wanted comes first, so that an interrupted table has it."""
+    """Sort key that puts the most important cases first, so that an interrupted table has them."""
     return not case.name.startswith(("plant", table.LAGRANGIAN))

@@ -40,7 +40,7 @@ class Arguments(Folder):
 
 
 def main(given: Arguments) -> None:
-    """Measures, prints and writes; what is measured is kept even if a later subject is interrupted."""
+    """Measures, prints and writes; finished subjects are kept even if a later one is interrupted."""
     if given.against and given.subject != "c":
         raise InputError(f"--against is for subject c; {given.subject} does not use it")
     chosen = [

@@ -37,7 +37,7 @@ class Arguments(Options, Folder, Drawn, Scaled):
 
 
 def main(given: Arguments) -> None:
-    """Trains by all methods, prints and writes."""
+    """Trains by all methods, prints the comparison and writes it."""
     mesh = mesh_of(given)
     ppo.check(given.lanes, mesh)
     task = prepare(given, METHODS, mesh)

@@ -24,7 +24,7 @@ from scripts.reports.case import Case, measure_and_publish
 
 SUBJECTS = ("published", "letters", "speeds", "online")
 QUICK_STEPS = 500
-"""Of Adam."""
+"""Adam steps with --quick."""
 
 
 @dataclass(frozen=True)

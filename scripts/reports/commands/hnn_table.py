@@ -48,7 +48,7 @@ class Arguments(Resumable, Drawn):
 
 
 def main(given: Arguments) -> None:
-    """Measures what has not been measured yet, prints and writes."""
+    """Measures the cases that are not stored yet, prints the table and writes it."""
     if given.own is not None:
         compare_own_files(given, given.own)
         return
@@ -77,7 +77,7 @@ def main(given: Arguments) -> None:
 
 
 def compare_own_files(given: Arguments, own: Path) -> None:
-    """Own files beside the named tasks."""
+    """Compares own files with the named tasks."""
     refuse_given(given, ["trajectories", "real_pendulum"], "for the table without --own")
     require_positive_if_given(given, ["seeds", "steps"])
     counts = {"seeds": given.seeds, "steps": given.steps}
@@ -97,7 +97,7 @@ def compare_own_files(given: Arguments, own: Path) -> None:
 
 
 def chosen_tasks(given: Arguments) -> list[str]:
-    """The tasks that can be measured; checks their data before anything is written."""
+    """The tasks whose data are available; checks the data before anything is written."""
     names = names_in("--tasks", given.tasks, TASKS)
     if given.real_pendulum is None:
         names = [name for name in names if name != REAL]

@@ -29,7 +29,7 @@ class Arguments(Folder):
 
 
 def main(given: Arguments) -> None:
-    """Kills, resumes, compares, prints and writes."""
+    """Kills and resumes the runs, compares them with unbroken ones, prints and writes the counts."""
     chosen = cases(names_in("--runs", given.runs, RUNS), kills=given.kills, seed=given.seed)
     with run_folder(given.out, "interruptions") as folder:
         rows = rows_in(measure(chosen, say))
@@ -37,7 +37,7 @@ def main(given: Arguments) -> None:
 
 
 def say(done: Done) -> None:
-    """Says what one run came to."""
+    """Prints the result of one kind of run."""
     (row,), moments = done.findings
     shown = ", ".join(f"{moment:.2f}" for moment in moments["moments"])
     print(f"{row.case}: {row.value} of {row.bound} as the unbroken run; killed s after a checkpoint: {shown}")

@@ -63,7 +63,7 @@ def main(given: Arguments) -> None:
 
 
 def lanes_in(text: str | None) -> tuple[int, ...] | None:
-    """The numbers of --lanes; `InputError` for what are none."""
+    """Parses --lanes; `InputError` unless it lists positive whole numbers."""
     if text is None:
         return None
     numbers = tuple(int(each) if each.strip().isdecimal() and len(each) < 10 else 0 for each in text.split(","))

@@ -31,14 +31,14 @@ from scripts.reports.case import Case, Findings, measure_and_publish
 from scripts.reports.robots.faulty_logs import FAULTS, Arrays, Fault, random_arm, rough_file, sound_log
 
 JOINTS = (2, 3, 4, 6)
-"""Of the arms, one after the other."""
+"""Numbers of joints of successive arms."""
 NOISES = (0.0, 0.01, 0.05, 0.1)
-"""Of the torques, in units of each one's deviation."""
+"""Standard deviations of the torque noise, relative to the torque's own."""
 
 
 LEARNED_JOINTS = 2
 LEARNED_FAULTS = ("flipped-sign", "swapped-columns", "torques-of-another-motion", "rates-exchanged", "spikes")
-"""Of logs that trees of unknown frames are fitted to."""
+"""Faults of the logs that trees with unknown joint frames are fitted to."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def main(given: Arguments) -> None:
 
 
 def case(name: str, logs: int, verdict_of: Callable[[int, Fault | None], str], seed: int) -> Case:
-    """The verdicts on logs of one kind, which is the last part of the name."""
+    """A case with the verdicts on logs of one kind; the kind is the last part of the name."""
     fault = FAULTS.get(name.rpartition("/")[2])
     return Case(name, partial(findings, name, fault, logs, verdict_of, seed))
 
@@ -74,14 +74,14 @@ def case(name: str, logs: int, verdict_of: Callable[[int, Fault | None], str], s
 def findings(
     case: str, fault: Fault | None, logs: int, verdict_of: Callable[[int, Fault | None], str], seed: int
 ) -> Findings:
-    """How many logs got which verdict."""
+    """Shares of the verdicts over the logs."""
     counts = Counter(verdict_of(seed + number, fault) for number in range(logs))
     shares = {level: counts[level] / logs for level in LEVELS}
     rows = [Row(case, f"{level}_share", shares[level]) for level in LEVELS]
     told_frames = case.startswith("identify")
     if fault is None and told_frames:
         rows[0] = expect(case, "good_share", "sound logs are good", shares["good"], 1.0, at_least=True)
-    elif fault is None:  # of the arms' friction, such a tree lacks the offsets
+    elif fault is None:  # the arms' friction has offsets, which such a tree does not model
         rows[2] = expect(case, "refused_share", "sound logs are not refused", shares["refused"], 0.0)
     elif fault.level == "refused" and told_frames:
         rows[2] = expect(case, "refused_share", "ruined", shares["refused"], 1.0, at_least=True)
@@ -91,7 +91,7 @@ def findings(
 
 
 def log_of(seed: int, joints: int, fault: Fault | None) -> tuple[Arm, Arrays]:
-    """A random arm and its log, spoiled if a fault is given."""
+    """A random arm and its log, with the fault if there is one."""
     arm = random_arm(seed, joints)
     log = sound_log(arm, seed, NOISES[(3 * seed + seed // len(JOINTS)) % len(NOISES)])
     return arm, log if fault is None else fault.spoil(log, np.random.default_rng([seed, 3]))
@@ -120,9 +120,9 @@ def learned_tree(seed: int, fault: Fault | None) -> str:
 
 
 def identified(folder: Path, log: Arrays, *, accepted: bool) -> dict[str, str]:
-    """The verdict on a log, with reason and remedy, by the robot's file arm.xml in the folder.
+    """The verdict on a log with reason and remedy, identified from the robot file arm.xml in the folder.
 
-    Logs that are `accepted` are fitted although the check of the log finds errors; others are then refused.
+    If the log check finds errors, `accepted` logs are fitted all the same, and others are refused.
     """
     np.savez(folder / "log.npz", **log)
     options = Options(
@@ -133,7 +133,7 @@ def identified(folder: Path, log: Arrays, *, accepted: bool) -> dict[str, str]:
 
 
 def _verdict(folder: Path, fit: Callable[[], None]) -> dict[str, str]:
-    """The verdict that a command stores in its run's folder; input that it refuses is refused."""
+    """The verdict that a command stores in its run folder; "refused" if the command rejects the input."""
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(FitRefused):
             fit()

@@ -22,7 +22,7 @@ from dln_jax.scenes.datasets import generators
 from scripts.reports.walks import Walk, walk_of
 
 BOUNDS = {"npz to torque error": (30, 60), "URDF and log to parameters": (40, None)}
-"""Files and arrows to reach."""
+"""Largest numbers of files and arrows."""
 PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.5"/>
 <mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="hinge" type="revolute"><parent link="base"/><child link="rod"/>
@@ -39,7 +39,7 @@ class Arguments(Folder):
 
 
 def main(given: Arguments) -> None:
-    """Walks, prints and writes."""
+    """Traces both commands, prints the counts and writes them."""
     with command_folder(given, "walk_report") as folder:
         walks = measured()
         for name, walk in walks.items():
@@ -53,7 +53,7 @@ def main(given: Arguments) -> None:
 
 
 def measured() -> dict[str, Walk]:
-    """The walks of both commands, on files that are made for it."""
+    """The walks of both commands on small generated files."""
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         schema.save(place / "log.npz", generators.uniform(cart_pole(friction=0.1), samples=60))

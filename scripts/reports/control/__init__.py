@@ -1,1 +1,1 @@
-"""What is measured of controllers: swing-ups from many starts, and a public board's acrobot and pendubot."""
+"""Measurements of controllers, such as swing-ups from many starts and a public board's acrobot and pendubot."""

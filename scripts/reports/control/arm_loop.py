@@ -1,7 +1,7 @@
-"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo or in our own equations, and its hardware.
+"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo or our own equations, with a model of the hardware.
 
-Torques are limited and a sample late; angles alone are read, by encoders of 14 bits on the motors' side of a gear of
-100, and rates are their differences through a low-pass.
+Torques are limited and one sample late. Only angles are measured, by 14-bit encoders on the motor side of a 100:1 gear;
+rates are low-passed differences of angles.
 """
 
 from collections.abc import Callable
@@ -21,27 +21,27 @@ from scripts.reports.robots.arm import STEP, D, Motion, simulator
 from scripts.reports.robots.known_kinematics import USUAL_SCALE
 
 LIMITS = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
-"""N m."""
+"""Torque limits, N m."""
 ENCODER_STEP = 2 * np.pi / (2**14 * 100)
-"""rad."""
+"""Resolution of the encoders at the joint, rad."""
 CUTOFF = 100.0
-"""Hz, of the rates' low-pass."""
+"""Cut-off of the low-pass on rates, Hz."""
 
 Plant = Callable[[Motion], tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]
-"""A motion -> the first angles, and what gives the next ones for a torque."""
+"""A motion -> the initial angles, and a function from torques to the next angles."""
 
 
 class Tracked(NamedTuple):
-    """Of one law and one motion."""
+    """Tracking result of one control law on one motion."""
 
     rms: float
-    """mrad; NaN for a run that is no number."""
+    """Root mean square tracking error, mrad; NaN for a run that diverged to NaN."""
     trusted: float = np.nan
-    """Share of the samples at which the model was used, for a law that may fall back."""
+    """Share of samples that used the model, for a law with a fallback."""
 
 
 def in_mujoco(robot: Robot) -> Plant:
-    """The arm with dry friction as a constraint; `InputError` where MuJoCo is missing."""
+    """The arm in MuJoCo, with dry friction as a constraint; `InputError` if MuJoCo is missing."""
     mujoco, model, data = simulator(robot)
 
     def start(wanted: Motion) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
@@ -59,7 +59,7 @@ def in_mujoco(robot: Robot) -> Plant:
 
 
 def in_equations(robot: Robot) -> Plant:
-    """The same tree with a smooth law of dry friction, by the classical Runge-Kutta method."""
+    """The same tree in our equations, with smooth dry friction, by the classical Runge-Kutta method."""
     system = dynamics(tree_system(robot.tree, friction_of(robot)))
 
     @jax.jit
@@ -81,12 +81,12 @@ def in_equations(robot: Robot) -> Plant:
 
 
 def friction_of(robot: Robot) -> Any:
-    """That of the joints, dry friction smooth."""
+    """Friction of the joints, with a smooth law of dry friction."""
     return joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE)
 
 
 def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, samples: int | None = None) -> Tracked:
-    """A closed loop along a motion, on the hardware of the head of this file."""
+    """Runs a closed loop along a motion with the hardware model of this module."""
 
     @jax.jit
     def asked(q: Any, qd: Any, now: Reference) -> Any:
@@ -105,7 +105,7 @@ def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, sampl
         tau, usable = asked(seen, qd, Reference(*(each[number] for each in wanted)))
         off.append(q - wanted.q[number])
         used += bool(usable)
-        # A sample late, as are the torques of the start, which hold the arm.
+        # Torques act one sample late; the first torque holds the arm at the start.
         now, late = (np.asarray(tau) if number == 0 else late), np.asarray(tau)
         q = step(now)
         if not np.isfinite(q).all():

@@ -1,7 +1,7 @@
 """The acrobot and the pendubot of a public board (Wiebe et al. 2022, "RealAIGym"): its plant, integration and score.
 
-Ten seconds of the classical Runge-Kutta method at 500 Hz, from hanging at rest; success is a tip that is at last, and
-from then on, above nine tenths of the stretched length. Score v2 is
+Ten seconds of the classical Runge-Kutta method at 500 Hz, from hanging at rest. A run succeeds if the tip rises above
+nine tenths of the stretched length and stays there to the end. Score v2 is
 
     success (1 - 1/5 sum over criteria of tanh(pi criterion / size))
 """
@@ -20,24 +20,24 @@ from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
 
 RATE, SECONDS = 500.0, 10.0
 LIMIT = 6.0
-"""N m."""
+"""Torque limit, N m."""
 HEIGHT = 0.9
-"""Of the stretched length, above the shoulder."""
+"""Height of the tip above the shoulder that counts as up, relative to the stretched length."""
 GOAL = np.array([np.pi, 0.0, 0.0, 0.0])
 Motor = Literal["elbow", "shoulder"]
 
 
 class Criteria(NamedTuple):
-    """Of a run; the smaller the better."""
+    """Criteria of a run; smaller is better."""
 
     time: float
-    """s, of the first sample after which the tip stays up; infinite where it does not."""
+    """Time from which the tip stays up, s; infinite if it does not."""
     energy: float
     """Sum of |dq tau|, J."""
     torque_cost: float
     """Integral of tau², N² m² s."""
     smoothness: float
-    """Standard deviation of differences of neighbouring torques, N m."""
+    """Standard deviation of the differences of successive torques, N m."""
     velocity_cost: float
     """Integral of |qd|², rad²/s."""
 
@@ -52,7 +52,7 @@ def plant(motor: Motor) -> tuple[Scene, Array]:
 
 
 def play(motor: Motor, controller: Controller) -> Run:
-    """The closed loop as the board runs it."""
+    """Runs the closed loop with the board's settings."""
     scene, B = plant(motor)
     field = field_of(dynamics(scene.energies), B)
     lab = Hardware(-LIMIT, LIMIT)
@@ -62,7 +62,7 @@ def play(motor: Motor, controller: Controller) -> Run:
 
 
 def criteria(motor: Motor, run: Run) -> Criteria:
-    """Of a run."""
+    """The criteria of a run."""
     driven = {"shoulder": 0, "elbow": 1}[motor]
     q, qd = np.split(np.asarray(run.x), 2, axis=1)
     u = np.asarray(run.u)[:, 0]
@@ -79,7 +79,7 @@ def criteria(motor: Motor, run: Run) -> Criteria:
 
 
 def score(found: Criteria) -> float:
-    """Version 2, from 0 to 1; 0 without success, and for what is no number."""
+    """Score of version 2, from 0 to 1; 0 without success or if a criterion is NaN."""
     if not np.isfinite(found).all():
         return 0.0
     return 1 - float(np.mean([np.tanh(np.pi * value / size) for value, size in zip(found, SIZES, strict=True)]))

@@ -1,4 +1,4 @@
-"""The cases of the report of control."""
+"""The cases of the control report."""
 
 import functools
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from scripts.reports.control.planned import Weights, follower, search
 from scripts.reports.control.values import equation, fits
 
 TURN = 2 * np.pi / 2048
-"""rad, of an encoder."""
+"""Resolution of an encoder, rad."""
 SWING_UPS = {
     "cart-pole": SwingUp(
         cart_pole(cart_mass=0.57, pole_mass=0.127, length=0.16825, friction=0.002),
@@ -42,16 +42,16 @@ SWING_UPS = {
         0.1,
     ),
 }
-"""With the sizes of desktop plants, and their models known."""
+"""Swing-ups of plants of desktop size with known models."""
 STARTS, SUCCESS = 1000, 0.995
 PLANNED = {"acrobot": 0.66, "pendubot": None}
-"""Score to reach; the board's best acrobot has 0.655."""
+"""Score to reach; the best acrobot on the board has 0.655."""
 HORIZONS = (1.5, 1.6, 1.8, 2.0)
 WEIGHTS = (Weights(), Weights(torque=0.3, velocity=0.01, slope=3e-3))
 
 
 def swing_up(name: str, quick: bool) -> Findings:
-    """Share of starts that are up after ten seconds, and when."""
+    """Share of starts that are up after ten seconds, and the time it takes."""
     found = success(SWING_UPS[name], 50 if quick else STARTS)
     words = f"of {len(found.seconds)} starts near hanging, on simulated hardware"
     rows = rows_of_outcomes(f"swing-up/{name}/known", found, words, SUCCESS)
@@ -75,7 +75,7 @@ def by_energy(motor: Motor, quick: bool) -> Findings:
 
 
 def cases(*, quick: bool = False) -> list[Case]:
-    """All, named SUBJECT/NAME, in float64."""
+    """All cases, named SUBJECT/NAME, in float64."""
     measures: dict[str, Callable[[bool], Findings]] = {
         **{f"swing-up/{name}": functools.partial(swing_up, name) for name in SWING_UPS},
         **{f"starts/{name}-starts": functools.partial(traces.from_anywhere, SWING_UPS[name]) for name in SWING_UPS},

@@ -1,17 +1,17 @@
-"""The board's plant with what its robustness table does to it, one thing at a time (version 2 of that table).
+"""The board's plant with the disturbances of its robustness table, one at a time (version 2 of that table).
 
 Numbers are those of the board's own program (`leaderboard/acrobot/robustness_v2` of Wiebe et al. 2022, and its
-`analysis/benchmark.py`). 21 values each of
+`analysis/benchmark.py`). The disturbances take 21 values:
 
-    ten parameters of the plant, which the controller does not know to be wrong
-    the standard deviation of the measured rates' noise, 0 to 0.5 rad/s; ten runs each, of which more than half succeed
-    that of the torque's, 0 to 1.1 N m; likewise
+    ten parameters of the plant, of which the controller assumes the nominal values
+    the standard deviation of the noise on measured rates, 0 to 0.5 rad/s; more than half of ten runs must succeed
+    the standard deviation of the noise on torques, 0 to 1.1 N m; likewise
     the response k of the motor, u_k = u_{k-1} + k (wanted - u_{k-1}), 0.1 to 2
-    the delay of all that is measured, 0 to 40 ms
+    the delay of all measurements, 0 to 40 ms
 
-and 50 runs with six pushes each, drawn for both joints. The board's plant multiplies all torques by B, pushes too, so
-those on the passive joint do nothing. Success is, as there, a last state near the goal. The criterion is the share of
-successes, and the score the mean of the six.
+In 50 further runs the joints get three random pushes each. The board's plant multiplies all torques by B, including
+pushes, so pushes on the passive joint have no effect. As on the board, a run succeeds if its last state is near the
+goal. A criterion is the share of successes, and the score the mean of the six criteria.
 """
 
 from collections.abc import Callable
@@ -31,60 +31,60 @@ from scripts.reports.control.board import GOAL, LIMIT, RATE, SECONDS, Motor, pla
 
 VALUES, REPETITIONS, PUSHED = 21, 10, 50
 NEAR = np.array([0.35, 0.35, 1.0, 1.0])
-"""rad and rad/s, of a last state that is a success."""
+"""Tolerance of the last state of a successful run, rad and rad/s."""
 LONGEST = 20
-"""Samples of delay."""
+"""Longest delay in samples."""
 GEAR = 6.0
-"""Ratio, by which a rotor's inertia counts."""
+"""Gear ratio between a rotor and its joint."""
 SPREAD = 0.25
-"""Relative, of masses and inertias."""
+"""Relative range of masses, centres and inertias, to either side."""
 VISCOUS, DRY, ROTOR = 0.1, 0.2, 1e-4
-"""N m s, N m (both of either sign) and kg m², the largest."""
+"""Largest viscous and dry friction (of either sign), N m s and N m, and largest rotor inertia, kg m²."""
 RATES_NOISE, TORQUE_NOISE, SLOWEST, FASTEST = 0.5, 1.1, 0.1, 2.0
 APART, WIDTHS, PUSHES = 1.0, (0.05, 0.1), (0.5, 5.0)
-"""s between neighbouring pushes, s of their standard deviations, and N m."""
+"""Time between successive pushes, s, range of their standard deviations, s, and range of their torques, N m."""
 TOGETHER = 105
-"""Runs in one program."""
+"""Runs per program call."""
 CRITERIA = ("model", "rate_noise", "torque_noise", "response", "delay", "pushes")
 
 
 class Disturbance(NamedTuple):
-    """What is unlike the plant that a controller knows."""
+    """Differences from the nominal plant."""
 
     links: Links
     rotor: Any
-    """Inertia of the motors, kg m²."""
+    """Rotor inertia of the motors, kg m²."""
     viscous: Any
-    """[2], N m s."""
+    """Viscous friction [2], N m s."""
     dry: Any
-    """[2], N m, of the law arctan(100 qd)."""
+    """Dry friction [2], N m, by the law arctan(100 qd)."""
     rate_noise: Any
-    """Standard deviation, rad/s."""
+    """Standard deviation of the noise on measured rates, rad/s."""
     torque_noise: Any
-    """N m."""
+    """Standard deviation of the noise on torques, N m."""
     response: Any
     delay: Any
-    """Samples."""
+    """Delay of measurements in samples."""
     times: Any
-    """Of the pushes at each joint [2, P], s."""
+    """Times of the pushes by joint [2, P], s."""
     widths: Any
-    """Their standard deviations [2, P], s."""
+    """Standard deviations of the pushes in time [2, P], s."""
     pushes: Any
-    """[2, P], N m."""
+    """Peak torques of the pushes [2, P], N m."""
 
 
 def undisturbed() -> Disturbance:
-    """Nothing is."""
+    """The nominal plant."""
     none = np.zeros(2)
     return Disturbance(Links(), 0.0, none, none, 0.0, 0.0, 1.0, 0, np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)))
 
 
 def disturbances(seed: int = 0) -> dict[str, list[Disturbance]]:
-    """All of the table, by criterion; those with noise come ten times, and pushes are drawn."""
+    """All disturbances of the table by criterion; values of noise repeat ten times, and pushes are random."""
     base, random = undisturbed(), np.random.default_rng(seed)
     factors = np.linspace(1 - SPREAD, 1 + SPREAD, VALUES)
     model = [base._replace(rotor=each) for each in np.linspace(0, ROTOR, VALUES)]
-    # Two names are products of which a part is varied; the inertias, about the joints, stay.
+    # Two of the board's parameters are products; one factor varies, and the inertias about the joints stay.
     of_links = (("centres", 0), ("inertias", 0), ("centres", 1), ("masses", 1), ("inertias", 1))
     model += [base._replace(links=_scaled(*which, factor)) for which in of_links for factor in factors]
     for key, most in (("viscous", VISCOUS), ("dry", DRY)):
@@ -110,7 +110,7 @@ def _scaled(key: str, link: int, factor: float) -> Links:
 
 
 def _pushed(random: np.random.Generator) -> Disturbance:
-    """Three at each joint, never two within a second."""
+    """Three random pushes at each joint, all at least a second apart."""
     count = 6
     room = (SECONDS - (count + 1) * APART) / count
     times = random.permutation(np.cumsum(APART + random.uniform(0, room, count))).reshape(2, 3)
@@ -121,7 +121,7 @@ def _pushed(random: np.random.Generator) -> Disturbance:
 
 
 def disturbed(motor: Motor, disturbance: Disturbance) -> Callable[[Array, Array], Array]:
-    """(x, torques of both joints) -> dx/dt of the plant as it is."""
+    """(x, torques of both joints) -> dx/dt of the disturbed plant."""
     system = dynamics(two_link_pendulum(motor, links=disturbance.links).closed_form)
     rotor = jnp.asarray(disturbance.rotor) * jnp.array([[GEAR**2 + 1, -GEAR], [-GEAR, GEAR**2]])
 
@@ -129,7 +129,7 @@ def disturbed(motor: Motor, disturbance: Disturbance) -> Callable[[Array, Array]
         q, qd = jnp.split(x, 2)
         friction = disturbance.viscous * qd + disturbance.dry * jnp.arctan(100 * qd)
         held = system.inverse_dynamics(q, qd, jnp.zeros(2)) + friction
-        # Two by two: a factorisation would cost more than the rest.
+        # Cramer's rule: a factorisation of a 2 x 2 matrix would cost more than the rest.
         (a, b), (_, d) = system.mass_matrix(q) + rotor
         f, g = tau - held
         return jnp.concatenate([qd, jnp.stack([d * f - b * g, a * g - b * f]) / (a * d - b * b)])
@@ -138,7 +138,7 @@ def disturbed(motor: Motor, disturbance: Disturbance) -> Callable[[Array, Array]
 
 
 def last_state(motor: Motor, controller: Controller, disturbance: Disturbance, key: Array) -> Float[Array, "4"]:
-    """After ten seconds from hanging, the controller being given (q, qd) as measured."""
+    """The state after ten seconds from hanging; the controller gets measured (q, qd)."""
     B, dt = plant(motor)[1], 1.0 / RATE
     field = disturbed(motor, disturbance)
 
@@ -162,23 +162,23 @@ def last_state(motor: Motor, controller: Controller, disturbance: Disturbance, k
 
 
 def successes(motor: Motor, controller: Controller, all_of: list[Disturbance], seed: int = 0) -> np.ndarray:
-    """Whether each run ends near the goal; one that is no number does not."""
+    """Whether the runs end near the goal; False for a run that diverges to NaN."""
     count, joints = len(all_of), plant(motor)[0].needs.joints
     keys = jax.random.split(jax.random.key(seed), count)
     run = jax.jit(jax.vmap(lambda each, key: last_state(motor, controller, each, key)))
     ends = []
-    # Neighbours are alike: a controller that waits for a delay keeps no others waiting.
+    # Neighbours are similar, so a controller that waits for a delay does not hold up very different runs.
     for first in range(0, count, TOGETHER):
         places = np.minimum(np.arange(first, first + TOGETHER), count - 1)
         chunk = jax.tree.map(lambda *each: jnp.asarray(np.stack(each)), *(all_of[place] for place in places))
         ends.append(np.asarray(run(chunk, keys[places])))
     off = np.abs(jax.vmap(lambda x: error(x, GOAL, joints))(jnp.asarray(np.concatenate(ends)[:count])))
-    # What is no number is not below.
+    # NaN compares as False, hence as a failure.
     return np.all(off < NEAR, axis=1)
 
 
 def robustness(motor: Motor, controller: Controller, seed: int = 0, *, every: int = 1) -> dict[str, float]:
-    """The share of successes by criterion, and their mean; of each list one of `every` so many, for a quick look."""
+    """The share of successes by criterion, and their mean; uses one in `every` disturbances, for a quick look."""
     table = {name: listed[::every] for name, listed in disturbances(seed).items()}
     found = successes(motor, controller, [each for listed in table.values() for each in listed], seed)
     ends = np.cumsum([len(listed) for listed in table.values()])

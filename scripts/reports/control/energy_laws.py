@@ -1,12 +1,12 @@
-"""Swing-ups by energy: of the acrobot and the pendubot on the board, and of other plants from many starts.
+"""Swing-ups by energy: the acrobot and the pendubot on the board, and other plants from many starts.
 
-On the board the law is Spong's with the total energy: the driven joint accelerates by
+The law on the board is Spong's with the total energy: the driven joint accelerates by
 
     a = -k1 (q_a - goal) - k2 qd_a + k3 qd_p (E - E*)
 
-its torque is limited below the motor's limit and low-passed, so that it is smooth, and a linear-quadratic regulator
-takes over where its own value is small. Numbers are drawn at random, and the best by the score are kept: the plant is
-known, and the score is what is asked for.
+The torque is limited below the motor's limit and low-passed, so that it is smooth. A linear-quadratic regulator takes
+over where its value function is small. The law's numbers are drawn at random and the ones with the best score are kept:
+the plant is known, and the score is the objective.
 """
 
 from collections.abc import Callable
@@ -43,31 +43,31 @@ from scripts.reports.case import Findings
 from scripts.reports.control.board import GOAL, LIMIT, RATE, SECONDS, Criteria, Motor, criteria, plant, score
 
 STATE_COST, CONTROL_COST = np.diag([0.97, 0.93, 0.39, 0.26]), np.array([[0.11]])
-"""Of the regulator, as the board's own controller has them."""
+"""Cost matrices of the regulator, from the board's own controller."""
 STILL = 1e-3
-"""rad/s, at and below which the full torque is applied once more, to leave rest."""
+"""Largest joint rate, rad/s, that counts as rest; the full torque is then applied to start the motion."""
 DRAWS = 1000
 UNITS = ("s", "J", "N² m² s", "N m", "rad²/s")
-"""Of the criteria."""
+"""Units of the criteria."""
 TO_REACH = 0.40
-"""Score of the acrobot."""
+"""Score that the acrobot is to reach."""
 
 
 class Law(NamedTuple):
-    """Numbers of a swing-up on the board."""
+    """Numbers of a swing-up law on the board."""
 
     gains: Array
     """k1, k2, k3 [3]."""
     level: Array
-    """Of the regulator's value, where it takes over."""
+    """Level of the regulator's value function at which it takes over."""
     share: Array
-    """Of a new torque in a sample's, the rest being that of the sample before."""
+    """Low-pass coefficient: weight of the new torque against that of the previous sample."""
     most: Array
-    """Torque that the law may ask for, N m."""
+    """Largest torque of the law, N m."""
 
 
 def drawn_laws(count: int, seed: int = 0) -> Law:
-    """Numbers over the decades in which they may lie."""
+    """Random laws; the numbers are log-uniform over their plausible decades, except the torque limit (uniform)."""
     random = np.random.default_rng(seed)
     return Law(
         jnp.asarray(10 ** random.uniform(-0.3, 1.3, (count, 3))),
@@ -78,7 +78,7 @@ def drawn_laws(count: int, seed: int = 0) -> Law:
 
 
 def pumping(motor: Motor) -> Callable[..., Array]:
-    """(x, the gains k1, k2, k3, energy beyond the goal's in J) -> the torque [1] of the swing-up by energy."""
+    """(x, gains k1, k2, k3, energy above the goal's, J) -> torque [1] of the swing-up by energy."""
     scene, B = plant(motor)
     system, parts = dynamics(scene.closed_form), parts_of(B)
     forces, (active,), (passive,) = partial_linearisation(system, parts), parts.active, parts.passive
@@ -94,7 +94,7 @@ def pumping(motor: Motor) -> Callable[..., Array]:
 
 
 def controllers_by_energy(motor: Motor) -> Callable[[Law], Controller]:
-    """A law's numbers -> what asks for torques, of x = (q, qd)."""
+    """A law's numbers -> its controller of x = (q, qd)."""
     scene, B = plant(motor)
     system, joints, far = dynamics(scene.energies), scene.needs.joints, pumping(motor)
     at = linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
@@ -122,19 +122,19 @@ def runs_by_energy(motor: Motor) -> Callable[[Law], Run]:
 
 
 def runs_of_drawn_laws(motor: Motor, draws: int) -> list[Criteria]:
-    """Of laws drawn at random."""
+    """Criteria of laws drawn at random."""
     runs = jax.jit(jax.vmap(runs_by_energy(motor)))(drawn_laws(draws))
     return [criteria(motor, jax.tree.map(lambda each, index=index: each[index], runs)) for index in range(draws)]
 
 
 def best_law(motor: Motor, draws: int = DRAWS) -> Law:
-    """The one with the best score."""
+    """The random law with the best score."""
     place = int(np.argmax([score(each) for each in runs_of_drawn_laws(motor, draws)]))
     return jax.tree.map(lambda each: each[place], drawn_laws(draws))
 
 
 def board(motor: Motor, draws: int = DRAWS) -> Findings:
-    """The best score of laws drawn at random, and how many succeed."""
+    """The best score of laws drawn at random, and the share that succeeds."""
     found = runs_of_drawn_laws(motor, draws)
     scores = np.array([score(each) for each in found])
     best = found[int(np.argmax(scores))]
@@ -147,7 +147,7 @@ def board(motor: Motor, draws: int = DRAWS) -> Findings:
 
 
 def rows_of_criteria(case: str, found: Criteria) -> list[Row]:
-    """The five numbers that a score is made of."""
+    """The five criteria of the score."""
     numbers = zip(found._fields, found, UNITS, strict=True)
     return [Row(case, key, float(number), unit) for key, number, unit in numbers]
 
@@ -160,16 +160,16 @@ class SwingUp(NamedTuple):
     state_cost: np.ndarray
     control_cost: float
     limit: float
-    """N or N m."""
+    """Limit of force or torque, N or N m."""
     level: float
     encoder_step: tuple[float, float]
-    """m or rad."""
+    """Resolution of the encoders, m or rad."""
     position: float
     """Standard deviation of the driven coordinate at the start, m or rad."""
 
 
 def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Run]:
-    """Start [4] -> run on simulated hardware: only encoders are read, at 500 Hz; rates are their differences,
+    """Start [4] -> run with a model of the hardware: only encoders are read, at 500 Hz, rates are their differences,
     and torques act one sample late."""
     scene, rate = case.scene, RATE
     system, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints
@@ -185,18 +185,18 @@ def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Ru
 
 
 def success(case: SwingUp, starts: int, seed: int = 0, *, seconds: float = 10.0) -> Outcomes:
-    """Of starts near hanging."""
+    """Outcomes from random starts near hanging."""
     return tried(case, hanging_starts(starts, seed, position=case.position), seconds=seconds)
 
 
 def tried(case: SwingUp, starts: np.ndarray, *, seconds: float = 10.0) -> Outcomes:
-    """Likewise of any starts [K, 4]."""
+    """Outcomes from these starts [K, 4]."""
     run = closed_loop(case, seconds=seconds)
     return outcomes(jax.jit(jax.vmap(lambda start: run(start).x[:, 1]))(starts), rate=RATE)
 
 
 def rows_of_outcomes(case: str, found: Outcomes, words: str, bound: float | None = None) -> list[Row]:
-    """Share that is up, and when."""
+    """Share of successes, number of NaN runs, and median and worst time."""
     return [
         Row(case, "success_share", found.share, expected=words, bound=bound, at_least=True),
         Row(case, "no_number", float(found.failed.sum()), expected="runs, counted as failures"),

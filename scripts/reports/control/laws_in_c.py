@@ -1,7 +1,7 @@
-"""Controllers as C: whether they answer as in JAX does, and how long one call takes, warm and from cold caches.
+"""Controllers as C: agreement with JAX, and the time of one call from warm and cold caches.
 
-A control loop's call is the cold one: other code has had the caches for a millisecond. `LAWS` is the table; whoever has
-another controller adds a line.
+Calls of a control loop are cold: other code has used the caches for a millisecond. To measure another controller, add a
+line to `LAWS`.
 """
 
 import tempfile
@@ -44,12 +44,12 @@ from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
 
 AGREEMENT = 1e-10
-"""Relative to the largest control, of C and JAX at drawn states."""
+"""Largest difference of C and JAX at random states, relative to the largest control."""
 STATES = 8
 STEPS = 80
-"""Of a plan."""
+"""Steps of a plan."""
 LEAST_EVICTED = 32
-"""MiB that are read before a cold call, at least."""
+"""Minimum memory, MiB, that is read before a cold call to evict the caches."""
 
 
 class Law(NamedTuple):
@@ -57,35 +57,35 @@ class Law(NamedTuple):
 
     function: Callable[..., Any]
     examples: tuple[Any, ...]
-    """One for each argument; states are drawn about them."""
+    """Example arguments; random states are drawn about them."""
     spread: float = 0.1
-    """Standard deviation of what is drawn."""
+    """Standard deviation of the random states."""
 
 
 def regulator() -> Law:
-    """Four states and one motor, angles the short way round."""
+    """A linear-quadratic regulator of four states and one motor, with wrapped angle errors."""
     return Law(_rotary()[0], (np.zeros(4),))
 
 
 def swing_up() -> Law:
-    """The energy law, and near the top the regulator."""
+    """The energy law, with the regulator near the top."""
     near, cost, swing = _rotary()
     return Law(switched(lambda x: swing(x[:2], x[2:]), near, cost, 0.1), (np.array([0.0, np.pi, 0.0, 0.0]),), 0.3)
 
 
 def tree_by_computed_torque() -> Law:
-    """A seven-axis arm, its model known."""
+    """Computed torque for a seven-axis arm with a known model."""
     follow = computed_torque(dynamics(tree_system(arm(coulomb=False).tree)), Gains(np.full(D, 400.0), np.full(D, 40.0)))
     return _tracking(follow, D)
 
 
 def tree_by_feed_forward() -> Law:
-    """Likewise, the model asked on the reference."""
+    """Feed-forward for the same arm: the model is evaluated on the reference."""
     return _tracking(feed_forward(dynamics(tree_system(arm(coulomb=False).tree)), Gains(STIFFNESS, DAMPING)), D)
 
 
 def network_by_computed_torque(d: int = 7, width: int = 32) -> Law:
-    """A structured DeLaN of two layers, with drawn parameters."""
+    """Computed torque by a structured DeLaN of two layers with random parameters."""
     model = build(describe("structured-delan", precision="f64", needs=chain(d).needs, width=width, depth=2))
     random = np.random.default_rng(0)
     shapes = jax.eval_shape(model.init, jax.random.key(0))
@@ -95,12 +95,12 @@ def network_by_computed_torque(d: int = 7, width: int = 32) -> Law:
 
 
 def value_policy() -> Law:
-    """The optimal control by a value network of two layers of 64, a cart-pole."""
+    """Optimal control of a cart-pole by a value network of two layers of 64."""
     return Law(drawn_law("cart-pole"), (np.zeros(4),))
 
 
 def one_iteration() -> Law:
-    """A call of `mpc` with one iteration, a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
+    """A call of `mpc` with one iteration for a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
     return Law(one_call(STEPS), tuple(map(np.asarray, first_state(STEPS))), 1e-4)
 
 
@@ -117,7 +117,7 @@ LAWS: dict[str, Callable[[], Law]] = {
 
 
 def laws(quick: bool) -> Findings:
-    """Agreement with JAX, and microseconds of one call."""
+    """Agreement with JAX, and time of one call in microseconds."""
     rows: list[Row] = []
     effort = {"repeats": 3, "calls": 100, "cold": 50} if quick else {"repeats": 9, "calls": 1000, "cold": 1000}
     mebibytes = max(evicting(), LEAST_EVICTED)
@@ -128,7 +128,7 @@ def laws(quick: bool) -> Findings:
             export_c({name: (law.function, law.examples)}, folder, stack=STACK)
             rows.append(agreement(name, law, load_c(folder)))
             program = programs(folder, compiled(folder, folder), [name])[name]
-            # A plan takes a hundred times as long as a law.
+            # A plan takes a hundred times as long as a control law.
             spent = {**effort, "calls": max(effort["calls"] // 20, 10)} if name == "one_iteration" else effort
             rows += rows_of(name, timed(program, mebibytes=mebibytes, **spent))
     rows.append(Row("laws", "emptied_by_mib", mebibytes, "MiB", expected="read before each cold call"))
@@ -136,7 +136,7 @@ def laws(quick: bool) -> Findings:
 
 
 def agreement(name: str, law: Law, loaded: Any) -> Row:
-    """The largest difference of C and JAX at drawn states, relative to the largest number of the answer."""
+    """Largest difference between C and JAX at random states, relative to the largest element of the result."""
     in_jax, in_c, random, worst = jax.jit(law.function), getattr(loaded, name), np.random.default_rng(0), 0.0
     for _ in range(STATES):
         state = [each + law.spread * random.normal(size=np.shape(each)) for each in law.examples]
@@ -149,7 +149,7 @@ def agreement(name: str, law: Law, loaded: Any) -> Row:
 
 
 def rows_of(name: str, times: Times) -> list[Row]:
-    """Microseconds, warm and cold."""
+    """Times of warm and cold calls, in microseconds."""
     case, cold = f"laws/{name}", np.percentile(times.cold, [50, 99.9]) / 1e3
     return [
         Row(case, "warm_us", float(np.median(times.hot)) / 1e3, "us"),

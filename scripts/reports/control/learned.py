@@ -1,4 +1,4 @@
-"""Swing-ups by models that were learned from at most thirty seconds of the hardware's motions, over several seeds."""
+"""Swing-ups by models learned from at most thirty seconds of simulated motion, over several seeds."""
 
 import functools
 from collections.abc import Callable
@@ -17,15 +17,15 @@ from scripts.reports.case import Findings
 
 SECONDS_OF_DATA = 30.0
 SEEDS = (0, 1, 2)
-"""Of the exploration and the network; each has its own rough model, noise and starts."""
+"""Seeds of exploration and network; a seed also sets the rough model, the noise and the starts."""
 STARTS, SUCCESS = 1000, 0.995
 TRY_SEED = 100
-"""Added to a seed, for the starts that are counted: gains were chosen by others (`swing_up_gains`)."""
+"""Offset of the seed for evaluated starts; the gains were chosen on other starts (`swing_up_gains`)."""
 LEARNED = ("delan", "identified")
 
 
 def by_model(name: str, model: str, quick: bool) -> Findings:
-    """What comes of swing-ups by a model that was learned, over seeds of the data: the median and the worst."""
+    """Results of swing-ups by a learned model: median and worst over seeds of the data."""
     plant, seeds = desktop_plant(name), SEEDS[:1] if quick else SEEDS
     found = [_of_seed(plant, model, seed, quick) for seed in seeds]
     case = f"learned/{name}/{model}"
@@ -47,7 +47,7 @@ def by_model(name: str, model: str, quick: bool) -> Findings:
 
 
 def by_nominal(name: str, quick: bool) -> Findings:
-    """The same by the nominal model, which knows no friction, and learns nothing."""
+    """Results by the nominal model, which lacks friction and is not fitted."""
     plant, model = desktop_plant(name), nominal_model(desktop_plant(name))
     tries = [
         try_starts(plant, model, starts=50 if quick else STARTS, seed=seed + TRY_SEED)
@@ -68,7 +68,7 @@ def _of_seed(plant: DesktopPlant, model: str, seed: int, quick: bool) -> tuple[O
 
 
 def tries_or_none(plant: DesktopPlant, got: Obtained, starts: int, seed: int) -> Tried:
-    """What comes of a model's swing-ups; none is up where it cannot be used at all."""
+    """Outcomes of a model's swing-ups; all fail if the controller rejects the model."""
     try:
         return try_starts(plant, got.dynamics, starts=starts, seed=seed)
     except InputError:
@@ -89,7 +89,7 @@ def _of_tries(case: str, tries: list[Tried], words: str, bound: float | None) ->
 
 
 def cases(quick: bool) -> dict[str, Callable[[], Findings]]:
-    """By name, for the report of control."""
+    """Cases of the control report by name."""
     found: dict[str, Callable[[], Findings]] = {}
     for name in PLANTS:
         for model in LEARNED:

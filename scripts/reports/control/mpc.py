@@ -1,8 +1,8 @@
-"""Model-predictive control of a cart-pole at 100 Hz: whether it swings up from many starts, and how long a call takes.
+"""Model predictive control of a cart-pole at 100 Hz: swing-ups from many starts.
 
 The plant is the Quanser cart-pole of Lutter et al. 2021 (arXiv 2105.04682) with its viscous friction and a limit of
-12 N. Each 10 ms one iteration improves the plan that the last call left, from no plan at all at the start: no guess, no
-solution ahead.
+12 N. Every 10 ms one iteration improves the plan of the previous call. The first plan applies no force: there is no
+guess and no solution in advance.
 """
 
 from typing import NamedTuple
@@ -21,24 +21,24 @@ from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.scene import Scene
 
 RATE, SECONDS, LIMIT, RAIL = 100.0, 6.0, 12.0, 0.5
-"""Hz, s, N and m."""
+"""Control rate, Hz, length of a run, s, force limit, N, and half the length of the rail, m."""
 HORIZONS = (1.2, 0.8)
-"""s."""
+"""Horizons of the plans, s."""
 HANGING = np.array([0.0, np.pi, 0.0, 0.0])
 UP = 0.1
-"""rad."""
+"""Largest angle from upright that counts as up, rad."""
 
 
 class Weights(NamedTuple):
-    """Of the cost's integral, and how much more the last state counts."""
+    """Weights of the cost's integrand, and the factor on the last state's cost."""
 
     position: float = 4.0
     angle: float = 1.0
-    """Of 2 (1 - cos)."""
+    """Weight of 2 (1 - cos)."""
     rates: tuple[float, float] = (0.1, 0.01)
     force: float = 1e-3
     beyond: float = 200.0
-    """Of the square by which the cart is further than nine tenths of the rail, m."""
+    """Weight of the squared excess of the cart's position over nine tenths of the rail, m²."""
     last: float = 20.0
 
 
@@ -49,13 +49,13 @@ def scene() -> Scene:
 
 
 def field() -> Field:
-    """Its field; forces that are written out are less work than those of energies."""
+    """The plant's vector field, in closed form, which is cheaper than forces derived from energies."""
     known = scene()
     return field_of(dynamics(known.closed_form), np.asarray(known.needs.actuation))
 
 
 def cart_pole_problem(weights: Weights = Weights()) -> Problem:  # noqa: B008
-    """One step of 10 ms, by the classical Runge-Kutta method, and its cost."""
+    """The optimal control problem: steps of 10 ms by the classical Runge-Kutta method, and their costs."""
     plant, dt = field(), 1.0 / RATE
 
     def off(x: Array) -> Array:
@@ -75,13 +75,13 @@ def cart_pole_problem(weights: Weights = Weights()) -> Problem:  # noqa: B008
 
 
 def starts(count: int, seed: int = 0) -> np.ndarray:
-    """Near hanging [count, 4], as the published evaluation draws them, about a cart that may be off the middle."""
+    """Random starts near hanging [count, 4], distributed as in the published evaluation; the cart may be off centre."""
     random = np.random.default_rng(seed)
     return random.normal(size=(count, 4)) * np.sqrt([1e-3, 5e-2, 1e-6, 1e-6]) + HANGING
 
 
 def controller(problem: Problem, steps: int) -> Controller:
-    """Of the whole state; the plan is its memory, and first that of no force."""
+    """A controller of the full state; its memory is the plan, initially without force."""
     act = mpc(problem)
     waiting = first_plan(problem, HANGING, np.zeros((steps, 1)))
 
@@ -93,7 +93,7 @@ def controller(problem: Problem, steps: int) -> Controller:
 
 
 def swing_ups(steps: int, count: int, seed: int = 0) -> np.ndarray:
-    """Time from which on the pole is up and the cart on its rail, s, infinite where it is not, by start."""
+    """Times from which the pole stays up and the cart on its rail, s, by start; infinite for failures."""
     joints, plant, law = scene().needs.joints, field(), controller(cart_pole_problem(), steps)
     lab = Hardware(-LIMIT, LIMIT)
 

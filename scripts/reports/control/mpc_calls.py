@@ -1,6 +1,6 @@
-"""Times calls of model-predictive control along its own closed loops, in a process of its own: one thread, low latency.
+"""Times calls of model predictive control along closed loops, in a separate process: one thread, low-latency mode.
 
-The mode of low latency is settled as JAX starts. Prints one line of JSON.
+JAX fixes the low-latency mode when it starts, hence the process. Prints one line of JSON.
 """
 
 import json
@@ -27,14 +27,14 @@ from dln_jax.types import InputError
 from scripts.reports.control.mpc import HANGING, RATE, cart_pole_problem, field, starts
 
 ROOT = Path(__file__).parents[3]
-"""Where the package is, which the process is to import."""
+"""Folder of the package that the process imports."""
 LIMIT = 170.0
-"""Seconds after which the process is given up."""
+"""Time limit of the process, s."""
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false"
 STACK = 2**20
-"""Bytes that a call may take in C."""
+"""Stack limit of a call in C, bytes."""
 SECONDS = 3.0
-"""Of a loop: the swing-up, and balancing."""
+"""Length of a closed loop, which covers the swing-up and balancing."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Arguments:
 
 
 class Calls(NamedTuple):
-    """Of calls one after the other, compilation apart."""
+    """Times of successive calls, and of the compilation."""
 
     compile_seconds: float
     p50_ms: float
@@ -58,7 +58,7 @@ class Calls(NamedTuple):
 
 
 def main(given: Arguments) -> None:
-    """Times JAX, and C where there is a compiler, and prints JSON."""
+    """Times JAX, and C if there is a compiler, and prints JSON."""
     enable_low_latency()
     jax.config.update("jax_enable_x64", True)
     act = one_call(given.steps)
@@ -80,7 +80,7 @@ def main(given: Arguments) -> None:
 
 
 def one_call(steps: int) -> Callable[..., Any]:
-    """(x, u, states, K, damping) -> the control and the next four."""
+    """(x, u, states, K, damping) -> the control, and the next u, states, K and damping."""
     act = mpc(cart_pole_problem())
     plan = first_plan(cart_pole_problem(), HANGING, np.zeros((steps, 1)))
 
@@ -92,13 +92,13 @@ def one_call(steps: int) -> Callable[..., Any]:
 
 
 def first_state(steps: int) -> tuple[Any, ...]:
-    """Hanging, and no plan."""
+    """Arguments of the first call: hanging, with a plan without force."""
     plan = first_plan(cart_pole_problem(), HANGING, np.zeros((steps, 1)))
     return HANGING, plan.u, plan.x, plan.K, plan.damping
 
 
 def timed(act: Callable[..., Any], first: tuple[Any, ...], loops: int, compile_seconds: float) -> Calls:
-    """Of every call of some closed loops."""
+    """Times all calls along some closed loops."""
     plant = field()
     after = jax.jit(
         lambda x, u: advance(runge_kutta(CLASSICAL, lambda t, state: plant(state, u)), 0.0, x, 1 / RATE, substeps=4)
@@ -111,7 +111,7 @@ def timed(act: Callable[..., Any], first: tuple[Any, ...], loops: int, compile_s
             answer = jax.block_until_ready(act(x, *plan))
             nanoseconds.append(time.perf_counter_ns() - start)
             named = answer if isinstance(answer, dict) else answer._asdict()
-            # As they come from the binding: by the names of the dictionary, which may have a suffix.
+            # The C binding returns the names of the dictionary, possibly with a suffix.
             named = {key.removesuffix("_result"): value for key, value in named.items()}
             control, *plan = (np.asarray(named[key]) for key in ("control", "planned", "states", "gains", "size"))
             x = np.asarray(after(x, control))
@@ -120,7 +120,7 @@ def timed(act: Callable[..., Any], first: tuple[Any, ...], loops: int, compile_s
 
 
 def calls_in_a_process(steps: int, loops: int) -> dict[str, Calls]:
-    """What `main` prints, by "jax" and "c"; InputError where the process fails."""
+    """Runs this module in a process; returns the calls of "jax" and "c". `InputError` if the process fails."""
     command = [sys.executable, "-m", "scripts.reports.control.mpc_calls"]
     flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD}"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags.strip(), "OMP_NUM_THREADS": "1"}

@@ -1,4 +1,4 @@
-"""The rows of model-predictive control of a cart-pole: success from many starts, and what a call takes."""
+"""The rows of model predictive control of a cart-pole: success from many starts, and the time of a call."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ from scripts.reports.control.mpc import HORIZONS, RATE, swing_ups
 from scripts.reports.control.mpc_calls import calls_in_a_process
 
 STARTS, LOOPS = 30, 10
-"""Of swing-ups, and of those whose calls are timed."""
+"""Number of swing-ups, and number of loops with timed calls."""
 WITHIN = 1e3 / RATE
-"""ms that a call may take."""
+"""Time limit of a call, ms."""
 
 
 def mpc(quick: bool) -> Findings:
-    """Success and time to be up by horizon, and milliseconds of a call in JAX and in C, of one thread."""
+    """Success and time to swing up by horizon, and single-threaded times of a call in JAX and in C, ms."""
     rows: list[Row] = []
     for seconds in HORIZONS[:1] if quick else HORIZONS:
         steps = round(seconds * RATE)
@@ -23,7 +23,7 @@ def mpc(quick: bool) -> Findings:
         rows.append(Row(case, "success_share", float(np.isfinite(times).mean()), expected=words))
         for quantity, of in (("median", np.median), ("worst", np.max)):
             rows.append(Row(case, f"seconds_{quantity}", float(of(reached)) if len(reached) else np.inf, "s"))
-        # The longest is what takes the time.
+        # Only the longest horizon is timed: its calls take the most time.
         timed = calls_in_a_process(steps, 1 if quick else LOOPS) if seconds == HORIZONS[0] else {}
         for way, found in timed.items():
             rows.append(Row(f"{case}/{way}", "compile_seconds", found.compile_seconds, "s"))

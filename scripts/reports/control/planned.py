@@ -1,8 +1,8 @@
-"""A planned swing-up of the acrobot or the pendubot: least cost over a horizon, then a regulator that holds it.
+"""A planned swing-up of the acrobot or the pendubot: trajectory optimisation, then a regulator that holds the goal.
 
-The torque is a state of the plan and its slope the control, so that smooth torques can be asked for. Feedback about the
-plan is that of its linear-quadratic gains. Of several horizons and weights the one is kept whose run has the best
-score: the plant is known, and the score is what is asked for.
+The torque is a state of the plan and its slope the control, so that the cost can favour smooth torques. The plan's
+linear-quadratic gains give the feedback. Several horizons and weights are tried and the run with the best score is
+kept: the plant is known, and the score is the objective.
 """
 
 from collections.abc import Sequence
@@ -29,29 +29,29 @@ from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, criteria, plant, play, score
 
 EVERY = 10
-"""Samples of the board to a step of the plan."""
+"""Samples of the board per step of the plan."""
 END = np.array([300.0, 300.0, 30.0, 30.0, 3.0])
-"""Weights of what the last state is off, with the torque."""
+"""Weights of the squared error of the last state, including the torque."""
 BEYOND = 100.0
-"""Weight of the square by which a torque is beyond nine tenths of its limit."""
+"""Weight of the squared excess of a torque over nine tenths of its limit."""
 
 
 class Weights(NamedTuple):
-    """Of the integrals."""
+    """Weights of the integrals in the cost."""
 
     torque: float = 0.3
     velocity: float = 0.01
     slope: float = 1e-3
-    """Of the torque's slope."""
+    """Weight of the torque's slope."""
 
 
 def problem(motor: Motor, weights: Weights) -> Problem:
-    """On (q, qd, tau), by steps of `EVERY` samples over which the torque grows linearly."""
+    """The optimal control problem on (q, qd, tau), in steps of `EVERY` samples with a constant slope of the torque."""
     scene, B = plant(motor)
     field, dt = field_of(dynamics(scene.energies), B), 1.0 / RATE
 
     def sample(state: Array, slope: Array) -> Array:
-        # As the board has it: the torque of a sample is held.
+        # As on the board, the torque is constant over a sample.
         step = runge_kutta(CLASSICAL, lambda t, x: field(x, state[4:]))
         return jnp.concatenate([step(0.0, state[:4], dt), state[4:] + dt * slope])
 
@@ -71,12 +71,12 @@ def problem(motor: Motor, weights: Weights) -> Problem:
 
 
 def planned(motor: Motor, weights: Weights, guess: Array, *, iterations: int = 300) -> Plan:
-    """The best trajectory from a guess of the torque's slopes [N, 1], which says how long it takes."""
+    """Optimises the trajectory from a guess of the torque's slopes [N, 1], whose length sets the horizon."""
     return optimise(problem(motor, weights), np.zeros(5), guess, iterations=iterations)
 
 
 def follower(motor: Motor, weights: Weights, plan: Plan) -> Controller:
-    """Feedback about the plan, and at its end a regulator about the goal."""
+    """Feedback about the plan, followed by a regulator about the goal."""
     scene, B = plant(motor)
     field, joints, dt = field_of(dynamics(scene.energies), B), scene.needs.joints, 1.0 / RATE
     at = linearise(field, GOAL, holding_controls(dynamics(scene.energies), GOAL[:2], B))
@@ -97,7 +97,7 @@ def follower(motor: Motor, weights: Weights, plan: Plan) -> Controller:
 def search(
     motor: Motor, horizons: Sequence[float], weights: Sequence[Weights], guesses: int = 3
 ) -> tuple[float, Plan, Weights]:
-    """The best score of all horizons, weights and random guesses, its plan, and its weights."""
+    """The best score over horizons, weights and random guesses, with its plan and weights."""
     best: tuple[float, Plan, Weights] | None = None
     for each in weights:
         for seconds in horizons:

@@ -1,7 +1,7 @@
-"""A swing-up of the board that comes back: the plan first, then a regulator, and by energy wherever that is too far.
+"""A swing-up on the board that recovers: first the plan, then a regulator, and the energy law where that is too far.
 
-Angles alone are believed, and rates are differences of theirs; how late they come is measured when the plant first
-moves, and its known model predicts what has come since (`control.with_prediction`).
+The controller trusts only angles; rates are their differences. It measures the delay when the plant first moves, and
+predicts the current state by the known model (`control.with_prediction`).
 """
 
 from collections.abc import Callable
@@ -32,24 +32,24 @@ from scripts.reports.control.energy_laws import Law, pumping
 from scripts.reports.control.planned import EVERY, Weights, follower
 
 CUTOFF = 1000.0
-"""Hz, of the differences: above the samples' own, so that nearly all of each is taken."""
+"""Cut-off of the differences, Hz: above the sampling rate, so that they are hardly filtered."""
 STATE_COST = np.diag([10.0, 10.0, 1.0, 1.0])
-"""Of the regulator."""
+"""State cost of the regulator."""
 
 
 class Recovery(NamedTuple):
-    """Numbers of what follows the plan."""
+    """Numbers of the controllers after the plan."""
 
     law: Law
-    """By energy, and where the regulator takes over."""
+    """The energy law, and the level at which the regulator takes over."""
     sweep: Any = 0.0
-    """J, by which the energy that is pumped to goes up and down: a wrong model has the goal's wrong."""
+    """Amplitude of the sweep of the target energy, J: a wrong model has a wrong energy of the goal."""
     period: Any = 2.0
-    """s, of the sweep."""
+    """Period of the sweep, s."""
 
 
 def by_angles(motor: Motor, controller: Controller) -> Controller:
-    """A controller of x that believes the angles alone, and predicts the state of now where they come late."""
+    """A controller of x that uses only the measured angles and predicts the current state if they are delayed."""
     scene, B = plant(motor)
     field = field_of(dynamics(scene.closed_form), B)
     step = lambda x, u: runge_kutta(MIDPOINT, lambda t, x: field(x, u))(0.0, x, 1 / RATE)  # noqa: E731
@@ -59,13 +59,13 @@ def by_angles(motor: Motor, controller: Controller) -> Controller:
 
 
 def recovering(motor: Motor, weights: Weights, plan: Plan, control_cost: float) -> Callable[[Recovery], Controller]:
-    """The plan; from its end on a regulator where its value is below the law's level, and else the law by energy.
+    """The plan; after its end the regulator where its value function is below the law's level, else the energy law.
 
     Args:
-        motor: of the board.
-        weights: of the plan.
-        plan: from hanging.
-        control_cost: of the regulator.
+        motor: driven joint of the board's plant.
+        weights: weights of the plan's cost.
+        plan: plan from hanging.
+        control_cost: control cost of the regulator.
     """
     scene, B = plant(motor)
     system, joints = dynamics(scene.closed_form), scene.needs.joints

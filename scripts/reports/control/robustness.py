@@ -1,4 +1,4 @@
-"""The board's table of robustness, of controllers that are planned, by energy, and both: rows and a figure."""
+"""The board's robustness table for planned, energy-based and combined controllers: rows and a figure."""
 
 from typing import Any
 
@@ -35,28 +35,28 @@ PUBLISHED = {
         "iLQR Riccati": (5.2, 38.1, 9.5, 85.7, 14.3, 0.0, 0.255),
     },
 }
-"""Per cent by criterion and the mean, as the board prints them (version 2; the mean is rounded there)."""
+"""Published percentages by criterion, and the mean (version 2; the board rounds the mean)."""
 HORIZON, DRAWS = 1.6, 300
-"""s of the plan, and laws by energy of which the best by the nominal score is taken."""
-# Gains, the regulator's level, the share of a new torque and the largest one; the sweep and its period. The best of
-# hundreds drawn by how many random states come up undisturbed, then of eighty about it by disturbances that are drawn
-# likewise, but are not those of the table.
+"""Horizon of the plan, s, and number of random energy laws, from which the best nominal score is chosen."""
+# Gains, the regulator's level, the share of a new torque and the largest one; the sweep and its period. Chosen from
+# hundreds of random draws by the number of random states that swing up undisturbed, then from eighty draws about the
+# best by disturbances drawn like those of the table, but not the same ones.
 RECOVERIES: dict[Motor, tuple[tuple[float, float, float], float, float, float, float, float]] = {
     "elbow": ((2.89, 17.1, 41.5), 313.0, 1.0, 6.0, 0.2, 1.5),
     "shoulder": ((47.8, 2.15, 3.44), 63.9, 1.0, 6.0, 0.2, 1.0),
 }
 CONTROL_COSTS: dict[Motor, float] = {"elbow": 1.0, "shoulder": 10.0}
-"""Of the regulators that they fall back to."""
+"""Control costs of the regulators that take over after the plan."""
 
 
 def recovery(motor: Motor) -> Recovery:
-    """The best that was found."""
+    """The chosen numbers of `RECOVERIES`."""
     *law, sweep, period = RECOVERIES[motor]
     return Recovery(Law(*map(jnp.array, law)), sweep, period)
 
 
 def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
-    """Ours, by name; gains and plans are of the plant without disturbance."""
+    """Our controllers by name, with gains and plans of the undisturbed plant."""
     weights = Weights()
     _, plan, weights = search(motor, (HORIZON,), (weights,), guesses=1)
     law = best_law(motor, 20 if quick else DRAWS)
@@ -69,7 +69,7 @@ def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
 
 
 def robust(motor: Motor, quick: bool) -> Findings:
-    """Shares of successes by criterion and their mean, and the score of the plant without disturbance beside them."""
+    """Shares of successes by criterion, their mean, and the score of the undisturbed plant."""
     name, table = plant(motor)[0].name, {}
     rows: list[Row] = []
     best = max(each[-1] for each in PUBLISHED[name].values())
@@ -88,5 +88,5 @@ def robust(motor: Motor, quick: bool) -> Findings:
 
 
 def draw(curves: dict[str, Any]) -> Figure:
-    """The board's table with ours above it."""
+    """Draws the board's table with our controllers above it."""
     return shares(curves)

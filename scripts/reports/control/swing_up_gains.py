@@ -1,8 +1,8 @@
-"""How the gains of the desktop plants' swing-ups were chosen: drawn at random, by the analytic model alone.
+"""Choice of the gains for the desktop plants' swing-ups: random search with analytic models alone.
 
-Each draw swings the plant up by two models, the analytic one with friction and the nominal without; kept are those that
-come up from every start by both, and the best of these from more starts. Starts and noise have seeds that no report
-uses, and what comes out is the same for every model, learned ones too.
+Every draw swings the plant up with two models: the analytic one with friction, and the nominal without. Draws that
+succeed from all starts with both models are tried again from more starts. Starts and noise have seeds that no report
+uses, and all models, including learned ones, get the same gains.
 """
 
 from typing import NamedTuple
@@ -20,27 +20,27 @@ from dln_jax.control.swing_up_runs import model_of_plant, motion_of, nominal_mod
 from dln_jax.mechanics.dynamics import Dynamics
 
 SEED = 1_000_000
-"""Of starts and noise, where reports have theirs below 1000."""
+"""Seed of starts and noise; reports use seeds below 1000."""
 DECADES = {"energy": (-1.0, 1.0), "proportional": (0.7, 1.8), "derivative": (0.0, 1.3), "level": (-1.5, 0.5)}
-"""Around the numbers of a first guess for the energy's gain and the level; of 1/s² and 1/s for the others."""
+"""Decades of the search: factors on a first guess for energy gain and level, 1/s² and 1/s for the other gains."""
 
 
 class Candidate(NamedTuple):
-    """Numbers, and what came of them."""
+    """Numbers of a law and their results."""
 
     numbers: SwingUpNumbers
     share: float
-    """Of starts that are up, by the worse of two models."""
+    """Share of successful starts, by the worse of two models."""
     worst: float
-    """s, likewise."""
+    """Worst time to swing up, s, likewise."""
     farthest: float
-    """m or rad, of the driven coordinate in any run."""
+    """Largest excursion of the driven coordinate in any run, m or rad."""
 
 
 def choose(
     plant: DesktopPlant, *, draws: int = 100, starts: int = 8, finalists: int = 8, more: int = 100, farthest: float
 ) -> list[Candidate]:
-    """The finalists, the best first: all starts up, within the room that the driven joint has, and soonest."""
+    """The finalists, best first: ranked by success from all starts, excursion within `farthest`, and time."""
     random = np.random.default_rng(SEED)
     drawn = {name: 10 ** random.uniform(*decades, draws) for name, decades in DECADES.items()}
     first = plant.numbers

@@ -1,4 +1,4 @@
-"""Swing-ups to look at: some runs from near hanging, and the time to come up from anywhere in the phase plane."""
+"""Figures of swing-ups: some runs from near hanging, and the time to swing up over the phase plane."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -16,15 +16,15 @@ from scripts.reports.case import Findings
 from scripts.reports.control.energy_laws import SwingUp, closed_loop, rows_of_outcomes, tried
 
 SHOWN, SECONDS, EVERY = 6, 3.0, 4
-"""Runs of a figure, their length in s, and samples of them between two that are drawn."""
+"""Runs in a figure, their length, s, and the stride of the drawn samples."""
 ANYWHERE = 1000
-"""Starts."""
+"""Number of starts over the phase plane."""
 FASTEST = 15.0
-"""rad/s, of the pole at a start; the driven joint is at rest at home."""
+"""Largest rate of the pole at the start, rad/s; the driven joint starts at rest at zero."""
 
 
 def traces(case: SwingUp) -> dict[str, list[float]]:
-    """Runs as numbers that a report stores."""
+    """Runs as lists of numbers, which a report can store."""
     run = jax.jit(jax.vmap(closed_loop(case, seconds=SECONDS)))(hanging_starts(SHOWN, 0, position=case.position))
     energy = dynamics(case.scene.energies).energy
     x = run.x[:, ::EVERY]
@@ -37,7 +37,7 @@ def traces(case: SwingUp) -> dict[str, list[float]]:
 
 
 def draw_traces(curves: Mapping[str, Any]) -> Figure:
-    """The figure of `traces`."""
+    """Draws the result of `traces`."""
     t, d = np.array(curves["t"]), len(curves["revolute"])
     x = np.reshape(curves["x"], (-1, len(t), 2 * d))
     u = np.reshape(curves["u"], (len(x), -1, 1))[:, : len(t) - 1]
@@ -63,9 +63,9 @@ def from_anywhere(case: SwingUp, quick: bool) -> Findings:
 
 
 def draw_starts(curves: Mapping[str, Any]) -> Figure:
-    """The figure of `from_anywhere`."""
+    """Draws the result of `from_anywhere`."""
     return success_over_starts(np.stack([curves["angle"], curves["rate"]], axis=1), np.array(curves["seconds"]))
 
 
 DRAWN: dict[str, Callable[[dict[str, Any]], Figure]] = {"swing-up": draw_traces, "starts": draw_starts}
-"""By subject."""
+"""Functions that draw a subject's curves."""

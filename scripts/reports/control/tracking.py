@@ -1,7 +1,7 @@
-"""A seven-axis arm that follows references in closed loop, by models that are known, identified and learned.
+"""A seven-axis arm that follows references in closed loop with known, identified and learned models.
 
-The arm is that of the report of robots (`studies.robots.arm`), with dry friction, in MuJoCo; where that is missing, by
-our own equations with a smooth law of friction. The loop is in `arm_loop`.
+The arm is that of the robot report (`robots.arm`) with dry friction, simulated in MuJoCo. Without MuJoCo our own
+equations with a smooth law of friction replace it. The loop is in `arm_loop`.
 """
 
 from collections.abc import Callable
@@ -39,22 +39,22 @@ from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm, measured, mot
 from scripts.reports.robots.known_kinematics import DECIMATE, LAWS, logs, rough
 
 COMPUTED = Gains(np.full(D, 400.0), np.full(D, 40.0))
-"""1/s² and 1/s, critically damped at 20 rad/s."""
+"""Gains of computed torque, 1/s² and 1/s: critically damped at 20 rad/s."""
 AHEAD = Gains(STIFFNESS, DAMPING)
 FEW = 2
-"""Motions that the bad network is trained on."""
+"""Number of training motions of the deliberately bad network."""
 STEPS = 30
-"""Of Gauss-Newton, for a network."""
+"""Gauss-Newton steps of a network."""
 
 
 class Effort(NamedTuple):
-    """How much is measured."""
+    """Size of the measurement."""
 
     seeds: int
     motions: int
     unseen: int
     samples: int | None
-    """Of each unseen motion; all by default."""
+    """Samples of an unseen motion to track; all by default."""
     searched: Search
 
 
@@ -63,9 +63,9 @@ QUICK = Effort(1, 4, 1, 400, Search(starts=2, iterations=5))
 
 
 def models(robot: Robot, seed: int, effort: Effort, random: np.random.Generator) -> dict[str, tuple[Dynamics, Any]]:
-    """Models by name, each with what tells whether a state is outside its data, or `None`.
+    """Models by name, with a test for out-of-distribution states or `None`.
 
-    Fitted are logs of PD control at 125 Hz, encoders and torques with noise (`robots.arm.measured`).
+    They are fitted to logs of PD control at 125 Hz with noisy encoders and torques (`robots.arm.measured`).
     """
     seen = smooth(from_arrays(measured(logs(robot, random, effort.motions), random))).data
     data = every(seen, DECIMATE)
@@ -89,7 +89,7 @@ def models(robot: Robot, seed: int, effort: Effort, random: np.random.Generator)
 
 
 def network(robot: Robot, data: Trajectories, seed: int, scale: float, effort: Effort) -> Dynamics:
-    """A structured DeLaN with friction of the joints, of the size that suits the data, by the library's training."""
+    """A structured DeLaN with joint friction and the library's default size for the data, trained by the library."""
     train, validation = hold_out(data, 0.1, seed)
     needs = robot.tree.needs._replace(friction=False, joint_friction=LAWS, velocity_scale=scale)
     chosen = suited_network(needs, train)
@@ -103,7 +103,7 @@ def network(robot: Robot, data: Trajectories, seed: int, scale: float, effort: E
 
 
 def within(data: Trajectories) -> Callable[..., Any]:
-    """(q, qd, qdd) -> whether an angle or a rate is beyond those of the data."""
+    """(q, qd, qdd) -> whether an angle or a rate lies outside the range of the data."""
     states = np.concatenate([data.q, data.qd], axis=1)
     low, high = states.min(axis=0), states.max(axis=0)
 
@@ -115,7 +115,7 @@ def within(data: Trajectories) -> Callable[..., Any]:
 
 
 def laws(known: dict[str, tuple[Dynamics, Any]], held_out: Trajectories) -> dict[str, Any]:
-    """By name; feedback alone first. `judged` trusts a model that explains held-out motions, too."""
+    """Control laws by name, feedback alone first. `judged` also requires that the model explains held-out motions."""
     found: dict[str, Any] = {"feedback-alone": lambda q, qd, now: feedback(AHEAD, q, qd, now)}
     for name, (model, outside) in known.items():
         ahead, computed = feed_forward(model, AHEAD), computed_torque(model, COMPUTED)
@@ -128,7 +128,7 @@ def laws(known: dict[str, tuple[Dynamics, Any]], held_out: Trajectories) -> dict
 
 
 def tracking(quick: bool) -> Findings:
-    """Rms errors in mrad by law and model, over seeds of the data and unseen motions; failures counted apart."""
+    """Rms errors, mrad, by law and model over seeds of the data and unseen motions; failures count separately."""
     effort, robot = QUICK if quick else FULL, arm(coulomb=True)
     try:
         plant = in_mujoco(robot)
@@ -149,7 +149,7 @@ def tracking(quick: bool) -> Findings:
 def one_seed(
     robot: Robot, plant: Plant, seed: int, effort: Effort
 ) -> tuple[dict[str, float], dict[str, list[Tracked]]]:
-    """nMSE of each model on a motion that it has not seen, and what each law makes of others."""
+    """nMSE of the models on an unseen motion, and tracking results of the laws on other unseen motions."""
     random = np.random.default_rng(seed)
     known = models(robot, seed, effort, random)
     wanted = [motion(random) for _ in range(effort.unseen)]
@@ -166,7 +166,7 @@ def one_seed(
 
 
 def rows_of(name: str, runs: list[Tracked]) -> list[Row]:
-    """Median and worst over seeds and motions of those that are numbers, and how many are none."""
+    """Median and worst rms error over finite runs, and the number of runs that failed."""
     case, rms = f"tracking/{name}", np.array([run.rms for run in runs])
     sound = rms[np.isfinite(rms)]
     rows = [Row(case, f"rms_mrad_{key}", float(of(sound)) if len(sound) else np.inf, "mrad") for key, of in SPREADS]

@@ -22,15 +22,15 @@ from scripts.reports.case import Case, Findings
 
 INPUTS = (1, 2, 4, 7)
 BOUNDS = {2: 4.0, 7: 4.0}
-"""At least so many times as fast as jax.hessian of the plain network, by number of inputs."""
+"""Speed-up over jax.hessian of the plain network to reach, by number of inputs."""
 PLAIN = {"tanh": jnp.tanh, "softplus": jax.nn.softplus, "cos": jnp.cos, "sin": jnp.sin, "silu": jax.nn.silu}
-"""Activations as jax.numpy has them."""
+"""Activations in plain JAX."""
 
 
 def cases(
     *, width: int = 128, depth: int = 2, batch: int = 512, activation: str = "tanh", repetitions: int = 30
 ) -> list[Case]:
-    """A case for each number of inputs; `InputError` for sizes that are not positive."""
+    """One case per number of inputs; `InputError` for sizes that are not positive."""
     require_network(width=width, depth=depth)
     require_positive(batch=batch, repetitions=repetitions)
     settings = {"hidden": (width,) * depth, "batch": batch, "activation": activation, "repetitions": repetitions}
@@ -55,7 +55,7 @@ def compared(inputs: int, *, hidden: tuple[int, ...], batch: int, activation: st
 
 
 def programs_for(sizes: tuple[int, ...], batch: int, name: str) -> tuple[dict[str, Callable], tuple]:
-    """Gradients of a loss on value, gradient and Hessian by either way, and of one on the value; (layers, x)."""
+    """Programs for gradients of a loss on value, gradient and Hessian, and of a loss on the value; and (layers, x)."""
     function = activation(name)
     layers = differential_mlp.init(jax.random.key(0), sizes, dtype=jnp.float32)
     x = jax.random.normal(jax.random.key(1), (batch, sizes[0]), jnp.float32)

@@ -1,4 +1,4 @@
-"""All that the published table of differential networks has, trained by both optimisers."""
+"""The published table of differential networks, trained by both optimisers."""
 
 import itertools
 import time
@@ -32,14 +32,14 @@ LOSSES = ("type1", "type2")
 ACTIVATIONS = ("relu", "softplus", "tanh", "cos")
 QUANTITIES = ("value_mse", "gradient_mse", "hessian_mse")
 FACTORS = {"sin": 30.0, "cos_sin": 10.0}
-"""By how much the best of our row is to beat the best of the published row."""
+"""Factor by which our best error of a row must beat the best published one."""
 TITLES = {"sin": ("1-D f", "1-D f'", "1-D f''"), "cos_sin": ("2-D f", "2-D gradient", "2-D Hessian")}
 
 
 def cases(
     *, samples: int = 25_600, seed: int = 0, steps: int = 40, coarse_steps: int = 200, epochs: int = 500
 ) -> list[Case]:
-    """A case for each function, loss and activation by each optimiser; `InputError` for settings that cannot be.
+    """One case per function, loss, activation and optimiser; `InputError` for invalid settings.
 
     Gauss-Newton takes `steps` iterations on all samples at most, before those `coarse_steps` on some; Adam `epochs`.
     """
@@ -67,12 +67,12 @@ def cases(
 
 
 def findings(case: str, sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> Findings:
-    """The numbers of one network, the published one or for Gauss-Newton one that starts small."""
+    """Trains one network and returns its numbers; Gauss-Newton grows the width from a small one."""
     return Findings(rows_of(case, trained(sets, test, network, optimiser)))
 
 
 def trained(sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> dict[str, float]:
-    """Trains one network, at the width that validation chooses or the published one, and measures it on the grid."""
+    """Trains one network and measures it on the grid; validation chooses the width, except with Adam (published)."""
     began = time.perf_counter()
     if isinstance(optimiser, Adam):
         every = [training := train(sets, network, optimiser)]
@@ -89,7 +89,7 @@ def trained(sets: SampleSplit, test: FunctionSamples, network: Network, optimise
 
 
 def table_rows(rows: Sequence[Row]) -> list[Row]:
-    """Every number beside the published one, the best of each published row, and the time of all."""
+    """All numbers with their published references, the best of every published row, and the total time."""
     found = []
     for row in rows:
         theirs = published(TABLE, row.case.rpartition("/")[0], row.quantity)  # without the optimiser
@@ -104,7 +104,7 @@ def table_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def comparison(found: Mapping[str, Mapping[str, float]], optimizer: str, recipe: str) -> Table:
-    """The published table with ours above each published number."""
+    """The published table, with our numbers above the published ones."""
     recipes = list(itertools.product(LOSSES, ACTIVATIONS))
     columns = [f"{loss} {name}" for loss, name in recipes]
     table = Table("", "", *columns, title=f"{optimizer}: {recipe}", caption="mean squared errors on the clean grid")

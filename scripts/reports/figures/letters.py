@@ -1,4 +1,4 @@
-"""Figures of the experiments on letters: errors of several models, and what an arm writes while it learns."""
+"""Figures of the experiments on letters: errors of several models, and letters written by an arm that learns."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,13 +13,13 @@ from dln_jax.figures.labels import label_ends
 
 
 def error_lines(curves: Mapping[str, Any], *, x: str, zero: str) -> Figure:
-    """Median and range over runs of each model's error, and below it the share of samples outside the training data.
+    """Median and range over runs of the models' errors, and below them the share of out-of-distribution samples.
 
     Args:
         curves: "places" [K] along x; "torque_mean_square" and "share_outside_training" [K, runs]; all others are the
             errors of models [K, runs] in (N m)².
-        x: name of the places.
-        zero: name of the line of mean squares.
+        x: label of the x axis.
+        zero: label of the line of mean squares.
     """
     places, mean_squares, share = (np.asarray(curves[key], float) for key in _NOT_MODELS)
     models = {model: np.asarray(errors, float) for model, errors in curves.items() if model not in _NOT_MODELS}
@@ -51,12 +51,12 @@ _NOT_MODELS = ("places", "torque_mean_square", "share_outside_training")
 
 
 def written_letters(curves: Mapping[str, Any], *, title: str) -> Figure:
-    """What each model's arm writes, letter by letter as it learns, over what it is to write; and all errors of the tip.
+    """Letters written with the models, in order, over their references, and all errors of the tip.
 
     Args:
         curves: "letters" [K]; "wanted" [K] and "paths" by model [K] of tips [N, 2], m; "errors" by model [runs, K], m,
-            of which a letter that was lost is infinite.
-        title: of the figure.
+            infinite for a lost letter.
+        title: title of the figure.
     """
     letters, models = curves["letters"], list(curves["paths"])
     shown = _shown(len(letters))
@@ -77,7 +77,7 @@ def written_letters(curves: Mapping[str, Any], *, title: str) -> Figure:
 
 
 def _shown(count: int) -> list[int]:
-    """Letters that are drawn: the first ones, then some of the later ones."""
+    """Indices of the letters to draw: the first ones, then some later ones."""
     return list(dict.fromkeys(place for place in (0, 1, 2, 4, count - 1) if place < count))
 
 
@@ -94,7 +94,7 @@ def _letter(axis: Axes, wanted: Any, path: Any, colour: str) -> None:
 
 
 def _errors(axis: Axes, errors: Mapping[str, Sequence[Sequence[float]]]) -> None:
-    """All errors and their median over runs, in the order of writing; letters that were lost are hollow, on top."""
+    """Draws all errors and their median over runs, in the order of writing; hollow marks on top are lost letters."""
     style.prepare(axis)
     values = {model: 1e3 * np.asarray(runs, float) for model, runs in errors.items()}
     every = np.concatenate([each.ravel() for each in values.values()])

@@ -1,4 +1,4 @@
-"""Figures of the report of robots: errors of each joint by method, and of arms by what is known of them."""
+"""Figures of the robot report: errors by joint and method, and errors by arm and prior knowledge."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,15 +8,15 @@ from matplotlib.figure import Figure
 from dln_jax.figures import style
 
 SPREAD = 0.5
-"""Of a place on the axis that its marks share."""
+"""Width over which the marks at one place are spread, relative to the distance of places."""
 
 
 def errors_by_joint(errors: Mapping[str, Sequence[float]], names: Sequence[str] = ()) -> Figure:
-    """nMSE of each joint, a mark for each method; lines only lead the eye.
+    """nMSE by joint, with one mark per method.
 
     Args:
-        errors: of each joint, by method.
-        names: of the joints; by default their numbers.
+        errors: nMSE of the joints, by method.
+        names: names of the joints; by default their numbers.
     """
     figure, [[axis]] = style.figure(height=3.2)
     joints = np.arange(max(map(len, errors.values())))
@@ -32,10 +32,10 @@ def errors_by_joint(errors: Mapping[str, Sequence[float]], names: Sequence[str] 
 
 
 def errors_by_arm(errors: Mapping[str, Sequence[float]]) -> Figure:
-    """Median and worst nMSE, the mean over joints, of each arm by what was known of it.
+    """Median and worst nMSE, averaged over joints, by arm and method.
 
     Args:
-        errors: by "ARM/FRICTION/SAMPLES/METHOD", the median and the worst over seeds.
+        errors: median and worst over seeds, by "ARM/FRICTION/SAMPLES/METHOD".
     """
     places = list(dict.fromkeys(name.rsplit("/", 1)[0] for name in errors))
     methods = list(dict.fromkeys(name.rsplit("/", 1)[1] for name in errors))

@@ -1,4 +1,4 @@
-"""Shares of successes by what disturbs, as a map of numbers."""
+"""Shares of successes by disturbance, as a map of numbers."""
 
 from collections.abc import Mapping
 
@@ -12,11 +12,11 @@ COLOURS = LinearSegmentedColormap.from_list("shares", ["#ffffff", "#9ecae1", sty
 
 
 def shares(tables: Mapping[str, Mapping[str, Mapping[str, float]]], *, ours: str = "ours") -> Figure:
-    """A panel for each plant: shares [0, 1] by controller and criterion, darker where more succeed.
+    """Shares [0, 1] by controller and criterion, one panel per plant; darker is better.
 
     Args:
-        tables: by plant, controller and criterion, the same criteria in all.
-        ours: with which the names of own controllers begin; they are set apart from the others.
+        tables: shares by plant, controller and criterion; the criteria are the same in all tables.
+        ours: prefix of the names of our controllers, which a line separates from the others.
     """
     heights = [len(table) for table in tables.values()]
     figure, axes = style.figure(

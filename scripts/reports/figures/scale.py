@@ -1,4 +1,4 @@
-"""What sharing work gains: measured on one machine, and on paper for many hosts."""
+"""Speed-ups by shared work: measured on one machine, and modelled for many hosts."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,10 +21,10 @@ def speed_ups(
     """Speed-ups over one device.
 
     Args:
-        measured: by work and by who shares it: bars.
-        modelled: by work and by network, a value for each number of hosts: lines beside the ideal one.
-        hosts: these numbers.
-        x: what tells the works of the bars apart.
+        measured: speed-ups by work and layout, drawn as bars.
+        modelled: speed-ups by work and network, one per number of hosts, drawn as lines beside the ideal one.
+        hosts: numbers of hosts.
+        x: label of the bars' axis, which names the works.
     """
     figure, [[bars, lines]] = style.figure(1, 2, height=3.6)
     _draw_bars(bars, measured)

@@ -1,4 +1,4 @@
-"""Pictures of the cost to go of a pendulum: level sets and the paths that descend them, policies, and errors."""
+"""Figures of the cost to go of a pendulum: level sets with closed-loop paths, policies, and errors."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from dln_jax.figures import style
 
 LEVELS = 16
 LEAST_ERROR, MOST_ERROR = 1e-4, 1.0
-"""Relative errors that are drawn apart."""
+"""Range of the colour scale of relative errors."""
 TICKS = {-np.pi: "-π", -np.pi / 2: "-π/2", 0.0: "0", np.pi / 2: "π/2", np.pi: "π"}
 
 
@@ -24,17 +24,17 @@ def value_figure(
     limit: float,
     seconds: float,
 ) -> Figure:
-    """A fitted value and policy beside true ones, the error between, and the closed loop from downward starts.
+    """A fitted value and policy beside the true ones, the relative error, and the closed loop from downward starts.
 
     Args:
-        nodes: states, the first coordinate an angle that is zero upright.
-        values: V there [A, B], fitted and true.
-        controls: likewise.
-        paths: of the closed loop with the fitted policy.
-        limit: of the control.
-        seconds: of the paths.
+        nodes: states; the first coordinate is an angle, zero upright.
+        values: V at the nodes [A, B], fitted and true.
+        controls: controls at the nodes [A, B], fitted and true.
+        paths: closed-loop states with the fitted policy.
+        limit: limit of the control.
+        seconds: length of the paths.
     """
-    # The circle closes: its first nodes are its last too.
+    # The angle is periodic: repeat the first nodes at the end.
     nodes = np.concatenate([nodes, nodes[:1] + np.array([2 * np.pi, 0])])
     fitted, true, u, best = (np.concatenate([each, each[:1]]) for each in (*values, *controls))
     figure, axes = style.figure(2, 3, height=4.9, width=9.6)
@@ -83,7 +83,7 @@ def _bar(figure: Figure, shown: ScalarMappable, axis: Axes, label: str) -> None:
 
 
 def _paths(axis: Axes, paths: np.ndarray) -> None:
-    """On the circle, with gaps where an angle goes round."""
+    """Draws paths with wrapped angles, and gaps where an angle wraps."""
     for path in paths:
         angle = np.arctan2(np.sin(path[:, 0]), np.cos(path[:, 0]))
         angle[1:][np.abs(np.diff(angle)) > np.pi] = np.nan
@@ -94,7 +94,7 @@ def _paths(axis: Axes, paths: np.ndarray) -> None:
 def _over_time(axis: Axes, paths: np.ndarray, seconds: float) -> None:
     t = np.linspace(0, seconds, paths.shape[1])
     for path in paths:
-        # Upright is whichever turn the pole comes to.
+        # Shift every path by whole turns, so that it ends near zero.
         turns = 2 * np.pi * np.round(path[-1, 0] / (2 * np.pi))
         axis.plot(t, path[:, 0] - turns, color=style.VERMILLION, linewidth=0.9, alpha=0.8)
     axis.axhline(0, color="0.4", linewidth=0.7)

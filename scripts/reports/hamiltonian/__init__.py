@@ -1,1 +1,1 @@
-"""Hamiltonian tasks: data, training, errors, beside the published results."""
+"""Hamiltonian tasks: data, training and errors, compared with published results."""

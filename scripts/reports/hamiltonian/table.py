@@ -1,4 +1,4 @@
-"""The table of Hamiltonian tasks: every model of the published ones, medians over seeds, beside published errors."""
+"""The table of Hamiltonian tasks: models of the published tasks, medians over seeds, and published errors."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -20,7 +20,7 @@ from scripts.reports.case import Case, Findings, by_case, rows_of
 from scripts.reports.published import HAMILTONIAN, published
 
 TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
-"""The published ones."""
+"""The published tasks."""
 BOUNDS = {
     "spring/separable-hnn": {"energy_mse": 3.8e-5, "train_seconds": 5.0},
     "pendulum/separable-hnn": {"published_energy_mse": 2.5e-3, "train_seconds": 8.0},
@@ -29,7 +29,7 @@ BOUNDS = {
     "three-body/pairwise-hnn": {"energy_mse": 4.2e-3, "energy_mse_median": 4.2e-3, "train_seconds": 300.0},
     "pixels/black-box-hnn": {"energy_mse": 1.5e-4, "energy_mse_over_baseline": 0.1, "train_seconds": 300.0},
 }
-"""Figures to reach, of the model that suits the scene."""
+"""Bounds for the model that suits the scene."""
 SHOWN = (
     *("test_loss", "clean_field_mse", "energy_mse", "energy_mse_standard_error", "energy_mse_median"),
     *("energy_mse_over_baseline", "published_energy_mse", "rollout_mse", "train_seconds", "compile_seconds"),
@@ -53,10 +53,10 @@ def cases(
     real_pendulum: Path | None = None,
     folder: Path | None = None,
 ) -> list[Case]:
-    """A case for each task, with every model of it; `InputError` for a number that is not positive.
+    """One case per task, with all its models; `InputError` for a number that is not positive.
 
-    By default `steps` of each fit are each task's own, `trajectories` the published number, and the measured task needs
-    the file `real_pendulum`. With a `folder`, each task's figure is drawn while what it shows is at hand.
+    `steps` of a fit default to the task's own and `trajectories` to the published number; the measured task needs the
+    file `real_pendulum`. With a `folder`, a task's figure is drawn as soon as the task is measured.
     """
     given = {"steps": steps, "trajectories": trajectories}
     require_positive(seeds=seeds, **{key: value for key, value in given.items() if value is not None})
@@ -72,14 +72,14 @@ def cases(
 def phase_task(
     name: str, *, seeds: int, steps: int | None, trajectories: int | None, data: Path | None, folder: Path | None
 ) -> Findings:
-    """Every model of a task in coordinates and momenta, and its figure."""
+    """Measures all models of a task in coordinates and momenta, and draws its figure."""
     problem = problem_of(name, trajectories=trajectories, data=data)
     options: dict[str, Any] = {"steps": steps, "seconds": RECIPES[name].seconds}
     rows: list[Row] = []
     seen: dict[str, Seen] = {}
     for kind in models_of(name):
         description = description_of(problem, kind)
-        # Each seed pays for its own compilation, as a user does.
+        # Every seed compiles anew, as a user's run does.
         runs = [measured_once(problem, train(problem, description, seed=seed, **options)) for seed in range(seeds)]
         rows += rows_of(f"{name}/{kind}", medians(runs))
         seen[kind] = runs[0][1]
@@ -89,7 +89,7 @@ def phase_task(
 
 
 def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folder: Path | None) -> Findings:
-    """The models of pictures, and their animation and pictures."""
+    """Measures the models of images, and draws an animation and figures."""
     data = pixels.pixel_data(trajectories)
     numbers, seen = {}, {}
     for kind in pixels.MODELS:
@@ -103,7 +103,7 @@ def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folde
 
 
 def medians(runs: Sequence[tuple[dict[str, float], *tuple[Any, ...]]]) -> dict[str, float]:
-    """Of each quantity over the seeds, and the largest energy error."""
+    """Medians of all quantities over the seeds, and the largest energy error."""
     of_seeds = [numbers for numbers, *_ in runs]
     found = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
     found["energy_mse_largest"] = float(np.max([each["energy_mse"] for each in of_seeds]))
@@ -111,7 +111,7 @@ def medians(runs: Sequence[tuple[dict[str, float], *tuple[Any, ...]]]) -> dict[s
 
 
 def table_rows(rows: Sequence[Row]) -> list[Row]:
-    """Numbers with the published ones and the figures to reach; every Hamiltonian network beside the published one."""
+    """Adds units, published references and bounds; Hamiltonian networks refer to the published one."""
     return [
         row._replace(
             unit=unit_of(row.quantity),
@@ -123,14 +123,14 @@ def table_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def beside(case: str, quantity: str) -> float | None:
-    """The published number that a model stands beside: the baseline's, or the Hamiltonian network's."""
+    """The published number to compare a model with: the baseline's, or the Hamiltonian network's."""
     task, kind = case.split("/")
     name = kind if kind == "phase-network" else "black-box-hnn"
     return published(HAMILTONIAN, f"{task}/{name}", quantity)
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Ours / published, a line per case: of the model that suits the scene, and of the baseline."""
+    """Markdown table, one line per case; "ours / published" for the model that suits the scene and the baseline."""
     lines, compared = [], {*BOUNDS, *(f"{task}/phase-network" for task in TASKS)}
     for case, numbers in by_case(rows).items():
         cells = [case]

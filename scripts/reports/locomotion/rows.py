@@ -1,4 +1,4 @@
-"""Ways of learning to move, compared: what each needs until a creature travels one body length."""
+"""Methods of learning to move, compared by their cost until a creature travels one body length."""
 
 import math
 
@@ -8,9 +8,9 @@ from dln_jax.metrics.report import Row
 
 
 def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goal: float, seed: int) -> list[Row]:
-    """What each method needs, and the ratios to gradients; only the crawler's numbers have bounds.
+    """Steps and seconds of the methods, and ratios to gradients; only the crawler's numbers have bounds.
 
-    `curves` has, by method, the records of each seed, the first of which is `seed`; `goal` is in body lengths.
+    `curves` holds, by method, the records of successive seeds starting at `seed`; `goal` is in body lengths.
     """
     rows, needed, crawls, steps = [], {}, creature == "crawler", "environment_steps_to_one_body_length"
     for method, seeds in curves.items():

@@ -1,4 +1,4 @@
-"""What is measured of robots: identification, tracking, learned kinematics, real logs and speed."""
+"""Measurements of robots: identification, tracking, learned kinematics, real logs and speed."""
 
 import functools
 from collections.abc import Callable
@@ -36,13 +36,13 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
     },
     "speed": {"seven-axis": speed.speed},
 }
-"""quick -> findings, by subject and by name; only `speed` depends on the machine."""
+"""Functions quick -> findings, by subject and name; only `speed` depends on the machine."""
 DRAWN: dict[str, Callable[[dict[str, Any]], Figure]] = {
     "arm/noisy": errors_by_joint,
     "recordings/arm": errors_by_joint,
     **dict.fromkeys((f"learned/{name}" for name in MEASURES["learned"]), errors_by_arm),
 }
-"""Figures of their curves."""
+"""Functions that draw the curves of cases."""
 
 
 def cases(
@@ -51,9 +51,9 @@ def cases(
     """All cases, named SUBJECT/NAME, in float64; quick ones have fewer seeds and motions.
 
     Args:
-        quick: less of everything.
-        log, robot: of a recorded arm, and its URDF or MJCF file; without them there is no such case.
-        pendulum: recordings of a double pendulum; likewise.
+        quick: smaller measurements.
+        log, robot: log of a recorded arm and its URDF or MJCF file; without them the case is left out.
+        pendulum: recordings of a double pendulum; without them the case is left out.
     """
     measures = {f"{subject}/{name}": measure for subject, named in MEASURES.items() for name, measure in named.items()}
     if log is not None and robot is not None:

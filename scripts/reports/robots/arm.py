@@ -1,9 +1,9 @@
-"""A seven-axis arm that MuJoCo simulates, and the logs of it that an engineer would have.
+"""A seven-axis arm simulated in MuJoCo, with the logs that an engineer would have.
 
-Frames are those of a Panda (modified Denavit-Hartenberg rows). Links have masses and centres like its own and moments
-of ellipsoids about the centre; motors have armature; joints have viscous friction and, in one case, dry friction.
-MuJoCo holds dry friction as a constraint, so that no law of ours is exact. A PD controller at 1 kHz follows Fourier
-series, of which 125 samples a second are logged, with noise of encoders and of torques.
+The frames are a Panda's (modified Denavit-Hartenberg rows). Masses and centres are similar to its own; moments of
+inertia are those of ellipsoids about the centre. Motors have armature; joints have viscous and optionally dry friction.
+MuJoCo treats dry friction as a constraint, so none of our laws is exact. A PD controller at 1 kHz follows Fourier
+series; logs have 125 samples per second, with noise on encoders and torques.
 """
 
 import importlib
@@ -23,43 +23,43 @@ ROWS = (
     *((0, 0, 0.333, 0), (-RIGHT, 0, 0, 0), (RIGHT, 0, 0.316, 0), (RIGHT, 0.0825, 0, 0)),
     *((-RIGHT, -0.0825, 0.384, 0), (RIGHT, 0, 0, 0), (RIGHT, 0.088, 0, 0)),
 )
-"""alpha, a, d, theta; rad and m."""
+"""Denavit-Hartenberg rows alpha, a, d, theta; rad and m."""
 MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
-"""kg."""
+"""Masses of the links, kg."""
 CENTRES = (
     *((0.004, 0.002, -0.175), (-0.003, -0.029, 0.003), (0.028, 0.039, -0.067), (-0.053, 0.104, 0.027)),
     *((-0.012, 0.041, -0.038), (0.060, -0.014, -0.011), (0.011, -0.004, 0.062)),
 )
-"""m, in the link's frame."""
+"""Centres of mass in the link's frame, m."""
 SPREADS = (
     *((0.08, 0.08, 0.04), (0.05, 0.05, 0.04), (0.06, 0.06, 0.04), (0.06, 0.06, 0.05)),
     *((0.09, 0.08, 0.03), (0.04, 0.04, 0.04), (0.03, 0.03, 0.03)),
 )
 """Standard deviations of the mass along axes through the centre, m."""
 ARMATURE = (0.2, 0.2, 0.2, 0.2, 0.07, 0.07, 0.07)
-"""kg m²."""
+"""Armature of the motors, kg m²."""
 VISCOUS = (1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2)
-"""N m s."""
+"""Viscous friction, N m s."""
 COULOMB = (1.0, 1.2, 0.8, 0.8, 0.5, 0.4, 0.3)
-"""N m."""
+"""Dry friction, N m."""
 STIFFNESS = np.array([600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0])
-"""Of the PD controller, N m/rad."""
+"""Proportional gains of the PD controller, N m/rad."""
 DAMPING = np.array([50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0])
-"""N m s/rad."""
+"""Derivative gains, N m s/rad."""
 MIDDLE = np.array([0.0, 0.0, 0.0, -1.5, 0.0, 1.9, 0.0])
 REACH = np.array([1.4, 0.9, 1.4, 0.75, 1.4, 0.95, 1.4])
 """Half the range of motions about the middle, rad."""
 HARMONICS, PERIOD = 5, 10.0
 STEP, EVERY = 0.001, 8
-"""s of the controller, and its steps to a logged sample."""
+"""Time step of the controller, s, and number of its steps per logged sample."""
 ENCODER_NOISE = 1e-4
-"""Standard deviation, rad."""
+"""Standard deviation of the noise on angles, rad."""
 TORQUE_NOISE = np.array([0.5, 0.5, 0.4, 0.4, 0.2, 0.1, 0.1])
-"""Standard deviation, N m."""
+"""Standard deviations of the noise on torques, N m."""
 
 
 class Motion(NamedTuple):
-    """References of a motion of T steps of the controller, each [T, d]."""
+    """References of a motion for T steps of the controller; fields [T, d]."""
 
     q: np.ndarray
     qd: np.ndarray
@@ -67,15 +67,15 @@ class Motion(NamedTuple):
 
 
 class Log(NamedTuple):
-    """Samples of one simulated motion, free of noise, each [N, d]."""
+    """Noise-free samples of one simulated motion; fields [N, d]."""
 
     q: np.ndarray
     qd: np.ndarray
     qdd: np.ndarray
     tau: np.ndarray
-    """Of the motors."""
+    """Motor torques, N m."""
     reference: np.ndarray
-    """q that was asked for."""
+    """Reference of q, rad."""
 
 
 def arm(*, coulomb: bool) -> Robot:
@@ -90,7 +90,7 @@ def arm(*, coulomb: bool) -> Robot:
 
 
 def motion(random: np.random.Generator) -> Motion:
-    """A Fourier series of drawn amplitudes within the reach of every joint, over one period from standstill."""
+    """A random Fourier series within the reach of every joint, over one period, starting and ending at rest."""
     t = STEP * np.arange(int(PERIOD / STEP))
     frequencies = 2 * np.pi / PERIOD * np.arange(1, HARMONICS + 1)
     sines, cosines = random.uniform(-1, 1, (2, D, HARMONICS)) / np.arange(1, HARMONICS + 1) ** 0.5
@@ -106,14 +106,14 @@ def motion(random: np.random.Generator) -> Motion:
 
 
 def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None) -> Log:
-    """The arm in MuJoCo under PD control, with torques [T, d] fed forward if any; every eighth step is logged.
+    """Runs the arm in MuJoCo under PD control, with optional feed-forward torques [T, d]; logs every eighth step.
 
     Raises:
         InputError: MuJoCo is missing.
     """
     mujoco, model, data = simulator(robot)
     data.qpos[:], data.qvel[:] = wanted.q[0], wanted.qd[0]
-    # Rates of the simulation are those of its last step, half a step behind its coordinates.
+    # The simulation's rates belong to its last step, half a step behind its coordinates.
     rates = np.diff(wanted.q, axis=0, prepend=wanted.q[:1]) / STEP
     logged = []
     for step, (q, qd) in enumerate(zip(wanted.q, rates, strict=True)):
@@ -127,7 +127,7 @@ def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None)
 
 
 def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
-    """Torques [T, d] that the arm takes on its references, by MuJoCo's inverse dynamics, dry friction included."""
+    """Torques [T, d] along the references by MuJoCo's inverse dynamics, including dry friction."""
     mujoco, model, data = simulator(robot)
     tau = []
     for state in zip(*wanted, strict=True):
@@ -138,7 +138,7 @@ def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
 
 
 def simulator(robot: Robot) -> tuple[Any, Any, Any]:
-    """MuJoCo, its model of the arm, and a state; `InputError` where it is missing."""
+    """MuJoCo, its model of the arm, and a state; `InputError` if MuJoCo is missing."""
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
@@ -148,7 +148,7 @@ def simulator(robot: Robot) -> tuple[Any, Any, Any]:
 
 
 def trajectories(logs: list[Log]) -> Trajectories:
-    """Logs as data that know everything, free of noise."""
+    """Converts logs to noise-free trajectories with q, qd, qdd and tau."""
     counts = [len(log.q) for log in logs]
     arrays = {key: np.concatenate([getattr(log, key) for log in logs]) for key in ("q", "qd", "qdd", "tau")}
     t = np.concatenate([STEP * EVERY * np.arange(count) for count in counts])
@@ -156,7 +156,7 @@ def trajectories(logs: list[Log]) -> Trajectories:
 
 
 def measured(data: Trajectories, random: np.random.Generator) -> dict[str, np.ndarray]:
-    """What a log has: q of encoders and torques of motors, both noisy, by the keys of the schema; no rates."""
+    """A realistic log by the keys of the schema: noisy encoder angles and motor torques, without rates."""
     return {
         "t": data.t,
         "q": data.q + random.normal(size=data.q.shape) * ENCODER_NOISE,

@@ -1,4 +1,4 @@
-"""What comes before a fit: motions that show the parameters, and what is made of encoders, as cases of the report."""
+"""Cases of the report on steps before a fit: exciting motions, and the preparation of encoder data."""
 
 import jax
 import numpy as np
@@ -17,16 +17,16 @@ from scripts.reports.robots.arm import ENCODER_NOISE, TORQUE_NOISE, arm
 from scripts.reports.robots.known_kinematics import FULL, QUICK, logs
 
 PARTS = 3
-"""Logs of as many motions each, with noise of their own."""
+"""Number of logs with equal numbers of motions and independent noise."""
 PERIOD, HARMONICS = 20.0, 5
 SMOOTH = 0.05
-"""rad/s, of the dry friction that motions are designed for."""
+"""Velocity scale of the dry friction in the design of motions, rad/s."""
 DESIGNS, SEEDS = 6, 60
-"""Of each kind of motion, and of the noise."""
+"""Number of motions of either kind, and number of seeds for the noise."""
 
 
 def encoders(quick: bool) -> Findings:
-    """Errors by what is made of q and tau before the fit, with viscous friction and with MuJoCo's dry one."""
+    """Errors by preparation of q and tau, with viscous friction and with MuJoCo's dry friction."""
     rows, effort = [], QUICK if quick else FULL
     for name, robot in (("viscous", arm(coulomb=False)), ("coulomb", arm(coulomb=True))):
         random = np.random.default_rng(0)
@@ -45,7 +45,7 @@ def encoders(quick: bool) -> Findings:
 
 
 def excitation(quick: bool) -> Findings:
-    """Errors of parameters after designed motions over those after random ones of the same series, by criterion."""
+    """Ratios of parameter errors after designed and random motions of the same series, by criterion."""
     task = lip_task(3 if quick else 7)
     count = 2 if quick else DESIGNS
     drawn = random_designs(task, count)
@@ -67,7 +67,7 @@ def excitation(quick: bool) -> Findings:
 
 
 def lip_task(active: int) -> Task:
-    """The Panda of the LIP protocol within its limits, its inertias and friction to be found."""
+    """The design task for the Panda of the LIP protocol, with its limits and unknown inertias and friction."""
     robot = panda(active)
     model = make_rigid_tree(robot.tree, friction=True, velocity_scale=SMOOTH)
     free = np.tile([-np.inf, np.inf], (active, 1))
@@ -76,6 +76,6 @@ def lip_task(active: int) -> Task:
 
 
 def designs(task: Task, criterion: str, starts: list[Design]) -> list[Design]:
-    """A motion by each start."""
+    """Optimises one motion per start."""
     optimise = make_optimiser(task, CRITERIA[criterion])
     return [best_design(task, optimise, CRITERIA[criterion], [start]) for start in starts]

@@ -1,8 +1,8 @@
 """A real double pendulum with motors: nine recordings of `design_A.0` (DFKI, BSD 3-Clause), some held out.
 
 A planar chain of ten parameters (two moments of inertia, their coupling, the second motor's armature, two weights,
-viscous and dry friction of both joints) is fitted in the ways of `double_pendulum_fits`, from q, t and tau, and judged
-by torques of filtered motions and by how long it predicts motions.
+viscous and dry friction of both joints) is fitted in the ways of `double_pendulum_fits` from q, t and tau. It is judged
+by torques of filtered motions and by its valid prediction time.
 """
 
 from collections.abc import Sequence
@@ -33,13 +33,13 @@ from scripts.reports.robots.double_pendulum_fits import (
 )
 
 FINE, BASE = 30.0, 500.0
-"""Hz: a cut-off that keeps the motion; and the rate of the recordings, nearly."""
+"""Cut-off that keeps the motion, and approximate rate of the recordings, Hz."""
 TRIM = 0.3
-"""s, that are left out at both ends of a recording."""
+"""Time left out at both ends of a recording, s."""
 HORIZON, EVERY = 2.2, 0.5
-"""s: predicted segments, and from one start to the next."""
+"""Length of predicted segments, and interval of their starts, s."""
 HELD_OUT = (("02", "11"), ("00", "12"), ("04", "13"), ("01", "05"), ("03", "13"))
-"""Recordings of each split."""
+"""Held-out recordings, by split."""
 WAYS = ("least-squares", "chosen-scale", "low-passed", "stacked", "motions", "both")
 QUANTITIES = {
     "torque_nmse": ("1", False),
@@ -47,16 +47,16 @@ QUANTITIES = {
     "vpt_seconds": ("s", True),
     "vpt_mean_seconds": ("s", True),
 }
-"""Their unit, and whether more is better."""
+"""Unit of a quantity, and whether larger is better."""
 
 Numbers = dict[str, float]
 
 
 def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
-    """Torque errors and valid prediction times of each way on recordings held out: median, worst, and each split's.
+    """Torque errors and valid prediction times on held-out recordings by method: median, worst, and by split.
 
-    The bounds of the others are the least squares' numbers. `torque_nmse` is that of torques which filtered motions
-    take, `torque_nmse_low_passed` that of torques of less filtered motions, low-passed beside the measured ones.
+    The results of least squares bound the other methods. `torque_nmse` is the error along filtered motions;
+    `torque_nmse_low_passed` is the low-passed error along less filtered motions.
     """
     logs = read(path)
     found = [split_numbers(logs, labels) for labels in held_out]
@@ -73,7 +73,7 @@ def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
 
 
 def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
-    """By way and quantity, for the recordings with these labels."""
+    """Numbers by method and quantity, with the recordings of these labels held out."""
     index = {label: place for place, label in enumerate(logs.fine.label)}
     test = [index[label] for label in held_out]
     rest = logs.of(each for each in np.unique(logs.fine.trajectory) if each not in test)
@@ -90,7 +90,7 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
 
 
 def judged(found: Fitted, held: Logs, every: Logs) -> Numbers:
-    """Errors of torques in the variance of all recordings, mean of both joints; and valid prediction times."""
+    """Torque errors relative to the variance over all recordings, averaged over joints, and valid prediction times."""
     torque = jax.jit(jax.vmap(dynamics(found.model.energies(found.parameters)).inverse_dynamics))
     variance = every.coarse.tau.var(axis=0)
 
@@ -112,7 +112,7 @@ def judged(found: Fitted, held: Logs, every: Logs) -> Numbers:
 
 
 def read(path: Path) -> Logs:
-    """The recordings of the file, resampled to equal steps, filtered, and without their ends."""
+    """Reads the recordings, resampled to equal steps, filtered, and trimmed at both ends."""
     data = load(path)
     known = {"rate": BASE, "trim": TRIM, "decimate": round(BASE / RATE), "filter_torque": True}
     return Logs(*(smooth(data, cutoff, **known).data for cutoff in (CUTOFF, FINE)))

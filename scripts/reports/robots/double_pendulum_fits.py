@@ -1,4 +1,4 @@
-"""Ways to fit a double pendulum with motors, by recordings that are not those it is judged by.
+"""Methods to fit a double pendulum with motors, without the held-out recordings.
 
     least-squares   torques of filtered motions, as engineers do it; q and tau filtered alike
     chosen-scale    the same, with the velocity scale of dry friction that explains each recording best from the others
@@ -45,19 +45,19 @@ and 25; and of what is fitted."""
 WINDOW = 11
 """Samples of a window and of a prediction's fitted start: 0.1 s."""
 NOISE = 2e-3
-"""rad, of q: more than its own, for what one unknown torque of a window leaves of other forces."""
+"""Standard deviation of q in the fit, rad: larger than the sensor noise, to allow for unmodelled forces."""
 STEPS = 8
-"""Of Gauss-Newton."""
+"""Gauss-Newton steps."""
 USUAL_SCALE = 0.1
-"""rad/s, of dry friction."""
+"""Default velocity scale of dry friction, rad/s."""
 SCALES = (0.05, 0.1, 0.2, 0.5, 1.0)
-"""That are tried."""
+"""Candidate velocity scales, rad/s."""
 SHARE = 3.0
-"""Of torques beside motions, in units of what either is off; one for all splits, and not chosen by them."""
+"""Weight of torques relative to motions, both normalised by their errors; the same for all splits."""
 
 
 class Logs(NamedTuple):
-    """The recordings at equal steps, twice, at the same times."""
+    """The recordings at equal steps, filtered twice, at the same times."""
 
     coarse: Trajectories
     """Filtered at `CUTOFF`."""
@@ -65,7 +65,7 @@ class Logs(NamedTuple):
     """Filtered to keep the motion."""
 
     def of(self, recordings: Iterable[int]) -> "Logs":
-        """Some of them."""
+        """The selected recordings."""
         indices = list(recordings)
         return Logs(*(select(each, indices) for each in self))
 
@@ -79,14 +79,14 @@ class Fitted(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def ten_parameters(velocity_scale: float = USUAL_SCALE, laws: tuple[FrictionLaw, ...] = ()) -> Model:
-    """Of two links with motors; with further laws they have more."""
+    """The chain of two links with motors; additional friction laws add parameters."""
     needs = Needs(joints=("revolute", "revolute"), friction=True, velocity_scale=velocity_scale)
     chain = make_planar_chain(needs, armature=True, velocity_scale=velocity_scale)
     return with_joint_friction(chain, needs._replace(joint_friction=laws), dtype=jnp.float64)
 
 
 def choose_scale(logs: Logs) -> float:
-    """The velocity scale whose least squares explain each recording best from all others."""
+    """The velocity scale with the lowest leave-one-out error over the recordings."""
     errors = {}
     for scale in SCALES:
         equations = _equations(ten_parameters(scale), logs)
@@ -100,13 +100,13 @@ def choose_scale(logs: Logs) -> float:
 
 
 def fit_torques(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
-    """Least squares of filtered motions, each joint's in units of its torque's deviation."""
+    """Least squares of filtered motions; a joint's equations are scaled by the standard deviation of its torque."""
     model = ten_parameters(scale)
     return Fitted(model, _parameters(model, _solved(_equations(model, logs).values())))
 
 
 def fit_low_passed(logs: Logs, scale: float = USUAL_SCALE) -> tuple[Fitted, tuple[float, ...]]:
-    """Least squares of low-passed equations; and what each joint's torque is off, N m."""
+    """Least squares of low-passed equations, and the rms torque errors of the joints, N m."""
     model = ten_parameters(scale)
     equations = _equations(model, logs, cutoff=CUTOFF)
     x = _solved(equations.values())
@@ -116,21 +116,21 @@ def fit_low_passed(logs: Logs, scale: float = USUAL_SCALE) -> tuple[Fitted, tupl
 
 
 def fit_stacked(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
-    """Least squares of filtered motions and of low-passed equations at once, which count alike."""
+    """Least squares of filtered motions and low-passed equations together, with equal weights."""
     model = ten_parameters(scale)
     equations = [*_equations(model, logs).values(), *_equations(model, logs, cutoff=CUTOFF).values()]
     return Fitted(model, _parameters(model, _solved(equations)))
 
 
 def fit_motions(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
-    """Motions alone; one recording selects the iteration."""
+    """Fits motions alone; one recording selects the iteration."""
     start, off = fit_low_passed(logs, scale)
     parts = _parted(logs)
     return _trained(start, _motions(start, parts, off))
 
 
 def fit_both(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
-    """Motions and torques, with friction by load; one recording selects the iteration."""
+    """Fits motions and torques, with load-dependent friction; one recording selects the iteration."""
     rigid, off = fit_low_passed(logs, scale)
     model = ten_parameters(scale, ("load",))
     start = Fitted(model, model.init(jax.random.key(0)) | {"model": rigid.parameters})
@@ -140,7 +140,7 @@ def fit_both(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
 
 
 def _parted(logs: Logs) -> tuple[Logs, Logs]:
-    """All but the middle recording, and that one."""
+    """Splits off the middle recording for validation."""
     present = np.unique(logs.fine.trajectory)
     chosen = present[len(present) // 2]
     return logs.of(present[present != chosen]), logs.of([chosen])
@@ -156,7 +156,7 @@ def _trained(start: Fitted, task: Problem) -> Fitted:
 
 
 def _equations(model: Model, logs: Logs, *, cutoff: float | None = None) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Weighted columns and torques of each recording, of the coarse motions, or of low-passed columns of the fine."""
+    """Weighted columns and torques by recording: of coarse motions, or low-passed, of fine motions with `cutoff`."""
     data = logs.coarse if cutoff is None else logs.fine
     scale = logs.coarse.tau.std(axis=0)
     zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
@@ -171,7 +171,7 @@ def _equations(model: Model, logs: Logs, *, cutoff: float | None = None) -> dict
 
 
 def low_passed(values: np.ndarray, cutoff: float = CUTOFF) -> np.ndarray:
-    """One recording's [N, ...], without its ends, where a filter knows one side only."""
+    """Low-passes one recording [N, ...] and drops its ends, where the filter has data on one side only."""
     ends = round(TRIMMED * RATE / cutoff)
     return low_pass(values.reshape(len(values), -1), rate=RATE, cutoff=cutoff)[ends:-ends].reshape(
         -1, *values.shape[1:]

@@ -1,4 +1,4 @@
-"""Random arms, their logs, and what spoils a log: what a verdict on an identified robot is measured by."""
+"""Random arms, their logs, and faults in logs, to test the verdict on identified robots."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,19 +14,19 @@ from dln_jax.scenes.robot_arms import Arm
 Arrays = dict[str, Any]
 TRAJECTORIES, SECONDS, RATE = 5, 8.0, 100.0
 TURNS = (0.0, -np.pi / 2, np.pi / 2, 0.0, 0.6)
-"""rad, angles between neighbouring axes that arms are drawn from; 0 is a planar arm."""
+"""Angles between successive axes of random arms, rad; 0 gives a planar arm."""
 
 
 class Fault(NamedTuple):
-    """What is done to the arrays of a sound log, and what a verdict must then be."""
+    """A change of a sound log's arrays, and the verdict it must lead to."""
 
     spoil: Callable[[Arrays, np.random.Generator], Arrays]
     level: str
-    """"refused", or "doubtful" where that is the least."""
+    """"refused", or "doubtful" if that suffices."""
 
 
 def random_arm(seed: int, d: int) -> Arm:
-    """A serial arm of d revolute joints in a vertical plane or in space, whose bodies can exist, with friction."""
+    """A serial arm of d revolute joints, planar or spatial, with physically consistent inertias and friction."""
     random = np.random.default_rng([seed, d, 0])
     turns = np.zeros(d) if random.random() < 0.3 else random.choice(TURNS, d)
     turns[0] = np.pi / 2 if not turns.any() else turns[0]
@@ -46,7 +46,7 @@ def random_arm(seed: int, d: int) -> Arm:
 
 
 def rough_file(arm: Arm, seed: int) -> Robot:
-    """The arm as a file has it that nobody measured: masses wrong by a third, no armature, no friction."""
+    """The arm as in an unmeasured file: masses wrong by about a third, no armature, no friction."""
     factors = np.exp(np.random.default_rng([seed, 1]).normal(0.0, 0.3, (len(arm.tree.inertias), 1)))
     tree = arm.tree._replace(inertias=np.asarray(arm.tree.inertias) * factors, armature=np.zeros(len(factors)))
     none = np.zeros(len(factors))
@@ -55,7 +55,7 @@ def rough_file(arm: Arm, seed: int) -> Robot:
 
 @in_float64
 def sound_log(arm: Arm, seed: int, noise: float) -> Arrays:
-    """Motions by five sines a joint, and torques with white noise, a share `noise` of each one's deviation."""
+    """Motions of five sines per joint; torques have white noise, `noise` times their standard deviation."""
     random, d = np.random.default_rng([seed, 2]), len(arm.rates)
     t = np.arange(0.0, SECONDS, 1 / RATE)
     states = []
@@ -112,7 +112,7 @@ FAULTS: dict[str, Fault] = {
     "late-by-200-ms": Fault(_delayed, "doubtful"),
     "dead-channel": Fault(_dead, "doubtful"),
 }
-"""By name. Torques of 20 times their deviation are spikes of 1 in 100 samples."""
+"""Faults by name. Spikes are torques of 20 standard deviations in 1 of 100 samples."""
 
 
 def _body(mass: float, random: np.random.Generator) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""A seven-axis arm whose frames are known, from logs: parameters, torques of other motions, and tracking at 1 kHz.
+"""A seven-axis arm with known frames, identified from logs: torque errors on unseen motions, and tracking at 1 kHz.
 
-The rival is given the same samples, the same filter and the same columns, and once our velocity scales too. Errors are
-those of unseen motions of the true arm, free of noise.
+The rival gets the same samples, filter and columns, and in a second run also our velocity scales. Errors are those on
+noise-free unseen motions of the true arm.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,20 +28,20 @@ from scripts.reports.robots.rivals import regression
 
 LAWS = ("viscous", "coulomb", "offset")
 USUAL_SCALE = 0.01
-"""rad/s, of dry friction whose shape is not fitted: the rival's, and that of our robust fit."""
+"""Velocity scale of dry friction, rad/s, where it is not fitted: for the rival and our robust fit."""
 DECIMATE = 3
-"""Every so manyth sample is fitted; torques are not filtered, which would smear dry friction."""
+"""Stride of the fitted samples; torques are not filtered, which would smear dry friction."""
 CLEAN, SEEN = 1e-12, 1.65e-3
-"""nMSE to reach: clean data, viscous friction; noisy ones with dry friction, which a regressor reached."""
+"""nMSE to reach: on clean data with viscous friction, and on noisy data with dry friction (a regressor's result)."""
 TRACKING = 1.1
-"""Times the error with true parameters."""
+"""Tracking error to reach, relative to the error with true parameters."""
 
 Torque = Callable[[Any, Any, Any], np.ndarray]
-"""q, qd, qdd, each [N, d] -> tau [N, d]."""
+"""q, qd, qdd [N, d] -> tau [N, d]."""
 
 
 class Effort(NamedTuple):
-    """How much is measured."""
+    """Size of the measurement."""
 
     seeds: int
     motions: int
@@ -58,19 +58,19 @@ def rough(tree: Tree) -> Tree:
 
 
 def torque_of(model: Any, parameters: Any) -> Torque:
-    """The inverse model of a batch."""
+    """The inverse dynamics of a batch."""
     batch = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
     return lambda q, qd, qdd: np.asarray(batch(q, qd, qdd))
 
 
 def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = False) -> Torque:
-    """Ours: physically consistent bodies, torques weighted by their noise, or Huber's estimate.
+    """Our identification: physically consistent, with torques weighted by their noise, optionally by Huber's loss.
 
     Args:
-        tree: whose frames are known.
-        data: to fit.
-        scale: of dry friction, rad/s, for each joint or one for all.
-        robust: count errors of torque beyond the noise, as where friction turns round, by their size.
+        tree: tree with known frames.
+        data: data to fit.
+        scale: velocity scale of dry friction, rad/s, by joint or one for all.
+        robust: use Huber's loss, which is linear in errors beyond the noise, such as at reversals of friction.
     """
     shape = tuple(np.broadcast_to(scale, D).tolist())
     model = make_rigid_tree(rough(tree), friction=LAWS, velocity_scale=shape)
@@ -95,7 +95,7 @@ def clean(quick: bool) -> Findings:
 
 
 def noisy(quick: bool) -> Findings:
-    """Encoders and torques with noise, dry friction: ours, with fitted shapes or robust, and Pinocchio's regressor."""
+    """Noisy encoders and torques, dry friction: our fit (fitted scales, or robust), and Pinocchio's regressor."""
     effort, robot = (QUICK if quick else FULL), arm(coulomb=True)
     by_method: dict[str, list[np.ndarray]] = {}
     tracked: dict[str, list[float]] = {}
@@ -120,7 +120,7 @@ def noisy(quick: bool) -> Findings:
 
 
 def tracking(robot: Any, methods: dict[str, Torque], random: np.random.Generator, count: int) -> dict[str, list[float]]:
-    """Rms errors in mrad of unseen motions under PD control with each model's torques fed forward, and without."""
+    """Rms tracking errors, mrad, on unseen motions under PD control, by model of the feed-forward and without any."""
     true = tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE))
     exact = jax.jit(jax.vmap(dynamics(true).inverse_dynamics))
     feeds: dict[str, Callable[[Motion], np.ndarray | None]] = {
@@ -138,7 +138,7 @@ def tracking(robot: Any, methods: dict[str, Torque], random: np.random.Generator
 
 
 def rows_of_errors(by_method: dict[str, list[np.ndarray]], seeds: int) -> list[Row]:
-    """Median and worst over seeds of the mean over joints; medians of joints of ours."""
+    """Median and worst over seeds of the mean nMSE over joints, and the medians of our fit by joint."""
     means = {name: np.mean(errors, axis=1) for name, errors in by_method.items()}
     rows = []
     for name, each in means.items():
@@ -159,7 +159,7 @@ def rows_of_errors(by_method: dict[str, list[np.ndarray]], seeds: int) -> list[R
 
 
 def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
-    """Medians over motions and seeds, and ours over that with the true parameters."""
+    """Median errors over motions and seeds, and our errors relative to those with true parameters."""
     rows = [Row(f"arm/tracking/{name}", "rms_mrad", float(np.median(each)), "mrad") for name, each in tracked.items()]
     words = "median over motions of ours over that with true parameters and dry friction of the usual scale"
     for name in (name for name in tracked if name.startswith("ours")):
@@ -169,22 +169,22 @@ def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
 
 
 def curves_of(by_method: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:
-    """nMSE of each joint, the median over seeds, by method."""
+    """Median nMSE over seeds, by method and joint."""
     return {name: np.median(errors, axis=0).tolist() for name, errors in by_method.items()}
 
 
 def logs(robot: Any, random: np.random.Generator, count: int) -> Trajectories:
-    """Drawn motions that the arm follows under PD control, free of noise."""
+    """Noise-free logs of random motions under PD control."""
     return trajectories([follow(robot, motion(random)) for _ in range(count)])
 
 
 def error(torque: Torque, test: Trajectories) -> np.ndarray:
-    """nMSE of each joint [d] on true states."""
+    """nMSE by joint [d] on true states."""
     return normalised_error(torque(test.q, test.qd, test.qdd), test.tau)
 
 
 def rms(log: Log) -> float:
-    """Tracking error, rad."""
+    """Root mean square tracking error, rad."""
     return float(np.sqrt(np.mean((log.q - log.reference) ** 2)))
 
 

@@ -1,13 +1,13 @@
-"""Arms whose kinematics is not known, on the LIP protocol, as cases of the report."""
+"""Cases of the report on arms with unknown kinematics, by the LIP protocol."""
 
 from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings, by_case
 from scripts.reports.robots.lip import kernel_rows, rows
 
 SEEDS = range(10)
-"""Of the starts."""
+"""Seeds of the starts."""
 SAMPLES = {500: 10, 150: 33, 50: 100}
-"""Of the training motion, and of how many samples each is one."""
+"""Numbers of training samples, and the strides that give them."""
 SMALLER = ("panda-3", "panda-4", "panda-5", "panda-6", "skew-arm", "sliding-arm")
 
 
@@ -47,7 +47,7 @@ def fewer_samples(quick: bool) -> Findings:
 
 
 def kernels(quick: bool) -> Findings:
-    """Energies in kernel form, of the Panda's first three to seven joints, and of all from fewer samples."""
+    """Energies in kernel form for the Panda's first three to seven joints, and for all joints from fewer samples."""
     if quick:
         return found(kernel_rows("panda-3", friction=False, every=SAMPLES[50], tests=(101,)))
     arms = [(f"panda-{d}", SAMPLES[500]) for d in range(3, 8)] + [("panda-7", SAMPLES[150]), ("panda-7", SAMPLES[50])]
@@ -57,7 +57,7 @@ def kernels(quick: bool) -> Findings:
 
 
 def found(listed: list[Row]) -> Findings:
-    """The rows, and of each case the median and the worst error, to draw."""
+    """Findings with the rows, and median and worst errors by case to draw."""
     curves = {}
     for case, numbers in by_case(listed).items():
         median = numbers["nmse_mean_median"]

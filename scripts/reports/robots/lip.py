@@ -1,4 +1,4 @@
-"""Torques of arms that were not seen, by a learned tree, a kernel and a tree of known kinematics: the LIP protocol.
+"""The LIP protocol: torques on unseen motions by a learned tree, a kernel and a tree of known kinematics.
 
 One motion of 50 s trains, motions of other seeds test (`datasets.robot_arms`); the torques of the tests are exact, so
 that errors may fall below the noise of the training torques.
@@ -34,31 +34,31 @@ ARMS: dict[str, Callable[[], Arm]] = {
     "sliding-arm": sliding_arm,
 }
 VELOCITY_SCALE = 1e-3
-"""1/s or m/s, of the models' dry friction; that of the arms changes sign at once."""
+"""Velocity scale of the models' dry friction, rad/s or m/s; the arms' own dry friction is discontinuous."""
 TESTS = tuple(range(101, 121))
 """Seeds of the test motions."""
 TEST_EVERY = 50
-"""Samples of test motions of which a kernel, which is slow, has one: two a second."""
+"""Stride of the test samples for a kernel, which is slow: two samples per second."""
 TARGET = 1e-3
 """Mean nMSE to reach at seven joints from 500 samples."""
 PUBLISHED = {"panda-6": 0.03, "panda-7": 0.1}
-"""Mean nMSE of the LIP paper's own kernel from 500 samples without friction: some 3 %, and below 10 %."""
+"""Mean nMSE of the LIP paper's kernel from 500 samples without friction: about 3 %, and below 10 %."""
 FRICTION: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
 
 
 STATES = 5_001
-"""Whose torques are computed at a time."""
+"""Number of states per call of the inverse dynamics."""
 
 
 class Outcome(NamedTuple):
-    """Of one fit."""
+    """Result of one fit."""
 
     nmse: Float[np.ndarray, "T d"]
     """Mean square error over variance of the torque, by test motion and joint."""
     joint_mse: Float[np.ndarray, " d"]
-    """Of the training samples, (N m)² or N²."""
+    """Mean squared errors on the training samples, (N m)² or N²."""
     agreeing: int
-    """Descents that ended as low as the lowest; 0 for a linear fit."""
+    """Number of descents that reached the lowest loss; 0 for a linear fit."""
     descents: int
     seconds: float
 
@@ -125,7 +125,7 @@ def unseen_errors(
 def _torques(system: RecursiveSystem, data: Trajectories) -> Float[np.ndarray, "N d"]:
     inverse = jax.jit(jax.vmap(dynamics(system).inverse_dynamics), compiler_options=quick_compilation())
     states = (data.q, data.qd, data.qdd)
-    # A kernel takes memory for each state.
+    # The memory of a kernel grows with the number of states.
     pieces = [slice(first, first + STATES) for first in range(0, len(data.q), STATES)]
     return np.concatenate([inverse(*(each[piece] for each in states)) for piece in pieces])
 
@@ -133,7 +133,7 @@ def _torques(system: RecursiveSystem, data: Trajectories) -> Float[np.ndarray, "
 def kernel_rows(
     name: str, *, friction: bool, every: int = 10, serial: bool = True, tests: Sequence[int] = TESTS
 ) -> list[Row]:
-    """Numbers of one arm, by name; bounded by what the paper's kernel was published with."""
+    """Numbers of one arm, by name; the published errors of the paper's kernel are the bounds."""
     found = kernel(ARMS[name](), friction=friction, every=every, serial=serial, tests=tests)
     means = found.nmse.mean(axis=1)
     compared = serial and every == 10 and not friction
@@ -154,7 +154,7 @@ def kernel_rows(
 def rows(
     name: str, *, friction: bool, every: int = 10, seeds: Sequence[int] = (0,), tests: Sequence[int] = TESTS
 ) -> list[Row]:
-    """Numbers of one arm, by name, over seeds of the starts, and of the fit with known kinematics beside them."""
+    """Numbers of one arm, by name, over seeds of the starts, and of the fit with known kinematics."""
     arm = ARMS[name]()
     reference = known(arm, friction=friction, every=every, tests=tests)
     fits = [learned(arm, friction=friction, every=every, seed=seed, tests=tests) for seed in seeds]

@@ -1,9 +1,9 @@
-"""How often the check of a log is wrong: findings on sound logs, and planted faults that it does not find.
+"""Error rates of the log validation: false findings on sound logs, and planted faults that it misses.
 
-Arms have random frames and two to seven joints, some of them branched, and there is the Panda; they move from point to
-point, wait, and shake. Torques have noise, friction with a Stribeck curve, or neither; encoders have steps and noise. A
-fault that no log without its robot can show (a tilted base, torques in mN m, a wrong clock without measured rates) is
-looked for with the robot, all others without. Checks are those of commands that train, by few torques.
+Arms have random frames and two to seven joints; some are branched, and one is the Panda. They move from point to point,
+wait, and shake. Torques have noise, friction with a Stribeck curve, or neither; encoders have steps and noise. Faults
+that a log without its robot cannot show (a tilted base, torques in mN m, a wrong clock without measured rates) are
+checked with the robot, all others without. The checks are the quick ones of training commands.
 """
 
 import functools
@@ -23,13 +23,13 @@ from dln_jax.scenes.panda import panda
 from scripts.reports.case import Findings
 
 SOUND, FAULTY, QUICK = 60, 10, 6
-"""Logs without a fault, logs of each kind of fault, and those without a fault where it is to be quick."""
+"""Number of sound logs, of logs per kind of fault, and of sound logs in a quick run."""
 SEED = 20_000
-"""Of the reported logs; thresholds were found on other arms, motions and seeds."""
+"""First seed of the reported logs; thresholds were chosen on other arms, motions and seeds."""
 FALSE_ALARMS, FOUND = 0.02, 0.9
-"""To reach."""
+"""Largest share of false alarms, and smallest share of detected faults."""
 STATEMENTS = ("split", "condition", "unexcited", "raw-differences", "gaps", "jitter", "quantisation", "rates")
-"""Checks that say how a log was recorded, not that it is wrong."""
+"""Checks that state how a log was recorded, not that it is wrong."""
 
 Arrays = dict[str, Any]
 _Fault = Callable[[Arrays, np.random.Generator, int], Arrays]
@@ -197,7 +197,7 @@ FAULTS: Mapping[str, tuple[_Fault, tuple[str, ...], str]] = {
     ),
     "tilted-base": (lambda a, r, d: a, ("gravity",), "tilted"),
 }  # fmt: skip
-"""What each does to a log, the findings that name it, and what is given beside t, q and tau."""
+"""A fault's change of a log, the findings that name it, and the inputs beyond t, q and tau."""
 
 
 def sound(few: bool, *, with_robot: bool) -> Findings:
@@ -213,7 +213,7 @@ def sound(few: bool, *, with_robot: bool) -> Findings:
 
 
 def faulty(few: bool, *, kind: str) -> Findings:
-    """The share of logs with a fault in which it is found and named."""
+    """The share of faulty logs in which the fault is detected and named."""
     count, found = 1 if few else FAULTY, []
     fault, checks, given = FAULTS[kind]
     for number in range(count):
@@ -225,24 +225,24 @@ def faulty(few: bool, *, kind: str) -> Findings:
 
 
 def drawn(number: int, *, repeats: bool) -> Simulated:
-    """The log of a number."""
+    """The log with this number."""
     return simulate(_arm(SEED + (number // 6) % 2, 2 + number % 6), SEED + number, repeats=repeats)
 
 
 @functools.cache
 def _arm(seed: int, d: int) -> _Arm:
-    """A random arm; arms are kept, because their programs take long to compile."""
+    """A random arm; arms are cached because their programs take long to compile."""
     return random_arm(seed, d)
 
 
 def false_findings(log: Simulated, robot: Robot | None) -> list[str]:
-    """Errors and warnings on a sound log that are no statements on how it was recorded."""
+    """Errors and warnings on a sound log, except statements on how it was recorded."""
     true = (*STATEMENTS, *(("repeated",) if log.repeated else ()))
     return [name for name in _checks(log.arrays, robot) if name not in true]
 
 
 def planted(log: Simulated, fault: _Fault, given: str, seed: int) -> list[str]:
-    """What is found in a log with a fault."""
+    """Findings in a log with a planted fault."""
     random, d = np.random.default_rng([SEED, seed, 2]), log.arrays["q"].shape[1]
     arrays = dict(log.arrays)
     if given == "rates":

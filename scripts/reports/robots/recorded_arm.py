@@ -38,13 +38,13 @@ LAWS: tuple[tuple[FrictionLaw, ...], ...] = (
     ("viscous", "coulomb", "stribeck", "offset"),
     ("asymmetric", "offset"),
 )
-"""That are chosen from."""
+"""Candidate sets of friction laws."""
 USUAL_SCALE = 0.01
-"""rad/s, of the rival's dry friction, which it does not fit."""
+"""Velocity scale of the rival's dry friction, rad/s, which it does not fit."""
 LEARNED_SCALES = (0.01, 0.1)
 """rad/s, of the dry friction of a learned tree while its frames are found; chosen from."""
 CHOOSING = 4
-"""Every so manyth block of those that are fitted chooses."""
+"""Stride of the fitted blocks that serve as validation."""
 
 Predict = Callable[[Trajectories], np.ndarray]
 
@@ -70,7 +70,7 @@ def recorded_arm(log: Path, robot: Path, quick: bool) -> Findings:
 
 
 def methods(tree: Tree, data: Trajectories) -> dict[str, Predict]:
-    """Predictions of each way, fitted to these blocks."""
+    """Predictors by method, fitted to these blocks."""
     present = np.unique(data.trajectory)
     chosen = present[1::CHOOSING]
     train, validation = select(data, np.setdiff1d(present, chosen)), select(data, chosen)
@@ -91,7 +91,7 @@ def methods(tree: Tree, data: Trajectories) -> dict[str, Predict]:
 
 
 def learned(needs: Needs, train: Trajectories, validation: Trajectories) -> Tree:
-    """A tree whose frames come from these motions alone."""
+    """A tree with frames learned from these motions alone."""
     wanted = needs._replace(friction=True)
     fits = [fit_tree(wanted, train, validation, velocity_scale=scale) for scale in LEARNED_SCALES]
     best = min(fits, key=lambda fit: fit.validation_error)
@@ -100,7 +100,7 @@ def learned(needs: Needs, train: Trajectories, validation: Trajectories) -> Tree
 
 
 def predictor(model: Any, parameters: Any) -> Predict:
-    """Torques of held-out samples."""
+    """A function from held-out samples to their torques."""
     batch = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
     return lambda held: np.asarray(batch(held.q, held.qd, held.qdd))
 
@@ -116,7 +116,7 @@ def _parts(fit: FrictionFit) -> tuple[Any, Any]:
 
 
 def rows_of(squares: dict[str, list[np.ndarray]], variance: np.ndarray, names: Sequence[str]) -> list[Row]:
-    """Of each way: the mean over joints of all blocks, of the worst pair of blocks, and each joint's."""
+    """Rows by method: mean nMSE over joints for all blocks and for the worst pair of blocks, and nMSE by joint."""
     over = functools.partial(np.mean, axis=0)
     pairs = {name: np.array([over(each) / variance for each in found]) for name, found in squares.items()}
     every = {name: over(np.concatenate(found)) / variance for name, found in squares.items()}

@@ -22,7 +22,7 @@ class Regression(NamedTuple):
 
 
 def pinocchio() -> Any:
-    """The package, or `None` and a line on standard output where it is missing."""
+    """The package; prints a line and returns `None` if it is missing."""
     try:
         return importlib.import_module("pinocchio")
     except ImportError:
@@ -34,7 +34,7 @@ def pinocchio_model(pin: Any, tree: Tree) -> Any:
     """The same tree, without armature."""
     model = pin.Model()
     model.gravity.linear = np.asarray(tree.gravity)
-    # Joints about z have a faster model of their own.
+    # Pinocchio has a faster model for joints about z.
     along_z = {"revolute": pin.JointModelRZ, "prismatic": pin.JointModelPZ}
     others = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
     for link, parent in enumerate(tree.parents):
@@ -53,9 +53,9 @@ def regression(tree: Tree, data: Trajectories, *, velocity_scale: Any) -> Regres
     """Pinocchio's regressor with armature, viscous, dry friction and an offset of each joint; `None` without Pinocchio.
 
     Args:
-        tree: whose frames are known.
-        data: to fit; hold out those that the result is judged by.
-        velocity_scale: of dry friction, as `joint_dissipation` has it, for each joint or one for all.
+        tree: tree with known frames.
+        data: data to fit, without the test data.
+        velocity_scale: velocity scale of dry friction, as in `joint_dissipation`, by joint or one for all.
     """
     pin = pinocchio()
     if pin is None:

@@ -24,11 +24,11 @@ CASE = "seven-axis-tree"
 BATCH = 10_000
 RIVALS = {"inverse_dynamics": "rnea", "forward_dynamics": "aba"}
 MOST = 2.0
-"""Times of Pinocchio's that a call of ours may take."""
+"""Largest time of our calls, relative to Pinocchio's."""
 
 
 def speed(quick: bool) -> Findings:
-    """Microseconds of a call from Python in C and in Pinocchio, and states a second of batches, in one run."""
+    """Time of a call from Python in C and in Pinocchio, µs, and throughput of batches, states/s, in one run."""
     tree = arm(coulomb=False).tree
     system = tree_system(tree)
     exported = functions_of_system(system, D, dtype=np.float64)

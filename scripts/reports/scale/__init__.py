@@ -1,1 +1,1 @@
-"""What devices and processes that share batches gain, and what they cannot: measured here, and for n hosts on paper."""
+"""Speed-ups of devices and processes that share batches: measured here, and modelled for n hosts."""

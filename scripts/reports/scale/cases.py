@@ -15,24 +15,24 @@ from scripts.reports.scale.turns import Layout, Measured, taken_in_turns, team, 
 
 LANES = (64, 512, 4096)
 STEPS = 10
-"""Of each crawler, in a turn."""
+"""Steps of a crawler per turn."""
 EPISODE = 80
-"""Steps of an episode that evolution judges."""
+"""Steps of an episode in evolution."""
 TURNS = 5
 BATCH = 65_536
-"""States whose torques are asked for."""
+"""Number of states in the batch of inverse dynamics."""
 SAMPLES = 4096
 TRAININGS = {"adam": {"optimiser": "adam", "steps": 200}, "gauss-newton": {"optimiser": "gauss-newton", "steps": 5}}
 BASE = "one-device"
 
 
 def layouts(count: int) -> dict[str, Layout]:
-    """One device, so many of one process, and so many processes."""
+    """One device, `count` devices of one process, and `count` processes."""
     return {BASE: Layout(), f"{count}-devices": Layout(devices=count), f"{count}-processes": Layout(processes=count)}
 
 
 def cases(*, quick: bool, lanes: Sequence[int] | None = None, count: int = 2) -> list[Case]:
-    """All of them; `lanes` are the numbers of crawlers, and `count` those who share the work."""
+    """All cases; `lanes` are the numbers of crawlers, and `count` devices or processes share the work."""
     lanes = lanes or ((16,) if quick else LANES)
     turns, samples = (2, 1024) if quick else (TURNS, SAMPLES)
     of_crawlers = partial(measure_crawlers, lanes, 2 if quick else STEPS, turns, count)
@@ -44,7 +44,7 @@ def cases(*, quick: bool, lanes: Sequence[int] | None = None, count: int = 2) ->
 
 
 def measure_crawlers(lanes: Sequence[int], steps: int, turns: int, count: int) -> Findings:
-    """Seconds of a step of one crawler where many are stepped side by side, and what evolution would gain by hosts."""
+    """Time per step of a crawler in batches of many, and the modelled speed-up of evolution by hosts."""
     rows, curves, alone = [], {}, 0.0
     with contextlib.ExitStack() as stack:
         teams = teams_of(stack, layouts(count))
@@ -62,7 +62,7 @@ def measure_crawlers(lanes: Sequence[int], steps: int, turns: int, count: int) -
 
 
 def measure_training(samples: int, turns: int, count: int) -> Findings:
-    """Seconds of a step of training a small network, and what it would gain by hosts."""
+    """Time per training step of a small network, and its modelled speed-up by hosts."""
     rows, curves, lines = [], {}, {}
     with contextlib.ExitStack() as stack:
         teams = teams_of(stack, layouts(count))
@@ -80,7 +80,7 @@ def measure_training(samples: int, turns: int, count: int) -> Findings:
 
 
 def measure_accelerator(quick: bool, lanes: int, turns: int) -> Findings:
-    """An accelerator against the processor; nothing where JAX sees none."""
+    """Compares an accelerator with the processor; no rows if JAX sees no accelerator."""
     with team(Layout(platform="")) as (_, seen):
         platform, kind = str(seen["platform"]), str(seen["kind"])
     if platform == "cpu":
@@ -106,7 +106,7 @@ def measure_accelerator(quick: bool, lanes: int, turns: int) -> Findings:
 
 
 def compared(case: str, found: Mapping[str, Measured], quantity: str, count: float | int) -> list[Row]:
-    """What each layout takes for one of `count`, how many cores were busy, and how many times as fast it is."""
+    """Time of one in `count` work items by layout, number of busy cores, and speed-up over one device."""
     rows = []
     for name, each in found.items():
         at = f"{case}/{name}"
@@ -116,12 +116,12 @@ def compared(case: str, found: Mapping[str, Measured], quantity: str, count: flo
 
 
 def gains(found: Mapping[str, Measured]) -> dict[str, float]:
-    """How many times as fast as one device the others are."""
+    """Speed-ups of the other layouts over one device."""
     return {name: found[BASE].seconds / each.seconds for name, each in found.items() if name != BASE}
 
 
 def draw(x: str, curves: dict[str, Any]) -> Figure:
-    """What was measured beside what is modelled."""
+    """Draws measured and modelled speed-ups."""
     return speed_ups(curves["measured"], curves["modelled"], hosts=hosts.HOSTS, x=x)
 
 

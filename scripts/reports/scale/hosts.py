@@ -1,12 +1,12 @@
-"""What n hosts would gain, on paper: measured seconds of computing against bytes and messages of a network.
+"""A model of the speed-up by n hosts: measured computing time against bytes and messages of a network.
 
     T(n) = C / n + B(n) 8 / rate + M(n) latency
     all-gather of G bytes:   B = (n - 1) / n G,     M = n - 1
     sum of S bytes:          B = 2 (n - 1) / n S,   M = 2 (n - 1)        (each of them)
 
-in rings, which move as few bytes as can be (Patarasuk and Yuan 2009, "Bandwidth optimal all-reduce algorithms for
-clusters of workstations"). C is what one device takes. Left out is what all hosts do alike, such as the solution of the
-normal equations, and that lanes which wait for each other wait less in smaller groups.
+in rings, which move the minimum number of bytes (Patarasuk and Yuan 2009, "Bandwidth optimal all-reduce algorithms for
+clusters of workstations"). C is the time of one device. The model neglects work that all hosts repeat, such as solving
+the normal equations, and the shorter waits of lanes in smaller groups.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from dln_jax.metrics.report import Row
 from scripts.reports.case import by_case
 
 CASES = "hosts/"
-"""Beginning of the cases of modelled rows."""
+"""Prefix of the cases of modelled rows."""
 
 HOSTS = (1, 2, 4, 8, 16, 64)
 NUMBER = 8
@@ -26,30 +26,30 @@ NUMBER = 8
 
 
 class Network(NamedTuple):
-    """Between hosts; an assumption."""
+    """An assumed network between hosts."""
 
     rate: float
-    """bit/s."""
+    """Bandwidth, bit/s."""
     latency: float = 5e-5
-    """s of a message: TCP within a room."""
+    """Latency of a message, s: TCP in a local network."""
 
 
 NETWORKS = {"1_gbit": Network(1e9), "25_gbit": Network(25e9)}
 
 
 class Exchange(NamedTuple):
-    """What a step sends."""
+    """Communication of a step."""
 
     gathered: float = 0.0
-    """Bytes of the results of all, which all get."""
+    """Bytes of all results, gathered on all hosts."""
     summed: float = 0.0
-    """Bytes of the sums, which all get."""
+    """Bytes of the sums, which all hosts receive."""
     sums: int = 0
-    """How many there are one after the other."""
+    """Number of successive sums."""
 
 
 def of_results(lanes: int, size: int = 1) -> Exchange:
-    """So many numbers of every lane, gathered: the fitness of an episode, or a gradient."""
+    """Gathers `size` numbers per lane: the fitness of an episode, or a gradient."""
     return Exchange(gathered=NUMBER * lanes * size)
 
 
@@ -64,7 +64,7 @@ def of_normal_equations(parameters: int) -> Exchange:
 
 
 def exchange_seconds(exchange: Exchange, hosts: int, network: Network) -> float:
-    """What a step waits for the network."""
+    """Time that a step waits for the network, s."""
     share = (hosts - 1) / hosts
     sent = share * (exchange.gathered + 2 * exchange.summed)
     messages = (hosts - 1) * ((exchange.gathered > 0) + 2 * exchange.sums)
@@ -72,7 +72,7 @@ def exchange_seconds(exchange: Exchange, hosts: int, network: Network) -> float:
 
 
 def speed_up(seconds: float, exchange: Exchange, hosts: int, network: Network) -> float:
-    """How many times as fast n hosts are as one, which takes `seconds`."""
+    """Speed-up of n hosts over one host, which takes `seconds`."""
     return seconds / (seconds / hosts + exchange_seconds(exchange, hosts, network))
 
 
@@ -88,12 +88,12 @@ def rows(work: str, seconds: float, exchange: Exchange) -> list[Row]:
 
 
 def curves(modelled: Sequence[Row]) -> dict[str, list[float]]:
-    """By network, the speed-ups in rows of one work."""
+    """Speed-ups by network, from the rows of one work."""
     return {name: [row.value for row in modelled if row.case.endswith(f"/{name}")] for name in NETWORKS}
 
 
 def table(modelled: Sequence[Row]) -> Table:
-    """A line for each work and network, a column for each number of hosts."""
+    """Table of speed-ups with one line per work and network, and one column per number of hosts."""
     titles = [f"{hosts} host{'s' if hosts > 1 else ''}" for hosts in HOSTS]
     shown = Table("times as fast as one", *titles, caption="modelled, not measured: see the conditions in report.json")
     for case, numbers in by_case(modelled).items():

@@ -1,4 +1,4 @@
-"""The same work by one device, several, and several processes, which take turns: a slow spell meets all of them."""
+"""The same work by one device, several devices and several processes, interleaved so that slow spells affect all."""
 
 import contextlib
 import json
@@ -16,28 +16,28 @@ import numpy as np
 from dln_jax.types import InputError
 
 ROOT = Path(__file__).parents[3]
-"""Where the package is, which the processes are to import."""
+"""Folder of the package that the processes import."""
 
 
 class Layout(NamedTuple):
     """Who shares the work."""
 
     devices: int = 1
-    """Of each process."""
+    """Devices per process."""
     processes: int = 1
     platform: str = "cpu"
-    """JAX's name; empty for the one that JAX prefers."""
+    """JAX's name of the platform; empty for JAX's default."""
 
 
 class Measured(NamedTuple):
-    """Of one layout."""
+    """Measurement of one layout."""
 
     seconds: float
-    """Of the slowest process; the median over turns."""
+    """Time of the slowest process, median over turns."""
     processors: float
-    """Processor seconds of all processes a second: how many cores were busy."""
+    """Average number of busy cores: processor seconds of all processes per second."""
     facts: dict[str, Any]
-    """What the work came to."""
+    """Facts that the work reports."""
 
 
 Team = Callable[[Any], list[dict[str, Any]]]
@@ -46,10 +46,10 @@ Team = Callable[[Any], list[dict[str, Any]]]
 
 @contextlib.contextmanager
 def team(layout: Layout) -> Iterator[tuple[Team, dict[str, Any]]]:
-    """The processes of a layout, and what the first one says of its device.
+    """Starts the processes of a layout; yields a function to question them, and the first process's device facts.
 
     Raises:
-        InputError: a process that ends instead of answering.
+        InputError: a process ended instead of answering.
     """
     command = [sys.executable, "-m", "scripts.reports.scale.worker", str(layout.devices), str(layout.processes)]
     told = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "PYTHONPATH": _path()}
@@ -77,7 +77,7 @@ def team(layout: Layout) -> Iterator[tuple[Team, dict[str, Any]]]:
 
 
 def taken_in_turns(teams: Mapping[str, Team], work: Mapping[str, Any], repetitions: int) -> dict[str, Measured]:
-    """What some work costs each team."""
+    """Measures some work on all teams in turns."""
     facts = {name: ask(work)[0] for name, ask in teams.items()}
     turns: dict[str, list[tuple[float, float]]] = {name: [] for name in teams}
     for _ in range(repetitions + 1):
@@ -102,7 +102,7 @@ def _started(command: Sequence[str], told: Mapping[str, str], error: IO[bytes]) 
 
 @contextlib.contextmanager
 def _ended(worker: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
-    # A process that waits for another one, which has ended, would not see that its input has.
+    # A process that waits for a peer which has ended would not notice that its input is closed.
     try:
         yield worker
     finally:

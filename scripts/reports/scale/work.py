@@ -1,4 +1,4 @@
-"""What devices share in a measurement of scale: crawlers that are stepped, a training, inverse dynamics of a batch."""
+"""Work shared by devices in a measurement of scale: steps of crawlers, a training, inverse dynamics of a batch."""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,22 +27,22 @@ from dln_jax.softbody.terms.creature import TIME_STEP
 from scripts.reports.soft_bodies.gradients import crawling_scene, gait
 
 SPEED = 0.3
-"""m/s, standard deviation of the vertices' velocities at the start: no two crawlers take the same iterations."""
+"""Standard deviation of the vertices' initial velocities, m/s: crawlers then differ in their iterations."""
 
 
 class Work(NamedTuple):
-    """Something to be done again and again."""
+    """A repeatable piece of work."""
 
     fresh: Callable[[], Any]
-    """What `run` is given; is not timed."""
+    """Creates the argument of `run`; not timed."""
     run: Callable[[Any], Any]
-    """Compiled."""
+    """The compiled work."""
     facts: dict[str, float] = {}  # noqa: RUF012  never written to
-    """What it came to."""
+    """Facts about the result."""
 
 
 def crawlers(mesh: Mesh | None, *, lanes: int, steps: int) -> Work:
-    """Crawlers that take some steps side by side; all devices have what each travelled."""
+    """Steps of a batch of crawlers; all devices receive all distances."""
     scene, muscles = crawling_scene()
     init, step = make_step(scene, TIME_STEP)
     controls = gait(steps, muscles)
@@ -62,7 +62,7 @@ def crawlers(mesh: Mesh | None, *, lanes: int, steps: int) -> Work:
     facts = {
         "least_travelled": float(travelled.min()),
         "converged_share": float(converged.mean()),
-        # All wait in every step for the one that takes longest.
+        # In every step all lanes wait for the slowest.
         "useful_iterations_share": float(iterations.sum() / (lanes * iterations.max(axis=0).sum())),
     }
     return Work(lambda: starts, run, facts)
@@ -114,4 +114,4 @@ WORK: dict[str, Callable[..., Work]] = {
     "training": training,
     "inverse-dynamics": inverse_dynamics,
 }
-"""By the names under which other processes are asked for it."""
+"""Works by the names in questions to other processes."""

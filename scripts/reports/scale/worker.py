@@ -16,12 +16,12 @@ from dln_jax.scale.mesh import batch_mesh
 from scripts.reports.scale.work import WORK
 
 LIMIT = 600.0
-"""Seconds for an answer, after which the process ends."""
+"""Time limit of an answer, s, after which the process ends."""
 
 
 def main(devices: int, processes: int, process: int, port: int) -> None:
     """Answers until there are no more questions."""
-    # What libraries print goes to standard error; answers alone to standard output.
+    # Output of libraries goes to standard error; standard output carries only answers.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     jax.config.update("jax_enable_x64", True)

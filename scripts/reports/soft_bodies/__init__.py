@@ -1,4 +1,4 @@
-"""Soft bodies: closed forms, hard cases, gradients and speed, each number beside what one may expect."""
+"""Soft bodies: closed forms, hard cases, gradients and speed, compared with expected values."""
 
 import functools
 from collections.abc import Callable
@@ -33,7 +33,7 @@ SUBJECTS = {
     subject: {measure.__name__.replace("_", "-"): measure for measure in measures}
     for subject, measures in MEASURES.items()
 }
-"""quick -> findings, by subject and by name; only `speed` depends on the machine."""
+"""Functions quick -> findings, by subject and name; only `speed` depends on the machine."""
 
 
 def cases(*, quick: bool = False) -> list[Case]:

@@ -28,11 +28,11 @@ WAYS = {"blocks": linear_solvers.block_tridiagonal, "matrix-free": linear_solver
 MODULI, RATIOS, TIME_STEPS = (1e5, 1e7, 1e9), (0.3, 0.49), (1e-3, 1 / 60)
 STEPS = 2
 WORSE, RIGHT = 1.5, 0.9
-"""Largest time by the chosen solver over that by the better one, and least share of bodies with the better one."""
+"""Largest time by the chosen solver relative to the other, and smallest share of bodies with the faster choice."""
 
 
 def solver_choice(quick: bool) -> Findings:
-    """Time of a step by the chosen linear solver over that by the other, for stiffness and time step."""
+    """Ratio of step times by the chosen linear solver and the other, by stiffness and time step."""
     mesh = unordered_bar()
     programs = {name: _program(mesh, way) for name, way in WAYS.items()}
     rows, right = [], []
@@ -78,7 +78,7 @@ def _program(mesh: Mesh, way: linear_solvers.LinearSolverFactory) -> Any:
 
 
 def _choice(scene: SoftScene, dt: float) -> linear_solvers.LinearSolverFactory:
-    """What `make_step` takes for a step of backward Euler from rest."""
+    """The solver that `make_step` chooses for a step of backward Euler from rest."""
     rest, masses = scene.params.rest, scene.params.masses
     inertia = ElementEnergy(_inertia, np.arange(len(rest))[:, None], unrolled=True)
     energies = (inertia, *element_energies(scene))

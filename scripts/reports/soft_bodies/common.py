@@ -1,4 +1,4 @@
-"""What the cases of soft bodies share: a solid under its weight, its motion, and that every step must converge."""
+"""Shared parts of the soft-body cases: a solid under its weight, its motion, and the check of convergence."""
 
 import functools
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from dln_jax.softbody.terms.term import Term
 from dln_jax.softbody.verdict import Info
 
 GRAVITY = 9.8
-"""In m/s², of the reference values."""
+"""Gravity of the reference values, m/s²."""
 
 
 class Seen(NamedTuple):
-    """What is seen after each of T steps."""
+    """Observations after T steps."""
 
     x: Float[np.ndarray, "T n dim"]
     v: Float[np.ndarray, "T n dim"]
@@ -39,17 +39,17 @@ def solid(mesh: Mesh, *others: Term, modulus: float, poisson_ratio: float = 0.3,
 
 
 def cantilever_of(mesh: Mesh, modulus: float = 1e6, **others: Any) -> SoftScene:
-    """A solid that is held where x = 0; one of 4 m x 1 m and 1e6 Pa sags by about a length."""
+    """A solid held at x = 0; a beam of 4 m x 1 m and 1e6 Pa sags by about its length."""
     return solid(mesh, modulus=modulus, held=vertices_where(mesh, lambda x: x[:, 0] == 0), **others)
 
 
 def converges(name: str, converged: Any) -> Row:
-    """That no step has failed."""
+    """Row that counts the steps that did not converge."""
     return expect(name, "steps_not_converged", "every step converges", np.sum(~np.asarray(converged)), 0.0)
 
 
 def motion(step: Step, steps: int) -> Callable[[Params, State], Seen]:
-    """(params, state) -> so many steps from there, compiled at its first call."""
+    """(params, state) -> observations of `steps` steps, compiled at the first call."""
 
     def observe(state: State, info: Info) -> tuple:
         return state.x, state.v, info.iterations, info.converged

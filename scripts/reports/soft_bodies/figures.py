@@ -1,4 +1,4 @@
-"""Figures of the cases of soft bodies where a picture says more; each returns a Matplotlib figure."""
+"""Figures of soft-body cases; all functions return a Matplotlib figure."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from scripts.reports.soft_bodies.motions import DT
 from scripts.reports.soft_bodies.statics import ELASTICA
 
 LEAST_SHARE = 0.1
-"""Of the energy, that its axis shows above and below the start at least."""
+"""Minimum range of the energy axis above and below the initial energy, relative to it."""
 
 
 def orders(curves: dict) -> Figure:
@@ -39,7 +39,7 @@ def energies(curves: dict) -> Figure:
 
 
 def elastica(curves: dict) -> Figure:
-    """Tip of the elastica against the load, for each mesh and extrapolated."""
+    """Tip of the elastica against the load, by mesh and extrapolated."""
     figure, [[axis]] = style.figure(height=3.6)
     for number, (cells, tips) in enumerate(zip(curves["cells"], curves["tips"], strict=True), start=1):
         shade = style.CYCLE[number % len(style.CYCLE)]
@@ -55,7 +55,7 @@ def elastica(curves: dict) -> Figure:
 
 
 def recovery(curves: dict) -> Figure:
-    """The least J of all elements while a mesh recovers."""
+    """Smallest J over all elements while a mesh recovers."""
     figure, [[axis]] = style.figure(height=3.4)
     colours = style.colours_of(curves)
     for name, least in curves.items():
@@ -109,4 +109,4 @@ FIGURES: dict[str, Callable[[dict], Figure]] = {
     "linear-solvers": solver_times,
     "speed-against-error": speed_against_error,
 }
-"""By the name of the measurement."""
+"""Functions that draw a measurement's curves, by name."""

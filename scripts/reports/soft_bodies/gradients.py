@@ -5,7 +5,7 @@ fourth order,
 
     D(e) = (8 (L(e) - L(-e)) - (L(2 e) - L(-2 e))) / 12 e,    L(e) = L(theta + e d)
 
-for steps e that halve. Of these the one counts that changes least from the step before: a rule that does not look at
+for steps e that halve. The quotient that changes least from the previous step counts, a rule that does not depend on
 the gradient.
 """
 
@@ -35,10 +35,10 @@ from scripts.reports.soft_bodies.common import GRAVITY, solid
 BOUND = 1e-7
 STEPS = 100
 TOLERANCE = 1e-9
-"""Of the steps, in m/s²: differences need more digits than motions do."""
+"""Tolerance of the steps, m/s²: differences need more digits than motions."""
 HALVINGS = 14
 LARGEST_STEP = 2.0**-8
-"""Relative to the size of theta."""
+"""Largest step e, relative to the size of theta."""
 
 Loss = Callable[[dict[str, Any]], Array]
 
@@ -52,7 +52,7 @@ def crawler(quick: bool) -> Findings:
 def modes(quick: bool) -> Findings:
     """Forward against reverse mode, `vmap` against one by one, and second derivatives, of springs that swing."""
     loss, at = _swinging(10)
-    # NumPy's from here on: every operation of JAX outside a program is a program.
+    # NumPy arrays from here on: every JAX operation outside a program would be compiled as its own program.
     at, compiled = jax.tree.map(np.asarray, at), jax.jit(jax.grad(loss))
 
     def slopes(at: Any) -> Any:
@@ -60,7 +60,7 @@ def modes(quick: bool) -> Findings:
 
     reverse = slopes(at)
     random = np.random.default_rng(0)
-    # Per cent of each quantity, so that each counts.
+    # One per cent of every quantity, so that all of them count.
     along = jax.tree.map(lambda leaf: 0.01 * _size(leaf) * random.normal(size=leaf.shape), at)
     _, forward = jax.jit(lambda at: jax.jvp(loss, (at,), (along,)))(at)
     inner = _inner(reverse, along)
@@ -128,7 +128,7 @@ def coulomb(quick: bool) -> Findings:
 
 
 def crawling_scene() -> tuple[SoftScene, int]:
-    """The crawler of the preset, and how many muscles it has."""
+    """The preset crawler and its number of muscles."""
     body = creatures.crawler()
     return creature_scene(body), len(body.muscles)
 
@@ -140,7 +140,7 @@ def gait(steps: int, muscles: int) -> Array:
 
 
 def crawling(steps: int, tolerance: float = TOLERANCE) -> tuple[Loss, dict[str, Any]]:
-    """How far the crawler gets as a function of all that it depends on, and the point where that is looked at."""
+    """Distance of the crawler as a function of all its inputs, and the point of evaluation."""
     scene, muscles = crawling_scene()
     init, step = make_step(scene, TIME_STEP, tolerance=tolerance)
     terms, start = scene.params.terms, init()
@@ -170,7 +170,7 @@ def crawling(steps: int, tolerance: float = TOLERANCE) -> tuple[Loss, dict[str, 
 
 
 def _swinging(steps: int) -> tuple[Loss, dict[str, Any]]:
-    """Springs that hang from a vertex: what compiles fast, as four programs are made of it."""
+    """Springs that hang from a vertex, a scene that compiles fast, as four programs are made of it."""
     mesh = beam(1.0, 0.5, 1, 1)
     pairs = [[0, 1], [1, 3], [3, 2], [2, 0], [0, 3]]
     scene = make_scene(mesh, [springs(pairs, stiffness=2e4), gravity(mesh, (0.0, -GRAVITY))], held=[0])
@@ -189,7 +189,7 @@ def _swinging(steps: int) -> tuple[Loss, dict[str, Any]]:
 
 
 def _objective(step: Step, start: State, params: Params, controls: Any, steps: int | None = None) -> Array:
-    """How far the body gets, plus its velocity and a part of its shape; in m."""
+    """Distance of the body, m, plus terms of its shape and velocity."""
     last, _ = rollout(functools.partial(step, params), start, controls, steps=steps, observe=lambda state, info: None)
     return last.x[:, 0].mean() + 0.1 * (last.x[:, 1] ** 2).sum() + 0.1 * last.v[0, 0]
 

@@ -1,4 +1,4 @@
-"""Motions whose steps are known exactly, and what a method keeps and loses.
+"""Motions with exactly known steps, and the invariants that a method keeps or loses.
 
 Backward Euler in free fall is n steps of a sum, x_n = x_0 + n h v_0 + g h² n (n + 1)/2. On a linear oscillator of
 angular frequency w the amplitude sqrt(w² x² + v²) shrinks by (1 + w² h²)^-1/2 per step, and stays with the midpoint
@@ -27,16 +27,16 @@ from scripts.reports.soft_bodies.common import GRAVITY, Seen, converges, motion,
 DT = 0.01
 STEPS = 50
 TOLERANCE = 1e-9
-"""Of the steps, in m/s²: what is exact in the method is then exact to rounding."""
+"""Tolerance of the steps, m/s²: exact properties of the method then hold to rounding."""
 ORDERS = {"backward-euler": 1, "bdf2": 2, "midpoint": 2}
 DURATION = 1.0
-"""Of the swing that orders are measured on, in s."""
+"""Length of the swing for measuring orders, s."""
 SWING = np.array([[0.0, 0.0], [0.0, 1.0], [0.5, -1.0]])
 """Velocities at its start, in m/s."""
 
 
 def free_fall(quick: bool) -> Findings:
-    """A body thrown without deformation: every vertex falls as the method says, to rounding."""
+    """A body thrown without deformation: every vertex follows the method's formula to rounding."""
     scene, init, run = _thrown(BACKWARD_EULER)
     velocity = np.array([1.0, 2.0])
     seen = run(scene.params, init(v=velocity))

@@ -1,7 +1,7 @@
-"""What breaks solvers: long steps, stiff and nearly incompressible bodies, bad starts, uneven masses, large twists.
+"""Hard cases for solvers: long steps, stiff and nearly incompressible bodies, bad starts, uneven masses, large twists.
 
-Every case asks whether each step says that it has converged, and what came out: Newton iterations, the least J = det F
-of all elements, or the difference between two precisions.
+Every case checks that all steps report convergence, and a result: Newton iterations, the smallest J = det F over all
+elements, or the difference between two precisions.
 """
 
 import functools
@@ -27,7 +27,7 @@ from scripts.reports.soft_bodies.common import GRAVITY, Seen, cantilever_of, con
 
 DT = 1 / 30
 STEPS = 60
-"""Of motions of length 2 s."""
+"""Steps of a motion of 2 s."""
 
 
 def time_steps(quick: bool) -> Findings:
@@ -68,7 +68,7 @@ def bad_starts(quick: bool) -> Findings:
     cases, curves = [], {}
     for name, x in starts.items():
         found = run(scene.params, init(np.where(scene.free, x, rest)))
-        # Elements are inverted as it starts, and such steps do not count as converged.
+        # Elements are inverted at the start, and steps with inverted elements do not count as converged.
         curves[name] = _least_J(scene.mesh, found.x)
         upright = curves[name] > 0
         recovered = found._replace(converged=found.converged | ~upright)
@@ -81,7 +81,7 @@ def bad_starts(quick: bool) -> Findings:
 def mass_ratio(quick: bool) -> Findings:
     """Vertices that are 1e4 times heavier than their neighbours, in turn."""
     scene, init, run = _beam(quick)
-    # More weight would turn elements inside out, which is no fault of the solver.
+    # More weight would invert elements, which would not be the solver's fault.
     heavy = np.where(np.arange(len(scene.mesh.vertices)) % 2, 1e2, 1e-2)
     stiffer = with_parameters(scene.params, elastic={"youngs_modulus": 1e7})
     found = run(stiffer._replace(masses=jnp.asarray(heavy)), init())
@@ -89,7 +89,7 @@ def mass_ratio(quick: bool) -> Findings:
 
 
 def chain(quick: bool) -> Findings:
-    """A chain of 100 springs with a weight of 1e4 times a link's at its end, let go from level."""
+    """A chain of 100 springs, released from level, with an end mass 1e4 times that of a link."""
     links = 100
     mesh = Mesh(np.stack([np.linspace(0.0, 10.0, links + 1), np.zeros(links + 1)], axis=1), np.zeros((0, 3), int))
     pairs = np.stack([np.arange(links), np.arange(1, links + 1)], axis=1)
@@ -106,7 +106,7 @@ def chain(quick: bool) -> Findings:
 
 
 def twist(quick: bool) -> Findings:
-    """A bar whose end is turned about its axis, held vertices moving with their velocity."""
+    """A bar with one end turned about its axis; its held vertices move with prescribed velocities."""
     cells, turns, steps = ((8, 1, 1), 1.0, 30) if quick else ((32, 4, 4), 3.0, 90)
     mesh = box((4.0, 0.5, 0.5), cells)
     left = vertices_where(mesh, lambda x: x[:, 0] == 0)
@@ -146,7 +146,7 @@ def float32(quick: bool) -> Findings:
 
 
 def not_converged(quick: bool) -> Findings:
-    """A solver that may take one Newton step only: it says that it has not converged, and the gradient is NaN."""
+    """A solver limited to one Newton step: it reports that it has not converged, and the gradient is NaN."""
     scene = cantilever_of(beam(1.0, 0.25, 4, 1), modulus=1e4)
     init, step = make_step(scene, 0.1, iterations=1)
 

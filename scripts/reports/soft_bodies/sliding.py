@@ -17,10 +17,10 @@ from scripts.reports.case import Findings
 from scripts.reports.soft_bodies.common import GRAVITY, converges, motion
 
 STIFFNESS = 1e6
-"""Of the ground, in N/m."""
+"""Stiffness of the ground, N/m."""
 MASS = 10.0
 THRESHOLD = 1e-4
-"""Below which friction is smooth, in m/s."""
+"""Speed below which friction is smooth, m/s."""
 SPEED = 1.0
 FRICTION = 0.3
 SLOPE = 0.5
@@ -80,7 +80,7 @@ def slope(quick: bool) -> Findings:
 
 
 def _block(normal: np.ndarray, friction: float) -> SoftScene:
-    """A block that only translates is a particle; two of them, so that none is special."""
+    """Two particles, since a block that only translates is a particle; two, so that neither is special."""
     mesh = Mesh(np.outer([0.0, 1.0], [normal[1], -normal[0]]), np.zeros((0, 3), int))
     ground = plane_contact(
         [0, 1], normal=normal, stiffness=STIFFNESS, width=0.0, friction=friction, threshold_speed=THRESHOLD

@@ -27,7 +27,7 @@ from scripts.reports.soft_bodies.gradients import crawling, crawling_scene, gait
 LANES = 64
 DT = 1 / 30
 LIMIT = 20.0
-"""Seconds; what would take longer is left out."""
+"""Time limit, s; measurements that would take longer are left out."""
 PROTOTYPE = {
     243: {"dense": 0.5e-3, "block-tridiagonal": 0.4e-3},
     902: {"dense": 9.5e-3, "block-tridiagonal": 1.0e-3},
@@ -35,7 +35,7 @@ PROTOTYPE = {
     3402: {"dense": 286e-3, "block-tridiagonal": 5.6e-3},
     8019: {"block-tridiagonal": 211e-3},
 }
-"""Seconds per factor-and-solve by unknowns, on two cores."""
+"""Reference times of a factorisation and solve, s, by number of unknowns and solver, on two cores."""
 
 
 def creature(quick: bool) -> Findings:

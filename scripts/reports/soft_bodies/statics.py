@@ -35,11 +35,11 @@ ELASTICA = {1.0: (0.30172, 0.05643), 2.0: (0.49346, 0.16064), 5.0: (0.71379, 0.3
 SLENDERNESS = 50
 """Length over height of the elastica: shear adds 0.6 (H/L)² to the deflection."""
 MODULUS, POISSON, DENSITY = 1e9, 0.3, 1e3
-"""Of the cantilever, in Pa, 1 and kg/m³."""
+"""Young's modulus, Pa, Poisson's ratio, and density, kg/m³, of the cantilever."""
 BENDING, SHEAR = 3.7632e-3, 0.2446e-3
-"""Deflection of the cantilever's tip in m."""
+"""Deflection of the cantilever's tip by bending and by shear, m."""
 BENDING_FREQUENCY, AXIAL_FREQUENCY = 10.096, 62.5
-"""Of the cantilever, in Hz."""
+"""First bending and first axial frequency of the cantilever, Hz."""
 SHEAR_FREQUENCY = (5 / 6 * MODULUS / 2.6 / DENSITY) ** 0.5 / 16
 """First frequency of a beam of this length that only shears, in Hz."""
 

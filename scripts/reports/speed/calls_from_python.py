@@ -20,11 +20,11 @@ class Timed(NamedTuple):
     d: int
     dtype: DTypeLike
     title: str = ""
-    """Of a rival's: what it is, and its release."""
+    """Name and release of a rival."""
 
 
 def seconds_of_calls(functions: Mapping[str, Timed], *, repetitions: int) -> dict[str, float]:
-    """Seconds of a call of each, arrays in and out; loops over drawn states take turns, and their medians count."""
+    """Times of calls with arrays in and out, s; loops over random states take turns, and medians count."""
     random, loops = np.random.default_rng(0), {}
     for name, (function, d, dtype, _) in functions.items():
         states = random.normal(size=(STATES, 3, d)).astype(dtype)
@@ -33,7 +33,7 @@ def seconds_of_calls(functions: Mapping[str, Timed], *, repetitions: int) -> dic
 
 
 def call_all(function: Callable[..., Any], states: Sequence[tuple[np.ndarray, ...]]) -> None:
-    """Calls a function of each state."""
+    """Calls a function with all states."""
     for state in states:
         function(*state)
 
@@ -41,8 +41,8 @@ def call_all(function: Callable[..., Any], states: Sequence[tuple[np.ndarray, ..
 def pinocchio_functions(d: int) -> dict[str, Timed]:
     """Pinocchio's inverse and forward dynamics, rnea and aba, of an arm of d revolute joints.
 
-    None, and a line on standard output, where the package is missing. Joints turn about axes of their frames, which
-    Pinocchio is faster with than with any others.
+    Prints a line and returns none if the package is missing. Joints turn about axes of their frames, which Pinocchio
+    handles faster than general axes.
     """
     try:
         pin: Any = importlib.import_module("pinocchio")

@@ -1,7 +1,7 @@
-"""Times of single functions of exported C, measured in C: loops of warm calls, and calls after caches were emptied.
+"""Times of single functions of exported C, measured in C: loops of warm calls, and calls after emptying the caches.
 
-What a control loop sees is the cold call: it comes once a millisecond, and other code has had the caches meanwhile. The
-program that times is written from the header of an export, so that it fits whatever wrote it: declarations are
+Calls of a control loop are cold: they come once a millisecond, and other code has used the caches in between. The
+timing program is generated from the header of an export, so that it fits any exporter: declarations are
 `void NAME_function(const real q[2], real dt, real tau[2]);`, and a function that returns a number returns its result.
 """
 
@@ -20,7 +20,7 @@ from dln_jax.export.c.load import FLAGS, STANDARD, compile_c
 from dln_jax.types import InputError
 
 SMALLEST, LARGEST = 8, 64
-"""MiB that are read to empty the caches: twice the last level within these."""
+"""Bounds on the memory that is read to empty the caches, MiB; within them it is twice the last-level cache."""
 
 _PROGRAM = """\
 #define _POSIX_C_SOURCE 199309L
@@ -130,29 +130,29 @@ class Prototype(NamedTuple):
 
     real: str
     inputs: dict[str, int]
-    """0 is the size of a number that is passed by value."""
+    """Sizes of the inputs by name; 0 for a number passed by value."""
     results: dict[str, int]
     returns: bool
-    """Whether a number is returned."""
+    """Whether the function returns a number."""
 
 
 class Times(NamedTuple):
     """Nanoseconds of calls of one function in one process."""
 
     hot: np.ndarray
-    """Means over a loop of calls, one each repeat."""
+    """Mean times of a call in a loop, one per repeat."""
     cold: np.ndarray
-    """Single calls, the clock's own time subtracted."""
+    """Times of single calls, without the clock's own time."""
     timer: float
-    """That time."""
+    """The clock's own time."""
     sum: float
-    """Of the sizes of the results over the states, by which exports of one model are compared; NaN if not finite."""
+    """Sum of the magnitudes of all results, for comparing exports of one model; NaN if not finite."""
     compiler: str
-    """Name and version."""
+    """Name and version of the compiler."""
 
 
 def prototypes(header: str, name: str) -> dict[str, Prototype]:
-    """The functions NAME_... that a header declares and that take and give numbers of one type, without NAME_."""
+    """The functions NAME_... declared in a header with numbers of one type, by their names without NAME_."""
     found = {}
     for returned, function, text in re.findall(_PROTOTYPE.format(name=re.escape(name)), header, re.MULTILINE):
         arguments = [match for each in text.split(",") if (match := _ARGUMENT.fullmatch(each))]
@@ -168,7 +168,7 @@ def prototypes(header: str, name: str) -> dict[str, Prototype]:
 
 
 def program(name: str, function: str, prototype: Prototype) -> str:
-    """C text of what times one function; it takes REPEATS CALLS COLD BYTES and prints JSON, in nanoseconds."""
+    """C source of a program that times one function; it takes REPEATS CALLS COLD BYTES and prints JSON, in ns."""
     inputs, results, arguments = 0, 0, []
     for size in prototype.inputs.values():
         arguments.append(f"&x[{inputs}]" if size else f"x[{inputs}]")
@@ -182,17 +182,17 @@ def program(name: str, function: str, prototype: Prototype) -> str:
 
 
 def compiled(export: Path, place: Path, *, name: str = "model") -> Path:
-    """The object file of an export's source, compiled as `load_c` does; `InputError` where that fails."""
+    """Compiles an export's source to an object file as `load_c` does; `InputError` if that fails."""
     built = place / f"{name}.o"
     compile_c([*STANDARD, *FLAGS, "-c", str(export / f"{name}.c"), "-o", str(built)])
     return built
 
 
 def programs(export: Path, model: Path, functions: Iterable[str], *, name: str = "model") -> dict[str, Path]:
-    """What times each of those functions that an export declares, beside the object file `model` of its source.
+    """Builds timing programs for the functions that an export declares, beside the object file `model` of its source.
 
     Raises:
-        InputError: the export declares none of them, or the header does not compile.
+        InputError: the export declares none of the functions, or the header does not compile.
     """
     declared, found = prototypes((export / f"{name}.h").read_text(), name), {}
     for function in functions:
@@ -200,7 +200,7 @@ def programs(export: Path, model: Path, functions: Iterable[str], *, name: str =
             source = model.with_name(f"time_{function}.c")
             source.write_text(program(name, function, declared[function]))
             found[function] = source.with_suffix("")
-            # Apart from the model's source, so that no call is folded into the loop.
+            # Compiled separately from the model, so that no call is inlined into the loop.
             compile_c([*STANDARD, *FLAGS, f"-I{export}", str(source), str(model), "-lm", "-o", str(found[function])])
     if not found:
         raise InputError(f"{export / f'{name}.h'} declares none of {', '.join(functions)}; export it again")
@@ -211,14 +211,14 @@ def timed(program: Path, *, repeats: int, calls: int, cold: int, mebibytes: int)
     """Runs a program that `programs` built.
 
     Args:
-        program: of one function.
-        repeats: loops of warm calls.
-        calls: of each loop.
-        cold: single calls, before each of which the caches are emptied.
-        mebibytes: that are read for it.
+        program: program of one function.
+        repeats: number of loops of warm calls.
+        calls: number of calls per loop.
+        cold: number of single calls with emptied caches.
+        mebibytes: memory that is read to empty the caches.
 
     Raises:
-        InputError: it ends by an error.
+        InputError: the program ends with an error.
     """
     command = [program, *map(str, (repeats, calls, cold, mebibytes << 20))]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -231,12 +231,12 @@ def timed(program: Path, *, repeats: int, calls: int, cold: int, mebibytes: int)
 
 
 def last_level_cache() -> int | None:
-    """MiB of the processor's largest cache; `None` where the system does not say (it is no Linux)."""
+    """Size of the processor's largest cache, MiB; `None` if the system does not report it (other than Linux)."""
     units = {"K": 2**10, "M": 2**20}
     sizes = [path.read_text().strip() for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size")]
     return max((int(size[:-1]) * units[size[-1]] >> 20 for size in sizes if size[-1:] in units), default=None)
 
 
 def evicting() -> int:
-    """MiB to read so that caches are emptied."""
+    """Memory to read to empty the caches, MiB."""
     return min(max(2 * (last_level_cache() or LARGEST), SMALLEST), LARGEST)

@@ -1,6 +1,6 @@
-"""benchmark throughput and scaling: what a structured DeLaN of two layers of 64 costs, with the batch and with joints.
+"""benchmark throughput and scaling: cost of a structured DeLaN of two layers of 64, by batch and by number of joints.
 
-Throughput is that of batched states, also against the full-Hessian way.
+Throughput counts batched states, and is also compared with the full-Hessian method.
 """
 
 import time
@@ -30,7 +30,7 @@ TRAINING_BATCH = 512
 NAMES = ("inverse", "forward")
 JOINTS, QUICK_JOINTS = (1, 2, 3, 4, 6, 8, 10, 12, 30), (2, 4)
 FITTED = (2, 12)
-"""Joints between which exponents of growth are fitted."""
+"""Range of joints in which exponents of growth are fitted."""
 UNITS = {
     **{"inverse_p50_us": "us", "inverse_p99_us": "us", "inverse_compile_seconds": "s"},
     **{"training_step_ms": "ms", "training_compile_seconds": "s", "training_memory_mib": "MiB"},
@@ -44,7 +44,7 @@ SHOWN = {
 
 
 def measure_throughput(quick: bool) -> Findings:
-    """Inverse and forward dynamics for growing batches; at one batch, the full-Hessian way for growing d."""
+    """Inverse and forward dynamics by batch; the full-Hessian method by d, at one batch."""
     repetitions = 10 if quick else 40
     batches = QUICK if quick else BATCHES
     rows: list[Row] = []
@@ -70,7 +70,7 @@ draw_throughput = partial(cost_curves, **titles)
 
 
 def hessian_row(d: int, repetitions: int) -> Row:
-    """How many times the states per second of the full-Hessian way."""
+    """Throughput relative to the full-Hessian method."""
     energies, states = structured(d, TRAINING_BATCH)
     ways = {
         "ours": jax.jit(jax.vmap(dynamics(energies).inverse_dynamics)),
@@ -90,7 +90,7 @@ def structured(d: int, batch: int) -> tuple[NaturalSystem, tuple[Array, ...]]:
 
 
 def by_full_hessian(L: Lagrangian):
-    """(q, qd, qdd) -> tau by `jax.hessian` over both arguments, as published implementations have it."""
+    """(q, qd, qdd) -> tau by `jax.hessian` over both arguments, as in published implementations."""
 
     def inverse_dynamics(q: Array, qd: Array, qdd: Array) -> Array:
         _, (mixed, inertia) = jax.hessian(L, argnums=(0, 1))(q, qd)
@@ -100,7 +100,7 @@ def by_full_hessian(L: Lagrangian):
 
 
 def measure_scaling(quick: bool) -> Findings:
-    """Latency of single calls, a training step at batch 512, compilation and memory; and how fast each grows."""
+    """Latency of single calls, a training step at batch 512, compilation and memory, and their exponents of growth."""
     sizes = QUICK_JOINTS if quick else JOINTS
     found = {d: cost(d, calls=500 if quick else 4_000, repetitions=10 if quick else 30) for d in sizes}
     rows = [Row(f"structured-delan/d-{d}", *item, UNITS[item[0]]) for d in sizes for item in found[d].items()]
@@ -115,13 +115,13 @@ def measure_scaling(quick: bool) -> Findings:
 
 
 def draw_scaling(lines: dict) -> Figure:
-    """Each cost against the number of joints."""
+    """Draws the costs against the number of joints."""
     panels = {name: {"structured-delan": (sizes, values)} for name, (sizes, values, _) in lines.items()}
     return cost_panels(panels, x="joints", y=[unit for *_, unit in lines.values()])
 
 
 def cost(d: int, *, calls: int, repetitions: int) -> dict[str, float]:
-    """Of d joints."""
+    """Costs at d joints."""
     model = make_delan(chain(d).needs, width=64, depth=2)
     parameters = jax.jit(model.init)(jax.random.key(0))
     arrays = jax.random.normal(jax.random.key(1), (4, TRAINING_BATCH, d), jnp.float32)

@@ -27,14 +27,14 @@ BATCHES = {1: "single-call", 512: "training-step-batch-512"}
 
 
 def cases(*, width: int = 64, repetitions: int = 40) -> list[Case]:
-    """A case for each number of joints and each batch; `InputError` for numbers that are not positive."""
+    """One case per number of joints and batch; `InputError` for numbers that are not positive."""
     require_positive(repetitions=repetitions, width=width)
     chosen = {f"d-{d}/{kind}": (d, batch) for d in SIZES for batch, kind in BATCHES.items()}
     return [Case(name, partial(compared, name, *sizes, width, repetitions)) for name, sizes in chosen.items()]
 
 
 def compared(case: str, d: int, batch: int, width: int, repetitions: int) -> Findings:
-    """Median times of both ways, microseconds, and their ratio."""
+    """Median times of both methods, µs, and their ratio."""
     keys = jax.random.split(jax.random.key(0), 3)
     outputs = d * (d + 1) // 2
     layers = tuple(

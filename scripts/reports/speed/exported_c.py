@@ -1,8 +1,8 @@
 """benchmark c: exported C, called in a warm loop, with cold caches and from Python; its derivatives, rivals and making.
 
-What is compared takes turns in one run, each turn in processes of its own; medians over turns count, and quantiles of
-cold calls are those of all turns. Before a cold call twice the last-level cache is read, 64 MiB at most; numbers are
-drawn, since times do not depend on them.
+Programs that are compared take turns in one run, in separate processes; medians over turns count, and quantiles of cold
+calls are those of all turns. Before a cold call twice the last-level cache is read, 64 MiB at most. Parameters are
+random, since times do not depend on them.
 """
 
 import json
@@ -38,7 +38,7 @@ class Arm(NamedTuple):
     precision: str
     d: int
     speedup: float | None = None
-    """Bound on how many times as fast as another export its inverse dynamics must be."""
+    """Smallest speed-up of its inverse dynamics over another export."""
 
 
 ARMS = {
@@ -46,17 +46,17 @@ ARMS = {
     for arm in (Arm(8, "f64", 2, 1.2), Arm(64, "f64", 2, 2.0), Arm(64, "f32", 2, 1.3), Arm(8, "f64", 7))
 }
 SMALLEST, *_, RIVALLED = ARMS
-"""What a quick run has; the rival is given as many joints as the second."""
+"""The arms of a quick run; the rival gets as many joints as the second."""
 LARGEST = {"structured-delan-64x64-f64-d-7": Arm(64, "f64", 7)}
-"""Is only exported and compiled."""
+"""An arm that is only exported and compiled."""
 FUNCTIONS = INVERSE, FORWARD, JACOBIAN = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian")
-"""Those that an export declares are timed."""
+"""Functions to time, if an export declares them."""
 RIVALS = {INVERSE: "rnea", FORWARD: "aba"}
-"""Pinocchio's functions of the same arguments."""
+"""Pinocchio's functions with the same arguments."""
 OURS, OTHERS = "ours", "against"
 TURNS, QUICK_TURNS = 5, 2
 SECONDS = 20.0
-"""Within which the largest export must be written and compiled."""
+"""Time limit for writing and compiling the largest export."""
 AGREEMENT = {"f64": 1e-11, "f32": 1e-4}
 """Bound on the relative difference of sums of results of two exports."""
 WAYS = {
@@ -66,11 +66,11 @@ WAYS = {
     "python_us": "from Python",
     "pinocchio_us": "from Python",
 }
-"""What is drawn."""
+"""Quantities to draw."""
 
 
 def export(arm: Arm, folder: Path) -> None:
-    """Writes the C of an arm with drawn parameters, the same at every call, as model.c, .h and .json."""
+    """Writes the C code of an arm with fixed random parameters, as model.c, .h and .json."""
     needs = chain(arm.d).needs
     description = describe("structured-delan", precision=arm.precision, needs=needs, width=arm.width, depth=2)
     random = np.random.default_rng(0)
@@ -83,17 +83,17 @@ def export(arm: Arm, folder: Path) -> None:
 
 
 def export_all(folder: Path) -> None:
-    """Exports every arm into a folder of its name; another release measures itself against that by `--against`."""
+    """Exports all arms into folders named after them; another release can measure against them with `--against`."""
     for name, arm in ARMS.items():
         export(arm, folder / name)
 
 
 def measure(quick: bool, against: Path | None = None) -> Findings:
-    """Every function of every arm, hot, cold and from Python, against Pinocchio, and against another export.
+    """Times all functions of all arms, hot, cold and from Python, against Pinocchio and against another export.
 
     Args:
         quick: fewer arms, turns and calls.
-        against: folder of what `export_all` wrote, of another release for instance.
+        against: folder written by `export_all`, such as that of another release.
 
     Raises:
         InputError: the other export lacks an arm, or something does not compile.
@@ -132,7 +132,7 @@ def measure(quick: bool, against: Path | None = None) -> Findings:
 
 
 def require_exports(against: Path | None, names: Sequence[str]) -> None:
-    """`InputError` unless a folder, if one is given, has an export of each arm."""
+    """Raises `InputError` if the folder, if any, lacks an export of an arm."""
     wanted = [f"{name}/model{suffix}" for name in names for suffix in (".h", ".c")]
     missing = [path for path in wanted if against and not (against / path).is_file()]
     if missing:
@@ -140,7 +140,7 @@ def require_exports(against: Path | None, names: Sequence[str]) -> None:
 
 
 def made(arm: Arm, folder: Path) -> tuple[float, float]:
-    """Seconds in which an arm is exported, and compiled to model.o in the same folder."""
+    """Exports an arm and compiles it to model.o in the same folder; returns both times, s."""
     began = time.perf_counter()
     export(arm, folder)
     written = time.perf_counter()
@@ -149,7 +149,7 @@ def made(arm: Arm, folder: Path) -> tuple[float, float]:
 
 
 def rows_of_making(arm: str, seconds: tuple[float, float], compiler: str) -> list[Row]:
-    """The seconds that `made` returns, and together, which are bounded for the largest export."""
+    """Rows of the times returned by `made` and of their sum, which has a bound for the largest export."""
     rows = [Row(arm, f"{what}_seconds", each, "s") for what, each in zip(("export", "compiler"), seconds, strict=True)]
     words = f"export, and {compiler} {' '.join(FLAGS)}"
     bound = SECONDS if arm in LARGEST else None
@@ -157,7 +157,7 @@ def rows_of_making(arm: str, seconds: tuple[float, float], compiler: str) -> lis
 
 
 def stated(arm: str, description: Mapping[str, Any]) -> list[Row]:
-    """Stack and operations of the functions that are timed, where the description of an export states them."""
+    """Stack and operations of the timed functions, if the description of an export states them."""
     found, units = description["functions"], {"stack_bytes": "B", "operations": "1"}
     return [
         Row(f"{arm}/{function}", key, float(found[function][key]), unit)
@@ -168,7 +168,7 @@ def stated(arm: str, description: Mapping[str, Any]) -> list[Row]:
 
 
 def rows_of_calls(name: str, arm: Arm, turns: Mapping[tuple[str, str], Sequence[Times]]) -> list[Row]:
-    """Of the calls of one arm in C, by whose they are and by function; ratios are medians of those of each turn."""
+    """Rows of one arm's calls in C, by origin of the code and function; ratios are medians over turns."""
     rows = []
     for (whose, function), times in turns.items():
         case = f"{name}/{function}" if whose == OURS else f"{name}/{function}/{whose}"
@@ -194,22 +194,22 @@ def rows_of_calls(name: str, arm: Arm, turns: Mapping[tuple[str, str], Sequence[
 
 
 def hot(times: Times) -> float:
-    """Nanoseconds of a call in a loop, the median of the repeats."""
+    """Time of a call in a loop, ns, median over repeats."""
     return float(np.median(times.hot))
 
 
 def cold_median(times: Times) -> float:
-    """Nanoseconds of the median cold call."""
+    """Median time of a cold call, ns."""
     return float(np.median(times.cold))
 
 
 def ratio(one: Sequence[Times], other: Sequence[Times], number: Callable[[Times], float]) -> float:
-    """How many times as long one takes as the other, the median over turns."""
+    """Ratio of the times of one and the other, median over turns."""
     return float(np.median([number(a) / number(b) for a, b in zip(one, other, strict=True)]))
 
 
 def from_python(exports: Mapping[str, Any], *, repetitions: int) -> list[Row]:
-    """Microseconds of calls from Python, of loaded exports by arm and of Pinocchio, and how both compare."""
+    """Times of calls from Python, µs, of loaded exports by arm and of Pinocchio, and their ratios."""
     functions = {
         f"{name}/{each}": Timed(getattr(loaded, each), ARMS[name].d, data_type(ARMS[name].precision))
         for name, loaded in exports.items()
@@ -227,7 +227,7 @@ def from_python(exports: Mapping[str, Any], *, repetitions: int) -> list[Row]:
 
 
 def curves_of(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Nanoseconds by ARM/FUNCTION, by whose the code is, and by way to call it."""
+    """Times by ARM/FUNCTION, origin of the code, and kind of call, ns."""
     found: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
         if row.quantity in WAYS:
@@ -240,7 +240,7 @@ def curves_of(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def draw(times: dict[str, dict[str, dict[str, float]]]) -> Figure:
-    """Times of calls, a panel for each function."""
+    """Draws times of calls, one panel per function."""
     panels: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for case, by_owner in times.items():
         arm, function = case.split("/")

@@ -21,19 +21,19 @@ from dln_jax.zoo.descriptions import build
 from scripts.reports.case import Findings
 
 SCENES = {"pendulum": 0.2, "double-pendulum": 0.04, "henon-heiles": 0.4, "two-body": 0.4}
-"""Largest time step of each, in s; it is halved."""
+"""Largest time step by scene, s; it is halved repeatedly."""
 SEPARABLE = ("pendulum", "henon-heiles", "two-body")
 HALVINGS = 6
 POINTS = 26
 """Times at which states are compared."""
 MOTIONS = 16
-"""From the first test starts, side by side."""
+"""Number of motions, from the first test starts, in one batch."""
 METHODS = ("explicit-euler", "symplectic-euler", "stormer-verlet", "rk4", "implicit-midpoint", "gauss-legendre-4")
 QUICK = ("stormer-verlet", "rk4")
 
 
 def measure(quick: bool) -> Findings:
-    """Some motions of each scene by each integrator, with dt halved; the truth is integrated to 1e-12 per step."""
+    """Integrates motions of all scenes by all integrators, halving dt; the truth is integrated to 1e-12 per step."""
     rows: list[Row] = []
     lines: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
     for scene in ("henon-heiles",) if quick else SCENES:
@@ -64,7 +64,7 @@ draw = functools.partial(cost_panels, x="µs per simulated second", y="trajector
 def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
     """The energy of the model that suits the scene, trained as in the table of Hamiltonian tasks.
 
-    If quick, by a few steps of Adam, whose program compiles sooner.
+    A quick run takes a few steps of Adam, whose program compiles faster.
     """
     options = {"optimiser": Adam(), "steps": 50} if quick else {}
     trained = train(problem, description_of(problem, "auto"), seed=0, **options)
@@ -72,7 +72,7 @@ def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
 
 
 def step_of(method: str, H: Hamiltonian, *, separable: bool) -> Step | None:
-    """The integrator of a Hamiltonian; `None` for one that needs a separable energy where this is none."""
+    """The integrator of a Hamiltonian; `None` if the method needs a separable energy and this one is not."""
     slope_q, slope_p = (jax.grad(H, argnums=argument) for argument in range(2))
 
     def field(t, state):
@@ -91,7 +91,7 @@ def step_of(method: str, H: Hamiltonian, *, separable: bool) -> Step | None:
         return None
     if method == "symplectic-euler":
         return integrators.symplectic_euler(lambda t, q, p: slope_p(q, p), lambda t, q, p: -slope_q(q, p))
-    # Each half is evaluated where the other variable is zero, since it does not read it.
+    # Both parts of a separable energy are evaluated with the other variable zero, on which they do not depend.
     return integrators.stormer_verlet(
         lambda t, p: slope_p(jnp.ones_like(p), p), lambda t, q: -slope_q(q, jnp.zeros_like(q))
     )

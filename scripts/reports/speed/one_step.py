@@ -1,6 +1,6 @@
 """benchmark one-step: microseconds of single calls against test error, for every model and call path.
 
-How JAX dispatches is settled when it starts: each way is timed in a process of its own, whose main this module has.
+JAX fixes its mode of dispatch when it starts, so every mode is timed in its own process, which runs this module.
 """
 
 import json
@@ -52,11 +52,11 @@ CALLS = 20_000
 STATES = 512
 EXPORTED = "model"
 PROCESSES = 3
-"""Of each way to dispatch, in turns; their medians count, and their spread shows the machine's noise."""
+"""Processes per mode of dispatch, in turns; medians count, and the spread shows the machine's noise."""
 
 
 def measure(quick: bool) -> Findings:
-    """Trains every model of the arm, and times single calls in processes of their own."""
+    """Trains all models of the arm, and times single calls in separate processes."""
     sets = published_split(letters(None))
     names = (WIDE, TRIGONOMETRIC) if quick else (*WIDTHS, WIDE, TRIGONOMETRIC)
     with tempfile.TemporaryDirectory() as place:
@@ -86,7 +86,7 @@ draw = partial(
 
 
 def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
-    """A run folder with a trained model: by Gauss-Newton, the wide one by Adam, the trigonometric one by its solve."""
+    """Trains a model into a folder: the wide one by Adam, the trigonometric one directly, others by Gauss-Newton."""
     folder = place / name
     folder.mkdir()
     kind, wide = SMALL if name == WIDE else name, name == WIDE
@@ -103,7 +103,7 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
 
 
 def time_in_a_process(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
-    """What `main` measures, by run."""
+    """The measurements of `main`, by run."""
     command = [sys.executable, "-m", "scripts.reports.speed.one_step", "--dispatch", dispatch, "--calls", str(calls)]
     done = subprocess.run([*command, "--runs", *map(str, folders)], capture_output=True)
     if done.returncode:
@@ -112,7 +112,7 @@ def time_in_a_process(folders: list[Path], dispatch: str, *, calls: int) -> dict
 
 
 def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
-    """Medians of each quantity over the processes that have it, and the spread of the median call."""
+    """Medians of the quantities over processes, and the spread of the median call."""
     found: dict[str, dict[str, dict[str, float]]] = {}
     for path in dict.fromkeys(path for turn in turns for path in turn):
         of_path = [turn[path] for turn in turns if path in turn]
@@ -126,7 +126,7 @@ def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
-    """Quantiles of each function."""
+    """Rows of the functions' quantiles."""
     rows = []
     for name, latency in functions.items():
         if "calls_per_second" in latency:
@@ -165,7 +165,7 @@ def main(given: Arguments) -> None:
 
 
 def times_of(folder: Path, states: dict[str, tuple[np.ndarray, ...]], given: Arguments) -> dict[str, Any]:
-    """Of one run, by call path and function."""
+    """Times of one run by call path and function."""
     precision = json.loads((folder / "model.json").read_text())["model"]["precision"]
     dtype = {"f32": np.float32, "f64": np.float64}[precision]
     system = load(folder).dynamics

@@ -20,7 +20,7 @@ from scripts.reports.case import Findings
 BATCH = 1_000
 INPUTS = {"inverse": ("q", "qd", "qdd"), "forward": ("q", "qd", "tau")}
 MEASURED = ("structured-delan", "black-box-delan", "structured-hnn", "feed-forward", TRIGONOMETRIC)
-"""Not black-box-hnn: parameters are random, and a random energy need not have a momentum for each velocity."""
+"""Models; not black-box-hnn, since a random energy need not have a momentum for every velocity."""
 
 
 def measure(quick: bool) -> Findings:
@@ -30,10 +30,10 @@ def measure(quick: bool) -> Findings:
     for kind in ("structured-delan",) if quick else MEASURED:
         answers, seconds = {}, {}
         model = {p: build(described(kind, data, precision=p, width=64, depth=2)) for p in ("f32", "f64")}
-        # A linear model starts at zero, which has no motion, and gets its fit instead.
+        # A linear model starts at zero, which has no dynamics, so it gets its fitted parameters instead.
         linear = kind == TRIGONOMETRIC
         start = fit_linear(model["f32"], data).parameters if linear else jax.jit(model["f32"].init)(jax.random.key(0))
-        # Parameters of float32 are exact in float64, so that arithmetic is all that differs.
+        # float32 parameters are exact in float64, so that only the arithmetic differs.
         narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), start)
         for precision, dtype in (("f32", jnp.float32), ("f64", jnp.float64)):
             parameters = jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), narrow)

@@ -42,7 +42,7 @@ SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Fi
     "softbody": (measure_soft_bodies, draw_soft_bodies),
     "c": (exported_c.measure, exported_c.draw),
 }
-"""What measures each, by quick, and what draws it."""
+"""Functions that measure (quick -> findings) and draw the subjects."""
 
 
 def cases(*, quick: bool = False, **options: Mapping[str, Any]) -> list[Case]:

@@ -29,7 +29,7 @@ UNITS = {"torque_mse": "N^2 m^2", "train_seconds": "s"}
 
 
 def measure(quick: bool) -> Findings:
-    """One seed of each on the embedded letters; the arm's table has medians of several."""
+    """Trains one seed of every model on the embedded letters; the arm's table has medians over several seeds."""
     sets = published_split(letters(None))
     linear = linear_alone if quick else measure_trigonometric
     jobs: dict[str, Callable[[], Measured]] = {"trigonometric/letters": partial(linear, sets)}
@@ -47,7 +47,7 @@ def measure(quick: bool) -> Findings:
 
 
 def linear_alone(sets: Split) -> Measured:
-    """The linear fit, without the rollouts and latencies that the arm's table has beside it: they take far longer."""
+    """The linear fit, without the rollouts and latencies of the arm's table, which take far longer."""
     fitted, energies = linear_fit(sets.train)
     numbers = {"torque_mse": torque_mse(dynamics(energies), sets.test), "train_seconds": fitted.seconds}
     return numbers, end_of(numbers)

@@ -1,4 +1,4 @@
-"""Hard cases: what is measured, what theory expects, and whether it is met."""
+"""Hard cases: measured values compared with theory."""
 
 import functools
 
@@ -20,12 +20,12 @@ SHORT = (
     *(torque_channels, batches, not_finite, noise, missing_friction),
 )
 LONG = (separatrix, lyapunov_time)
-"""Those whose length is a choice."""
+"""Cases of selectable length."""
 NAMES = tuple(measure.__name__.replace("_", "-") for measure in (*SHORT, *LONG))
 
 
 def cases(*, steps: int = 100_000) -> list[Case]:
-    """All hard cases, in float64; `steps` is the length of long motions, `InputError` for none."""
+    """All hard cases, in float64; `steps` is the length of long motions; `InputError` unless it is positive."""
     require_positive(steps=steps)
     measures = (*SHORT, *(functools.partial(measure, steps) for measure in LONG))
     named = zip(NAMES, measures, strict=True)

@@ -1,7 +1,7 @@
-"""Mass matrices that are hard to solve with, of condition up to 1e12 or of many joints, and some that are none.
+"""Mass matrices that are hard to solve with, of condition up to 1e12 or of many joints, and indefinite ones.
 
-A solver that is backward stable leaves a residual of rounding whatever the condition number kappa of M, and an error
-that kappa multiplies,
+A backward stable solver leaves a residual of the size of rounding for any condition number kappa of M, and an error
+proportional to kappa,
 
     |M x - b| <= c d eps |M| |x|,   |x - x_true| <= c d eps kappa |x|
 
@@ -29,13 +29,13 @@ from scripts.reports.stability.random_models import random_states, untrained
 
 EPS = float(np.finfo(np.float64).eps)
 FACTOR = 8.0
-"""c: a few matrix products, each with its half rounding per term."""
+"""c: a few matrix products with half a rounding per term."""
 CONDITIONS = (1.0, 1e4, 1e8, 1e12)
 SIZES = (1, 2, 7, 12, 30)
 _DIMENSION = 6
 _SWING = 0.1
 _RANGES = (np.pi, 2.0, 5.0)
-"""Of q, qd and qdd."""
+"""Ranges of q, qd and qdd."""
 
 
 def mass_conditions() -> Findings:
@@ -76,7 +76,7 @@ def mass_conditions() -> Findings:
 
 
 def sizes() -> Findings:
-    """Chains of 1 to 30 rods by their energies against the closed form, and structured networks of as many joints."""
+    """Chains of 1 to 30 rods: energies against the closed form, and structured networks with as many joints."""
     rows = []
     for d in SIZES:
         scene = chain(d)
@@ -104,7 +104,7 @@ def sizes() -> Findings:
 
 
 def indefinite_hessians() -> Findings:
-    """Mass matrices that are none: known ones, and those of a black-box network that nothing has trained."""
+    """Mass matrices that are not positive definite: known ones, and those of an untrained black-box network."""
 
     def known(q, qd):
         """M = diag(1, q_0): definite, singular and indefinite where q_0 is positive, 0 and negative."""
@@ -156,7 +156,7 @@ def _constant(mass: np.ndarray) -> Dynamics:
 
 
 def _solve(build, factor, *states):
-    """tau of qdd, qdd of that tau, a gradient through both, and M, of each state."""
+    """tau from qdd, qdd from that tau, a gradient through both, and M, by state."""
     system = build(NaturalSystem(lambda q: (1 + _SWING * jnp.sin(q[0])) * factor))
 
     def one(q, qd, qdd):
@@ -180,7 +180,7 @@ def _residual(mass: np.ndarray, q, qd, qdd, tau) -> tuple[np.ndarray, np.ndarray
 
 
 def _there_and_back(system: Dynamics, *states) -> tuple[np.ndarray, np.ndarray]:
-    """tau of qdd, and qdd of that tau; one state at a time, as batched library calls within one program may wait."""
+    """tau from qdd, and qdd from that tau; one state at a time, as batched library calls in one program may wait."""
 
     def one(state):
         q, qd, qdd = state

@@ -1,4 +1,4 @@
-"""Data that break programs: torque channels that never vary, no samples or one, NaN and infinity."""
+"""Data that break programs: constant torque channels, no samples or a single one, NaN and infinity."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ WIDTH = 8
 
 
 def torque_channels() -> Findings:
-    """Channels of torque that are zero or constant, and data in which none varies."""
+    """Torque channels that are zero or constant, and data without any varying channel."""
     scene = cart_pole()
     data = generators.uniform(scene, samples=200)  # the pole has no motor: tau_1 = 0
     constant = data._replace(tau=data.tau * [1.0, 0.0] + [0.0, 5.0])
@@ -119,13 +119,13 @@ def _systems() -> dict[str, Dynamics | PlainDynamics]:
 
 
 def _answers(system: Dynamics | PlainDynamics) -> Callable[..., list[np.ndarray]]:
-    """tau and qdd of a batch."""
+    """A function that computes tau and qdd of a batch."""
     compiled = jax.jit(jax.vmap(lambda *state: (system.inverse_dynamics(*state), system.forward_dynamics(*state))))
     return lambda *states: [np.asarray(leaf) for leaf in compiled(*states)]
 
 
 def _refuses(action: Callable[[], object], *words: str) -> bool:
-    """Whether an input is refused by a message that has all the words."""
+    """Whether an action is refused with a message that contains all the words."""
     try:
         action()
     except InputError as error:

@@ -4,10 +4,10 @@ The largest Lyapunov exponent lambda is the mean rate at which ln |v| grows, v c
 
     v <- d(step)/dx v
 
-and, independently, that of the distance of a second motion that is brought back to 1e-7 after every step (Benettin,
-Galgani, Giorgilli and Strelcyn 1980, "Lyapunov characteristic exponents"). Whatever perturbs a motion by e grows as
-e exp(lambda t): two ways to write the same equations, which differ by rounding alone, part after ln(1/eps) / lambda,
-and a step that is too coarse after ln(1/e) / lambda. No integrator can be asked for more.
+and, independently, that of the distance of a second motion that is rescaled to 1e-7 after every step (Benettin,
+Galgani, Giorgilli and Strelcyn 1980, "Lyapunov characteristic exponents"). A perturbation e of a motion grows as
+e exp(lambda t). Two forms of the same equations, which differ by rounding alone, diverge after ln(1/eps) / lambda, and
+a motion with a step error e after ln(1/e) / lambda. No integrator can do better.
 """
 
 from typing import NamedTuple
@@ -28,13 +28,13 @@ from dln_jax.scenes.scene import Scene
 from scripts.reports.case import Findings
 
 DT = 0.002
-"""s; 1e5 steps are 200 s."""
+"""Time step, s; 1e5 steps are 200 s."""
 COARSE = 5
-"""Of the coarser motion, in steps of the finer."""
+"""Time step of the coarser motion, in steps of the finer."""
 SEPARATION = 1e-7
-"""rad, at which the second motion is kept."""
+"""Distance at which the second motion is kept, rad."""
 STARTS = np.array([[2.0, 2.5], [2.2, -1.5], [-2.6, 2.0], [1.8, 3.0]])
-"""rad, at rest; all above the energy where the motion turns chaotic."""
+"""Initial angles at rest, rad; all above the energy where the motion becomes chaotic."""
 
 
 class Chaos(NamedTuple):
@@ -51,7 +51,7 @@ class Chaos(NamedTuple):
 
 
 def lyapunov_time(steps: int) -> Findings:
-    """How long predictions last, as a multiple of what the Lyapunov exponent allows."""
+    """Prediction horizons relative to those that the Lyapunov exponent allows."""
     scene = double_pendulum()
     system, rewritten = dynamics(scene.energies), natural.dynamics(_factored(scene))
     chaos = _motions(system, steps)
@@ -120,7 +120,7 @@ def _distance(chaos: Chaos, system: Dynamics, *, every: int) -> np.ndarray:
 
 
 def _horizon(distance: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """First time at which each motion is 1 rad off; infinite if it never is."""
+    """First times at which motions are 1 rad off; infinite if they never are."""
     lost = ~(distance < 1.0)
     return np.where(lost.any(axis=0), t[np.argmax(lost, axis=0)], np.inf)
 
@@ -138,7 +138,7 @@ def _factored(scene: Scene) -> NaturalSystem:
 
 
 def _energy_drift(scene: Scene, steps: int) -> Row:
-    """Chaos costs the motion, not its energy, where the method is symplectic."""
+    """Energy drift of a symplectic method, which conserves the energy of a chaotic motion though not the motion."""
     H = hamiltonian.legendre(scene.lagrangian)
     step = gauss_legendre4(lambda t, state: hamiltonian.time_derivative(H, state[0], state[1], jnp.zeros(2)))
 

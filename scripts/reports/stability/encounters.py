@@ -36,11 +36,11 @@ from scripts.reports.case import Findings
 
 GRAVITY = 9.81
 DT = 0.01
-"""s; 1e5 steps are 1000 s, some 130 swings."""
+"""Time step, s; 1e5 steps are 1000 s, some 130 swings."""
 BELOW_UPRIGHT = 1e-3
-"""rad from the saddle, where the swing starts from rest."""
+"""Initial angle from the saddle, rad; the swing starts from rest."""
 HIGHER_ORDERS = 1.1
-"""What the next orders of the expansion may add: g dt² and sqrt(g) dt are 0.001 and 0.03."""
+"""Allowance for the next orders of the expansion: g dt² and sqrt(g) dt are 0.001 and 0.03."""
 TOLERANCE = 1e-12
 STEPS_NEAR = 100
 """Steps whose errors may add up at the nearest point."""
@@ -72,7 +72,7 @@ def separatrix(steps: int) -> Findings:
         "implicit-midpoint": GRAVITY**2 * DT**2 / 6,
         "gauss-legendre-4": GRAVITY * (GRAVITY * DT**2) ** 2,
     }
-    # Of the motion only the angle of the end of each swing matters, and the largest error so far.
+    # Only the angles at the ends of swings and the largest error so far matter.
     kept = np.unique(np.geomspace(1, steps, 200).astype(int))
     start = (jnp.array([np.pi - BELOW_UPRIGHT]), jnp.zeros(1))
     t = DT * jnp.arange(steps + 1)
@@ -82,7 +82,7 @@ def separatrix(steps: int) -> Findings:
         q, p = np.asarray(q)[:, 0], np.asarray(p)[:, 0]
         with np.errstate(over="ignore", invalid="ignore"):
             energy = p**2 / 2 + GRAVITY * (1 - np.cos(q))
-        # A motion that is lost has no error that grows back.
+        # The running maximum keeps the error of a lost motion from shrinking again.
         error = np.maximum.accumulate(abs(energy - energy[0]))
         curves[name] = error[kept]
         if name not in references:

@@ -1,4 +1,4 @@
-"""Figures of the hard cases where a picture says more; each returns a Matplotlib figure."""
+"""Figures of the hard cases; all functions return a Matplotlib figure."""
 
 from collections.abc import Callable
 
@@ -43,7 +43,7 @@ def energy_errors(curves: dict) -> Figure:
 
 
 def divergence(curves: dict) -> Figure:
-    """How a chaotic motion and its rewritten twin part, beside exp(lambda t)."""
+    """Divergence of a chaotic motion and its rewritten twin, beside exp(lambda t)."""
     figure, [[axis]] = style.figure(height=3.6)
     t, exponents = curves["t"], curves["exponents"]
     shown = t <= 80 / exponents.min()
@@ -78,4 +78,4 @@ FIGURES: dict[str, Callable[[dict], Figure]] = {
     "lyapunov-time": divergence,
     "noise": noise_sweep,
 }
-"""By the name of the hard case."""
+"""Functions that draw a hard case's curves, by name."""

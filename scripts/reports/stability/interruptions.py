@@ -1,7 +1,7 @@
-"""Training runs that are killed at random moments and resumed: whether they come to what the unbroken run comes to.
+"""Training runs that are killed at random moments and resumed, compared with unbroken runs.
 
-Each run is started anew for every kill (SIGKILL, at a moment drawn between its first checkpoint and its end), resumed
-to the end, and its model file compared, bit for bit.
+A run starts anew for every kill (SIGKILL, at a random moment between its first checkpoint and its end) and is resumed
+to the end. Its model file is compared bit for bit.
 """
 
 import os
@@ -27,23 +27,23 @@ RUNS = {
     "function": ("train_diffnet", "--samples", "6000", "--width", "8"),
     "locomotion": ("train_locomotion", "--steps", "6000"),
 }
-"""Script and options of each run; short, but of several checkpoints."""
+"""Script and options of the runs, which are short but store several checkpoints."""
 TIMED = ("train_delan", "train_hnn_task")
 """Scripts that would also time calls in another process."""
 MODEL = "model.safetensors"
 ROOT = Path(__file__).parents[3]
-"""Where the package is, which the runs are to import."""
+"""Folder of the package that the runs import."""
 
 
 def cases(names: Sequence[str] = tuple(RUNS), *, kills: int = 10, seed: int = 0) -> list[Case]:
-    """A case for each run; `seed` is that of the moments of its kills, `InputError` for none."""
+    """One case per run; `seed` sets the moments of the kills; `InputError` for invalid numbers."""
     require_positive(kills=kills)
     random = np.random.default_rng(seed)
     return [Case(name, partial(killed_and_resumed, name, random, kills)) for name in names]
 
 
 def killed_and_resumed(name: str, random: np.random.Generator, kills: int) -> Findings:
-    """How many of the resumed runs are the unbroken one, and the moments of the kills in s after a checkpoint."""
+    """Number of resumed runs identical to the unbroken one, and the moments of the kills, s after a checkpoint."""
     with tempfile.TemporaryDirectory() as place:
         same, moments = interrupted(RUNS[name], Path(place), random, kills=kills)
     row = Row(name, "resumed_bit_for_bit", same, "runs", bound=kills, at_least=True)
@@ -53,8 +53,8 @@ def killed_and_resumed(name: str, random: np.random.Generator, kills: int) -> Fi
 def interrupted(
     command: Sequence[str], place: Path, random: np.random.Generator, *, kills: int
 ) -> tuple[int, list[float]]:
-    """How many of `kills` interrupted runs end as the unbroken one, and when they were killed, s after a checkpoint."""
-    # Twice: the second has the compiled programs of the first, as the runs that are killed do.
+    """Number of `kills` interrupted runs that end as the unbroken one, and the kills' times, s after a checkpoint."""
+    # Twice: the second run finds the compiled programs of the first, as the killed runs do.
     for name in ("first", "unbroken"):
         length = lasted(start(command, place, name), place / name)
     expected = (place / "unbroken" / MODEL).read_bytes()
@@ -65,7 +65,7 @@ def interrupted(
         name = f"killed-{len(moments)}"
         moment = float(random.uniform(0, length))
         if not killed(start(command, place, name), place / name, moment):
-            # It was faster than the unbroken one; nothing was interrupted.
+            # The run ended before the kill; nothing was interrupted.
             length *= 0.9
             (place / name).rename(place / f"over-{time.monotonic_ns()}")
             continue
@@ -102,7 +102,7 @@ def lasted(process: subprocess.Popen[str], folder: Path) -> float:
 
 
 def killed(process: subprocess.Popen[str], folder: Path, moment: float) -> bool:
-    """Kills a run so many seconds after its first checkpoint; whether it had no model yet."""
+    """Kills a run `moment` seconds after its first checkpoint; returns whether it had no model yet."""
     wait_for_checkpoint(process, folder)
     time.sleep(moment)
     process.send_signal(signal.SIGKILL)
@@ -111,7 +111,7 @@ def killed(process: subprocess.Popen[str], folder: Path, moment: float) -> bool:
 
 
 def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
-    """Until a run has written one; `InputError` where it ended before."""
+    """Waits until a run has written a checkpoint; `InputError` if it ends before."""
     while not any(folder.glob("checkpoint*.json")):
         if process.poll() is not None:
             finished(process, folder)
@@ -120,7 +120,7 @@ def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
 
 
 def finished(process: subprocess.Popen[str], folder: Path) -> None:
-    """Waits for the end of a run; `InputError` where it failed."""
+    """Waits for the end of a run; `InputError` if it failed."""
     said = process.communicate()[1]
     if process.returncode:
         raise InputError(f"the run in {folder} failed: {said.strip()[-200:]}")

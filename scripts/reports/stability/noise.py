@@ -24,12 +24,12 @@ from dln_jax.scenes.two_link_arm import two_link_arm
 from scripts.reports.case import Findings
 
 LEVELS = (1e-4, 1e-2, 1e-1)
-"""Standard deviations of the noise, in those of the quantity."""
+"""Standard deviations of the noise, relative to that of the quantity."""
 SAMPLES = 600
 FRICTION = 0.2
-"""N m s."""
+"""Viscous friction, N m s."""
 DEVIATIONS = 4.0
-"""Standard deviations that a sum of squares of noise may be above its mean."""
+"""Standard deviations by which a sum of squares of noise may exceed its mean."""
 
 
 def noise() -> Findings:
@@ -62,7 +62,7 @@ def noise() -> Findings:
 
 
 def missing_friction() -> Findings:
-    """A scene with friction, fitted by a model without and by one with it."""
+    """A scene with friction, fitted by models without and with friction."""
     scene = double_pendulum(friction=FRICTION)
     data, random = generators.uniform(scene, samples=SAMPLES), np.random.default_rng(2)
     sigma = 1e-2 * float(data.tau.std())

@@ -1,4 +1,4 @@
-"""Models that nothing has trained, and states to ask them about."""
+"""Untrained models and random states for them."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from dln_jax.models.model import Model, Parameters
 
 
 def random_parameters(model: Model) -> Parameters:
-    """Parameters of unit gain: drawn without compiling the model's initialisation."""
+    """Random parameters of unit gain, without compiling the model's initialisation."""
     random = np.random.default_rng(0)
 
     def draw(like: jax.ShapeDtypeStruct):
@@ -22,7 +22,7 @@ def random_parameters(model: Model) -> Parameters:
 
 
 def untrained(model: Model):
-    """The dynamics of a model that nothing has trained."""
+    """The dynamics of an untrained model."""
     return dynamics(model.energies(random_parameters(model)))
 
 

@@ -33,7 +33,7 @@ TURNS = 1_000
 WIDTH = 16
 LAYERS = 3
 RANGES = (np.pi, 3.0, 10.0)
-"""Of q, qd and qdd (or tau): with these all parts of the torque count."""
+"""Ranges of q, qd and qdd (or tau), for which all parts of the torque matter."""
 
 _DENSITY = 1 / math.sqrt(2 * math.pi)
 _Values = Callable[[np.ndarray], tuple]

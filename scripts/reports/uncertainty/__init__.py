@@ -1,1 +1,1 @@
-"""Whether models know what they do not know: coverage of their bands on held-out motions, and flags of far states."""
+"""Quality of uncertainty estimates: coverage of bands on held-out motions, and out-of-distribution flags."""

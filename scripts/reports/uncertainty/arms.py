@@ -1,4 +1,4 @@
-"""Arms of known frames, and noisy motions of them: torques of rigid bodies, friction, and what no model of ours has."""
+"""Arms with known frames and noisy motions: torques of rigid bodies, friction, and effects that our models lack."""
 
 from collections.abc import Callable
 from typing import Any
@@ -24,11 +24,11 @@ UR10 = (
     *((0, 0, 0.1273, 0), (RIGHT, 0, 0, 0), (0, -0.612, 0, 0)),
     *((0, -0.5723, 0.163941, 0), (RIGHT, 0, 0.1157, 0), (-RIGHT, 0, 0.0922, 0)),
 )
-"""Of the manufacturer, likewise."""
+"""Denavit-Hartenberg rows of the manufacturer, in the same order."""
 VELOCITY_SCALE = 0.05
-"""1/s, of dry friction."""
+"""Velocity scale of dry friction, rad/s."""
 SECONDS, STEP = 6.0, 0.04
-"""Of a motion, and between its samples."""
+"""Length of a motion, and time between its samples."""
 
 Plant = Callable[..., Any]
 
@@ -70,9 +70,9 @@ def motions(
     """Motions of four sines a joint with drawn amplitudes, frequencies and phases.
 
     Args:
-        torque: of a `plant`.
-        d: its joints.
-        count: of motions.
+        torque: torques of a `plant`.
+        d: number of its joints.
+        count: number of motions.
         noise: standard deviation of the first torque's noise, N m; it falls to 30 % of that at the last joint.
         seed: of everything drawn.
         reach: multiplies amplitudes.

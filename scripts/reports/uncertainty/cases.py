@@ -1,4 +1,4 @@
-"""Coverage of 95 % bands on motions that neither the fit nor the calibration has seen, and flags of states far away."""
+"""Coverage of 95 % bands on motions unseen by fit and calibration, and flags of out-of-distribution states."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -35,28 +35,28 @@ from scripts.reports.case import Case, Findings
 from scripts.reports.uncertainty.arms import UR10, VELOCITY_SCALE, arm, motions, plant
 
 LOWEST, HIGHEST = 0.90, 0.98
-"""Of the coverage to reach."""
+"""Bounds on the coverage."""
 NEGLIGIBLE = 1e-12
 TRIM, BLOCK = 0.5, 2.0
-"""s: left out at both ends of a recording, and of a block that counts as a trajectory."""
+"""Time left out at both ends of a recording, and length of a block that counts as a trajectory, s."""
 
 
 class HeldOut(NamedTuple):
-    """One split: what was found on its test motions, and on far states where there are any."""
+    """Results of one split on its test motions, and on far states if there are any."""
 
     coverage: np.ndarray
-    """[d]."""
+    """Share of test torques inside the bands, by joint [d]."""
     outside: float
-    """Share of the test's states that are flagged."""
+    """Share of test states that are flagged."""
     far_outside: float
-    """Of far states; NaN where there are none."""
+    """Share of far states that are flagged; NaN without far states."""
     far_coverage: float
 
 
 def judged(
     model: Model, parameters: Parameters, found: Estimate, test: Trajectories, far: Trajectories | None = None
 ) -> HeldOut:
-    """A model's bands and flags against held-out data."""
+    """Judges a model's bands and flags on held-out data."""
     answer = _answer(model)
     shares, flags = [], []
     for data in (test, far) if far is not None else (test,):
@@ -79,7 +79,7 @@ def _answer(model: Model) -> Callable[..., Any]:
     many = jax.jit(jax.vmap(one, in_axes=(None, None, 0, 0, 0)), compiler_options=quick_compilation())
 
     def answer(parameters, known, *states):
-        """By pieces of one size, so that tests of any size are one program."""
+        """Evaluates in chunks of one size, so that tests of any size share one program."""
         samples, parts = len(states[0]), []
         for first in range(0, samples, 256):
             rows = np.minimum(np.arange(first, first + 256), samples - 1)
@@ -188,7 +188,7 @@ def _linear(
 def cases(
     *, splits: int, recorded_arm: Path | None = None, recorded_pendulum: Path | None = None, steps: int = 150
 ) -> list[Case]:
-    """All of them; recordings where their files are given."""
+    """All cases; recordings only if their files are given."""
     made: dict[str, Callable[[str], Findings]] = {}
     for d in (3, 7):
         for what, unmodelled in (("modelled", False), ("unmodelled", True)):

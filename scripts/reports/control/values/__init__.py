@@ -1,1 +1,1 @@
-"""Value functions of published plants: what is controlled, the truth beside them, and what their policies cost."""
+"""Value functions of published plants: plants, reference values, and returns of their policies."""

@@ -1,7 +1,7 @@
-"""Values from the Hamilton-Jacobi-Bellman equation where they are known otherwise, and on a published plant.
+"""Values from the Hamilton-Jacobi-Bellman equation, on problems with a known solution and on a published plant.
 
-On a line, dx/dt = x + u with the cost (x² + u²)/2 has V = x² (1 + √2)/2, and with limited controls and no discount the
-equation is one of the slope alone, whose root is found and integrated. A linear plant with quadratic costs has the
+On a line, dx/dt = x + u with the cost (x² + u²)/2 has V = x² (1 + √2)/2. With limited controls and no discount the
+equation contains only the slope: its root is computed and integrated. A linear plant with quadratic costs has the
 solution of the Riccati equation.
 """
 
@@ -31,16 +31,16 @@ from scripts.reports.control.values import robust
 
 EXACT = 1e-8
 LIMIT, WEIGHT = 5.5, 2 * 5.5 / np.pi
-"""Of the limited control, whose cost is ½ u² near zero."""
+"""Limit and weight of the limited control, whose cost is ½ u² near zero."""
 LINE = ControlProblem(
     lambda x: x, lambda x: jnp.ones((1, 1)), lambda x: 0.5 * x @ x, quadratic(1.0), 0.0, [-5.0], [5.0], (), [0.0]
 )
 THETA = (1 + np.sqrt(2)) / 2, (1 - np.sqrt(2)) / 2
-"""Of V = theta x²: the cost to go, and the equation's other solution."""
+"""theta in V = theta x²: the cost to go, and the equation's other solution."""
 
 
 def line(quick: bool) -> Findings:
-    """The quadratic value by a form and by a network, which of two solutions is found, and limited controls."""
+    """The quadratic value by a form and by a network, with and without continuation, and limited controls."""
     case = "equation/line"
     rows = []
     form = lambda theta, x: (theta * x[0] ** 2, 2 * theta * x)  # noqa: E731
@@ -79,14 +79,14 @@ def limited_value(x: float) -> float:
             gain = LIMIT / np.pi * (2 * s * np.arctan(s / WEIGHT) - WEIGHT * np.log1p((s / WEIGHT) ** 2))
             return gain - x * s - x**2 / 2
 
-        # The other root drives away from the goal.
+        # The other root belongs to controls that drive away from the goal.
         return float(brentq(left, WEIGHT * np.tan(np.pi * x / (2 * LIMIT)), 1e4, xtol=1e-13))  # type: ignore[arg-type]
 
     return quad(slope, 0, x, epsabs=1e-12, epsrel=1e-12)[0]
 
 
 def linear(quick: bool) -> Findings:
-    """Six states of the flexible cart-pole, by a quadratic form and by a network, against the Riccati equation."""
+    """The linearised flexible cart-pole (six states): a quadratic form and a network against the Riccati equation."""
     case, scene = "equation/flexible-cart-pole", flexible_cart_pole()
     field = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
     at = linearise(field, np.zeros(6), np.zeros(1))
@@ -118,7 +118,7 @@ def by_network(
     samples: int = 512,
     iterations: int = 30,
 ) -> dict[str, float]:
-    """Errors of V relative to the truth, medians and the worst of all states and seeds, and the seconds of training."""
+    """Relative errors of V, median and worst over states and seeds, and the training time."""
     errors, seconds = [], []
     for seed in range(seeds):
         network = value_network(problem, widths=widths, scale=float(np.max(truth)), floor=1e-3 if widths else 0.0)
@@ -139,7 +139,7 @@ def by_network(
 
 
 def published(quick: bool) -> Findings:
-    """The published pendulum, whose value has a ridge, by the equation alone: returns of its law over seeds."""
+    """The published pendulum, whose value has a ridge, by the equation alone: returns of the policy over seeds."""
     plant, case = PLANTS["pendulum"](), "equation/pendulum"
     widths, samples, iterations, seeds = ((8, 8), 512, 5, 1) if quick else ((24, 24), 4096, 15, 3)
     network = value_network(plant.problem, widths=widths, scale=30.0)
@@ -178,4 +178,4 @@ CASES: dict[str, Callable[[bool], Findings]] = {
     "equation/pendulum": published,
     "equation/robust": robust.pendulum,
 }
-"""Of the report of control."""
+"""Cases of the control report."""

@@ -1,7 +1,7 @@
-"""Fitted values of the published plants: how long they take, what their policies cost, and how far they are off.
+"""Fitted values of the published plants: training time, returns of their policies, and errors.
 
-The pendulum's value is compared with one on a grid over the whole box, that of the cart-pole with direct optimisation
-from the starts of the evaluation. Seeds are trained one after the other, and their mean is one more value.
+The pendulum's value is compared with a grid solution over the whole box, the cart-pole's with direct optimisation from
+the starts of the evaluation. Seeds are trained one after the other, and their mean is evaluated as one more value.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,33 +31,33 @@ from scripts.reports.figures.values import value_figure
 
 SEEDS = 3
 TO_REACH = {"pendulum": -30.9, "cart-pole": -25.0}
-"""Mean return of downward starts; the published policies have it by 0.06 and 0.05 less."""
+"""Mean return of downward starts to reach; the published policies' returns are lower by 0.06 and 0.05."""
 CLOSE = 1e-2
-"""Relative error of V, of the median state."""
+"""Bound on the median relative error of V over states."""
 LEAST = 1e-2
-"""Share of the largest V below which a state does not count, as its V is near zero."""
+"""States whose V is below this share of the largest are left out of relative errors, as their V is near zero."""
 GRIDS = (101, 201, 401)
 EDGE = 12.0
-"""rad/s, beyond which no trajectory from the box comes."""
+"""Rate that no trajectory from the box exceeds, rad/s."""
 
 
 class Trained(NamedTuple):
-    """Values of some seeds, in float64."""
+    """Value functions by seed, in float64."""
 
     values: list[ValueAndGradient]
     seconds: list[float]
-    """Of each training."""
+    """Training times."""
 
 
 def trained(plant: ValuePlant, fit: Fit, seeds: int) -> Trained:
-    """By fitted value iteration, one seed after the other."""
+    """Trains values by fitted value iteration, one seed after the other."""
     network = value_network(plant.problem, widths=fit.widths, scale=fit.scale)
     found = fit_values(plant.problem, network, range(seeds), numbers=fit.numbers)
     return Trained([_value(network, each.parameters) for each in found], [each.train_seconds for each in found])
 
 
 def mean_value(values: Sequence[ValueAndGradient]) -> ValueAndGradient:
-    """The mean of several values, and of their slopes."""
+    """The mean of several values and gradients."""
 
     def mean(x: Array) -> tuple[Array, Array]:
         each, slopes = zip(*(value(x) for value in values), strict=True)
@@ -67,7 +67,7 @@ def mean_value(values: Sequence[ValueAndGradient]) -> ValueAndGradient:
 
 
 def pendulum(quick: bool) -> Findings:
-    """The pendulum, against a grid over the box."""
+    """Compares the pendulum's value with a grid solution over the box."""
     plant, fit, seeds = PLANTS["pendulum"](), FITS["pendulum"], 1 if quick else SEEDS
     if quick:
         fit = fit._replace(widths=(24, 24), numbers=fit.numbers._replace(iterations=4, starts=128, seconds=1.0))
@@ -101,7 +101,7 @@ def pendulum(quick: bool) -> Findings:
 
 
 def cart_pole(quick: bool) -> Findings:
-    """The cart-pole, against direct optimisation from the starts all around the circle."""
+    """Compares the cart-pole's value with direct optimisation from starts all around the circle."""
     plant, fit, seeds = PLANTS["cart-pole"](), FITS["cart-pole"], 1 if quick else SEEDS
     if quick:
         numbers = fit.numbers._replace(iterations=3, starts=128, seconds=0.5, steps=50)
@@ -116,18 +116,18 @@ def cart_pole(quick: bool) -> Findings:
 
 
 CASES: dict[str, Callable[[bool], Findings]] = {"value/pendulum": pendulum, "value/cart-pole": cart_pole}
-"""Of the report of control."""
+"""Cases of the control report."""
 
 
 def states_of_box(plant: ValuePlant, count: int) -> Float[np.ndarray, "A B 2"]:
-    """A grid over the box of two states, whose first is an angle."""
+    """A grid over the box of two states; the first is an angle."""
     low, high = plant.problem.low, plant.problem.high
     axes = [np.linspace(low[0], high[0], count, endpoint=False), np.linspace(low[1], high[1], count + 1)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 def beside_ridge(found: GridValue, nodes: np.ndarray, limit: float, *, distance: float = 0.1) -> np.ndarray:
-    """Whether the best control changes by half the limit within a distance, in rad, and 2.5 of it in rad/s."""
+    """Whether the best control changes by half its limit within `distance` in rad, or 2.5 times that in rad/s."""
     near = [nodes + distance * np.array([i, 2.5 * j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     controls = np.stack([np.asarray(interpolated(found.grid, found.u, each)) for each in near])
     return np.ptp(controls, axis=0) > 0.5 * limit
@@ -140,13 +140,13 @@ def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None =
 
 
 def _of_grid(case: str, plant: ValuePlant, found: GridValue) -> Row:
-    """What the grid's own policy gets, against which returns are to be seen."""
+    """Return of the grid's own policy, for comparison."""
     got = evaluate(plant, lookahead(plant.problem, found, most=plant.limit), starts(plant, "down"))
     return Row(case, "grid_down_return", float(np.mean(got.returns)))
 
 
 def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, iterations: int) -> np.ndarray:
-    """The least cost that optimisation finds from the controls of each value's policy."""
+    """Lowest cost of direct optimisations that start from the controls of the values' policies."""
     dt = 0.0125
     guesses = np.stack([followed(plant.problem, _law(plant, value), x, dt=dt, steps=200) for value in values])
     found = direct_values(plant.problem, x, guesses, limit=plant.limit, dt=dt, iterations=iterations)
@@ -154,7 +154,7 @@ def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray
 
 
 def _returns(case: str, plant: ValuePlant, found: Trained) -> list[Row]:
-    """Of each kind of starts, over the seeds, and of their mean."""
+    """Returns by kind of starts: over the seeds, and of the mean value."""
     x = np.concatenate([starts(plant, "down"), starts(plant, "uniform")])
     half = len(x) // 2
     each = [evaluate(plant, _law(plant, value), x) for value in found.values]
@@ -187,7 +187,7 @@ def _returns(case: str, plant: ValuePlant, found: Trained) -> list[Row]:
 
 
 def _errors(case: str, of_all: Sequence[np.ndarray], truth: np.ndarray, counted: np.ndarray) -> list[Row]:
-    """Relative to the truth, where that is not near zero."""
+    """Errors relative to the truth, over the states that count."""
     off = _relative(of_all, truth)[:, counted]
     medians = np.median(off, axis=1)
     together = _relative([np.mean(of_all, axis=0)], truth)[:, counted]
@@ -223,11 +223,11 @@ def _controls(plant: ValuePlant, value: ValueAndGradient, nodes: np.ndarray) -> 
 
 
 def draw_pendulum(curves: dict[str, Any]) -> Figure:
-    """The first seed's value beside the grid's."""
+    """Draws the first seed's value beside the grid solution."""
     plant = PLANTS["pendulum"]()
     values, controls = (curves["V"], curves["truth"]), (curves["u"], curves["best"])
     return value_figure(curves["nodes"], values, controls, curves["runs"], limit=plant.limit, seconds=SECONDS)
 
 
 DRAWINGS: dict[str, Callable[[dict[str, Any]], Figure]] = {"value/pendulum": draw_pendulum}
-"""Of the curves of cases, by name."""
+"""Functions that draw a case's curves, by name."""

@@ -1,4 +1,4 @@
-"""Laws of value functions by size, for whoever times or exports them."""
+"""Policies of untrained value networks of a chosen size, for timing and export."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from dln_jax.control.optimal.value_networks import value_network
 
 
 def drawn_law(plant: str = "cart-pole", *, widths: Sequence[int] = (64, 64), members: int = 1, seed: int = 0) -> Law:
-    """x [n] -> u [m] of a network that is drawn and not trained: what a call takes is the same."""
+    """The policy x [n] -> u [m] of a random, untrained network; a call takes the same time as with a trained one."""
     problem = PLANTS[plant]().problem
     network = value_network(problem, widths=widths, members=members, scale=30.0)
     parameters = network.init(jax.random.key(seed))

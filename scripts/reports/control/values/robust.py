@@ -1,4 +1,4 @@
-"""Gains and costs of training a value against the worst disturbance, on plants that differ from the model."""
+"""Benefit of training a value against the worst disturbance, on plants that differ from the model, and its cost."""
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,9 @@ from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
 
 SHARE = 0.15
-"""Of mass and length, by which the worst disturbance moves them."""
+"""Relative range of mass and length that the worst disturbance may use."""
 FACTORS = {"model": (1.0, 1.0), "heavy_and_long": (1.15, 1.15), "far": (1.3, 1.15)}
-"""On mass and length, of the plants that are tried; the last is beyond what was trained for."""
+"""Factors on mass and length of the evaluated plants; the last one lies outside the trained range."""
 
 
 def rod(x: Array, u: Array, p: Array) -> Array:
@@ -29,7 +29,7 @@ def rod(x: Array, u: Array, p: Array) -> Array:
 
 
 def pendulum(quick: bool) -> Findings:
-    """Returns and successes of downward starts on other pendulums, with and without the worst disturbance."""
+    """Returns and successes of downward starts on altered pendulums, with and without the worst disturbance."""
     case, seeds, plant = "equation/robust", 1 if quick else 3, PLANTS["pendulum"]()
     x, rows = starts(plant, "down", 20 if quick else 100), []
     for name, share in (("trusting", 0.0), ("robust", SHARE)):
@@ -41,7 +41,7 @@ def pendulum(quick: bool) -> Findings:
 
 
 def trained(problem: ControlProblem, share: float, seed: int, quick: bool) -> Law:
-    """The law of a value from the equation, against the worst disturbance that moves mass and length by a share."""
+    """Trains a value against the worst disturbance of mass and length by a share, and returns its policy."""
     network = value_network(problem, widths=(8, 8) if quick else (16, 16), scale=30.0)
     of_parameters, of_samples = jax.random.split(jax.random.key(seed))
     fit = fit_residual(
@@ -53,7 +53,7 @@ def trained(problem: ControlProblem, share: float, seed: int, quick: bool) -> La
 
 
 def moved(problem: ControlProblem, factors: tuple[float, float]) -> ControlProblem:
-    """The problem of a pendulum with other mass and length."""
+    """The problem of a pendulum with mass and length multiplied by these factors."""
     p = jnp.asarray(factors)
     return problem._replace(
         drift=lambda x: rod(x, jnp.zeros(1), p), actuation=lambda x: jnp.array([[0.0], [3 / (p[0] * p[1] ** 2)]])
@@ -61,7 +61,7 @@ def moved(problem: ControlProblem, factors: tuple[float, float]) -> ControlProbl
 
 
 def rows_of_returns(case: str, name: str, found: list[Returns]) -> list[Row]:
-    """Over the seeds."""
+    """Median return and worst success share over the seeds."""
     return [
         Row(case, f"{name}_return_median", float(np.median([np.mean(run.returns) for run in found]))),
         Row(case, f"{name}_up_share_worst", float(min(np.mean(np.isfinite(run.settled)) for run in found))),

@@ -1,8 +1,8 @@
-"""Costs to go by direct optimisation from single states: what a value is measured against where no grid is fine enough.
+"""Costs to go by direct optimisation from single states, as a reference where no grid is fine enough.
 
-Controls are held for steps of a horizon, and after it the cost is that of the linear-quadratic regulator at the goal,
-with the discount: A - rho/2 in place of A. Several guesses are improved, and the least cost is kept, which bounds V
-from above and is V where one of the guesses leads to the best trajectory.
+Controls are constant over the steps of a horizon. After it the cost is that of the linear-quadratic regulator at the
+goal with discount: A - rho/2 in place of A. Several guesses are improved and the lowest cost is kept. It bounds V from
+above, and equals V if one of the guesses leads to the best trajectory.
 """
 
 import math
@@ -23,7 +23,7 @@ from dln_jax.types import Scalar
 
 
 def regulator_value(problem: ControlProblem) -> Callable[[Array], Scalar]:
-    """x -> V of the problem's second order at its goal, angles the short way round."""
+    """x -> V of the linear-quadratic approximation at the goal, with wrapped angle errors."""
     goal = jnp.asarray(problem.goal)
     B = problem.actuation(goal)
     A = jax.jacfwd(problem.drift)(goal) - 0.5 * problem.discount * jnp.eye(len(goal))
@@ -49,18 +49,18 @@ def direct_values(
     iterations: int = 60,
     tolerance: float = 1e-7,
 ) -> Float[np.ndarray, "G N"]:
-    """Costs from states x [N, n], of each guess, of problems with one control.
+    """Optimised costs from states x [N, n] by guess, for problems with one control.
 
-    The integral of the state's cost is by the trapezoidal rule, whose error, as that of held controls, is of dt².
+    The trapezoidal rule integrates the state's cost; its error, like that of constant controls, is of order dt².
 
     Args:
-        problem: what is controlled.
-        x: the starts.
+        problem: control problem.
+        x: initial states.
         guesses: controls [G, N, K] of the horizon's K steps.
-        limit: of the control.
-        dt: s, of a step.
-        iterations: of the optimisation, at most.
-        tolerance: relative change of the cost at which it ends.
+        limit: limit of the control.
+        dt: length of a step, s.
+        iterations: maximum number of iterations.
+        tolerance: relative change of the cost at which the optimisation ends.
     """
     move, tail = flow(problem, dt), regulator_value(problem)
     discount, half = math.exp(-problem.discount * dt), math.exp(-problem.discount * dt / 2)
@@ -80,7 +80,7 @@ def direct_values(
         plan = optimise(planned, jnp.append(x, 1.0), u[:, None], iterations=iterations, tolerance=tolerance)
         return plan.cost - 0.5 * dt * problem.state_cost(x)
 
-    # One guess after the other: a batch takes as long as its slowest.
+    # One guess after the other: a batch takes as long as its slowest member.
     of_all = jax.jit(jax.vmap(best))
     return np.stack([of_all(jnp.asarray(x, float), jnp.asarray(u, float)) for u in guesses])
 
@@ -88,7 +88,7 @@ def direct_values(
 def followed(
     problem: ControlProblem, law: Callable[[Array], Array], x: Any, *, dt: float, steps: int
 ) -> Float[np.ndarray, "N K"]:
-    """The controls of a law of one control from states x [N, n], as guesses."""
+    """The controls of a policy with one control along its trajectories from states x [N, n], as guesses."""
     move = flow(problem, dt)
 
     def step(x: Array, _: Any) -> tuple[Array, Array]:
