@@ -30,14 +30,21 @@ MINUTES, TIMEOUTS = 60, 20
 def here(at_once: int, gpus: int) -> Iterator[Submit]:
     """Runs jobs as processes of this machine.
 
-    A process gets its share of the cores as XLA threads, one BLAS thread, and one GPU or none. Variables that the user
-    has set keep their values, except CUDA_VISIBLE_DEVICES.
+    A process gets its share of the cores as XLA threads, one BLAS thread, and one GPU or none, of those that the user's
+    CUDA_VISIBLE_DEVICES names. Other variables that the user has set keep their values.
+
+    Raises:
+        InputError: CUDA_VISIBLE_DEVICES names fewer GPUs.
     """
     running: list[Popen] = []
     ending = threading.Event()
     free = queue.SimpleQueue[str]()
-    for gpu in range(gpus):
-        free.put(str(gpu))
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = visible.split(",") if visible else [str(number) for number in range(gpus)]
+    if len(names) < gpus:
+        raise InputError(f"--gpus is {gpus}, but CUDA_VISIBLE_DEVICES names {len(names)} of them: {visible}")
+    for name in names[:gpus]:
+        free.put(name)
     shares = {"OPENBLAS_NUM_THREADS": "1", "NPROC": str(max(1, cores() // at_once))}
 
     def started(process: Popen) -> None:

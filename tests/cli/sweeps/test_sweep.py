@@ -23,6 +23,7 @@ from dln_jax.data import schema
 from dln_jax.figures.sweeps import Point, error_against_seconds
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.registry import scene_named
+from dln_jax.types import InputError
 
 WIDTHS = {"2": 3e-3, "4": 1e-4, "8": 2e-4}
 """Validation errors of pretended trainings; seeds add to them."""
@@ -228,6 +229,28 @@ def test_an_interrupt_ends_the_processes_of_this_machine(tmp_path):
         raise KeyboardInterrupt
     assert futures[0].done() and futures[1].cancelled()
     assert status_of(jobs[0].folder)[:2] == ("killed", "interrupted") and not jobs[1].folder.exists()
+
+
+@pytest.mark.parametrize(("visible", "expected"), [("2,5,7", {"2", "5"}), (None, {"0", "1"})])
+def test_jobs_get_the_gpus_that_the_user_has_made_visible(visible, expected, monkeypatch, tmp_path):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    together, seen = threading.Barrier(2, timeout=60), set()
+
+    class Waiting(Job):
+        def __call__(self, environment, started=None):
+            seen.add(environment["CUDA_VISIBLE_DEVICES"])
+            together.wait()  # both run at once, each with a GPU of its own
+
+    jobs = [Waiting(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
+    with here(2, 2) as submit:
+        for future in submit(jobs):
+            future.result()
+    assert seen == expected
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    with pytest.raises(InputError, match="names 1 of them: 3"), here(2, 2):
+        pass
 
 
 MISTAKES = [
