@@ -9,6 +9,8 @@ from pathlib import Path
 
 # As in the scripts: small factorisations on several threads burn the processor waiting for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Its own configuration closes all handlers of logging, those of pytest's captures too.
+os.environ.setdefault("SUBMITIT_LOG_LEVEL", "NOCONFIG")
 
 import jax
 import jaxlib
