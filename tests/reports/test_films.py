@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from calls import command
+from calls import command, refused
 
 from scripts.reports.commands import film_strip
 from scripts.reports.films import sampled
@@ -11,6 +11,12 @@ from scripts.reports.films import sampled
 def test_samples_begin_and_end_with_the_motion():
     motion = np.arange(101.0)
     assert sampled(motion, 5).tolist() == [0.0, 25.0, 50.0, 75.0, 100.0]
+
+
+@pytest.mark.parametrize("option", ["--frames", "--frames-per-second"])
+def test_a_strip_without_frames_is_refused(option, capsys, tmp_path):
+    assert "expected a positive number" in refused(capsys, film_strip, option, "0", "--out", tmp_path / "strip")
+    assert not (tmp_path / "strip").exists()
 
 
 @pytest.mark.slow

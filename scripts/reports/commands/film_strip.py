@@ -12,6 +12,7 @@ from dln_jax.cli.options import Folder
 from dln_jax.cli.running import command_folder
 from dln_jax.figures import style
 from dln_jax.figures.animations import DPI, write_gif
+from dln_jax.types import require_positive
 from scripts.reports.films import FILMS
 
 
@@ -27,6 +28,7 @@ class Arguments(Folder):
 
 def main(given: Arguments) -> None:
     """Makes the films, draws and writes them."""
+    require_positive(frames=given.frames, frames_per_second=given.frames_per_second)
     jax.config.update("jax_enable_x64", True)
     with command_folder(given, "film_strip") as folder:
         films = {}
