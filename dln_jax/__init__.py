@@ -4,81 +4,32 @@ This module gathers the most used names; every package has its own `__all__`. Fu
 tau` of shape [d], SI units): `jax.vmap` them over samples. The documentation has a page for every concept.
 """
 
+import importlib
 import importlib.metadata
+from typing import TYPE_CHECKING, Any
 
 import dln_jax.interrupts
 import dln_jax.time_limit  # noqa: F401  first, as its import starts the clock
-from dln_jax.data.robots import Robot, read_robot
-from dln_jax.data.schema import Trajectories
-from dln_jax.data.schema import load as load_trajectories
-from dln_jax.data.schema import save as save_trajectories
-from dln_jax.export.c.load import load_c
-from dln_jax.export.c.source import export_c
-from dln_jax.export.low_latency import enable_low_latency, low_latency
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import Adam, GaussNewton
-from dln_jax.learning.engine.problem import Problem, Training
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
-from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.hamiltonian import HamiltonianSystem
-from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
-from dln_jax.mechanics.recursive import RecursiveSystem
-from dln_jax.mechanics.trees import Tree, tree_system
-from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.model import Model
-from dln_jax.types import InputError, Needs
-from dln_jax.zoo.descriptions import build, describe
-from dln_jax.zoo.run import Run, load
-from dln_jax.zoo.run import save_model as save
 
-__version__ = importlib.metadata.version("dln-jax")
+if TYPE_CHECKING:
+    from dln_jax.public import *  # noqa: F403
 
-__all__ = [
-    "Adam",
-    "ClosedForm",
-    "Decomposition",
-    "Dynamics",
-    "Flow",
-    "GaussNewton",
-    "HamiltonianSystem",
-    "InputError",
-    "InverseForward",
-    "LagrangianSystem",
-    "Model",
-    "NaturalHamiltonian",
-    "NaturalSystem",
-    "Needs",
-    "PhaseRates",
-    "PlainDynamics",
-    "PlainFlow",
-    "Problem",
-    "RecursiveSystem",
-    "Robot",
-    "Run",
-    "Training",
-    "Trajectories",
-    "Tree",
-    "__version__",
-    "build",
-    "describe",
-    "dynamics",
-    "enable_low_latency",
-    "export_c",
-    "fit",
-    "flow",
-    "joint_dissipation",
-    "load",
-    "load_c",
-    "load_trajectories",
-    "low_latency",
-    "make_delan",
-    "read_robot",
-    "save",
-    "save_trajectories",
-    "tree_system",
-]
+
+def __getattr__(name: str) -> Any:
+    """Imports the public names, and JAX with them, at first use: the help of a command needs neither."""
+    if name == "__version__":
+        return importlib.metadata.version("dln-jax")
+    if name.startswith("__") and name != "__all__":
+        raise AttributeError(f"module 'dln_jax' has no attribute {name!r}")
+    public = importlib.import_module("dln_jax.public")
+    if name == "__all__":
+        return [*public.__all__, "__version__"]
+    if name in public.__all__:
+        return getattr(public, name)
+    if name in globals():  # a subpackage, which the import above has loaded
+        return globals()[name]
+    raise AttributeError(f"module 'dln_jax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__getattr__("__all__")})

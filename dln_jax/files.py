@@ -7,10 +7,11 @@ import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import NoneType
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Any
 
-from dln_jax.types import InputError
+import msgspec
+
+from dln_jax.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,7 +86,7 @@ def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
     if not is_file(path):
         raise InputError(f"{path}: no such file; {remedy}")
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = msgspec.json.decode(path.read_bytes())
     except (ValueError, OSError, RecursionError) as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise InputError(f"{path}: not readable as JSON ({reason}); {remedy}") from error
@@ -94,27 +95,31 @@ def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
     return values
 
 
-def matches(value: Any, hint: Any) -> bool:
-    """Whether a JSON value has a type: bool, int, float (finite), str, Path (a str), None, Literal or a union."""
-    if get_origin(hint) is Literal:
-        return any(type(value) is type(each) and value == each for each in get_args(hint))
-    if options := get_args(hint):
-        return any(matches(value, option) for option in options)
-    if isinstance(value, int) and not isinstance(value, bool):
-        return hint in (int, float) and abs(value) < 2**63
-    if isinstance(value, float):
-        return hint is float and math.isfinite(value)
-    return isinstance(value, str) if hint is Path else type(value) is (NoneType if hint is None else hint)
+def matches(value: Any, kind: Any) -> bool:
+    """Whether a JSON value has a type."""
+    try:
+        as_type(value, kind, name="", remedy="")
+    except InputError:
+        return False
+    return not (isinstance(value, float) and not math.isfinite(value))
 
 
-def in_words(hint: Any) -> str:
-    """Describes a type of `matches` for a message: "a whole number", "one of a, b, or null"."""
-    if get_origin(hint) is Literal:
-        return f"one of {', '.join(map(str, get_args(hint)))}"
-    if options := get_args(hint):
-        return ", or ".join(in_words(option) for option in options)
-    names = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text", Path: "a path"}
-    return names.get(hint, "null")
+def as_type(values: Any, kind: Any, *, name: str, remedy: str) -> Any:
+    """Converts JSON values to a dataclass, a NamedTuple or any other type; a path is text.
+
+    Raises:
+        InputError: a value does not fit the type; the message starts with `name` and ends with `remedy`.
+    """
+    try:
+        return msgspec.convert(values, kind, dec_hook=_decoded)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{name}: {error}; {remedy}") from None
+
+
+def _decoded(kind: type, value: Any) -> Any:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise ValueError(f"Expected `{kind.__name__}`, got `{type(value).__name__}`")
 
 
 def cache_folder() -> Path:

@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from dln_jax.types import InputError
+from dln_jax.errors import InputError
 
 MOST: dict[str, int] = {
     "batch": 10_000_000,

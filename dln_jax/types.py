@@ -24,6 +24,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from dln_jax.errors import InputError as InputError
+
 Scalar = Float[Array, ""]
 Vector = Float[Array, "d"]
 Matrix = Float[Array, "d d"]
@@ -47,10 +49,6 @@ FrictionLaw = Literal["viscous", "coulomb", "stribeck", "offset", "asymmetric", 
 """Laws of friction in a joint; `mechanics.friction` has their formulas."""
 ResidualTerm = Literal["potential", "dissipation", "inertia"]
 """Energies that a residual may have; `mechanics.residual` states what they explain."""
-
-
-class InputError(ValueError):
-    """Invalid user input; the message states what was wrong, what was expected and what to do."""
 
 
 def require_positive(**numbers: int | float) -> None:

@@ -1,20 +1,17 @@
-"""Typed command lines: help texts, and mistakes reported in one line."""
+"""Typed command lines: options that belong to a choice, help texts, and mistakes reported in one line."""
 
-import contextlib
 import dataclasses
-import inspect
-import io
 import math
-import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import NoneType
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args
 
 import tyro
+from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErrorEvent, on_parse_error
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from dln_jax.errors import InputError
 from dln_jax.sizes import require_magnitude
-from dln_jax.types import InputError, require_positive
 
 T = TypeVar("T")
 Arguments = TypeVar("Arguments")
@@ -22,14 +19,30 @@ Arguments = TypeVar("Arguments")
 Unstated = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
 """An option that is `None` by default; its help text states the effective default."""
 
-UNREADABLE = {
-    r"Error parsing (--\S+): invalid literal for int\(\) with base 10: (.*)": "a whole number",
-    r"Error parsing (--\S+): Exceeds the limit \(\d+ digits\)()[^']*": "a whole number of fewer than 4,300 digits",
-    r"Error parsing (--\S+): could not convert string to float: (.*)": "a number",
-}
-"""Python's conversion errors (groups: the option and its text), and the value that the option expects."""
-
 _rules = ConstructorRegistry()
+
+
+@_rules.primitive_rule
+def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Reads int and float, and says what was expected in the words of every other message."""
+    kinds = {int: "a whole number of fewer than 4,300 digits", float: "a number"}
+    if info.type not in kinds:
+        return None
+    kind, wanted = info.type, kinds[info.type]
+
+    def read(words: list[str]) -> Any:
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"must be {wanted}; got {words[0]!r:.60}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, int | kind) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 @_rules.primitive_rule
@@ -59,79 +72,147 @@ def choice(names: Iterable[str], *, several: bool = False, unstated: bool = Fals
     )
 
 
+class Variants(NamedTuple):
+    """Options that exist for some choices of a command only, such as those of one model: its attribute `VARIANTS`."""
+
+    chosen: Callable[[Mapping[str, Any]], Sequence[type]]
+    """Options that were typed or stored, by name -> dataclasses of further options that they bring."""
+    known: Mapping[type, str]
+    """For each of these dataclasses the options that bring it, in words."""
+
+
+def arguments_for(arguments: type, stated: Mapping[str, Any]) -> type:
+    """The dataclass of a command's options for the choices among them; `stated` is what was typed or stored."""
+    variants: Variants | None = getattr(arguments, "VARIANTS", None)
+    if variants is None:
+        return arguments
+    defaults = {field.name: field.default for field in dataclasses.fields(arguments)}
+    return class_with(arguments, variants.chosen({**defaults, **stated}))
+
+
+def class_with(arguments: type, more: Sequence[type]) -> type:
+    """A dataclass with the fields of `arguments` and of further dataclasses."""
+    documented = {"__doc__": arguments.__doc__}
+    return dataclasses.make_dataclass(
+        arguments.__name__, [], bases=(*more, arguments), frozen=True, namespace=documented
+    )
+
+
+def arguments_of(arguments: type, **stated: Any) -> Any:
+    """A command's options as Python values, as typed on its command line.
+
+    Raises:
+        InputError: an option that the command does not read for these choices.
+    """
+    whole = arguments_for(arguments, stated)
+    names = {field.name for field in dataclasses.fields(whole)}
+    for name in stated:
+        if name not in names:
+            raise InputError(_unknown(f"--{name.replace('_', '-')}", arguments))
+    return whole(**stated)
+
+
 def parse(
-    arguments: type[Arguments], *, prog: str, description: str | None, line: Sequence[str] | None = None
-) -> Arguments:
-    """Parses a command line, by default that of this process; `--help` prints the help and exits.
+    arguments: type, *, prog: str, description: str | None, line: Sequence[str], common: type | None = None
+) -> Any:
+    """Parses a command line; `--help` prints the help and exits.
+
+    Args:
+        arguments: dataclass of the command.
+        prog: the command as the user typed it.
+        description: text above the options.
+        line: words after the command.
+        common: dataclass of options that every command has.
 
     Raises:
         InputError: the line cannot be parsed.
     """
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            return tyro.cli(arguments, prog=prog, description=description, args=line, registry=_rules)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise InputError(f"{_complaint(said.getvalue())} (see {prog} --help)") from None
+    whole = arguments_for(arguments, _typed(line))
+
+    def refuse(event: ParseErrorEvent) -> None:
+        raise InputError(f"{_complaint(event, arguments)} (see {prog} --help)")
+
+    fields: list[Any] = [("own", Annotated[whole, tyro.conf.arg(name="")])]
+    if common is not None:
+        fields.append(("common", Annotated[common, tyro.conf.arg(name="")]))
+    both = dataclasses.make_dataclass("Whole", fields)
+    with on_parse_error(refuse):
+        return tyro.cli(both, prog=prog, description=description, args=line, registry=_rules)
 
 
-def own_first(arguments: type[Arguments]) -> type[Arguments]:
-    """Reorders a dataclass's fields for the help: its own first (a dataclass puts inherited fields first)."""
-    fields = arguments.__dataclass_fields__  # type: ignore[attr-defined]
-    names = [name for base in arguments.__mro__ for name in inspect.get_annotations(base) if name in fields]
-    arguments.__dataclass_fields__ = {name: fields[name] for name in names}  # type: ignore[attr-defined]
-    return arguments
+def _typed(line: Sequence[str]) -> dict[str, Any]:
+    """The options on a command line with their text; those without a value are `True`."""
+    typed: dict[str, Any] = {}
+    for word, following in zip(line, [*line[1:], "--"], strict=True):
+        if word.startswith("--"):
+            option, equals, text = word[2:].partition("=")
+            typed[option.replace("-", "_")] = text if equals else following if following[:2] != "--" else True
+    return typed
+
+
+def _complaint(event: ParseErrorEvent, arguments: type) -> str:
+    """One line about a word that could not be parsed."""
+    argument = getattr(event, "argument", None)
+    option = argument.lowered.name_or_flags[-1] if argument is not None else ""
+    match event:
+        case InvalidChoice():
+            return f"{option} is {event.value!r:.60}; choose from {', '.join(event.choices)}"
+        case InstantiationFailure():
+            return f"{option} {event.message}"
+        case BadValue():
+            return f"{option} lacks a value" if event.offending_value is None else f"{option} takes no value"
+    if tokens := getattr(event, "tokens", []):
+        return _unknown(next((token for token in tokens if token.startswith("--")), tokens[0]), arguments)
+    missing = [context.arg.lowered.name_or_flags[-1] for context in getattr(event, "missing_arguments", [])]
+    return f"{', '.join(missing)} must be given" if missing else "the options contradict each other"
+
+
+def _unknown(option: str, arguments: type) -> str:
+    """Says what an option needs that exists for other choices of the command only."""
+    name, known = option.lstrip("-").partition("=")[0].replace("-", "_"), {}
+    if (variants := getattr(arguments, "VARIANTS", None)) is not None:
+        known = variants.known
+    for negated in (name, name.removeprefix("no_")):
+        for kind, words in known.items():
+            if negated in {field.name for field in dataclasses.fields(kind)}:
+                return f"{option} is an option of {words}; add that, or leave {option} out"
+    return f"unrecognised option: {option:.80}"
 
 
 def names_listed(text: str | None) -> tuple[str, ...]:
     """Splits the comma-separated names of an option such as --lock; empty if the option was not set."""
-    return tuple(name for each in (text or "").split(",") if (name := each.strip()))
+    return tuple(stripped for name in (text or "").split(",") if (stripped := name.strip()))
 
 
-def refuse_given(given: Any, names: Iterable[str], why: str) -> None:
-    """Raises `InputError` for the first of these options that was set, for example "--batch is for adam: ..."."""
+def refuse_given(options: Any, names: Iterable[str], why: str) -> None:
+    """Raises `InputError` for the first of these options that was set."""
     for name in names:
-        if getattr(given, name) is not None:
+        if getattr(options, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} is {why}; leave it out")
 
 
-def require_positive_if_given(given: Any, names: Iterable[str]) -> None:
+def require_positive_if_given(options: Any, names: Iterable[str]) -> None:
     """Raises `InputError` for the first of these options that is set but not positive."""
-    require_positive(**{name: getattr(given, name) for name in names if getattr(given, name) is not None})
+    for name in names:
+        value = getattr(options, name, None)
+        if value is not None and not value > 0:
+            raise InputError(f"{name} is {value}; expected a positive number")
 
 
-def resolved(given: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
+def resolved(options: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
     """The options named in `defaults`, with unset ones replaced by their defaults."""
-    stated = {name: getattr(given, name) for name in defaults}
+    stated = {name: getattr(options, name) for name in defaults}
     return {name: defaults[name] if value is None else value for name, value in stated.items()}
 
 
-def names_in(option: str, given: str, known: Iterable[str]) -> list[str]:
+def names_in(option: str, text: str, known: Iterable[str]) -> list[str]:
     """Splits a comma-separated list of names; `InputError` lists the known names if one is unknown or none is named."""
-    names = [name.strip() for name in given.split(",") if name.strip()]
+    names = list(names_listed(text))
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"{option}: '{unknown[0]}' is unknown; choose from {', '.join(known)}")
     if not names:
         raise InputError(f"{option} names nothing; choose from {', '.join(known)}")
     return names
-
-
-def _complaint(box: str) -> str:
-    """Extracts the error from tyro's text box as one line: the first section below the title.
-
-    A rule separates the title from the section where the box is drawn in ASCII.
-    """
-    framed = "│" in box
-    lines = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
-    sections = re.split(r"\n[─-]{4,}\n", "\n".join(lines))
-    section = sections[0] if framed else sections[min(1, len(sections) - 1)]
-    said = " ".join(section.split()).rstrip(".")
-    for pattern, wanted in UNREADABLE.items():
-        if found := re.fullmatch(pattern, said):
-            return f"{found[1]} must be {wanted}" + (f"; got {found[2]:.60}" if found[2] else "")
-    return said
 
 
 def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive: bool = False) -> tuple[float, ...]:
@@ -147,7 +228,7 @@ def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive
         InputError: wrong count, text that is not a number, or a number out of range.
     """
     try:
-        numbers = tuple(float(each) for each in text.split(","))
+        numbers = tuple(map(float, text.split(",")))
     except ValueError:
         numbers = ()
     right = numbers and (not counts or len(numbers) in counts) and all(map(math.isfinite, numbers))

@@ -32,6 +32,11 @@ class Compilation(NamedTuple):
     """Number of programs that came from the cache."""
 
 
+def enable_double_precision() -> None:
+    """Turns on float64, in which commands hold data and references."""
+    jax.config.update("jax_enable_x64", True)
+
+
 def keep(wanted: bool) -> str:
     """Turns the cache on or off. Returns the reason if it cannot be turned on, else an empty string.
 

@@ -1,9 +1,18 @@
-"""Options shared by several commands. A command inherits the ones it takes; its help shows its own options first."""
+"""Options shared by several commands; a command inherits those that it takes. Importing them does not import JAX."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
-from dln_jax.cli.arguments import Unstated
+from dln_jax.cli.arguments import Unstated, choice
+
+SCENES = (
+    *("two-link-arm", "two-link-arm-hanging", "pendulum", "double-pendulum", "cart-pole", "flexible-cart-pole"),
+    *("rotary-pendulum", "acrobot", "pendubot", "mass-spring", "henon-heiles", "two-body", "three-body"),
+    *(f"chain-{d}" for d in range(1, 13)),
+)
+"""Names of `scenes.registry`, which imports JAX."""
+SceneName = Annotated[str, choice(SCENES)]
 
 
 @dataclass(frozen=True)
@@ -11,7 +20,7 @@ class Folder:
     """Where the results go."""
 
     out: Unstated[Path] = None
-    """Folder of the results (default: runs/NAME-1, -2, ..., for a command NAME)."""
+    """Folder of the results (default: runs/NAME-1, -2, ...)."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +28,7 @@ class Resumable(Folder):
     """Where the results go, and whether to resume a run there."""
 
     resume: bool = False
-    """Continue what is in --out with the settings it was started with."""
+    """Continue the run in --out with its settings."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +44,7 @@ class Limited:
     """Time limit until the model is stored."""
 
     seconds: Unstated[float] = None
-    """Seconds from the start of the command until the model is stored (default: no limit). Reading the data, choosing a
-    model, compiling and fitting count; the evaluation, timings and figures that follow do not. The best parameters so
-    far are kept. Every fit does at least one dispatch of iterations, which may pass the limit. With --resume the
-    seconds count anew, and another number may be given."""
+    """Time until the model is stored, s, evaluation not counted (default: no limit)."""
 
 
 @dataclass(frozen=True)
@@ -46,20 +52,68 @@ class SingleCalls:
     """How to time single calls of a model."""
 
     low_latency: bool = True
-    """Time single calls also in low-latency mode, in a process of its own (about 2 s)."""
+    """Time single calls in low-latency mode, too."""
 
 
 @dataclass(frozen=True)
-class Scaled:
-    """Devices and processes that share the work."""
+class Devices:
+    """Devices of one process that share the work."""
 
     devices: Unstated[int] = None
-    """Devices of every process that share the batches (default: 1 of one process, of several all that each sees). A
-    processor makes any number, whose work then goes side by side."""
+    """Devices per process (default: 1; of several processes all)."""
+
+
+@dataclass(frozen=True)
+class Scaled(Devices):
+    """Devices and processes that share the work."""
+
     processes: Unstated[int] = None
-    """Processes, on one host or several, that are one run: start the same command in each, with --coordinator and
-    --process-id (default: the tasks of srun or mpirun, else 1)."""
+    """Processes of this run (default: tasks of srun or mpirun, else 1)."""
     coordinator: Unstated[str] = None
-    """host:port of process 0, with a free port, which all processes can reach."""
+    """host:port of process 0."""
     process_id: Unstated[int] = None
-    """Which of --processes this one is, from 0; 0 prints and writes the results."""
+    """Number of this process, from 0."""
+
+
+@dataclass(frozen=True)
+class Logged:
+    """Facts that a log does not state."""
+
+    rate: Unstated[float] = None
+    """Sampling rate of a file without t, Hz."""
+    units: Unstated[Literal["si", "degrees"]] = None
+    """CSV: units of columns whose titles state none."""
+
+
+@dataclass(frozen=True)
+class Checked(Logged):
+    """How to treat a log with errors."""
+
+    accept_log: bool = False
+    """Go on although the check of the log found errors."""
+
+
+@dataclass(frozen=True)
+class Filtered(Checked):
+    """How to derive rates where a log has no reliable ones."""
+
+    cutoff: Unstated[str] = None
+    """Low-pass q at this frequency, Hz, or auto, and derive the rates (default: the file's)."""
+    decimate: Unstated[int] = None
+    """With --cutoff: keep every n-th sample (default: 1)."""
+
+
+@dataclass(frozen=True)
+class CompilationCache:
+    """The option of all commands."""
+
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache (at most 512 MiB)."""
+
+
+@dataclass(frozen=True)
+class NoCompilationCache(CompilationCache):
+    """The option of commands that measure compilation."""
+
+    compilation_cache: bool = False
+    """Keep compiled programs for the next command; off where compilation is measured."""

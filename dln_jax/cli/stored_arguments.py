@@ -1,15 +1,17 @@
-"""Arguments of a run: stored in its folder and restored by --resume."""
+"""The run folder of a command, with its arguments: stored in config.json and restored by --resume."""
 
+import contextlib
 import dataclasses
 import hashlib
-import reprlib
-from collections.abc import Collection, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args, get_type_hints
+from typing import Any
 
-from dln_jax.files import in_words, is_file, matches, read_json, write_json
-from dln_jax.types import InputError
-from dln_jax.zoo.run_folder import CONFIG
+from dln_jax.cli.arguments import arguments_for
+from dln_jax.cli.scaled import copied_folder, is_first, wait_for_all
+from dln_jax.errors import InputError
+from dln_jax.files import as_type, is_file, read_json, write_json
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 CHOSEN = "chosen"
 """Key in config.json of values derived from the arguments."""
@@ -21,58 +23,60 @@ PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
 """Arguments that do not affect the result."""
 CHANGEABLE = ("seconds",)
 """Arguments that may change with --resume; a class of arguments may list more in its own `CHANGEABLE`."""
+REMEDY = "restore the file, or train again into another folder"
 
-Arguments = TypeVar("Arguments")
 
-
-def write_config(folder: Path, given: Any, **chosen: Any) -> None:
+def write_config(folder: Path, options: Any, **chosen: Any) -> None:
     """Writes config.json: the arguments of a run, the values `chosen` from them, and digests of the input files."""
-    files = fingerprints(stored_files(given))
+    files = fingerprints(stored_files(options))
     more = {CHOSEN: chosen} if chosen else {}
-    write_json(folder / CONFIG, {**stored_arguments(given), **more, **({FILES: files} if files else {})})
+    write_json(folder / CONFIG, {**stored_arguments(options), **more, **({FILES: files} if files else {})})
 
 
-def stored_arguments(given: Any) -> dict[str, Any]:
+def stored_arguments(options: Any) -> dict[str, Any]:
     """The arguments that affect the result, as JSON values."""
-    values = dataclasses.asdict(given)
+    values = dataclasses.asdict(options)
     return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if key not in PLACES}
 
 
-def stored_files(given: Any) -> dict[str, Path]:
+def stored_files(options: Any) -> dict[str, Path]:
     """The input files that affect the result, by argument name."""
-    values = dataclasses.asdict(given)
+    values = dataclasses.asdict(options)
     return {key: v for key, v in values.items() if isinstance(v, Path) and key not in PLACES and is_file(v)}
 
 
 def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
     """SHA-256 digests of files; a resumed run recognises its files by them, even if they have moved."""
-    found = {}
+    digests = {}
     for name, path in files.items():
         with path.open("rb") as file:
-            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
-    return found
+            digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digests
 
 
-def with_stored_arguments(given: Arguments) -> Arguments:
+def with_stored_arguments(typed: Any, arguments: type) -> Any:
     """Restores the arguments of the run in --out; arguments on the command line must not contradict them.
 
     A file may have moved, if its content is the same.
 
+    Args:
+        typed: arguments on the command line.
+        arguments: dataclass of the command, whose choices in the run decide which options exist.
+
     Raises:
         InputError: --out holds no run, its arguments or files differ, or its config.json is damaged.
     """
-    folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
+    folder = typed.out
     if folder is None or not is_file(folder / CONFIG):
         raise InputError(f"--resume continues the run in --out, but {folder or '--out'} holds none; name its folder")
-    unset = stored_arguments(type(given)())
-    stored = checked_arguments(folder / CONFIG, type(given), unset)
-    changeable = (*CHANGEABLE, *getattr(type(given), "CHANGEABLE", ()))
-    known = read_json(folder / CONFIG, remedy="restore it").get(FILES)
-    known = known if isinstance(known, dict) else {}
-    anew = stored_files(given)
-    for key, digest in known.items():
-        path = anew.get(key, Path(str(stored.get(key))))
-        option = f"--{key.replace('_', '-')}"
+    values = read_json(folder / CONFIG, remedy=REMEDY)
+    stored = checked_arguments(folder / CONFIG, values, arguments)
+    changes, changeable = {}, (*CHANGEABLE, *getattr(arguments, "CHANGEABLE", ()))
+    unset, mine = dataclasses.asdict(type(typed)()), dataclasses.asdict(stored)
+    digests = values.get(FILES)
+    for key, digest in (digests if isinstance(digests, dict) else {}).items():
+        moved = stored_files(typed).get(key)
+        path, option = moved or Path(str(values.get(key))), f"--{key.replace('_', '-')}"
         if not is_file(path):
             raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
         if fingerprints({key: path})[key] != digest:
@@ -80,37 +84,47 @@ def with_stored_arguments(given: Arguments) -> Arguments:
                 f"the run in {folder} was started with other data than {path} has now (SHA-256); give the file it was "
                 f"started with by {option}"
             )
-        stored[key] = str(path)
-    for key, value in stored_arguments(given).items():
-        if key not in changeable and value not in (stored[key], unset[key]):
+        changes[key] = path
+    for key, value in dataclasses.asdict(typed).items():
+        if value == unset[key] or key in changes:
+            continue
+        if key in PLACES or key in changeable:
+            changes[key] = value
+        elif key not in mine or value != mine[key]:
             option = key.replace("_", "-")
-            raise InputError(f"the run in {folder} was started with {key} = {stored[key]}; leave --{option} out")
-    hints = get_type_hints(type(given))
-    stored |= {key: getattr(given, key) for key in changeable if getattr(given, key, None) is not None}
-    for key, value in stored.items():
-        if isinstance(value, str) and Path in (hints[key], *get_args(hints[key])):
-            stored[key] = Path(value)
-    return dataclasses.replace(cast(Any, given), **stored)
+            raise InputError(f"the run in {folder} was started with {key} = {mine.get(key)}; leave --{option} out")
+    return dataclasses.replace(stored, **changes)
 
 
-def checked_arguments(path: Path, arguments: type, expected: Collection[str]) -> dict[str, Any]:
-    """Reads the arguments in a config.json and checks their types against the command's dataclass.
+def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
+    """The arguments of a command in a config.json.
 
     Raises:
         InputError: the file is damaged, or a release with other arguments wrote it.
     """
-    remedy = "restore the file, or train again into another folder"
-    stored = read_json(path, remedy=remedy)
-    for each in (CHOSEN, FILES):
-        stored.pop(each, None)
-    if absent := [key for key in expected if key not in stored]:
-        raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
-    hints = get_type_hints(arguments)
-    # An argument of another release that was left unset does not affect the result.
-    stored = {key: value for key, value in stored.items() if key in expected or value not in (None, False)}
-    for key, value in stored.items():
-        if key not in expected:
-            raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
-        if not matches(value, hints[key]):
-            raise InputError(f"{path}: {key} is {reprlib.repr(value)}; expected {in_words(hints[key])}; {remedy}")
-    return stored
+    values = {key: value for key, value in values.items() if key not in (CHOSEN, FILES)}
+    whole = arguments_for(arguments, values)
+    expected = stored_arguments(whole())
+    if absent := [key for key in expected if key not in values]:
+        raise InputError(f"{path}: {absent[0]} is missing; {REMEDY}")
+    for key, value in values.items():
+        # An argument of another release that was left unset does not affect the result.
+        if key not in expected and value not in (None, False):
+            raise InputError(f"{path}: {key!r:.40} is no argument of this release; {REMEDY}")
+    return as_type({key: values[key] for key in expected}, whole, name=str(path), remedy=REMEDY)
+
+
+@contextlib.contextmanager
+def command_folder(options: Any, command: str, **chosen: Any) -> Iterator[Path]:
+    """Yields the run folder of a command. config.json gets the arguments, and the values `chosen` from them."""
+    resume = getattr(options, "resume", False)
+    folder_of_run = (
+        run_folder(options.out, command, resume=resume, resumable=hasattr(options, "resume"))
+        if is_first(options)
+        else copied_folder(options, resume)
+    )
+    with folder_of_run as folder:
+        if resume:
+            wait_for_all(options)
+        write_config(folder, options, **chosen)
+        yield folder

@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.errors import FitRefused as FitRefused
 from dln_jax.types import InputError
 
 Level = Literal["good", "doubtful", "refused"]
@@ -73,14 +74,6 @@ class HeldOut(NamedTuple):
     def unit(self) -> Float[np.ndarray, " d"]:
         """Scale of the errors: the variance, or for a torque that does not vary the mean square of all."""
         return np.where(self.mean > CONSTANT * self.zero.mean(), self.mean, self.zero.mean())
-
-
-class FitRefused(Exception):
-    """A fit that must not be used. Its run folder is complete except files for a robot; commands end with status 1."""
-
-    def __init__(self, verdict: Verdict):
-        super().__init__(f"the fit is refused: {verdict.reason}; {verdict.remedy}")
-        self.verdict = verdict
 
 
 def held_out(

@@ -9,8 +9,8 @@ from typing import Any
 import jax
 from jax import Array
 
+from dln_jax.errors import InputError, ProcessLost
 from dln_jax.scale.meeting import Membership, address, meet
-from dln_jax.types import InputError
 
 HEARTBEAT = 10
 """Seconds without a heartbeat after which JAX treats a process as lost and ends the others."""
@@ -21,10 +21,6 @@ JOINING = 120
 _TASKS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 """Environment variables in which `srun` and `mpirun` state the number of their processes."""
 _OF_PEERS = re.compile(r"gloo|nccl|coordination|unavailable|deadline_exceeded", re.IGNORECASE)
-
-
-class ProcessLost(Exception):
-    """Another process of the program ended, or the connection to it was lost."""
 
 
 def host_devices(count: int | None) -> None:

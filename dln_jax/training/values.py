@@ -1,13 +1,13 @@
 """Trains value functions of published plants, and saves and loads their run folders."""
 
+import dataclasses
 import functools
 import itertools
-import reprlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal
 from dln_jax.control.optimal.residual import Stage, discounts_down_to, fit_residual
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
-from dln_jax.files import matches
+from dln_jax.files import as_type
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
@@ -41,7 +41,8 @@ Report = Callable[[int, int, str], None]
 """(iterations done, total iterations, result as text)."""
 
 
-class Family(NamedTuple):
+@dataclass(frozen=True)
+class Family:
     """Arguments of `value_network` other than the problem, as JSON values."""
 
     widths: tuple[int, ...]
@@ -49,6 +50,16 @@ class Family(NamedTuple):
     activation: str = "tanh"
     floor: float = 1e-3
     scale: float = 30.0
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What the manifest of a value function states."""
+
+    plant: str
+    goal: tuple[float, ...] | None
+    network: Family
+    dtype: Literal["float32", "float64"]
 
 
 class Trained(NamedTuple):
@@ -106,7 +117,7 @@ def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
 
 def family_of(plant: ValuePlant, family: Family) -> ValueNetwork:
     """The networks of a family for a plant."""
-    return value_network(plant.problem, **{**family._asdict(), "activation": activation(family.activation)})
+    return value_network(plant.problem, **{**dataclasses.asdict(family), "activation": activation(family.activation)})
 
 
 def usual(name: str, method: str) -> Fit:
@@ -191,7 +202,7 @@ def save_value(folder: Path, plant: str, goal: Sequence[float] | None, family: F
     facts = {
         "plant": OTHER_NAMES.get(plant, plant),
         "goal": None if goal is None else list(goal),
-        "network": {**family._asdict(), "widths": list(family.widths)},
+        "network": {**dataclasses.asdict(family), "widths": list(family.widths)},
         "dtype": str(jax.tree.leaves(parameters)[0].dtype),
     }
     save_tree(folder, VALUE, parameters, facts)
@@ -204,34 +215,17 @@ def load_value(folder: str | Path) -> ValueRun:
         InputError: there is none, or its files are damaged or of another release.
     """
     folder = Path(folder)
-    facts, path = load_manifest(folder, VALUE), folder / f"{VALUE}.json"
-    network, goal = facts.get("network"), facts.get("goal")
-    network = network if isinstance(network, dict) else {}
-    hints = {**get_type_hints(Family), "widths": tuple[int, ...]}
-    right = {
-        "plant": isinstance(facts.get("plant"), str),
-        "goal": goal is None or (isinstance(goal, list) and all(matches(each, float) for each in goal)),
-        "dtype": facts.get("dtype") in ("float32", "float64"),
-        "network": set(network) == set(hints) and all(_stated(network[name], hint) for name, hint in hints.items()),
-    }
-    if wrong := [name for name, each in right.items() if not each]:
-        raise InputError(f"{path}: {wrong[0]} is {reprlib.repr(facts.get(wrong[0]))}, which describes none; {REMEDY}")
+    path = folder / f"{VALUE}.json"
+    stored = as_type(load_manifest(folder, VALUE), Stored, name=str(path), remedy=REMEDY)
     try:
-        plant = plant_named(facts["plant"], goal)
-        network = family_of(plant, Family(**{**network, "widths": tuple(network["widths"])}))
+        plant = plant_named(stored.plant, stored.goal)
+        network = family_of(plant, Family(**dataclasses.asdict(stored.network)))
     except InputError as error:
         raise InputError(f"{path}: {error}; {REMEDY}") from None
-    dtype = jnp.dtype(facts["dtype"])
+    dtype = jnp.dtype(stored.dtype)
 
     def parameters(key: Array) -> Any:
         return jax.tree.map(lambda leaf: leaf.astype(dtype), network.init(key))
 
     like = jax.eval_shape(parameters, jax.random.key(0))
-    return ValueRun(facts["plant"], plant, network, load_tree(folder, VALUE, like))
-
-
-def _stated(value: Any, hint: Any) -> bool:
-    """Whether a JSON value is valid for a field of `Family`."""
-    if get_origin(hint) is tuple:
-        return isinstance(value, list) and all(matches(each, int) for each in value)
-    return matches(value, hint)
+    return ValueRun(stored.plant, plant, network, load_tree(folder, VALUE, like))

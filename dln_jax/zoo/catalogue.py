@@ -4,7 +4,6 @@ A name is the same on command lines, in files, in tables and beside published nu
 `Properties`, never on the spelling of a name.
 """
 
-import inspect
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -29,7 +28,7 @@ from dln_jax.models.networks import Scale
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.residual import make_residual, make_with_residual
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.rigid_tree import Number, make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
@@ -65,74 +64,93 @@ class Entry(NamedTuple):
     properties: Properties
     sizes: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """Keywords that are typical sizes, and the arrays of `Trajectories` whose standard deviation sets each."""
+    additions: tuple[Callable[..., Model], ...] = ()
+    """Terms that are added to the factory's model, the last one first. Each is a function of `make`, which makes the
+    model for other needs, of `needs`, and of keywords of its own."""
 
 
-def extending(make: Callable[..., Model], *replaced: str) -> Callable[[Callable[..., Model]], Callable[..., Model]]:
-    """Gives a factory that passes its `**keywords` on to `make` the signature of both, without the replaced ones.
+def friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
+    """Adds the friction laws that the needs name."""
+    return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=False, dtype=dtype)
 
-    A description stores every keyword in the signature of its factory.
+
+def linear_friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
+    """Adds the friction laws that the needs name to a model that is linear in its parameters."""
+    return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=True, dtype=dtype)
+
+
+def friction_network(
+    make: Callable[[Needs], Model],
+    needs: Needs,
+    *,
+    friction_width: int = 0,
+    friction_depth: int = 1,
+    friction_activation: Activation = tanh,
+    initial_friction: float = 0.05,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """Adds friction that may depend on q to a Hamiltonian: a network with `friction_width` hidden units.
+
+    With `friction_width` 0 each coordinate has one coefficient, as `make` has it. Without friction in the needs, the
+    keywords have no effect.
     """
-
-    def decorate(factory: Callable[..., Model]) -> Callable[..., Model]:
-        ours, theirs = (inspect.signature(each).parameters.values() for each in (factory, make))
-        own = [each for each in ours if each.kind is not each.VAR_KEYWORD]
-        names = {*replaced, *(each.name for each in own)}
-        every = [*own, *(each for each in theirs if each.name not in names)]
-        setattr(factory, "__signature__", inspect.Signature(every))  # noqa: B010
-        return factory
-
-    return decorate
-
-
-def with_friction_network(make: Callable[..., Model]) -> Callable[..., Model]:
-    """Adds friction that may depend on q to a Hamiltonian's factory: a network with `friction_width` hidden units.
-
-    With `friction_width` 0 each coordinate has one coefficient, as in `make`. Without friction in the needs, the
-    friction keywords have no effect.
-    """
-
-    @extending(make)
-    def factory(
-        needs: Needs,
-        *,
-        friction_width: int = 0,
-        friction_depth: int = 1,
-        friction_activation: Activation = tanh,
-        initial_friction: float = 0.05,
-        dtype: DTypeLike = jnp.float32,
-        **keywords: Any,
-    ) -> Model:
-        if not (needs.friction and friction_width):
-            return make(needs, dtype=dtype, **keywords)
-        require_network(width=friction_width, depth=friction_depth)
-        conservative = make(needs._replace(friction=False), dtype=dtype, **keywords)
-        return make_dissipative(
-            conservative,
-            needs,
-            width=friction_width,
-            depth=friction_depth,
-            activation=friction_activation,
-            initial_friction=initial_friction,
-            dtype=dtype,
-        )
-
-    return factory
+    if not (needs.friction and friction_width):
+        return make(needs)
+    require_network(width=friction_width, depth=friction_depth)
+    return make_dissipative(
+        make(needs._replace(friction=False)),
+        needs,
+        width=friction_width,
+        depth=friction_depth,
+        activation=friction_activation,
+        initial_friction=initial_friction,
+        dtype=dtype,
+    )
 
 
-def with_friction_laws(make: Callable[..., Model], *, linear: bool = False) -> Callable[..., Model]:
-    """Adds the friction laws named by the needs to a factory; `linear` as for `with_joint_friction`."""
+def residual_network(
+    make: Callable[[Needs], Model],
+    needs: Needs,
+    *,
+    terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
+    width: int = 8,
+    depth: int = 1,
+    activation: Activation = tanh,
+    resolved_velocity: Scale = 0.05,
+    torque_scale: Scale = 1.0,
+    rate_scale: Scale = 1.0,
+    acceleration_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float64,
+) -> Model:
+    """Adds a `make_residual`; its `velocity_scale` is called `resolved_velocity` here."""
+    residual = make_residual(
+        needs,
+        terms=tuple(terms),
+        width=width,
+        depth=depth,
+        activation=activation,
+        velocity_scale=resolved_velocity,
+        torque_scale=torque_scale,
+        rate_scale=rate_scale,
+        acceleration_scale=acceleration_scale,
+        dtype=dtype,
+    )
+    return make_with_residual(make(needs), residual)
 
-    @extending(make, "needs")
-    def factory(needs: Needs, **keywords: Any) -> Model:
-        model = make(needs._replace(joint_friction=()), **keywords)
-        dtype = keywords.get("dtype", inspect.signature(make).parameters["dtype"].default)
-        return with_joint_friction(model, needs, linear=linear, dtype=dtype)
 
-    return factory
-
-
-@extending(make_pairwise_hamiltonian, "bodies")
-def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model:
+def make_pairwise(
+    needs: Needs,
+    *,
+    dimension: int = 2,
+    order: str = "bodies",
+    alike: bool = True,
+    features: tuple[str, ...] = ("distance", "inverse", "logarithm"),
+    distance_scale: float = 1.0,
+    width: int = 32,
+    depth: int = 2,
+    activation: Activation = tanh,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
     """`make_pairwise_hamiltonian` for the bodies whose coordinates the needs state."""
     require_positive(dimension=dimension)
     has_friction = needs.friction or needs.joint_friction
@@ -140,92 +158,79 @@ def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model
         raise InputError(
             f"the pairwise model takes positions of bodies, {dimension} for each, without friction; it got {needs}"
         )
-    return make_pairwise_hamiltonian(needs.degrees_of_freedom // dimension, dimension, **keywords)
+    return make_pairwise_hamiltonian(
+        needs.degrees_of_freedom // dimension,
+        dimension,
+        order=order,
+        alike=alike,
+        features=features,
+        distance_scale=distance_scale,
+        width=width,
+        depth=depth,
+        activation=activation,
+        dtype=dtype,
+    )
 
 
-@extending(make_rigid_tree, "friction")
-def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
+def make_stored_tree(
+    needs: Needs,
+    *,
+    tree: dict[str, Any],
+    velocity_scale: Number = 0.01,
+    stribeck_velocity: Number = 0.1,
+    sigmoid_slope: Number = 10.0,
+    sigmoid_shift: Number = 0.0,
+    load: Number = 0.0,
+    dtype: DTypeLike = jnp.float64,
+) -> Model:
     """`make_rigid_tree` for a tree from `mechanics.trees.tree_to_json`, with the friction named by the needs."""
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(
             f"the rigid tree has the joints {frames.joints}, and gravity if it is not zero; it got {needs}"
         )
-    return make_rigid_tree(frames, friction=needs.joint_friction or needs.friction, **keywords)
-
-
-def with_residual_network(make: Callable[..., Model]) -> Callable[..., Model]:
-    """Adds a `make_residual` to the factory of a model; its `velocity_scale` is called `resolved_velocity` here."""
-
-    @extending(make)
-    def factory(
-        needs: Needs,
-        *,
-        terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
-        width: int = 8,
-        depth: int = 1,
-        activation: Activation = tanh,
-        resolved_velocity: Scale = 0.05,
-        torque_scale: Scale = 1.0,
-        rate_scale: Scale = 1.0,
-        acceleration_scale: Scale = 1.0,
-        dtype: DTypeLike = jnp.float64,
-        **keywords: Any,
-    ) -> Model:
-        residual = make_residual(
-            needs,
-            terms=tuple(terms),
-            width=width,
-            depth=depth,
-            activation=activation,
-            velocity_scale=resolved_velocity,
-            torque_scale=torque_scale,
-            rate_scale=rate_scale,
-            acceleration_scale=acceleration_scale,
-            dtype=dtype,
-        )
-        return make_with_residual(make(needs, dtype=dtype, **keywords), residual)
-
-    return factory
+    return make_rigid_tree(
+        frames,
+        friction=needs.joint_friction or needs.friction,
+        velocity_scale=velocity_scale,
+        stribeck_velocity=stribeck_velocity,
+        sigmoid_slope=sigmoid_slope,
+        sigmoid_shift=sigmoid_shift,
+        load=load,
+        dtype=dtype,
+    )
 
 
 MOMENTUM = {"momentum_scale": ("p",)}
-make_basis = with_friction_laws(make_trigonometric, linear=True)
-make_kernel = with_friction_laws(make_trigonometric_kernel, linear=True)
+LAWS, LINEAR = (friction_laws,), (linear_friction_laws,)
+NETWORK = (friction_laws, friction_network)
+RATES = {"rate_scale": ("qd",), "acceleration_scale": ("qdd",), "tau_scale": ("tau",)}
 CATALOGUE = {
-    "structured-delan": Entry(with_friction_laws(make_delan), Properties(definite=True)),
-    "black-box-delan": Entry(with_friction_laws(make_black_box_lagrangian), Properties(), {"rate_scale": ("qd",)}),
-    "trigonometric": Entry(make_basis, Properties(linear=True)),
-    "trigonometric-residual": Entry(with_residual_network(make_basis), Properties()),
-    "trigonometric-kernel": Entry(make_kernel, Properties(kernel=True)),
-    "trigonometric-kernel-residual": Entry(with_residual_network(make_kernel), Properties(kernel=True)),
-    "planar-chain": Entry(with_friction_laws(make_planar_chain, linear=True), Properties(linear=True)),
+    "structured-delan": Entry(make_delan, Properties(definite=True), additions=LAWS),
+    "black-box-delan": Entry(make_black_box_lagrangian, Properties(), {"rate_scale": ("qd",)}, LAWS),
+    "trigonometric": Entry(make_trigonometric, Properties(linear=True), additions=LINEAR),
+    "trigonometric-residual": Entry(make_trigonometric, Properties(), additions=(residual_network, *LINEAR)),
+    "trigonometric-kernel": Entry(make_trigonometric_kernel, Properties(kernel=True), additions=LINEAR),
+    "trigonometric-kernel-residual": Entry(
+        make_trigonometric_kernel, Properties(kernel=True), additions=(residual_network, *LINEAR)
+    ),
+    "planar-chain": Entry(make_planar_chain, Properties(linear=True), additions=LINEAR),
     "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
-    "rigid-tree-residual": Entry(with_residual_network(make_stored_tree), Properties()),
+    "rigid-tree-residual": Entry(make_stored_tree, Properties(), additions=(residual_network,)),
     "learned-tree": Entry(make_serial_tree, Properties(searched=True)),
-    "feed-forward": Entry(
-        with_friction_laws(make_feed_forward),
-        Properties(energy=False),
-        {"rate_scale": ("qd",), "acceleration_scale": ("qdd",), "tau_scale": ("tau",)},
-    ),
-    "structured-hnn": Entry(
-        with_friction_laws(with_friction_network(make_structured_hamiltonian)),
-        Properties(definite=True, canonical=True),
-    ),
-    "black-box-hnn": Entry(
-        with_friction_laws(with_friction_network(make_black_box_hamiltonian)), Properties(canonical=True), MOMENTUM
-    ),
-    "separable-hnn": Entry(
-        with_friction_laws(with_friction_network(make_separable_hamiltonian)), Properties(canonical=True), MOMENTUM
-    ),
+    "feed-forward": Entry(make_feed_forward, Properties(energy=False), RATES, LAWS),
+    "structured-hnn": Entry(make_structured_hamiltonian, Properties(definite=True, canonical=True), additions=NETWORK),
+    "black-box-hnn": Entry(make_black_box_hamiltonian, Properties(canonical=True), MOMENTUM, NETWORK),
+    "separable-hnn": Entry(make_separable_hamiltonian, Properties(canonical=True), MOMENTUM, NETWORK),
     "pairwise-hnn": Entry(make_pairwise, Properties(definite=True, canonical=True)),
     "polynomial-hamiltonian": Entry(make_polynomial_hamiltonian, Properties(canonical=True, linear=True)),
     "phase-network": Entry(
-        with_friction_laws(make_phase_network),
+        make_phase_network,
         Properties(energy=False, canonical=True),
         {**MOMENTUM, "rate_scale": ("qd", "pd")},
+        LAWS,
     ),
-    "helmholtz-hnn": Entry(with_friction_laws(make_helmholtz), Properties(energy=False, canonical=True), MOMENTUM),
+    "helmholtz-hnn": Entry(make_helmholtz, Properties(energy=False, canonical=True), MOMENTUM, LAWS),
     "differential-network": Entry(make_differential_network, Properties(energy=False)),
     "latent-phase": Entry(make_image_model, Properties(energy=False)),
 }

@@ -9,16 +9,15 @@ import importlib
 import inspect
 import math
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stated_needs import needs_from_json
-from dln_jax.files import matches
+from dln_jax.files import as_type
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.precision import data_type, require_precision
 from dln_jax.sizes import require_network
@@ -49,12 +48,12 @@ def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any
     """
     require_precision(precision)
     name = model if isinstance(model, str) else OWN
-    factory = factory_of(name, None if isinstance(model, str) else model, trust=True)
-    parameters = _parameters(factory)
-    values = {key: each.default for key, each in parameters.items() if each.default is not each.empty} | keywords
-    description = {"name": name, "precision": precision, **{key: _as_json(key, each) for key, each in values.items()}}
-    require_complete(description, factory)
-    return description
+    functions = functions_of(name, None if isinstance(model, str) else model, trust=True)
+    parameters = _parameters(functions)
+    defaults = {key: field.default for key, field in parameters.items() if field.default is not field.empty}
+    values = {key: _as_json(key, value) for key, value in (defaults | keywords).items()}
+    _require_keys(values, parameters)
+    return {"name": name, "precision": precision, **values}
 
 
 def describe_for(
@@ -112,28 +111,28 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
     name = description.get("name")
     if not isinstance(name, str):
         raise InputError(f"model description: name is {reprlib.repr(name)}, expected that of a model; {REMEDY}")
-    make = factory_of(name, factory, trust=trust)
-    require_complete(description, make)
-    if not matches(description["precision"], str):
-        raise InputError(f"precision is {reprlib.repr(description['precision'])}; expected f32 or f64")
-    dtype = data_type(description["precision"])
-    keywords = {
-        key: _from_json(key, description[key], each) for key, each in _parameters(make).items() if key in description
-    }
+    functions = functions_of(name, factory, trust=trust)
+    values = {key: value for key, value in description.items() if key not in ("name", "precision")}
+    _require_keys(values, _parameters(functions))
+    if "precision" not in description:
+        raise InputError(f"model description: lacks precision; {REMEDY}")
+    if not isinstance(precision := description["precision"], str):
+        raise InputError(f"precision is {reprlib.repr(precision)}; expected f32 or f64")
+    keywords = {"dtype": data_type(precision), **_keywords(values, functions)}
     if "width" in keywords and "depth" in keywords:
         require_network(width=keywords["width"], depth=keywords["depth"])
-    if "dtype" in inspect.signature(make).parameters:
-        keywords["dtype"] = dtype
     try:
-        return make(**keywords)
+        return _made(functions, keywords)
     except InputError:
         raise
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"model description: {error}; a release that is newer or older may have written it") from error
 
 
-def factory_of(name: str, given: Callable[..., Any] | None = None, *, trust: bool = False) -> Callable[..., Any]:
-    """The factory of a name: from the catalogue, as passed, or imported if trusted; arguments as `build`.
+def functions_of(
+    name: str, factory: Callable[..., Any] | None = None, *, trust: bool = False
+) -> tuple[Callable[..., Any], ...]:
+    """The functions that make the model of a name: additions and factory of the catalogue, or a factory of one's own.
 
     Raises:
         InputError: as `build`.
@@ -141,11 +140,11 @@ def factory_of(name: str, given: Callable[..., Any] | None = None, *, trust: boo
     module, colon, function = name.partition(":")
     if not colon and name != OWN:
         entry = entry_of(name)
-        if given is not None:
+        if factory is not None:
             raise InputError(f"the model is a {name}, which has a factory; leave factory= out")
-        return entry.factory
-    if given is not None:
-        return given
+        return (*entry.additions, entry.factory)
+    if factory is not None:
+        return (factory,)
     if not colon:
         raise InputError("the model has a factory of its own, which the file does not tell; give it as factory=")
     if not trust:
@@ -154,30 +153,42 @@ def factory_of(name: str, given: Callable[..., Any] | None = None, *, trust: boo
             "give that function as factory=, or trust=True to have it imported"
         )
     try:
-        found = getattr(importlib.import_module(module), function)
+        imported = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise InputError(f"{name[:200]} cannot be imported ({error}); expected package.module:function") from error
-    if not callable(found):
+    if not callable(imported):
         raise InputError(f"{name[:200]} is no function; expected a factory of models")
-    return found
+    return (imported,)
 
 
-def _parameters(factory: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    """Parameters of a factory that a description stores."""
-    every = inspect.signature(factory).parameters
+def _made(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, Any]) -> Any:
+    """Calls the factory, and the additions around it."""
+    first, *rest = functions
+    own = {key: keywords[key] for key in inspect.signature(first).parameters if key in keywords}
+    if not rest:
+        return first(**own)
+    return first(lambda needs: _made(tuple(rest), {**keywords, "needs": needs}), **own)
+
+
+def _parameters(functions: tuple[Callable[..., Any], ...]) -> dict[str, inspect.Parameter]:
+    """Parameters that a description stores."""
     variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    return {key: each for key, each in every.items() if key != "dtype" and each.kind not in variable}
+    return {
+        key: parameter
+        for function in reversed(functions)
+        for key, parameter in inspect.signature(function).parameters.items()
+        if key not in ("dtype", "make") and parameter.kind not in variable
+    }
 
 
-def require_complete(description: Description, factory: Callable[..., Any]) -> None:
+def _require_keys(values: Mapping[str, Any], expected: Collection[str]) -> None:
     """Raises `InputError` unless a description has exactly the expected keys."""
-    expected = {"name", "precision", *_parameters(factory)}
-    if missing := expected - set(description):
+    if missing := set(expected) - set(values):
         raise InputError(f"model description: lacks {', '.join(sorted(missing))}; {REMEDY}")
-    if unknown := set(description) - expected:
+    if unknown := set(values) - set(expected):
         raise InputError(f"model description: unknown are {reprlib.repr(', '.join(sorted(unknown)))}; {REMEDY}")
-    needs = description.get("needs")
-    if isinstance(needs, dict) and "needs" in expected and (missing := STATED - set(needs)):
+    needs = values.get("needs")
+    if isinstance(needs, dict) and (missing := STATED - set(needs)):
         raise InputError(f"model description: needs lack {', '.join(sorted(missing))}; {REMEDY}")
 
 
@@ -188,9 +199,9 @@ def _as_json(key: str, value: Any) -> Any:
         case Needs():
             return _as_json(key, value._asdict())
         case dict():
-            return {name: _as_json(key, each) for name, each in value.items()}
+            return {name: _as_json(key, item) for name, item in value.items()}
         case list() | tuple():
-            return [_as_json(key, each) for each in value]
+            return [_as_json(key, item) for item in value]
         case float() if not math.isfinite(value):
             raise InputError(f"{key} is {value}; expected a finite number")
         case None | bool() | int() | float() | str():
@@ -198,39 +209,33 @@ def _as_json(key: str, value: Any) -> Any:
     raise InputError(f"{key} is a {type(value).__name__}, which no file can hold; expected numbers, names or switches")
 
 
-def _from_json(key: str, value: Any, parameter: inspect.Parameter) -> Any:
-    """Converts a JSON value to a keyword of a factory, with lists as tuples so that it is hashable.
+def _keywords(values: Mapping[str, Any], functions: tuple[Callable[..., Any], ...]) -> dict[str, Any]:
+    """Converts JSON values to the types in the signatures, with lists as tuples so that they are hashable.
 
     Raises:
-        InputError: the value does not fit the factory's annotation.
+        InputError: a value does not fit its annotation.
     """
-    if key == "needs":
-        return needs_from_json(value)
-    hint = parameter.annotation
-    named = hint is Activation or isinstance(parameter.default, Activation)
-    if not _fits(value, str if named else hint):
-        wanted = "the name of an activation" if named else _words(hint)
-        raise InputError(f"model description: {key} is {reprlib.repr(value)}, expected {wanted}; {REMEDY}")
-    return activation(value) if named else _as_tuples(value)
+    keywords: dict[str, Any] = {}
+    for key, parameter in _parameters(functions).items():
+        hint, value = parameter.annotation, values[key]
+        if key == "needs":
+            keywords[key] = needs_from_json(value)
+        elif isinstance(parameter.default, Activation) or hint is Activation:
+            keywords[key] = activation(as_type(value, str, name=f"model description: {key}", remedy=REMEDY))
+        elif hint is parameter.empty or not _is_plain(hint):
+            keywords[key] = _as_tuples(value)  # left to the factory
+        else:
+            keywords[key] = _as_tuples(as_type(value, hint, name=f"model description: {key}", remedy=REMEDY))
+    return keywords
+
+
+def _is_plain(hint: Any) -> bool:
+    """Whether an annotation has JSON values only."""
+    inner = get_args(hint)
+    if get_origin(hint) is Literal or hint is Ellipsis:
+        return True
+    return all(map(_is_plain, inner)) if inner else hint in (bool, int, float, str, type(None), None, Any)
 
 
 def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a JSON value fits an annotation; annotations not covered here are left to the factory."""
-    origin, inner = get_origin(hint), get_args(hint)
-    if origin in (Union, UnionType):
-        return any(_fits(value, each) for each in inner)
-    if origin in (tuple, list, Sequence):
-        return isinstance(value, list | tuple) and all(_fits(each, inner[0]) for each in value)
-    if origin is Callable:
-        return False
-    if origin is Literal or hint in (bool, int, float, str, type(None), None):
-        return matches(value, hint)
-    return True
-
-
-def _words(hint: Any) -> str:
-    return hint.__name__ if isinstance(hint, type) else str(hint)

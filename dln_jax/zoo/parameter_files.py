@@ -8,19 +8,35 @@ import hashlib
 import importlib.metadata
 import reprlib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import jax
+import msgspec
 import numpy as np
 import safetensors.numpy
 
-from dln_jax.files import is_file, matches, read_json, write_bytes, write_json
+from dln_jax.files import as_type, is_file, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
 MODEL = "model"
 """Stem of the pair of files in a run folder that holds the trained model."""
 SCHEMA_VERSION = 2
 REMEDY = "restore the file or train again"
+
+
+class Shape(TypedDict):
+    """Shape of a stored tensor."""
+
+    shape: list[Annotated[int, msgspec.Meta(ge=0)]]
+
+
+class Manifest(msgspec.Struct):
+    """What every manifest states."""
+
+    schema_version: int
+    tensor_file: str
+    sha256: str
+    tensors: dict[str, Shape]
 
 
 def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, number: int | None = None) -> None:
@@ -80,16 +96,12 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
     if not is_file(path):
         raise InputError(f"{path}: no such file; give the folder of a run that has written one")
     manifest = read_json(path, remedy=REMEDY)
-    version, file_name = manifest.get("schema_version"), manifest.get("tensor_file")
-    if type(version) is not int or version != SCHEMA_VERSION:
-        raise InputError(f"{path}: schema version {reprlib.repr(version)}; expected {SCHEMA_VERSION}; {REMEDY}")
-    if not isinstance(file_name, str) or Path(file_name).name != file_name:
-        raise InputError(f"{path}: tensor_file is {reprlib.repr(file_name)}, expected a name in that folder; {REMEDY}")
-    tensors = manifest.get("tensors")
-    for key, each in tensors.items() if isinstance(tensors, dict) else [("tensors", tensors)]:
-        shape = each.get("shape") if isinstance(each, dict) else None
-        if not isinstance(shape, list) or not all(matches(size, int) and size >= 0 for size in shape):
-            raise InputError(f"{path}: {key:.80} is {reprlib.repr(each)}; expected the shape of an array; {REMEDY}")
+    if manifest.get("schema_version") != SCHEMA_VERSION:
+        version = reprlib.repr(manifest.get("schema_version"))
+        raise InputError(f"{path}: schema version {version}; expected {SCHEMA_VERSION}; {REMEDY}")
+    stated = as_type(manifest, Manifest, name=str(path), remedy=REMEDY)
+    if Path(stated.tensor_file).name != stated.tensor_file:
+        raise InputError(f"{path}: tensor_file is {stated.tensor_file!r:.60}, expected a name in that folder; {REMEDY}")
     return manifest
 
 

@@ -24,7 +24,8 @@ import numpy as np
 
 from dln_jax.cli.options import Resumable, Scaled
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder, run
+from dln_jax.cli.running import run
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.scaled import mesh_of
 from dln_jax.scale.mesh import gathered, shard, spread, summed
 from dln_jax.scale.processes import process_key

@@ -17,7 +17,7 @@ import numpy as np
 from dln_jax.cli.arguments import Unstated, choice, numbers_of
 from dln_jax.cli.options import Drawn, Folder
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data import schema
 from dln_jax.data.motion_tables import write_motion
 from dln_jax.data.robots import Robot, read_robot

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from dln_jax.cli.arguments import Unstated, refuse_given
-from dln_jax.cli.running import SceneName
+from dln_jax.cli.options import SceneName
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.scenes.datasets import generators

@@ -15,7 +15,7 @@ from typing import ClassVar, Literal
 from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.options import Resumable
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.sweeps.grid import fixed_of, grid_of, pairs
 from dln_jax.cli.sweeps.plan import closest, plan
 from dln_jax.cli.sweeps.sweep import Asked, sweep

@@ -12,7 +12,7 @@ from typing import Annotated
 
 from dln_jax.cli.arguments import choice
 from dln_jax.cli.options import Drawn, Folder
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.control.desktop_plants import NAMES
 from dln_jax.training.swing_ups.learned import MODELS
 from dln_jax.training.swing_ups.run import asked, swing_up

@@ -1,28 +1,24 @@
 """Train a model of dynamics on trajectories (q, qd, qdd, tau), and report its errors, its rollouts and its speed.
 
 Models: structured-delan (a deep Lagrangian network, M = L Lᵀ), black-box-delan (a network is the Lagrangian),
-trigonometric (linear in its parameters, one least-squares problem), trigonometric-kernel (the same energies of six or
-seven joints, as a Gaussian process), learned-tree (an arm's bodies and joint frames, found from random starts),
-feed-forward (no physics), and auto, the default for --data: model selection among those that the data allow, from the
-tree of --robot to a network, which keeps the first that no other betters on validation motions. Data are an npz or CSV
-file with t, q and tau; joints have friction unless --needs or the file says otherwise. Without --data it trains on
-the embedded set: the tip of a two-link arm writes 20 letters, of which e, q and v are the test. A run folder gets
-config.json, metrics.json, model.safetensors and model.json (load them with dln_jax.load), a checkpoint to --resume
-from, and figures. For Hamiltonian networks see train_hnn.
+trigonometric (linear in its parameters), trigonometric-kernel (the same energies as a Gaussian process), learned-tree
+(bodies and joint frames of an arm), feed-forward (no physics), and auto, the default for --data: model selection by
+validation motions. Each model has options of its own: --model NAME --help shows them. Without --data the embedded set
+is used: the tip of a two-link arm writes 20 letters. Load the run with dln_jax.load.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from dln_jax.cli.arguments import Unstated
-from dln_jax.training.dynamics.options import ArmOptions
-from dln_jax.training.dynamics.run import run
+from dln_jax.training.dynamics.options import VARIANTS, Options
 
 
 @dataclass(frozen=True)
-class Arguments(ArmOptions):
+class Arguments(Options):
     """What to train on, how, and where the results go."""
 
+    VARIANTS: ClassVar = VARIANTS
     model: Unstated[
         Literal[
             "structured-delan",
@@ -34,10 +30,12 @@ class Arguments(ArmOptions):
             "auto",
         ]
     ] = None
-    """What is learned; auto: several models, of which validation chooses one (default: auto for --data, unless an
-    option of networks is given; structured-delan for the embedded letters and scenes)."""
+    """What is learned; auto: several models, of which validation chooses one (default: auto for --data,
+    structured-delan for the embedded letters and scenes)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder."""
-    run(given, "train_delan")
+    from dln_jax.training.dynamics.run import run
+
+    run(options, "train_delan")

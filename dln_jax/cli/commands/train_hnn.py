@@ -7,27 +7,29 @@ the embedded letters; a run folder gets what train_delan writes. Motions without
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
-from dln_jax.data import schema
-from dln_jax.training.dynamics.options import Options
-from dln_jax.training.dynamics.run import run
-from dln_jax.types import InputError
+from dln_jax.errors import InputError
+from dln_jax.training.dynamics.options import VARIANTS, Options
 
 
 @dataclass(frozen=True)
 class Arguments(Options):
     """What to train on, how, and where the results go."""
 
+    VARIANTS: ClassVar = VARIANTS
     model: Literal["structured-hnn", "black-box-hnn"] = "structured-hnn"
     """What is learned."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder; `InputError` for data without tau."""
-    if given.data is not None and "tau" in schema.load(given.data).estimated:
+    from dln_jax.data import schema
+    from dln_jax.training.dynamics.run import run
+
+    if options.data is not None and "tau" in schema.load(options.data).estimated:
         raise InputError(
-            f"{given.data} has no tau, which train_hnn is fitted to; motions without applied forces are for "
-            f"train_hnn_task --task measured --data {given.data}"
+            f"{options.data} has no tau, which train_hnn is fitted to; motions without applied forces are for "
+            f"train_hnn_task --task measured --data {options.data}"
         )
-    run(given, "train_hnn")
+    run(options, "train_hnn")

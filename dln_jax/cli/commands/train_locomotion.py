@@ -11,8 +11,8 @@ from typing import Literal
 
 from dln_jax.cli.arguments import refuse_given
 from dln_jax.cli.options import Drawn, Resumable, Scaled
-from dln_jax.cli.running import command_folder
 from dln_jax.cli.scaled import mesh_of
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.locomotion.methods import settings_of
 from dln_jax.training.locomotion import Options, announce, learned, prepare, write_run
 from dln_jax.training.results import print_numbers

@@ -18,8 +18,8 @@ from jax.sharding import Mesh
 from dln_jax.cli.arguments import Unstated, choice, numbers_of, require_positive_if_given
 from dln_jax.cli.options import Folder, Scaled
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder
 from dln_jax.cli.scaled import mesh_of
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.plants import PLANTS, ValuePlant
 from dln_jax.files import finite, write_json
@@ -89,7 +89,7 @@ def main(given: Arguments) -> None:
     fit = usual(name, method)
     width, depth = given.width or fit.widths[0], given.depth or len(fit.widths)
     family = Family((width,) * depth, given.members or 1, scale=fit.scale)
-    with command_folder(given, "train_value", family=family._asdict()) as folder:
+    with command_folder(given, "train_value", family=dataclasses.asdict(family)) as folder:
         print(f"{name}: {method}, {family.members} x {depth} layers of {width}")
         trained = train(given, plant, family, fit.numbers, mesh)
         best = min(trained, key=lambda each: each.validation)

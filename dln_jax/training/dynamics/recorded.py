@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.cli.arguments import names_listed, refuse_given
-from dln_jax.cli.encoders import checked, fitted_torque, preparation, smoothed
-from dln_jax.cli.running import needs_from_option
+from dln_jax.cli.arguments import names_listed, refuse_given, require_positive_if_given
+from dln_jax.cli.encoders import checked, fitted_torque, needs_from_option, preparation, smoothed
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.joints import with_joints
@@ -36,7 +35,7 @@ class Recorded(NamedTuple):
     scene: Scene | None
     needs: Needs
     needs_origin: str
-    said: tuple[str, ...]
+    lines: tuple[str, ...]
     """Lines for the user: the origin of the rates, and findings about the data."""
     cutoff: float | None
     """Cut-off of the filter applied to q, Hz; `None` without a filter."""
@@ -49,21 +48,23 @@ class Recorded(NamedTuple):
     """The torques that models are fitted to and uncertainty bands refer to."""
 
 
-def read(given: Options) -> Recorded:
+def read(options: Options) -> Recorded:
     """Reads and checks the data and robot that the arguments name, before anything is written."""
-    scene = scene_named(given.scene) if given.scene else None
-    labels = tuple(given.test.split(",")) if given.test else None
-    if given.data is not None:
-        data, name = schema.load(given.data, rate=given.rate, units=given.units), str(given.data)
+    scene = scene_named(options.scene) if options.scene else None
+    labels = tuple(options.test.split(",")) if options.test else None
+    if options.data is None:
+        refuse_given(options, ["rate", "units"], "for a file: add --data")
+    if options.data is not None:
+        data, name = schema.load(options.data, rate=options.rate, units=options.units), str(options.data)
     else:
         scene = scene or two_link_arm()
         data, name = default_data(scene), f"default data of {scene.name}"
         if labels is None and scene.name == "two-link-arm":
             labels = CHARACTERS_TEST
-    robot = robot_of(given)
+    robot = robot_of(options)
     if robot is not None:
         data = with_joints(data, robot.tree.names)
-    needs, origin = stated_needs(given, scene, data, robot)
+    needs, origin = stated_needs(options, scene, data, robot)
     if needs.degrees_of_freedom != data.degrees_of_freedom:
         raise InputError(
             f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
@@ -81,43 +82,44 @@ def read(given: Options) -> Recorded:
     rubbing = bool(needs.friction or needs.joint_friction)
     cut = labels is None and len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES
     settled = (*["split"] * cut, *["friction"] * rubbing)
-    found = [] if given.data is None else checked(given, data, given.data, robot=robot, without=settled)
-    filtered = smoothed(given, data)
-    said = [*preparation(data, filtered), *found]
+    findings = [] if options.data is None else checked(options, data, options.data, robot=robot, without=settled)
+    filtered = smoothed(options, data)
+    lines = [*preparation(data, filtered), *findings]
     if filtered is not None:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)
     recordings = len(np.unique(data.trajectory))
     if cut and recordings < LEAST_TRAJECTORIES:
         data = in_blocks(data, BLOCKS)
-    parents = parents_of(given, needs.degrees_of_freedom)
-    sets = split(data, test=labels, seed=given.seed)
+    parents = parents_of(options, needs.degrees_of_freedom)
+    sets = split(data, test=labels, seed=options.seed)
     if len(np.unique(data.trajectory)) > recordings:
         counts = [f"{len(np.unique(part.trajectory))} for {use}" for part, use in zip(sets, USES, strict=True)]
         which = "one recording" if recordings == 1 else f"{recordings} recordings"
-        said.append(f"{which}: cut into blocks of time, {', '.join(counts)}")
+        lines.append(f"{which}: cut into blocks of time, {', '.join(counts)}")
     return Recorded(
         name=name,
         sets=sets,
         scene=scene,
         needs=needs,
         needs_origin=origin,
-        said=tuple(said),
+        lines=tuple(lines),
         cutoff=None if filtered is None else filtered.cutoff,
         robot=robot,
         parents=parents,
-        kinematic_prior=kinematic_prior_of(given, needs.degrees_of_freedom, parents),
+        kinematic_prior=kinematic_prior_of(options, needs.degrees_of_freedom, parents),
         torque=fitted_torque(filtered),
     )
 
 
-def stated_needs(given: Options, scene: Scene | None, data: Trajectories, robot: Robot | None) -> tuple[Needs, str]:
+def stated_needs(options: Options, scene: Scene | None, data: Trajectories, robot: Robot | None) -> tuple[Needs, str]:
     """`Needs` of the plant and their origin: the command line, the scene, the file, the robot, or an assumption."""
-    needs, origin = _needs_and_origin(given, scene, data, robot)
-    scale = given.velocity_scale if isinstance(given, ArmOptions) else None
+    needs, origin = _needs_and_origin(options, scene, data, robot)
+    require_positive_if_given(options, ["velocity_scale"])
+    scale = options.velocity_scale
     if scale is None:
         return needs, origin
-    trees = given.model == AUTO or entry_of(str(given.model)).properties.searched
+    trees = options.model == AUTO or entry_of(str(options.model)).properties.searched
     if not (needs.joint_friction or (trees and needs.friction)):
         raise InputError(
             "--velocity-scale is for dry friction of joints, which the needs do not state; "
@@ -127,10 +129,10 @@ def stated_needs(given: Options, scene: Scene | None, data: Trajectories, robot:
 
 
 def _needs_and_origin(
-    given: Options, scene: Scene | None, data: Trajectories, robot: Robot | None
+    options: Options, scene: Scene | None, data: Trajectories, robot: Robot | None
 ) -> tuple[Needs, str]:
-    if given.needs is not None:
-        return needs_from_option(given.needs), "--needs"
+    if options.needs is not None:
+        return needs_from_option(options.needs), "--needs"
     if scene is not None:
         return scene.needs, f"scene {scene.name}"
     if data.needs is not None:
@@ -141,37 +143,39 @@ def _needs_and_origin(
     return needs, "assumed: neither the file nor --needs says"
 
 
-def robot_of(given: Options) -> Robot | None:
+def robot_of(options: Options) -> Robot | None:
     """Reads the robot of --robot."""
-    if not isinstance(given, ArmOptions) or given.robot is None:
-        if isinstance(given, ArmOptions):
-            refuse_given(given, ["lock"], "for joints of --robot")
+    if not isinstance(options, ArmOptions) or options.robot is None:
+        if isinstance(options, ArmOptions):
+            refuse_given(options, ["lock"], "for joints of --robot")
         return None
-    return read_robot(given.robot, lock=names_listed(given.lock))
+    return read_robot(options.robot, lock=names_listed(options.lock))
 
 
-def parents_of(given: Options, d: int) -> tuple[int, ...] | None:
+def parents_of(options: Options, d: int) -> tuple[int, ...] | None:
     """Parses --parents into parents counted from 0, as everywhere else in the code."""
-    if not isinstance(given, ArmOptions) or given.parents is None:
+    if not isinstance(options, ArmOptions) or options.parents is None:
         return None
     try:
-        found = tuple(int(each) - 1 for each in given.parents.split(","))
+        parents = tuple(int(number) - 1 for number in options.parents.split(","))
     except ValueError:
-        found = ()
-    if len(found) != d or any(not -1 <= parent < link for link, parent in enumerate(found)):
+        parents = ()
+    if len(parents) != d or any(not -1 <= parent < link for link, parent in enumerate(parents)):
         raise InputError(
-            f"--parents is {given.parents!r:.60}; expected {d} whole numbers with commas between them, each of a joint "
-            "before, counted from 1, or 0 for the ground"
+            f"--parents is {options.parents!r:.60}; expected {d} whole numbers separated by commas: joints before, "
+            "counted from 1, or 0 for the ground"
         )
-    return found
+    return parents
 
 
-def kinematic_prior_of(given: Options, d: int, parents: tuple[int, ...] | None) -> KinematicPrior | None:
+def kinematic_prior_of(options: Options, d: int, parents: tuple[int, ...] | None) -> KinematicPrior | None:
     """Reads the kinematic prior of --kinematic-prior."""
-    if not isinstance(given, ArmOptions) or given.kinematic_prior is None:
+    if not isinstance(options, ArmOptions) or options.kinematic_prior is None:
         return None
     try:
-        return kinematic_prior_from_json(read_json(given.kinematic_prior, remedy="see --help"), d, parents)
+        return kinematic_prior_from_json(read_json(options.kinematic_prior, remedy="see --help"), d, parents)
     except InputError as error:
         text = str(error)
-        raise InputError(text if str(given.kinematic_prior) in text else f"{given.kinematic_prior}: {text}") from None
+        raise InputError(
+            text if str(options.kinematic_prior) in text else f"{options.kinematic_prior}: {text}"
+        ) from None

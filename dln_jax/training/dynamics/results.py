@@ -1,7 +1,8 @@
 """Evaluates a training of dynamics: test errors, speed, figures and tables."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,6 @@ from dln_jax import figures as drawing
 from dln_jax.background import in_background
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
-from dln_jax.files import write_figure
 from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.metrics.definiteness import Definiteness, definiteness
@@ -22,9 +22,10 @@ from dln_jax.precision import data_type
 from dln_jax.training.dynamics.programs import Programs, judged_data
 from dln_jax.training.dynamics.task import Task
 from dln_jax.training.dynamics.uncertainty import uncertainty_metrics
-from dln_jax.training.dynamics.verdict import Judged, judge_torques
+from dln_jax.training.dynamics.verdict import TorqueVerdict, judge_torques
 from dln_jax.training.low_latency_calls import low_latency_metrics
-from dln_jax.training.results import cost_metrics, print_numbers, unit_of
+from dln_jax.training.pipeline import png
+from dln_jax.training.results import cost_metrics, unit_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.run import load
@@ -71,21 +72,22 @@ MEANINGS = {
 """Labels of metrics; other names are self-explanatory."""
 
 
+class Evaluation(NamedTuple):
+    """What a stored model of dynamics does on the test."""
+
+    metrics: dict[str, float | int]
+    judged: TorqueVerdict
+    figures: dict[str, Callable[[Path], None]]
+
+
 def evaluate(
-    folder: Path,
-    task: Task,
-    training: Training,
-    programs: Programs,
-    *,
-    seeds: int,
-    figures: bool,
-    low_latency: bool,
-) -> tuple[dict[str, float | int], Judged]:
-    """Loads the stored model as a user would, evaluates it on the test trajectories, judges it and draws figures."""
+    folder: Path, task: Task, training: Training, programs: Programs, *, seeds: int, low_latency: bool
+) -> Evaluation:
+    """Loads the stored model as a user would and evaluates it on the test trajectories."""
     run = load(folder)
     functions, test = run.dynamics, task.sets.test
     latency = latency_of(functions, task)
-    # Another process times the low-latency mode while this one evaluates and draws.
+    # Another process times the low-latency mode while this one evaluates.
     timed = in_background(low_latency_metrics, folder, latency_states(task), print) if low_latency else dict
     samples = samples_of(judged_data(task), data_type(task.precision))
     answers = as_arrays(programs.predict(run.parameters, samples))
@@ -94,17 +96,16 @@ def evaluate(
     motions, of_rollouts = rollouts(run.parameters, task, programs)
     spread = {}
     if seeds > 1:
-        every = [programs.predict(parameters_of(training, index), samples) for index in range(seeds)]
-        of_seeds = [mean_square(np.asarray(each["tau"], float)[: len(test.t)] - test.tau) for each in every]
+        answers = [programs.predict(parameters_of(training, index), samples) for index in range(seeds)]
+        of_seeds = [mean_square(np.asarray(answer["tau"], float)[: len(test.t)] - test.tau) for answer in answers]
         spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
-    if figures:
-        draw(folder, task, training, motions, predicted)
-    return {
+    of_bands, bands = uncertainty_metrics(run, task, programs, predicted["tau"])
+    metrics = {
         **errors(predicted, test),
         **judged.metrics,
         **spread,
         **definiteness_metrics(functions, task),
-        **uncertainty_metrics(folder, run, task, programs, predicted["tau"], figures=figures),
+        **of_bands,
         **of_rollouts,
         **validation_metrics(training, seeds, task.best),
         **cost_metrics(
@@ -114,7 +115,8 @@ def evaluate(
             best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
         ),
         **timed(),
-    }, judged
+    }
+    return Evaluation(metrics, judged, {**figures_of(task, training, motions, predicted), **bands})
 
 
 def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
@@ -159,9 +161,9 @@ def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Traje
 
 def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
     """Metrics on the mass matrices of an unstructured model over the test states."""
-    found = definiteness_of(functions, task, task.sets.test)
+    definite = definiteness_of(functions, task, task.sets.test)
     names = {"smallest_eigenvalue": "smallest_mass_eigenvalue"}
-    return {} if found is None else {names.get(key, key): value for key, value in found._asdict().items()}
+    return {} if definite is None else {names.get(key, key): value for key, value in definite._asdict().items()}
 
 
 def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:
@@ -174,32 +176,35 @@ def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Moti
         return [], {}
     try:
         motions, energies = programs.follow(parameters, records_of(test, data_type(task.precision)))
-        found = metrics_of_motions(motions, energies, test)
+        metrics = metrics_of_motions(motions, energies, test)
     except InputError as error:
         # The model is trained, so metrics that the test cannot provide are left out instead of refused.
         print(f"no rollouts: {error}")
         return [], {}
     plant = programs.ceilings()
     ceilings = {ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}
-    return by_trajectory(motions, test, TORQUES)["interpolated"], {**found, **ceilings}
+    return by_trajectory(motions, test, TORQUES)["interpolated"], {**metrics, **ceilings}
 
 
-def draw(folder: Path, task: Task, training: Training, motions: list[Motion], predicted: dict[str, np.ndarray]) -> None:
-    """Writes all applicable figures; `motions` are the model's rollouts of the test, possibly none."""
+def figures_of(
+    task: Task, training: Training, motions: list[Motion], predicted: dict[str, np.ndarray]
+) -> dict[str, Callable[[Path], None]]:
+    """The applicable figures; `motions` are the model's rollouts of the test, possibly none."""
     test = task.sets.test
-    write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
+    figures = {"decomposition.png": png(drawing.force_decomposition, test, predicted, model=task.kind)}
     if training.history and task.solver is not None:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
-        write_figure(folder / "training.png", drawing.training_curve(training.history, best_step=best, **units))
+        figures["training.png"] = png(drawing.training_curve, training.history, best_step=best, **units)
     if task.scene is not None and task.scene.tip is not None:
-        paths = drawing.tip_paths(merged(task.sets), task.scene.tip, test=test, motions=motions, model=task.kind)
-        write_figure(folder / "tip_paths.png", paths)
+        options = {"test": test, "motions": motions, "model": task.kind}
+        figures["tip_paths.png"] = png(drawing.tip_paths, merged(task.sets), task.scene.tip, **options)
+    return figures
 
 
-def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
-    """Prints the metrics with units, and next to rollout metrics the true plant's values."""
+def table(metrics: dict[str, float | int], task: Task) -> dict[str, Any]:
+    """Rows, title and columns of the printed table; next to rollout metrics stand the true plant's values."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
     units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
     units |= {key: "1" for key in metrics if key.endswith("_nmse")}
@@ -215,7 +220,7 @@ def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
     calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
     rows.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
     columns = ("quantity", "value", *["true plant"] * known, "unit")
-    print_numbers(rows, title=f"test on {task.name}, {task.precision}", columns=columns)
+    return {"rows": rows, "title": f"test on {task.name}, {task.precision}", "columns": columns}
 
 
 def number(metric: str, value: int | float) -> str:

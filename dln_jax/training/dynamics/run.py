@@ -1,131 +1,136 @@
-"""Trains a task of dynamics into a run folder: the model, its errors, its speed and its verdict."""
+"""Trains dynamics, as a kind of the pipeline: the model, its errors, its speed and its verdict."""
 
+import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.cli.optimisers import name_of
-from dln_jax.cli.running import command_folder
-from dln_jax.cli.scaled import mesh_of
-from dln_jax.cli.stored_arguments import write_config
 from dln_jax.data.splits import merged
-from dln_jax.files import write_json
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
-from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, torque_scale
+from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.scale.devices import device_lines
-from dln_jax.training.dynamics.methods import METHODS
-from dln_jax.training.dynamics.model_selection import train_selected
-from dln_jax.training.dynamics.options import AUTO, Options, with_model
-from dln_jax.training.dynamics.planning import check_options, task_of
-from dln_jax.training.dynamics.programs import programs_ahead, programs_of
-from dln_jax.training.dynamics.recorded import Recorded, read
-from dln_jax.training.dynamics.results import best_seed, definiteness_of, evaluate, print_metrics
-from dln_jax.training.dynamics.task import Task
+from dln_jax.time_limit import deadline
+from dln_jax.training.dynamics.options import model_of
+from dln_jax.training.dynamics.programs import Programs, programs_ahead, programs_of
+from dln_jax.training.dynamics.recorded import read
+from dln_jax.training.dynamics.results import best_seed, definiteness_of, evaluate, table
+from dln_jax.training.dynamics.task import Task, method_of, planned
 from dln_jax.training.dynamics.uncertainty import store_uncertainty
-from dln_jax.training.dynamics.verdict import refuse, say
+from dln_jax.training.pipeline import Fitted, Judged, Kind, train
 from dln_jax.training.results import settings_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.run import load, save
+from dln_jax.zoo.run import load
 
 
-def run(given: Options, command: str) -> None:
-    """Trains, evaluates and writes a run folder, by default runs/`command`-1, -2, ...
+class Outcome(NamedTuple):
+    """A training of dynamics."""
 
-    Raises:
-        InputError: no validation error is finite, or the loss became non-finite; the last good parameters are kept.
-        FitRefused: the model predicts held-out torques no better than a constant, and neither --steps nor --seconds cut
-            its training short; the run folder is complete.
-    """
-    given, chosen_for = with_model(given)
-    mesh, recorded = mesh_of(given), read(given)
-    chosen = None
-    if given.model == AUTO:
-        check_options(given, AUTO)
-        require_scales(recorded.sets.train)
-    else:
-        chosen = task_of(given, recorded)
-    with command_folder(given, command) as folder:
-        announce(recorded, chosen_for)
-        if chosen is None:
-            task, training = train_selected(given, recorded, folder, mesh)
-            programs = programs_of(task, mesh)
-        else:
-            announce_model(chosen)
-            fixed = chosen.solver is not None and given.target is None  # the fit does not change its description
-            ahead = programs_ahead(chosen, mesh, uncertainty=given.uncertainty) if fixed else None
-            task, training = METHODS[chosen.kind].fit(chosen, given, folder, mesh)
-            programs = ahead or programs_of(task, mesh)
-        if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
-            raise InputError(
-                f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
-            )
-        parameters, best = best_seed(training, given.seeds, task.best)
-        save(folder, task.description, parameters)
-        if given.uncertainty:
-            store_uncertainty(folder, task, programs.double, parameters)
-        unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
-        options = {"seeds": given.seeds, "figures": given.figures, "low_latency": given.low_latency}
-        metrics, judged = evaluate(folder, task, training, programs, **options)
-        write_json(folder / "metrics.json", metrics)
-        optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
-        more = {"cutoff_hz": recorded.cutoff, "validation_units": unit}
-        more = {name: value for name, value in more.items() if value is not None}
-        more |= {} if judged.verdict is None else {"verdict": judged.verdict._asdict()}
-        write_config(folder, given, **task.description, **optimiser, **more, seeds=task.seeds)
-        print_metrics(metrics, task)
-        if given.seeds > 1:
-            by = "validation" if task.best is None else "cross-validation"
-            print(f"the run keeps seed {given.seed + best}, the best in {by}")
-        print(f"run folder: {folder}")
-        warn(task, training, folder)
-        say(judged)
-        refuse(judged, task, given)
+    task: Task
+    training: Training
+    programs: Programs
+    best: int
+    """Index of the seed that is kept."""
 
 
-def announce(recorded: Recorded, chosen_for: str) -> None:
-    """Prints the data used for training and the assumptions made."""
+def run(options: Any, command: str) -> None:
+    """Trains, evaluates and writes a run folder; errors as `training.pipeline.train`."""
+    train(DYNAMICS, dataclasses.replace(options, model=model_of(vars(options))), command)
+
+
+def prepare(options: Any) -> Task:
+    """Reads the data and plans the model that the options name."""
+    return planned(options, options.model, read(options), deadline(getattr(options, "seconds", None)))
+
+
+def announce(task: Task) -> Iterator[str]:
+    """Lines on the data, the assumptions, and the model and its optimiser."""
+    recorded, needs = task.recorded, task.needs
     counts = ", ".join(f"{len(part.t)} {role}" for role, part in recorded.sets._asdict().items())
-    needs = recorded.needs
     terms = [name for name in ("gravity", "friction") if getattr(needs, name)] or ["no potential, no friction"]
-    print(f"{recorded.name}: {counts} samples")
-    print(f"{'-'.join(needs.joints)} with {' and '.join(terms)} ({recorded.needs_origin})")
+    yield f"{recorded.name}: {counts} samples"
+    yield f"{'-'.join(needs.joints)} with {' and '.join(terms)} ({recorded.needs_origin})"
     if needs.joint_friction:
-        print(f"friction of joints: {', '.join(needs.joint_friction)}")
-    for line in (*recorded.said, *([chosen_for] if chosen_for else [])):
-        print(line)
-
-
-def announce_model(task: Task) -> None:
-    """Prints the model to train and its optimiser."""
+        yield f"friction of joints: {', '.join(needs.joint_friction)}"
+    yield from recorded.lines
+    if not task.description:  # model selection announces its candidates as it goes
+        return
     if CATALOGUE[task.kind].properties.canonical and task.objective.of_torques:
-        print("no momenta p in the data: the Hamiltonian is fitted to torques")
+        yield "no momenta p in the data: the Hamiltonian is fitted to torques"
     if task.solver is not None:
         why = f" ({task.solver.reason})" if task.solver.reason else ""
-        print(f"{task.kind}, {task.precision}, {name_of(task.solver.optimiser)}{why}")
-    for line in device_lines(task.precision):
-        print(line)
+        yield f"{task.kind}, {task.precision}, {name_of(task.solver.optimiser)}{why}"
+    yield from device_lines(task.precision)
 
 
-def warn(task: Task, training: Training, folder: Path) -> None:
-    """Warns about indefinite mass matrices and about a training that ended early."""
-    found = definiteness_of(load(folder).dynamics, task, merged(task.sets))
-    if found is not None and found.share_not_definite > 0:
+def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> Fitted:
+    """Fits the model; the programs that evaluate it compile meanwhile, if the fit does not change its description."""
+    fixed = task.solver is not None and getattr(options, "target", None) is None
+    ahead = programs_ahead(task, mesh, uncertainty=options.uncertainty) if fixed else None
+    task, training = method_of(task.kind).fit(task, options, folder, mesh)
+    if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
+        raise InputError(f"no validation error is finite; {folder} holds no model; look for large numbers in the data")
+    parameters, best = best_seed(training, np.size(task.seeds) if task.solver is not None else 1, task.best)
+    return Fitted(task.description, parameters, Outcome(task, training, ahead or programs_of(task, mesh), best))
+
+
+def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
+    """Errors, speed, uncertainty and verdict of the stored model, with the figures that apply."""
+    task, training, programs, best = fitted.outcome
+    if options.uncertainty:
+        store_uncertainty(folder, task, programs.double, fitted.parameters)
+    seeds = getattr(options, "seeds", 1)
+    evaluation = evaluate(folder, task, training, programs, seeds=seeds, low_latency=options.low_latency)
+    unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
+    more = {"cutoff_hz": task.recorded.cutoff, "validation_units": unit}
+    chosen = {**task.description, **({} if task.solver is None else settings_of(task.solver.optimiser))}
+    chosen |= {name: value for name, value in more.items() if value is not None} | {"seeds": task.seeds}
+    lines = []
+    if seeds > 1:
+        by = "validation" if task.best is None else "cross-validation"
+        lines.append(f"the run keeps seed {options.seed + best}, the best in {by}")
+    limits = [getattr(options, name, None) for name in ("steps", "seconds")]
+    return Judged(
+        metrics=evaluation.metrics,
+        **table(evaluation.metrics, task),
+        verdict=evaluation.judged.verdict,
+        figures=evaluation.figures,
+        chosen=chosen,
+        lines=(*lines, *warnings(task, training, folder), *evaluation.judged.warnings),
+        ended_by_user=task.solver is not None and limits != [None, None],
+        error=failure(task, training, folder),
+    )
+
+
+def warnings(task: Task, training: Training, folder: Path) -> Iterator[str]:
+    """Lines on indefinite mass matrices and on a training that ended early."""
+    definite = definiteness_of(load(folder).dynamics, task, merged(task.sets))
+    if definite is not None and definite.share_not_definite > 0:
         properties = CATALOGUE[task.kind].properties
         structured = f"--model {'structured-hnn' if properties.canonical else 'structured-delan'}"
         remedy = f"another --degree, {structured}" if "degree" in task.description else structured
-        print(
-            f"the mass matrix is not positive definite at {found.share_not_definite:.1%} of the states of the data: "
+        yield (
+            f"the mass matrix is not positive definite at {definite.share_not_definite:.1%} of the states of the data: "
             f"accelerations and rollouts are wrong or infinite there; try {remedy}, or more varied motions"
         )
     if training.stop.reason == "no improvement":
-        print(f"stopped early, at step {training.stop.step}: no better validation error for --patience steps")
+        yield f"stopped early, at step {training.stop.step}: no better validation error for --patience steps"
     if training.stop.reason == "time":
-        print(f"out of time at step {training.stop.step}: kept is the best so far; --resume continues")
-    if training.stop.reason == "not finite":
-        adam = task.solver is not None and isinstance(task.solver.optimiser, Adam)
-        remedy = "lower --learning-rate or use --precision f64" if adam else "check the data"
-        raise InputError(
-            f"the loss stopped being finite after step {training.stop.step}; {folder} holds the last good one; {remedy}"
-        )
+        yield f"out of time at step {training.stop.step}: kept is the best so far; --resume continues"
+
+
+def failure(task: Task, training: Training, folder: Path) -> str:
+    """Why the training failed; empty if it did not."""
+    if training.stop.reason != "not finite":
+        return ""
+    adam = task.solver is not None and isinstance(task.solver.optimiser, Adam)
+    remedy = "lower --learning-rate or use --precision f64" if adam else "check the data"
+    return f"the loss stopped being finite after step {training.stop.step}; {folder} holds the last good one; {remedy}"
+
+
+DYNAMICS = Kind(prepare, announce, fit, judge)

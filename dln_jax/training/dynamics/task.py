@@ -1,5 +1,6 @@
 """A task of dynamics: the data, what they need, the model, and how it is trained."""
 
+import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from dln_jax.learning.kinematics import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
 from dln_jax.scenes.scene import Scene
 from dln_jax.time_limit import seconds_left
-from dln_jax.training.dynamics.options import Options
+from dln_jax.training.dynamics.options import FITS
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build
@@ -81,30 +82,36 @@ class Task(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A way of fitting: what `methods.METHODS` has for the model of a name."""
+    """A way of fitting, `METHOD` of the module that `options.FITS` names for a model."""
 
-    check: Callable[[Options, str], None]
-    """(options, model) -> nothing; refuses options that the method does not read with an `InputError`."""
-    plan: Callable[[Options, str, Recorded, Objective], tuple[dict[str, Any], Solver | None]]
-    """(options, model, data, objective) -> description of the model, and its solver if it has one."""
-    fit: Callable[[Task, Options, Path, Mesh | None], tuple[Task, Training]]
+    plan: Callable[[Any, str, Recorded, Objective], tuple[dict[str, Any], Solver | None]]
+    """(options, model, data, objective) -> description of the model, and its solver if it has one; refuses options that
+    contradict the data with an `InputError`."""
+    fit: Callable[[Task, Any, Path, Mesh | None], tuple[Task, Training]]
     """(task, options, run folder, devices) -> the fit, and the task with the description that the fit has chosen."""
 
 
-def planned(method: Method, given: Options, kind: str, recorded: Recorded, until: float) -> Task:
-    """Returns the task of a model by name, which ends at `until` by `time.perf_counter`; nothing is written yet.
+def method_of(kind: str) -> Method:
+    """The way of fitting a model."""
+    return importlib.import_module(f"dln_jax.training.dynamics.methods.{FITS[kind].method}").METHOD
+
+
+def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:
+    """The task of a model, which ends at `until` by `time.perf_counter`; nothing is written yet.
 
     Raises:
         InputError: data that the model cannot be fitted to.
     """
-    objective = objective_of(kind, recorded.sets.train, given.objective)
-    if objective is TORQUE and given.target is None:
+    asked = getattr(options, "objective", None)
+    objective = objective_of(kind, recorded.sets.train, asked)
+    if objective is TORQUE and getattr(options, "target", None) is None:
         objective = SCALED_TORQUE
-    description, solver = method.plan(given, kind, recorded, objective)
+    description, solver = method_of(kind).plan(options, kind, recorded, objective)
     build(description)  # refuses what no model can be made of
-    return Task(recorded, kind, description, objective, solver, seeds_of(given), until)
+    return Task(recorded, kind, description, objective, solver, seeds_of(options), until)
 
 
-def seeds_of(given: Options) -> int | tuple[int, ...]:
-    """Returns the seed of the options, or all of them if several are trained in one program."""
-    return given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
+def seeds_of(options: Any) -> int | tuple[int, ...]:
+    """The seed of the options, or all of them if several are trained in one program."""
+    seeds = getattr(options, "seeds", 1)
+    return options.seed if seeds == 1 else tuple(range(options.seed, options.seed + seeds))

@@ -1,5 +1,6 @@
 """Uncertainty of a trained model of dynamics: estimated, stored with the run, tested and drawn."""
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ import numpy as np
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures.uncertainty import torque_bands
-from dln_jax.files import write_figure
 from dln_jax.learning.linear import linearised_chunks
 from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
@@ -17,6 +17,7 @@ from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, highest, scores_of_rows, torque_deviation
 from dln_jax.training.dynamics.programs import CHUNK, Programs
 from dln_jax.training.dynamics.task import Task
+from dln_jax.training.pipeline import png
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.run import Run
@@ -36,7 +37,7 @@ def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -
         print(f"a {task.kind} has as many parameters as data: the run does not say what it does not know")
         return
     try:
-        found = estimate(
+        solution = estimate(
             model,
             parameters,
             task.sets.train,
@@ -48,30 +49,29 @@ def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -
         # The model is trained, so an estimate that its data cannot provide is left out instead of refused.
         print(f"the run does not say what it does not know: {error}")
         return
-    facts = {"ridge": found.ridge, "degrees_of_freedom": found.degrees_of_freedom.tolist()}
-    save_uncertainty(folder, found.uncertainty, **facts, torque=task.recorded.torque)
+    facts = {"ridge": solution.ridge, "degrees_of_freedom": solution.degrees_of_freedom.tolist()}
+    save_uncertainty(folder, solution.uncertainty, **facts, torque=task.recorded.torque)
     print(f"bands are of {task.recorded.torque}, for one more motion of the kind that was recorded")
 
 
 def uncertainty_metrics(
-    folder: Path, run: Run, task: Task, programs: Programs, predicted: np.ndarray, *, figures: bool
-) -> dict[str, float]:
-    """Coverage of the 95 % bands on test torques (mean, worst joint), and the share of test states out of distribution.
-
-    Draws `uncertainty.png`. Empty for a run without uncertainty.
+    run: Run, task: Task, programs: Programs, predicted: np.ndarray
+) -> tuple[dict[str, float], dict[str, Callable[[Path], None]]]:
+    """Coverage of the 95 % bands on test torques (mean, worst joint), the share of test states out of distribution,
+    and the figure of both. Empty for a run without uncertainty.
     """
     if run.uncertainty is None:
-        return {}
+        return {}, {}
     test = task.sets.test
-    std, outside = bands(programs.double, run.parameters, run.uncertainty, test)
+    std, out_of_distribution = bands(programs.double, run.parameters, run.uncertainty, test)
     shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
-    if figures:
-        write_figure(folder / "uncertainty.png", torque_bands(test, predicted, std, outside, model=task.kind))
-    return {
+    metrics = {
         "coverage_95_share": float(shares.mean()),
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
-        "outside_share": float(outside.mean()),
+        "outside_share": float(out_of_distribution.mean()),
     }
+    drawn = png(torque_bands, test, predicted, std, out_of_distribution, model=task.kind)
+    return metrics, {"uncertainty.png": drawn}
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
@@ -79,15 +79,15 @@ def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Traject
 
     Reuses the program that the estimate compiled to linearise the torques; `Run.torque_std` would compile it again.
     """
-    found, first = [], 0
+    parts, first = [], 0
     with jax.enable_x64(True):
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         for rows, *_ in linearised_chunks(model, parameters, data, CHUNK):
             part = slice(first, first + len(rows))
-            found.append(_bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part])))
+            parts.append(_bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part])))
             first = part.stop
-    std, outside = zip(*found, strict=True)
-    return np.concatenate(std), np.concatenate(outside)
+    std, out_of_distribution = zip(*parts, strict=True)
+    return np.concatenate(std), np.concatenate(out_of_distribution)
 
 
 @jax.jit

@@ -12,8 +12,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.metrics.verdict import FitRefused, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
-from dln_jax.training.dynamics.options import Options
+from dln_jax.metrics.verdict import HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.training.dynamics.task import Task
 
 AT_NOISE, FAR_FROM_NOISE = 2.0, 4.0
@@ -21,7 +20,7 @@ AT_NOISE, FAR_FROM_NOISE = 2.0, 4.0
 above the second they may be wrong."""
 
 
-class Judged(NamedTuple):
+class TorqueVerdict(NamedTuple):
     """A verdict and the numbers behind it."""
 
     verdict: Verdict | None
@@ -31,8 +30,18 @@ class Judged(NamedTuple):
     validation_nmse: float
     """Mean over joints of the squared error, relative to the torque's variance."""
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A line if a constant torque would be closer than the model."""
+        if self.verdict is None or self.validation_nmse <= 1:
+            return ()
+        return (
+            f"warning: on validation motions the torque's mean square error is {self.validation_nmse:.3g} times its "
+            "variance: a constant torque would be closer than this model",
+        )
 
-def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) -> Judged:
+
+def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) -> TorqueVerdict:
     """The most severe verdict from test motions, validation motions and the search for joint frames.
 
     Args:
@@ -41,7 +50,7 @@ def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) ->
         on_validation: the model's torques on the validation motions.
     """
     if not task.objective.of_torques:
-        return Judged(None, {}, float("nan"))
+        return TorqueVerdict(None, {}, float("nan"))
     test, validation, robot = task.sets.test, task.sets.validation, task.recorded.robot
     noise = torque_noise(task.sets.train)
     tested, validated = (
@@ -54,39 +63,11 @@ def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) ->
         of_search, numbers = searched(task.search.losses, task.search.agreeing, task.search.agreement, tested)
         verdict = verdict if of_search is None else worst(verdict, of_search)
     nmse = {"test_nmse": _nmse(tested), "validation_nmse": _nmse(validated)}
-    return Judged(verdict, {**nmse, **verdict_metrics(tested, verdict), **numbers}, nmse["validation_nmse"])
+    return TorqueVerdict(verdict, {**nmse, **verdict_metrics(tested, verdict), **numbers}, nmse["validation_nmse"])
 
 
-def say(judged: Judged) -> None:
-    """Prints the verdict, and a warning if the error is no better than that of a constant torque."""
-    if judged.verdict is None:
-        return
-    if not judged.validation_nmse <= 1:
-        print(
-            f"warning: on validation motions the torque's mean square error is {judged.validation_nmse:.3g} times its "
-            "variance: a constant torque would be closer than this model"
-        )
-    print(judged.verdict.line)
-
-
-def refuse(judged: Judged, task: Task, given: Options) -> None:
-    """Raises `FitRefused` for a model that must not be used.
-
-    A network whose training ended at the user's own --steps or --seconds is exempt, since training can continue. The
-    command then says so and succeeds.
-    """
-    if judged.verdict is None or judged.verdict.level != "refused":
-        return
-    if task.solver is None or (given.steps is None and given.seconds is None):
-        raise FitRefused(judged.verdict)
-    print(
-        "warning: refused, but training ended at your own --steps or --seconds, so the exit status is 0; "
-        "train longer before you use this model"
-    )
-
-
-def _nmse(found: HeldOut) -> float:
-    return float(np.mean(found.error / found.unit))
+def _nmse(errors: HeldOut) -> float:
+    return float(np.mean(errors.error / errors.unit))
 
 
 def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
@@ -97,7 +78,7 @@ def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
 
 
 def searched(
-    losses: np.ndarray, agreeing: int, agreement: int, found: HeldOut
+    losses: np.ndarray, agreeing: int, agreement: int, errors: HeldOut
 ) -> tuple[Verdict | None, dict[str, float | int]]:
     """Verdict and metrics of a search for joint frames: agreement of its descents, and their errors over the noise.
 
@@ -105,12 +86,12 @@ def searched(
         losses: losses of all descents.
         agreeing: number of descents that reached the lowest loss.
         agreement: number of agreeing descents that the search aims for.
-        found: errors on held-out motions.
+        errors: errors on held-out motions.
     """
     numbers: dict[str, float | int] = {"descents": len(losses), "descents_agreeing": agreeing}
     above = None
-    if found.noise is not None and (found.noise > 0).all():
-        above = float(np.mean(found.error / found.noise))
+    if errors.noise is not None and (errors.noise > 0).all():
+        above = float(np.mean(errors.error / errors.noise))
         numbers |= {"error_over_noise": above}
         if above <= AT_NOISE:
             return None, numbers

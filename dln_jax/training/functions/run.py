@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 
 from dln_jax.cli.optimisers import name_of
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder
 from dln_jax.cli.scaled import mesh_of
-from dln_jax.cli.stored_arguments import write_config
+from dln_jax.cli.stored_arguments import command_folder, write_config
 from dln_jax.data.functions import SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve

@@ -7,7 +7,7 @@ import numpy as np
 from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.options import Drawn, Resumable
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder, write_config
 from dln_jax.cli.scaled import mesh_of
+from dln_jax.cli.stored_arguments import command_folder, write_config
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import write_json
 from dln_jax.learning.engine.problem import Progress

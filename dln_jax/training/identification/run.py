@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dln_jax.cli.running import command_folder
-from dln_jax.cli.stored_arguments import write_config
+from dln_jax.cli.stored_arguments import command_folder, write_config
 from dln_jax.data.robot_files import write_robot
 from dln_jax.figures.friction import friction_curves
 from dln_jax.figures.identification import torque_by_joint

@@ -13,7 +13,7 @@ import numpy as np
 
 from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.options import Resumable
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import write_bytes, write_figure
 from dln_jax.metrics.report import conditions, publish
 from dln_jax.types import InputError

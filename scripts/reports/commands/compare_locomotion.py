@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from dln_jax.cli.arguments import Unstated
 from dln_jax.cli.options import Drawn, Folder, Scaled
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.scaled import mesh_of
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.methods import METHODS, Trained, settings_of

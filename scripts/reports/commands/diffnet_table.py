@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dln_jax.cli.options import Resumable
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.learning.functions import WIDTHS
 from dln_jax.metrics.report import conditions, publish

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import jax
 
 from dln_jax.cli.options import Folder
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.figures import style
 from dln_jax.figures.animations import DPI, write_gif
 from dln_jax.types import require_positive

@@ -16,7 +16,7 @@ from typing import Annotated, ClassVar
 
 from dln_jax.cli.arguments import Unstated, choice, names_in, refuse_given, require_positive_if_given
 from dln_jax.cli.options import Drawn, Resumable
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import write_bytes
 from dln_jax.metrics.report import conditions, publish
 from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from dln_jax.cli.arguments import Unstated, choice, names_in
 from dln_jax.cli.options import Folder
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.types import InputError
 from scripts.reports.case import measure_and_publish
 from scripts.reports.robots import MEASURES, cases

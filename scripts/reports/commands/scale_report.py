@@ -12,7 +12,7 @@ from typing import Annotated
 
 from dln_jax.cli.arguments import Unstated, choice, names_in
 from dln_jax.cli.options import Drawn, Folder
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import finite, write_json
 from dln_jax.metrics.report import conditions, publish
 from dln_jax.types import InputError, require_positive

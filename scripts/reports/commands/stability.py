@@ -9,7 +9,7 @@ from typing import Annotated
 
 from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Drawn, Folder
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from scripts.reports.case import measure_and_publish, named
 from scripts.reports.stability import NAMES, cases
 

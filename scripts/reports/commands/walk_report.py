@@ -14,7 +14,7 @@ import numpy as np
 
 from dln_jax.cli.commands import identify, train_delan
 from dln_jax.cli.options import Folder
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data import schema
 from dln_jax.files import write_json
 from dln_jax.scenes.cart_pole import cart_pole

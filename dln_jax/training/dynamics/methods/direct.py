@@ -44,8 +44,8 @@ def refined(task: Task, start: Training) -> Training:
         why = reason if task.precision == "f64" else "the precision is f32"
         raise InputError(f"--objective refines a {task.kind} model by Gauss-Newton in f64, but {why}; leave it out")
     problem = dynamics.problem(model, task.sets, task.objective)._replace(parameters=start.parameters)
-    found = fit(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=task.seconds, must_start=False)
-    history = one_after_the_other([start.history, found.history])
-    print(f"refined by both sides' errors: validation {start.validation:.2e}, after it {found.validation:.2e}")
-    better = np.isfinite(found.validation) and found.validation < start.validation
-    return (found if better else start)._replace(history=history, compile_seconds=found.compile_seconds)
+    refit = fit(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=task.seconds, must_start=False)
+    history = one_after_the_other([start.history, refit.history])
+    print(f"refined by both sides' errors: validation {start.validation:.2e}, after it {refit.validation:.2e}")
+    better = np.isfinite(refit.validation) and refit.validation < start.validation
+    return (refit if better else start)._replace(history=history, compile_seconds=refit.compile_seconds)

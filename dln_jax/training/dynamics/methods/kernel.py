@@ -6,12 +6,12 @@ from typing import Any
 
 from jax.sharding import Mesh
 
-from dln_jax.cli.arguments import refuse_given, require_positive_if_given, resolved
+from dln_jax.cli.arguments import require_positive_if_given, resolved
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.kernel import choose_kernel
 from dln_jax.learning.objectives import Objective
 from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
-from dln_jax.training.dynamics.options import Options, check_direct_options
+from dln_jax.training.dynamics.options import KernelOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task
 from dln_jax.zoo.descriptions import describe_for
@@ -20,21 +20,15 @@ SAMPLES = 600
 """Largest number of samples that the kernel is made of, unless stated."""
 
 
-def check(given: Options, kind: str) -> None:
-    """Refuses the options of networks and of models with parameters."""
-    refuse_given(given, ["objective"], "for models with parameters; the trigonometric kernel is fitted to torques")
-    check_direct_options(given, ("degree", "seconds"), "the trigonometric kernel", "is one linear problem")
-    require_positive_if_given(given, ["samples"])
-
-
-def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
+def plan(options: KernelOptions, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
     """The kernel of at most the stated number of samples."""
-    sizes = resolved(given, {"samples": SAMPLES})
-    precision = given.precision or "f64"
+    require_positive_if_given(options, ["samples"])
+    sizes = resolved(options, {"samples": SAMPLES})
+    precision = options.precision or "f64"
     return describe_for(kind, recorded.sets.train, recorded.needs, precision=precision, **sizes), None
 
 
-def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+def fit(task: Task, options: KernelOptions, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """Fits two kernels, with and without the assumption of a serial chain, and selects one by validation."""
     began = time.perf_counter()
     upper, available = task.description["samples"], len(task.sets.train.tau)
@@ -57,4 +51,4 @@ def _order(serial: bool) -> str:
     return "a chain" if serial else "any order"
 
 
-KERNEL = Method(check, plan, fit)
+METHOD = Method(plan, fit)

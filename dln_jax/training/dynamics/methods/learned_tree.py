@@ -10,7 +10,7 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.objectives import Objective
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
-from dln_jax.training.dynamics.options import Options, check_direct_options
+from dln_jax.training.dynamics.options import TreeOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task
 from dln_jax.types import InputError, Needs
@@ -28,19 +28,16 @@ def needs_of_tree(needs: Needs) -> Needs:
     return needs._replace(friction=needs.friction or bool(needs.joint_friction), joint_friction=())
 
 
-def check(given: Options, kind: str) -> None:
-    """Refuses the options of networks."""
-    check_direct_options(given, ("degree", "samples"), "the learned tree", "has a search of its own")
-
-
-def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
+def plan(options: TreeOptions, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
     """The tree with the stated parents of its joints."""
     needs = needs_of_tree(recorded.needs)
     stated = {"parents": recorded.parents, "velocity_scale": needs.velocity_scale}
-    return describe_for(kind, recorded.sets.train, needs, precision=given.precision or "f64", **stated), None
+    return describe_for(
+        kind, recorded.sets.train, needs, precision=getattr(options, "precision", None) or "f64", **stated
+    ), None
 
 
-def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+def fit(task: Task, options: TreeOptions, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """Joint frames by Gauss-Newton from random starts, or near the stated kinematics; all else by elimination."""
     needs, kinematic_prior = needs_of_tree(task.needs), task.recorded.kinematic_prior
     near = (
@@ -59,7 +56,7 @@ def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Ta
         parents=task.description["parents"],
         acceleration=task.description["acceleration"],
         velocity_scale=task.description["velocity_scale"],
-        settings=Search(seed=given.seed, seconds=task.seconds, **near),
+        settings=Search(seed=options.seed, seconds=task.seconds, **near),
         report=print,
     )
     size = f"{solution.parameter_count} parameters, of the linear ones rank {solution.rank}, "
@@ -69,4 +66,4 @@ def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Ta
     return task, refined_if_asked(task, training)
 
 
-LEARNED_TREE = Method(check, plan, fit)
+METHOD = Method(plan, fit)

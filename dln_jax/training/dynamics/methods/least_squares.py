@@ -10,29 +10,26 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import Objective
 from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
-from dln_jax.training.dynamics.options import Options, check_direct_options
+from dln_jax.training.dynamics.options import TrigonometricOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task
 from dln_jax.zoo.descriptions import build, describe_for
 
 
-def check(given: Options, kind: str) -> None:
-    """Refuses the options of networks."""
-    check_direct_options(given, ("seconds", "samples"), "the trigonometric model", "is one least-squares problem")
-
-
-def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
+def plan(
+    options: TrigonometricOptions, kind: str, recorded: Recorded, objective: Objective
+) -> tuple[dict[str, Any], None]:
     """The model with the stated degree, or degree 1 until validation chooses others."""
-    degree = 1 if given.degree is None else given.degree
-    precision = given.precision or "f64"
+    degree = 1 if options.degree is None else options.degree
+    precision = options.precision or "f64"
     return describe_for(kind, recorded.sets.train, recorded.needs, precision=precision, degree=degree), None
 
 
-def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+def fit(task: Task, options: TrigonometricOptions, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """Fits the model by least squares; without a stated degree, validation chooses the degrees first."""
     began = time.perf_counter()
     chosen = None
-    if given.degree is None:
+    if options.degree is None:
         chosen, trials = choose_degrees(task.needs, task.sets.train, task.sets.validation)
         tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
         print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
@@ -48,4 +45,4 @@ def _degrees(degrees: tuple[int, ...]) -> str:
     return "-".join(map(str, degrees))
 
 
-LEAST_SQUARES = Method(check, plan, fit)
+METHOD = Method(plan, fit)

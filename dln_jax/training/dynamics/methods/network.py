@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.cli.arguments import refuse_given, resolved
+from dln_jax.cli.arguments import refuse_given, require_positive_if_given, resolved
 from dln_jax.cli.optimisers import name_of, optimiser_named
 from dln_jax.cli.progress import progress
 from dln_jax.data.splits import Split, drawn, merged, select
@@ -15,43 +15,31 @@ from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit as train_problem
 from dln_jax.learning.engine.problem import Problem, Training, require_finite_start
 from dln_jax.learning.objectives import Objective
-from dln_jax.learning.suited import MANY_JOINTS, suited_network
+from dln_jax.learning.suited import MANY_JOINTS, Suited, suited_network
 from dln_jax.sizes import require_network
 from dln_jax.training.dynamics.methods.growth import grow_to_target
-from dln_jax.training.dynamics.options import OF_ADAM, Options
+from dln_jax.training.dynamics.options import NETWORK, AdamOptions, NetworkOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Solver, Task, seeds_of
 from dln_jax.training.results import losses
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for
 
-
-def check(given: Options, kind: str) -> None:
-    """Refuses options of other models, and what does not go with --target."""
-    refuse_given(given, ["degree"], "for the trigonometric model")
-    if given.target is None:
-        return
-    if kind != "structured-delan" or given.optimizer == "adam" or given.seeds > 1:
-        raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
-    refuse_given(given, ["width", "depth"], "what --target grows")
-    refuse_given(given, ["samples"], "for one network, and --target grows several")
-    require_positive(target=given.target)
+OF_ADAM = tuple(AdamOptions.__dataclass_fields__)
 
 
-def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], Solver]:
+def plan(options: Any, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], Solver]:
     """The network and its optimiser: as stated, or as the size of the model and the data suggest."""
-    needs, sets, optimizer = recorded.needs, recorded.sets, given.optimizer
-    suited = None
-    sized = given.width is None and given.depth is None and given.target is None
-    if kind == "structured-delan" and optimizer == "auto" and sized and needs.degrees_of_freedom >= MANY_JOINTS:
-        suited = suited_network(needs, sets.train)
-        optimizer = suited.optimizer
+    check(options)
+    needs, sets, optimizer = recorded.needs, recorded.sets, options.optimizer
+    suited = suited_to_many_joints(options, kind, recorded)
+    optimizer = optimizer if suited is None else suited.optimizer
     adam = optimizer == "adam"
-    precision = given.precision or ("f32" if adam else "f64")
+    precision = options.precision or ("f32" if adam else "f64")
     # A structured model needs fewer units; first-order training needs more.
     width = 64 if adam else 8 if CATALOGUE[kind].properties.definite else 16
-    keywords = resolved(given, {"width": width, "depth": 2, "activation": "tanh"})
+    keywords = resolved(options, {"width": width, "depth": 2, "activation": "tanh"})
     keywords |= {} if suited is None else suited.keywords
     require_network(width=keywords["width"], depth=keywords["depth"])
     description = describe_for(kind, sets.train, needs, precision=precision, **keywords)
@@ -59,23 +47,41 @@ def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) ->
     if optimizer == "auto":
         suited_kind, reason = dynamics.suited_optimiser(build(description), sets, objective)
         optimizer = name_of(suited_kind)
-        description["precision"] = precision = given.precision or ("f32" if optimizer == "adam" else "f64")
-    if optimizer == "gauss-newton":
-        chosen = "auto chose gauss-newton" if reason else "the optimizer is gauss-newton"
-        refuse_given(given, OF_ADAM, f"for adam, but {chosen}: add --optimizer adam")
-    elif given.samples is not None:
-        chosen = "auto chose adam: add --optimizer gauss-newton" if reason else "the optimizer is adam"
-        raise InputError(f"--samples is for gauss-newton, but {chosen}; or leave it out")
-    settings = {name: getattr(given, name) for name in (*OF_ADAM, "steps", "target")}
-    if suited is not None and given.steps is None:
-        settings["steps"] = suited.steps
-    samples = given.samples if suited is None or given.samples is not None else suited.samples
-    optimiser, seeds = optimiser_named(optimizer, precision=precision, **settings), seeds_of(given)
+        description["precision"] = precision = options.precision or ("f32" if optimizer == "adam" else "f64")
+    settings = {name: getattr(options, name, None) for name in (*OF_ADAM, "steps", "target")}
+    samples = getattr(options, "samples", None)
+    if suited is not None:
+        settings["steps"] = suited.steps if options.steps is None else options.steps
+        samples = suited.samples if samples is None else samples
+    optimiser, seeds = optimiser_named(optimizer, precision=precision, **settings), seeds_of(options)
     model = build(description)
     require_finite_start(
         dynamics.problem(model, sets, objective, seeds=seeds), dynamics.samples(model, sets, objective)
     )
     return description, Solver(optimiser, reason, posed(description, sets, objective, samples, seeds), samples)
+
+
+def check(options: Any) -> None:
+    """Refuses numbers out of range, and options that --target decides."""
+    require_positive(seeds=options.seeds, folds=options.folds)
+    require_seed(options.seed, options.seeds)
+    require_positive_if_given(options, ["seconds", "target"])
+    if getattr(options, "target", None) is None:
+        return
+    if options.optimizer == "adam" or options.seeds > 1:
+        raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
+    refuse_given(options, ["width", "depth"], "what --target grows")
+    if hasattr(options, "samples"):
+        refuse_given(options, ["samples"], "for one network, and --target grows several")
+
+
+def suited_to_many_joints(options: Any, kind: str, recorded: Recorded) -> Suited | None:
+    """The structured network, optimiser and samples that suit data of four joints or more, unless they are stated."""
+    sized = options.width is None and options.depth is None and getattr(options, "target", None) is None
+    many = recorded.needs.degrees_of_freedom >= MANY_JOINTS
+    if kind == NETWORK and options.optimizer == "auto" and sized and many:
+        return suited_network(recorded.needs, recorded.sets.train)
+    return None
 
 
 def posed(
@@ -88,16 +94,16 @@ def posed(
     return dynamics.problem(build(description), some, objective._replace(scale=lambda data: scale), seeds=seeds)
 
 
-def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+def fit(task: Task, options: NetworkOptions, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """Trains the network; of several seeds cross-validation prefers one; --target grows networks."""
-    solver = solver_of(task)
-    if given.target is not None:
-        return grow_to_target(task, solver.optimiser, given.target, folder, resume=given.resume, mesh=mesh)
-    several = given.seeds > 1 and given.folds > 1
-    fits = given.folds + 1 if several else 1
-    training = train(task, solver, folder, resume=given.resume, mesh=mesh, fits=fits)
+    solver, resume = solver_of(task), getattr(options, "resume", False)
+    if (target := getattr(options, "target", None)) is not None:
+        return grow_to_target(task, solver.optimiser, target, folder, resume=resume, mesh=mesh)
+    several = options.seeds > 1 and options.folds > 1
+    fits = options.folds + 1 if several else 1
+    training = train(task, solver, folder, resume=resume, mesh=mesh, fits=fits)
     if several:
-        task = cross_validated(task, solver, folder, folds=given.folds, resume=given.resume, mesh=mesh)
+        task = cross_validated(task, solver, folder, folds=options.folds, resume=resume, mesh=mesh)
     return task, training
 
 
@@ -143,9 +149,9 @@ def cross_validated(task: Task, solver: Solver, folder: Path, *, folds: int, res
         )
         total += np.asarray(training.validation) * len(sets.validation.t)
     errors = total / len(rest.t)
-    said = ", ".join(f"{seed}: {error:.2e}" for seed, error in zip(np.ravel(task.seeds), errors, strict=True))
-    print(f"cross-validated errors by seed, {folds} folds: {said}")
+    text = ", ".join(f"{seed}: {error:.2e}" for seed, error in zip(np.ravel(task.seeds), errors, strict=True))
+    print(f"cross-validated errors by seed, {folds} folds: {text}")
     return task._replace(best=int(np.argmin(np.nan_to_num(errors, nan=np.inf))))
 
 
-NETWORK = Method(check, plan, fit)
+METHOD = Method(plan, fit)

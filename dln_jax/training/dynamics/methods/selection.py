@@ -12,6 +12,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
+from dln_jax.cli.arguments import class_with, require_positive_if_given
 from dln_jax.data.encoders.noise import noise_of
 from dln_jax.data.robots import Robot
 from dln_jax.data.splits import every
@@ -21,18 +22,16 @@ from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
 from dln_jax.learning.model_selection import Assessment, Candidate, FittedModel, Selection, select_model
-from dln_jax.learning.objectives import SCALED_TORQUE
+from dln_jax.learning.objectives import SCALED_TORQUE, Objective, require_scales
 from dln_jax.mechanics.trees import tree_to_json
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
 from dln_jax.models.serial_tree import tree_of
-from dln_jax.time_limit import deadline, seconds_left
-from dln_jax.training.dynamics.methods import METHODS
 from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
-from dln_jax.training.dynamics.options import NETWORK, ArmOptions, Options
+from dln_jax.training.dynamics.options import NETWORK, Options, SelectionOptions, options_of
 from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.task import Task, planned
+from dln_jax.training.dynamics.task import Method, Task, method_of, planned
 from dln_jax.training.identification.additions import with_network
 from dln_jax.training.identification.task import Case, Sets, with_description, with_shapes
 from dln_jax.zoo.descriptions import Description, build, describe
@@ -46,14 +45,22 @@ BESIDE = "-residual"
 """Suffix of the name of a model with a residual network."""
 
 
-def train_selected(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """Trains the model selected by validation; prints all candidates and writes them to `model_selection.json`.
+def plan(options: SelectionOptions, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
+    """No description: the selected model brings its own."""
+    require_positive_if_given(options, ["seconds"])
+    require_scales(recorded.sets.train)
+    return {}, None
+
+
+def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+    """Fits the candidates, prints them and writes them to `model_selection.json`; returns the selected one.
 
     The devices of a mesh share the final network; all other candidates are fitted on one device.
 
     Raises:
         InputError: no model could be fitted.
     """
+    recorded = task.recorded
     train_set, validation, _ = recorded.sets
     needs = recorded.needs
     if needs.friction:
@@ -62,17 +69,17 @@ def train_selected(given: Options, recorded: Recorded, folder: Path, mesh: Mesh 
         recorded = recorded._replace(needs=needs._replace(friction=False, joint_friction=laws))
         print(f"friction of every model: {', '.join(laws)} in each joint")
     noise = noise_of(train_set.tau, train_set.trajectory)
-    found = select_model(
-        _candidates(given, recorded, folder, mesh),
+    selection = select_model(
+        _candidates(options, recorded, folder, mesh),
         train_set,
         validation,
         noise=noise if np.isfinite(noise).all() and noise.all() else None,
-        seconds=SELECTION_SECONDS if given.seconds is None else seconds_left(deadline(given.seconds)),
+        seconds=SELECTION_SECONDS if options.seconds is None else task.seconds,
         report=report,
     )
-    print_selection(found)
-    write_json(folder / "model_selection.json", as_json(found))
-    return found.fitted.outcome
+    print_selection(selection)
+    write_json(folder / "model_selection.json", as_json(selection))
+    return selection.fitted.outcome
 
 
 def report(step: Assessment) -> None:
@@ -86,35 +93,37 @@ def report(step: Assessment) -> None:
         print(f"{step.name}: validation nMSE {step.nmse.mean():.3g}, {worst}, {step.seconds:.1f} s")
 
 
-def print_selection(found: Selection) -> None:
+def print_selection(selection: Selection) -> None:
     """Prints a table of all candidates, and why the selection ended."""
     title = "candidates, by errors on validation motions"
     table = Table("model", "nMSE, mean", "nMSE, worst joint", "s", "", title=title)
-    for step in found.steps:
-        numbers = ["", "", ""] if step.nmse is None else [f"{each:.2e}" for each in (step.nmse.mean(), step.nmse.max())]
+    for step in selection.steps:
+        numbers = (
+            ["", "", ""] if step.nmse is None else [f"{number:.2e}" for number in (step.nmse.mean(), step.nmse.max())]
+        )
         if step.nmse is not None:
             numbers.append(f"{step.seconds:.1f}")
-        said = "kept" if step is found.chosen else "not tried" if not step.tried else "none" * (step.nmse is None)
-        table.add_row(step.name, *numbers, said)
+        state = "kept" if step is selection.chosen else "not tried" if not step.tried else "none" * (step.nmse is None)
+        table.add_row(step.name, *numbers, state)
     Console(highlight=False, soft_wrap=True).print(table)
-    if found.ended:
-        print(f"no further model was tried: {found.ended}")
+    if selection.ended:
+        print(f"no further model was tried: {selection.ended}")
 
 
-def as_json(found: Selection) -> dict[str, Any]:
+def as_json(selection: Selection) -> dict[str, Any]:
     """Contents of `model_selection.json`."""
     candidates = []
-    for step in found.steps:
+    for step in selection.steps:
         mean = None if step.nmse is None else float(step.nmse.mean())
         joints = None if step.nmse is None else step.nmse.tolist()
         errors = {"validation_nmse": mean, "validation_nmse_joints": joints}
         candidates.append(
             {"name": step.name, "tried": step.tried, **errors, "seconds": step.seconds, "reason": step.reason}
         )
-    return {"kept": found.chosen.name, "ended": found.ended, "candidates": candidates}
+    return {"kept": selection.chosen.name, "ended": selection.ended, "candidates": candidates}
 
 
-def _candidates(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Candidate]:
+def _candidates(options: Any, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Candidate]:
     """The candidates, from the strongest prior knowledge to the weakest."""
     bases: dict[str, FittedModel] = {}
 
@@ -129,10 +138,10 @@ def _candidates(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | N
         ]
 
     def by_name(name: str) -> Callable[[float], FittedModel]:
-        return lambda left: _by_name(name, given, recorded, folder, mesh, left)
+        return lambda left: _by_name(name, options, recorded, folder, mesh, left)
 
     robot = recorded.robot
-    known = [] if robot is None else both("rigid-tree", lambda left: _rigid_tree(given, recorded, robot))
+    known = [] if robot is None else both("rigid-tree", lambda left: _rigid_tree(options, recorded, robot))
     learned = both("learned-tree", by_name("learned-tree"))
     first, second = (parameters_of_degree(recorded.needs, degree) for degree in (1, 2))
     # A small basis is fitted within a second; a search for joint frames takes half a minute.
@@ -158,17 +167,17 @@ def _too_large(size: int | None) -> Callable[[float], str]:
     return lambda left: f"its basis has {number} coefficients; at most {MOST_PARAMETERS:,} are tried"
 
 
-def _by_name(
-    name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float
-) -> FittedModel:
-    """Trains a model as `--model NAME` would."""
-    limit = min(left, CANDIDATE_SECONDS if given.seconds is None else math.inf)
-    own, method = dataclasses.replace(given, model=name), METHODS[name]
-    task, training = method.fit(planned(method, own, name, recorded, time.perf_counter() + limit), own, folder, mesh)
+def _by_name(name: str, options: Any, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float) -> FittedModel:
+    """Trains a model as `--model NAME` would, with the common options and the defaults of its fit."""
+    limit = min(left, CANDIDATE_SECONDS if options.seconds is None else math.inf)
+    common = {field.name: getattr(options, field.name) for field in dataclasses.fields(Options)}
+    own = class_with(Options, options_of({"model": name}))(**{**common, "model": name})
+    task = planned(own, name, recorded, time.perf_counter() + limit)
+    task, training = method_of(name).fit(task, own, folder, mesh)
     return FittedModel(build(task.description), training.parameters, (task, training))
 
 
-def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> FittedModel:
+def _rigid_tree(options: Any, recorded: Recorded, robot: Robot) -> FittedModel:
     """Identifies the robot's tree as the command `identify` does."""
     needs = recorded.needs
     train_set, validation, _ = recorded.sets
@@ -177,10 +186,9 @@ def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> FittedModel
     description = describe("rigid-tree", precision="f64", **stated)
     sets = Sets(train_set, validation, blocks=False)
     case = with_description(Case(robot, robot.tree.names, sets, description, None, None, None, (), ()))
-    scale = given.velocity_scale if isinstance(given, ArmOptions) else None
-    case = with_shapes(scale, case)
-    found = identify(case.model, case.known, train_set, joints=robot.tree.joints)
-    kept = parameters_of(found.theta, case.known)
+    case = with_shapes(options.velocity_scale, case)
+    solution = identify(case.model, case.known, train_set, joints=robot.tree.joints)
+    kept = parameters_of(solution.theta, case.known)
     return _as_training(recorded, case.description, case.model, kept, time.perf_counter() - began)
 
 
@@ -210,17 +218,19 @@ def _with_network(recorded: Recorded, base: FittedModel | None, left: float) -> 
 def _as_rigid(learned: FittedModel, recorded: Recorded) -> FittedModel:
     """Converts a learned tree to a tree with known frames."""
     task: Task = learned.outcome[0]
-    needs, given, found = needs_of_tree(recorded.needs), task.description, learned.parameters
-    tree = tree_of(found, needs, parents=given["parents"], acceleration=given["acceleration"])
+    needs, stated, solution = needs_of_tree(recorded.needs), task.description, learned.parameters
+    tree = tree_of(solution, needs, parents=stated["parents"], acceleration=stated["acceleration"])
     laws = USUAL if needs.friction else ()
     description = describe(
         "rigid-tree",
         precision="f64",
         needs=needs._replace(friction=False, joint_friction=laws),
         tree=tree_to_json(tree),
-        velocity_scale=given["velocity_scale"],
+        velocity_scale=stated["velocity_scale"],
     )
-    parameters = RigidTreeParameters(found.inertias, found.armature, found.viscous, found.coulomb, found.offset)
+    parameters = RigidTreeParameters(
+        solution.inertias, solution.armature, solution.viscous, solution.coulomb, solution.offset
+    )
     return _as_training(recorded, description, build(description), parameters, 0.0)
 
 
@@ -230,3 +240,6 @@ def _as_training(
     """Wraps a fit as a task and its training, as for models trained by name."""
     task = Task(recorded, description["name"], description, SCALED_TORQUE, None, 0, math.inf)
     return FittedModel(model, parameters, (task, training_of(task, parameters, float("nan"), seconds)))
+
+
+METHOD = Method(plan, fit)
