@@ -5,6 +5,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 LAYERS = {
+    "errors": -4,
     "types": -3,  # symbols: everyone may read them
     "interrupts": -3,
     "time_limit": -3,
@@ -35,7 +36,8 @@ LAYERS = {
     "cli.sweeps": 12,
     "cli.commands": 13,
     "__main__": 14,
-    "__init__": 14,  # the public names, gathered from every layer
+    "public": 14,  # the public names, gathered from every layer
+    "__init__": 15,
 }
 MODULES = sorted((ROOT / "dln_jax").rglob("*.py"))
 

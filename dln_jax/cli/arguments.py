@@ -1,6 +1,7 @@
 """Typed command lines: options that belong to a choice, help texts, and mistakes reported in one line."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import NoneType
@@ -143,7 +144,7 @@ def parse(
 def _typed(line: Sequence[str]) -> dict[str, Any]:
     """The options on a command line with their text; those without a value are `True`."""
     typed: dict[str, Any] = {}
-    for word, following in zip(line, [*line[1:], "--"], strict=True):
+    for word, following in itertools.pairwise([*line, "--"]):
         if word.startswith("--"):
             option, equals, text = word[2:].partition("=")
             typed[option.replace("-", "_")] = text if equals else following if following[:2] != "--" else True

@@ -1,8 +1,9 @@
-"""A new way of fitting is a method and an entry of the catalogue: the rest of the pipeline needs no change."""
+"""A new way of fitting is a method and two entries: the rest of the pipeline needs no change."""
 
 import json
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +11,15 @@ import numpy as np
 import pytest
 
 import dln_jax
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan, train_hnn
 from dln_jax.data import schema
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.models.model import Model
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.training.dynamics.methods import METHODS
 from dln_jax.training.dynamics.methods.direct import training_of
-from dln_jax.training.dynamics.options import AUTO, Options, check_direct_options
+from dln_jax.training.dynamics.options import AUTO, FITS, VARIANTS, Fit, Options
 from dln_jax.training.dynamics.run import run
 from dln_jax.training.dynamics.task import Method
 from dln_jax.types import Needs
@@ -36,34 +37,37 @@ def make_rod(needs: Needs, *, dtype=jnp.float64) -> Model:
     return Model(lambda key: jnp.ones(2, dtype), energies)
 
 
-def fit(task, given, folder, mesh):
+def fit(task, options, folder, mesh):
     """Inertia and weight from tau = inertia qdd + weight sin q, by least squares in closed form."""
     train = task.sets.train
     columns = np.column_stack([train.qdd[:, 0], np.sin(train.q[:, 0])])
     parameters = np.linalg.lstsq(columns, train.tau[:, 0])[0]
-    return task, training_of(task, jnp.asarray(parameters), 0.0, 0.0)
+    return task, training_of(task, options.heaviness * jnp.asarray(parameters), 0.0, 0.0)
 
 
-ROD = Method(
-    check=lambda given, kind: check_direct_options(given, ("degree",), "the rod", "has two parameters"),
-    plan=lambda given, kind, recorded, objective: (
-        describe_for(kind, recorded.sets.train, recorded.needs, precision="f64"),
-        None,
-    ),
-    fit=fit,
-)
+def plan(options, kind, recorded, objective):
+    return describe_for(kind, recorded.sets.train, recorded.needs, precision="f64"), None
+
+
+@dataclass(frozen=True)
+class RodOptions:
+    """Options of its fit."""
+
+    heaviness: float = 1.0
+    """Factor of the parameters."""
 
 
 @dataclass(frozen=True)
 class Arguments(Options):
     """Of a command that trains it."""
 
+    VARIANTS: ClassVar = VARIANTS
     model: str = "rod"
 
 
 @pytest.fixture
 def rod(monkeypatch):
-    monkeypatch.setitem(METHODS, "rod", ROD)
+    monkeypatch.setitem(FITS, "rod", Fit(lambda: Method(plan, fit), (RodOptions,)))
     monkeypatch.setitem(CATALOGUE, "rod", Entry(make_rod, Properties(linear=True), MappingProxyType({})))
 
 
@@ -72,7 +76,7 @@ def test_a_method_and_an_entry_are_all_that_a_new_model_needs(rod, tmp_path, mon
     scene = pendulum()
     schema.save("log.npz", generators.uniform(scene, samples=80))
     options = {"data": tmp_path / "log.npz", "out": tmp_path / "run", "figures": False, "low_latency": False}
-    run(Arguments(**options), "train_delan")
+    run(arguments_of(Arguments, heaviness=1.0, **options), "train_delan")
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["torque_mse"] < 1e-20 and metrics["verdict"] == 0
     plant = dln_jax.load(tmp_path / "run").dynamics
@@ -87,11 +91,11 @@ def test_a_method_and_an_entry_are_all_that_a_new_model_needs(rod, tmp_path, mon
 def test_every_model_of_a_command_has_a_method(command):
     hint = command.Arguments.__annotations__["model"]
     names = {name for literal in _literals(hint) for name in literal}
-    assert names - {AUTO} <= set(METHODS) <= set(CATALOGUE) and names
+    assert names - {AUTO} <= set(FITS) - {AUTO} <= set(CATALOGUE) and names
 
 
 def _literals(hint):
     inner = getattr(hint, "__args__", ())
-    if inner and all(isinstance(each, str) for each in inner):
+    if inner and all(isinstance(name, str) for name in inner):
         return [inner]
-    return [found for each in inner for found in _literals(each)]
+    return [literal for part in inner for literal in _literals(part)]

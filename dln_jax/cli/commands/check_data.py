@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from dln_jax.cli.arguments import Unstated, names_listed, refuse_given
-from dln_jax.cli.encoders import Logged
-from dln_jax.cli.options import Drawn, Folder
+from dln_jax.cli.options import Drawn, Folder, Logged
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data.checks import Examination, examine, read, report
 from dln_jax.data.robots import read_robot

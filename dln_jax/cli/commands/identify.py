@@ -6,17 +6,12 @@ parameters.json, the robot's file with the identified values, and figures. Judge
 of time where there is one trajectory only.
 """
 
-from dataclasses import dataclass
-
-from dln_jax.training.identification.run import run
-from dln_jax.training.identification.task import Options
+from dln_jax.training.identification.options import Options as Arguments
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arguments(Options):
-    """Robot, data and method of identification."""
-
-
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Identifies the robot, evaluates the model and writes the run folder."""
-    run(given, "identify")
+    from dln_jax.training.identification.run import IDENTIFICATION
+    from dln_jax.training.pipeline import train
+
+    train(IDENTIFICATION, options, "identify")

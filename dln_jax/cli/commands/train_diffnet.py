@@ -5,10 +5,22 @@ y [N, m] and optional dy, d2y. A run folder gets config.json, metrics.json, mode
 with dln_jax.load), and figures. For the published table of activations and losses see diffnet_table.
 """
 
-from dln_jax.training.functions.run import run
-from dln_jax.training.functions.task import Options as Arguments
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dln_jax.training.functions.options import VARIANTS, Options
 
 
-def main(given: Arguments) -> None:
+@dataclass(frozen=True)
+class Arguments(Options):
+    """What to train on, how, and where the results go."""
+
+    VARIANTS: ClassVar = VARIANTS
+
+
+def main(options: Arguments) -> None:
     """Trains and evaluates the network, and writes the run folder."""
-    run(given, "train_diffnet")
+    from dln_jax.training.functions.run import FUNCTIONS
+    from dln_jax.training.pipeline import train
+
+    train(FUNCTIONS, options, "train_diffnet")

@@ -4,10 +4,19 @@ The films are generated: 28 x 28 pixels of a swinging rod. A run folder gets con
 model.safetensors and model.json (load them with dln_jax.load), a checkpoint to --resume from, and figures.
 """
 
-from dln_jax.training.hamiltonian.images import Options as Arguments
-from dln_jax.training.hamiltonian.images import run
+from dataclasses import dataclass
+
+from dln_jax.training.hamiltonian.options import ImageOptions
 
 
-def main(given: Arguments) -> None:
+@dataclass(frozen=True)
+class Arguments(ImageOptions):
+    """What to train on, how, and where the results go."""
+
+
+def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder."""
-    run(given, "train_hnn_pixels")
+    from dln_jax.training.hamiltonian.images import IMAGES
+    from dln_jax.training.pipeline import train
+
+    train(IMAGES, options, "train_hnn_pixels")

@@ -8,10 +8,22 @@ gives the rates) and helmholtz-hnn (the gradients of two networks do, friction i
 needs state it. Load the model with dln_jax.load.
 """
 
-from dln_jax.training.hamiltonian.options import Options as Arguments
-from dln_jax.training.hamiltonian.run import run
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dln_jax.training.hamiltonian.options import VARIANTS, Options
 
 
-def main(given: Arguments) -> None:
+@dataclass(frozen=True)
+class Arguments(Options):
+    """What to train on, how, and where the results go."""
+
+    VARIANTS: ClassVar = VARIANTS
+
+
+def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder."""
-    run(given, "train_hnn_task")
+    from dln_jax.training.hamiltonian.run import PHASE_SPACE
+    from dln_jax.training.pipeline import train
+
+    train(PHASE_SPACE, options, "train_hnn_task")

@@ -3,7 +3,8 @@
 Importing this module does not import JAX, so that `--help` is quick.
 """
 
-from collections.abc import Mapping
+import importlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -153,22 +154,27 @@ class SelectionOptions(ArmOptions, Limited, Devices):
 class Fit(NamedTuple):
     """How a model is fitted."""
 
-    method: str
-    """Module in `training.dynamics.methods`, which is imported when it is used."""
+    method: Callable[[], Any]
+    """() -> `training.dynamics.task.Method`, imported when it is used."""
     options: tuple[type, ...]
     """Dataclasses of the options that the fit reads."""
 
 
+def fitted_by(module: str) -> Callable[[], Any]:
+    """A function that imports the `METHOD` of a module in `methods`."""
+    return lambda: importlib.import_module(f"dln_jax.training.dynamics.methods.{module}").METHOD
+
+
 FITS = {
-    "structured-delan": Fit("network", (GrownOptions, NetworkOptions)),
-    "black-box-delan": Fit("network", (NetworkOptions,)),
-    "feed-forward": Fit("network", (NetworkOptions,)),
-    "structured-hnn": Fit("network", (NetworkOptions,)),
-    "black-box-hnn": Fit("network", (NetworkOptions,)),
-    "trigonometric": Fit("least_squares", (TrigonometricOptions,)),
-    "trigonometric-kernel": Fit("kernel", (KernelOptions,)),
-    "learned-tree": Fit("learned_tree", (TreeOptions,)),
-    AUTO: Fit("selection", (SelectionOptions,)),
+    "structured-delan": Fit(fitted_by("network"), (GrownOptions, NetworkOptions)),
+    "black-box-delan": Fit(fitted_by("network"), (NetworkOptions,)),
+    "feed-forward": Fit(fitted_by("network"), (NetworkOptions,)),
+    "structured-hnn": Fit(fitted_by("network"), (NetworkOptions,)),
+    "black-box-hnn": Fit(fitted_by("network"), (NetworkOptions,)),
+    "trigonometric": Fit(fitted_by("least_squares"), (TrigonometricOptions,)),
+    "trigonometric-kernel": Fit(fitted_by("kernel"), (KernelOptions,)),
+    "learned-tree": Fit(fitted_by("learned_tree"), (TreeOptions,)),
+    AUTO: Fit(fitted_by("selection"), (SelectionOptions,)),
 }
 """Models of the commands; a new way of fitting is a module of `methods` and a line here."""
 

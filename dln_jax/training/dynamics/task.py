@@ -1,6 +1,5 @@
 """A task of dynamics: the data, what they need, the model, and how it is trained."""
 
-import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,7 +81,7 @@ class Task(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A way of fitting, `METHOD` of the module that `options.FITS` names for a model."""
+    """A way of fitting, `METHOD` of its module in `methods`."""
 
     plan: Callable[[Any, str, Recorded, Objective], tuple[dict[str, Any], Solver | None]]
     """(options, model, data, objective) -> description of the model, and its solver if it has one; refuses options that
@@ -93,7 +92,7 @@ class Method(NamedTuple):
 
 def method_of(kind: str) -> Method:
     """The way of fitting a model."""
-    return importlib.import_module(f"dln_jax.training.dynamics.methods.{FITS[kind].method}").METHOD
+    return FITS[kind].method()
 
 
 def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:

@@ -1,7 +1,9 @@
-"""Trains a differential network, or an ensemble, into a run folder: the model, its errors, its speed and figures."""
+"""Trains a differential network or an ensemble, as a kind of the pipeline: the model, its errors, speed, figures."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -10,26 +12,36 @@ from matplotlib.figure import Figure
 
 from dln_jax.cli.optimisers import name_of
 from dln_jax.cli.progress import progress
-from dln_jax.cli.scaled import mesh_of
-from dln_jax.cli.stored_arguments import command_folder, write_config
 from dln_jax.data.functions import SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
-from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Progress, Training, one_after_the_other
-from dln_jax.learning.functions import WIDTHS, Network, grow_width, train
+from dln_jax.learning.functions import WIDTHS, Network, grow_width
+from dln_jax.learning.functions import train as train_network
 from dln_jax.learning.growth import Trial
 from dln_jax.learning.standardisation import layers_in_own_units, to_units
 from dln_jax.metrics.functions import Prediction, errors, predictions, typical_spread
 from dln_jax.metrics.latency import one_step
 from dln_jax.nn.activations import activation
 from dln_jax.scale.devices import device_lines
-from dln_jax.training.functions.task import NAMED, Options, Task, of_named, prepare
-from dln_jax.training.results import OF_LOSSES, cost_metrics, print_numbers, settings_of, unit_of
+from dln_jax.training.functions.options import Options
+from dln_jax.training.functions.task import NAMED, Task, of_named, prepare
+from dln_jax.training.pipeline import Fitted, Judged, Kind, png
+from dln_jax.training.results import OF_LOSSES, cost_metrics, settings_of, unit_of
 from dln_jax.zoo.descriptions import describe
-from dln_jax.zoo.run import load, save
+from dln_jax.zoo.run import load
+
+
+class Outcome(NamedTuple):
+    """A training of a differential network."""
+
+    network: Network
+    training: Training
+    trials: list[Trial]
+    """Trainings of all widths tried; empty for a stated width."""
+
 
 RELU = (
     "a ReLU network is piecewise linear: its Hessian is zero almost everywhere, so its hessian_mse is that of "
@@ -37,49 +49,24 @@ RELU = (
 )
 
 
-def run(given: Options, command: str) -> None:
-    """Trains, evaluates and writes a run folder, by default runs/`command`-1, -2, ..."""
-    task, mesh = prepare(given), mesh_of(given)
-    with command_folder(given, command) as folder:
-        announce(task)
-        network, training, trials = fit(task, folder, resume=given.resume, mesh=mesh)
-        task = task._replace(network=network)
-        write_config(folder, given, **network._asdict(), **settings_of(task.optimiser), **of_named(given))
-        if training.stop.reason == "not finite":
-            print("the loss stopped being finite; the run keeps the best parameters before that")
-        layers = layers_in_own_units(training.parameters, task.units)
-        members, inputs, _ = layers[0][0].shape
-        stated = {"activation": network.activation, "precision": network.precision}
-        sizes = [inputs, *(weight.shape[2] for weight, _ in layers)]
-        save(folder, describe("differential-network", sizes=sizes, members=members, **stated), layers)
-        metrics = evaluate(folder, task, training, trials, figures=given.figures)
-        write_json(folder / "metrics.json", metrics)
-        numbers = ([key.replace("_", " "), number(key, value), unit_of(key, UNITS)] for key, value in metrics.items())
-        print_numbers(numbers, title=f"test on {task.name}, {network.precision}")
-        if network.activation == "relu":
-            print(RELU)
-        print(f"run folder: {folder}")
-
-
-def announce(task: Task) -> None:
-    """Prints the data, the network and the training method."""
+def announce(task: Task) -> Iterator[str]:
+    """Lines on the data, the network and the training method."""
     data, network = task.sets.train, task.network
     counts = f"{len(data.x)} training, {len(task.sets.validation.x)} validation, {len(task.test.x)} test samples"
     terms = ["value", *(["gradient"] if network.loss == "type1" else []), *(["Hessian"] * (network.derivative == 2))]
     width = "grown" if task.grown else str(network.width)
     layers = " x ".join([str(data.inputs), *[width] * network.depth, str(data.outputs)])
     networks = f"{network.members} networks" if network.members > 1 else "network"
-    print(f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs")
+    yield f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs"
     trained = f"{network.loss}: {', '.join(terms)}; {name_of(task.optimiser)}, {network.precision}"
-    print(f"{networks} {layers}, {network.activation}; {trained}")
+    yield f"{networks} {layers}, {network.activation}; {trained}"
     if network.activation == "relu" and network.derivative == 2:
-        print(RELU)
-    for line in device_lines(network.precision):
-        print(line)
+        yield RELU
+    yield from device_lines(network.precision)
 
 
-def fit(task: Task, folder: Path, *, resume: bool, mesh: Mesh | None) -> tuple[Network, Training, list[Trial]]:
-    """Trains at the requested width or at growing ones; returns the selected network, its training, and all trials."""
+def fit(task: Task, options: Options, folder: Path, mesh: Mesh | None) -> Fitted:
+    """Trains at the requested width or at growing ones, of which validation selects one."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
     optimiser, total = task.optimiser, task.optimiser.steps
     if isinstance(optimiser, GaussNewton) and optimiser.has_coarse_stage(len(standard.train.x)):
@@ -87,29 +74,36 @@ def fit(task: Task, folder: Path, *, resume: bool, mesh: Mesh | None) -> tuple[N
 
     def train_one(network: Network) -> Training:
         known = identity(optimiser, (array for data in standard for array in data), **network._asdict())
-        checkpoint = Checkpoint(folder, known, resume, f"checkpoint_width_{network.width}")
+        checkpoint = Checkpoint(folder, known, options.resume, f"checkpoint_width_{network.width}")
         with progress(total) as show:
 
             def report(at: Progress) -> None:
                 stage = f", {at.stage}" if at.stage else ""
-                losses = f"loss {at.loss:.3e}  validation {at.validation:.3e}"
-                show(min(at.step, total), f"width {network.width}{stage}: {losses}")
+                text = f"loss {at.loss:.3e}  validation {at.validation:.3e}"
+                show(min(at.step, total), f"width {network.width}{stage}: {text}")
 
-            return train(standard, network, optimiser, checkpoint=checkpoint, report=report, mesh=mesh)
+            return train_network(standard, network, optimiser, checkpoint=checkpoint, report=report, mesh=mesh)
 
-    if not task.grown:
-        return task.network, train_one(task.network), []
-    chosen, trials = grow_width(standard, task.network, train_one, widths=WIDTHS)
-    tried = ", ".join(f"{trial.candidate.width}: {trial.validation:.3e}" for trial in trials)
-    print(f"validation loss by width: {tried}; chosen {chosen.candidate.width}")
-    return chosen.candidate, chosen.outcome, trials
+    network, trials = task.network, []
+    if task.grown:
+        chosen, trials = grow_width(standard, network, train_one, widths=WIDTHS)
+        tried = ", ".join(f"{trial.candidate.width}: {trial.validation:.3e}" for trial in trials)
+        print(f"validation loss by width: {tried}; chosen {chosen.candidate.width}")
+        network, training = chosen.candidate, chosen.outcome
+    else:
+        training = train_one(network)
+    layers = layers_in_own_units(training.parameters, task.units)
+    members, inputs, _ = layers[0][0].shape
+    stated = {"activation": network.activation, "precision": network.precision}
+    sizes = [inputs, *(weight.shape[2] for weight, _ in layers)]
+    description = describe("differential-network", sizes=sizes, members=members, **stated)
+    return Fitted(description, layers, Outcome(network, training, trials))
 
 
-def evaluate(
-    folder: Path, task: Task, training: Training, trials: list[Trial], *, figures: bool
-) -> dict[str, float | int]:
-    """Loads the stored model as a user would, evaluates it on the test samples, and draws the applicable figures."""
-    loaded, function = load(folder), activation(task.network.activation)
+def judge(task: Task, fitted: Fitted, options: Options, folder: Path) -> Judged:
+    """Loads the stored model as a user would, and evaluates it on the test samples."""
+    network, training, trials = fitted.outcome
+    loaded, function = load(folder), activation(network.activation)
     tested = predictions(loaded.parameters, task.test.x, activation=function)
     # Without a bound, the figures show the test samples.
     shown = tested if task.bound is None else predictions(loaded.parameters, task.shown.x, activation=function)
@@ -119,26 +113,34 @@ def evaluate(
         metrics["spread_inside"] = typical_spread(shown.spread, inside)
         metrics["spread_outside"] = typical_spread(shown.spread, ~inside)
     latency = one_step(loaded.derivatives, [(x,) for x in task.test.x[:512]], calls=1000)
-    if figures:
-        for name, figure in drawings(task, shown, training, trials).items():
-            write_figure(folder / f"{name}.png", figure)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(loaded.parameters))
-    metrics |= {"validation_loss": float(training.validation), "width": task.network.width}
-    return metrics | cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
+    metrics |= {"validation_loss": float(training.validation), "width": network.width}
+    metrics |= cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
+    lines = (RELU,) if network.activation == "relu" else ()
+    if training.stop.reason == "not finite":
+        lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
+    return Judged(
+        metrics=metrics,
+        rows=[(key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()],
+        title=f"test on {task.name}, {network.precision}",
+        figures=drawings(task, shown, training, trials),
+        chosen={**network._asdict(), **settings_of(task.optimiser), **of_named(options)},
+        lines=lines,
+    )
 
 
-def drawings(task: Task, shown: Prediction, training: Training, trials: list[Trial]) -> dict[str, Figure]:
-    """Figures by name, as applicable to the number of inputs."""
-    drawn = {"training": training_figure(training, trials)} if training.history else {}
+def drawings(task: Task, shown: Prediction, training: Training, trials: list[Trial]) -> dict[str, Any]:
+    """Figures by file name, as applicable to the number of inputs."""
+    drawn = {"training.png": png(training_figure, training, trials)} if training.history else {}
     if task.test.inputs == 1:
-        drawn["curves"] = drawing.function_curves(task.shown, shown.mean)
+        drawn["curves.png"] = png(drawing.function_curves, task.shown, shown.mean)
     elif task.name in NAMED:
-        drawn["heat_maps"] = drawing.heat_maps(task.shown, shown.mean)
-        drawn["surfaces"] = drawing.surfaces(task.shown, shown.mean)
+        drawn["heat_maps.png"] = png(drawing.heat_maps, task.shown, shown.mean)
+        drawn["surfaces.png"] = png(drawing.surfaces, task.shown, shown.mean)
     else:
-        drawn["parity"] = drawing.parity(*(to_units(part, task.units) for part in (task.shown, shown.mean)))
+        drawn["parity.png"] = png(drawing.parity, *(to_units(part, task.units) for part in (task.shown, shown.mean)))
     if task.bound is not None and shown.spread is not None:
-        drawn["ensemble"] = drawing.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
+        drawn["ensemble.png"] = png(drawing.ensemble, task.shown, shown.mean, shown.spread, bound=task.bound)
     return drawn
 
 
@@ -172,3 +174,6 @@ def number(metric: str, value: int | float) -> str:
     if isinstance(value, int):
         return f"{value:,}"
     return f"{value:.2e}" if re.search("_mse|_loss|spread", metric) else f"{value:,.1f}"
+
+
+FUNCTIONS = Kind(prepare, announce, fit, judge)

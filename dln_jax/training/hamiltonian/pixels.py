@@ -5,6 +5,7 @@ autoencoder, loss and budget. The data are those of seed 0; a seed determines th
 samples.
 """
 
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -113,21 +114,24 @@ def measure_pixels(
     return numbers, SeenFrames(model, parameters, motions, components, training.history)
 
 
-def draw_pixels(seen: dict[str, SeenFrames], data: FrameSplit, folder: Path, *, shown: int = 0) -> list[Path]:
-    """Writes `pixels.gif` (truth and every model's frames) and, for an energy, `pixels-injection.png`.
-
-    Returns the paths of the files.
-    """
+def figures_of(seen: dict[str, SeenFrames], data: FrameSplit, *, shown: int = 0) -> dict[str, Callable[[Path], None]]:
+    """`pixels.gif` (truth and every model's frames) and, for an energy, `pixels-injection.png`."""
     times = data.test.frames.shape[1] - 1
     frames = {TRUTH: data.test.frames[shown, :times]}
-    frames |= {name: each.motions.frames[shown] for name, each in seen.items()}
-    written = [folder / "pixels.gif"]
-    write_frame_gif(written[0], frames, FRAME_TIME * np.arange(times))
+    frames |= {name: model.motions.frames[shown] for name, model in seen.items()}
+    figures = {"pixels.gif": lambda path: write_frame_gif(path, frames, FRAME_TIME * np.arange(times))}
     if hnn := seen.get("black-box-hnn"):
         # Start from a motion with little energy, so that three times as much is within the decoder's training data.
         ranges = np.abs(data.test.q).max(axis=1)
         quiet = int(np.argsort(ranges)[len(ranges) // 4])
         injected = inject_energy(hnn.model, hnn.parameters, data.test.pairs[quiet, 0], factor=3.0)
-        written.append(folder / "pixels-injection.png")
-        write_figure(written[-1], injection_figure(injected))
-    return written
+        figures["pixels-injection.png"] = lambda path: write_figure(path, injection_figure(injected))
+    return figures
+
+
+def draw_pixels(seen: dict[str, SeenFrames], data: FrameSplit, folder: Path, *, shown: int = 0) -> list[Path]:
+    """Writes the figures into a folder and returns their paths."""
+    figures = figures_of(seen, data, shown=shown)
+    for name, draw in figures.items():
+        draw(folder / name)
+    return [folder / name for name in figures]

@@ -1,5 +1,6 @@
 """Metrics and figures of a Hamiltonian training, with labels for metrics.json."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ from dln_jax.data.schema import column
 from dln_jax.figures import animations
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
-from dln_jax.files import write_figure
 from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.motion_verdict import judge_motions
 from dln_jax.metrics.verdict import Verdict
@@ -18,6 +18,7 @@ from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_o
 from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.training.hamiltonian.training import MOTIONS, RATES, Trained
 from dln_jax.training.low_latency_calls import low_latency_metrics
+from dln_jax.training.pipeline import png
 from dln_jax.training.results import OF_LOSSES, one_step_metrics, unit_of
 from dln_jax.zoo.run import load
 
@@ -56,19 +57,21 @@ def units_of_judgement(problem: Problem) -> dict[str, Any]:
     return {"size": np.where(size > 0, size, 1.0), "bounded": ~np.array(angles + [False] * d), "noise": noise}
 
 
-def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:
-    """Writes the applicable figures."""
-    write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
+def figures_of(problem: Problem, name: str, seen: Seen, trained: Trained) -> dict[str, Callable[[Path], None]]:
+    """The applicable figures and films, by file name."""
     truth = problem.truth[0]
-    stride = max(1, len(truth.t) // GIF_FRAMES)
-    motions, units = {TRUTH: truth, name: seen.motions}, units_of(problem)[:2]
-    animations.write_motion_gif(folder / "motions.gif", motions, stride=stride, units=units)
+    film: dict[str, Any] = {"stride": max(1, len(truth.t) // GIF_FRAMES), "units": units_of(problem)[:2]}
+    figures = {
+        "motions.png": png(figure_of, problem, {name: seen}),
+        "motions.gif": lambda path: animations.write_motion_gif(path, {TRUTH: truth, name: seen.motions}, **film),
+    }
     history = trained.history
     if len(history) > 1:
         best = history[-1].step - trained.result.history[-1].step + trained.result.best_step
         named = [at._replace(stage=LOSSES[at.stage]) for at in history]
-        curve = training_curve(named, best_step=best, unit="loss, of each stage in its own units", **OF_LOSSES)
-        write_figure(folder / "training.png", curve)
+        options: dict[str, Any] = {"best_step": best, "unit": "loss, of each stage in its own units", **OF_LOSSES}
+        figures["training.png"] = png(training_curve, named, **options)
+    return figures
 
 
 MEANINGS = {

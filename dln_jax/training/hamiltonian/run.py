@@ -1,74 +1,138 @@
-"""Trains a Hamiltonian model of a phase space into a run folder: the model, its errors, speed and figures."""
+"""Trains Hamiltonian models of a phase space, as a kind of the pipeline: the model, its errors, speed and figures."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jax.sharding import Mesh
 
+from dln_jax.cli.arguments import numbers_of, require_positive_if_given
+from dln_jax.cli.encoders import checked, needs_from_option
+from dln_jax.cli.optimisers import optimiser_named
 from dln_jax.cli.progress import progress
-from dln_jax.cli.scaled import mesh_of
-from dln_jax.cli.stored_arguments import command_folder, write_config
 from dln_jax.data.stated_needs import needs_from_json
-from dln_jax.files import write_json
+from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress
-from dln_jax.metrics.verdict import FitRefused
 from dln_jax.scale.devices import device_lines
 from dln_jax.time_limit import deadline, seconds_left
-from dln_jax.training.hamiltonian.model_selection import PAIRWISE
-from dln_jax.training.hamiltonian.options import Options, prepare
-from dln_jax.training.hamiltonian.results import draw, evaluate, line
+from dln_jax.training.hamiltonian.model_selection import PAIRWISE, choose_model, description_of
+from dln_jax.training.hamiltonian.options import MEASURED, POLYNOMIAL, REAL
+from dln_jax.training.hamiltonian.results import evaluate, figures_of, line
 from dln_jax.training.hamiltonian.stages import gauge_of, in_velocities
-from dln_jax.training.hamiltonian.tasks import MEASURED, REAL, Problem
-from dln_jax.training.hamiltonian.training import Trained, stages_of, train
-from dln_jax.training.results import losses, print_numbers
-from dln_jax.types import InputError
+from dln_jax.training.hamiltonian.tasks import Problem, Stated, problem_of
+from dln_jax.training.hamiltonian.training import MOTIONS, Trained, check, stages_of, train
+from dln_jax.training.pipeline import Fitted, Judged, Kind
+from dln_jax.training.results import losses
+from dln_jax.types import InputError, require_seed
+from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import save
 
+FILTERED_HERE = ("raw-differences",)
+"""Checks that do not apply here: estimated rates come from local polynomials, and motions are fitted to the states."""
+CHOICE_SHARE = 0.2
+"""Fraction of the time limit after which model selection starts no further candidate."""
+KEYWORDS = ("width", "depth", "activation", "degree", "coordinates", "order", "field")
+"""Options that are keywords of a model."""
 
-def run(given: Options, command: str) -> None:
-    """Trains, evaluates and writes a run folder, by default runs/`command`-1, -2, ...
 
-    Raises:
-        InputError: the validation error is not finite, or the loss became non-finite; the last good parameters are
-            kept.
-        FitRefused: test motions are predicted badly, and neither --steps nor --seconds cut the training short; the run
-            folder is complete.
+class Case(NamedTuple):
+    """A phase space to learn, and how."""
+
+    problem: Problem
+    description: dict[str, Any]
+    optimiser: Optimiser
+    findings: list[str]
+    """Findings about the log."""
+    until: float
+    """Deadline by `time.perf_counter`."""
+
+
+def prepare(options: Any) -> Case:
+    """Resolves the options into the problem, the model's description and the optimiser.
+
+    Everything is checked before anything is written, and the log before models are compared on it.
     """
-    until = deadline(given.seconds)
-    problem, description, training, said = prepare(given, until)
-    mesh = mesh_of(given)
-    with command_folder(given, command, **description) as folder:
-        announce(problem, description, said)
-        with stage_progress(stages_of(problem, description, training["steps"])) as report:
-            kept = {"directory": folder, "resume": given.resume}
-            keep = partial(save_first, folder, description)
-            limited = {"seconds": seconds_left(until), "report": report, "keep": keep, "mesh": mesh}
-            trained = train(problem, description, **training, **kept, **limited)
-        if not np.isfinite(trained.result.validation):
-            raise InputError(f"{trained.stopped}; {folder} holds no model")
-        save(folder, description, trained.result.parameters)
-        if given.seconds is not None:
-            print(f"{folder} holds the model; its evaluation follows and is not limited by --seconds")
-        metrics, seen, verdict = evaluate(folder, problem, trained, low_latency=given.low_latency)
-        write_json(folder / "metrics.json", metrics)
-        write_config(folder, given, **description, verdict=verdict._asdict())
-        if given.figures:
-            draw(folder, problem, description["name"], seen, trained)
-        numbers = [line(name, value) for name, value in metrics.items() if name != "verdict"]  # it has its own line
-        print_numbers(numbers, title=f"test motions of {problem.name}, f64")
-        print(f"run folder: {folder}")
-        print(verdict.line)
-        if trained.diverged:
-            raise InputError(f"{trained.stopped}; {folder} holds the best model before that")
-        if trained.stopped:
-            print(trained.stopped)
-        if verdict.level == "refused":
-            if given.steps is None and not trained.out_of_time:
-                raise FitRefused(verdict)
-            print("warning: training ended at the limit that you set; give it more --steps or --seconds")
+    until = deadline(options.seconds)
+    require_seed(options.seed)
+    require_positive_if_given(options, ["width", "depth", "degree", "steps", "trajectories", "seconds"])
+
+    def stated(name: str) -> Any:
+        return getattr(options, name, None)
+
+    needs = None if stated("needs") is None else needs_from_option(options.needs)
+    noise = None if stated("noise") is None else numbers_of("--noise", options.noise, positive=True)
+    known = Stated(needs, stated("test"), noise)._replace(rate=stated("rate"), units=stated("units"))
+    problem = problem_of(options.task, trajectories=stated("trajectories"), data=stated("data"), stated=known)
+    findings = []
+    if stated("data") is not None:
+        findings = checked(options, problem.fitted, options.data, without=FILTERED_HERE)
+    size = {name: stated(name) for name in KEYWORDS}
+    if options.model == "auto" and options.task == MEASURED:
+        networks = options.optimizer == "adam" or any(size[name] is not None for name in KEYWORDS[:3])
+        chosen = {"networks": networks, "report": print, "seconds": CHOICE_SHARE * seconds_left(until)}
+        description = choose_model(problem, **chosen, precision="f64", **size)
+    else:
+        description = description_of(problem, options.model, **size)
+    build(description)
+    if description["name"] == POLYNOMIAL:
+        refuse_iterations(options, problem, description)
+    name = "gauss-newton" if options.optimizer == "auto" else options.optimizer
+    optimiser = optimiser_named(name, precision=description["precision"], learning_rate=stated("learning_rate"))
+    check(problem, description, seed=options.seed)
+    return Case(problem, description, optimiser, findings, until)
+
+
+def refuse_iterations(options: Any, problem: Problem, description: dict[str, Any]) -> None:
+    """Refuses options of iterations for the polynomial model, whose fit of rates is one least-squares problem."""
+    if options.optimizer == "adam":
+        raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
+    for name in ("steps", "seconds", "processes"):
+        if getattr(options, name) is not None and MOTIONS not in stages_of(problem, description):
+            raise InputError(f"--{name} is for networks; the polynomial model is one least-squares problem")
+
+
+def fit(case: Case, options: Any, folder: Path, mesh: Mesh | None) -> Fitted:
+    """Fits rates and then motions, in one training with two stages."""
+    problem, description = case.problem, case.description
+    with stage_progress(stages_of(problem, description, options.steps)) as report:
+        trained = train(
+            problem,
+            description,
+            seed=options.seed,
+            optimiser=case.optimiser,
+            steps=options.steps,
+            directory=folder,
+            resume=options.resume,
+            seconds=seconds_left(case.until),
+            report=report,
+            keep=partial(save_first, folder, description),
+            mesh=mesh,
+        )
+    if not np.isfinite(trained.result.validation):
+        raise InputError(f"{trained.stopped}; {folder} holds no model")
+    if options.seconds is not None:
+        print(f"{folder} holds the model; its evaluation follows and is not limited by --seconds")
+    return Fitted(description, trained.result.parameters, trained)
+
+
+def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
+    """Errors, speed and verdict on the predicted test motions."""
+    problem, trained = case.problem, fitted.outcome
+    metrics, seen, verdict = evaluate(folder, problem, trained, low_latency=options.low_latency)
+    return Judged(
+        metrics=metrics,
+        rows=[line(name, value) for name, value in metrics.items() if name != "verdict"],  # it has its own line
+        title=f"test motions of {problem.name}, f64",
+        verdict=verdict,
+        figures=figures_of(problem, case.description["name"], seen, trained),
+        chosen=case.description,
+        lines=(trained.stopped,) if trained.stopped and not trained.diverged else (),
+        ended_by_user=options.steps is not None or trained.out_of_time,
+        error=f"{trained.stopped}; {folder} holds the best model before that" if trained.diverged else "",
+    )
 
 
 def save_first(folder: Path, description: dict[str, Any], trained: Trained) -> None:
@@ -94,43 +158,47 @@ def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None
         yield report
 
 
-def announce(problem: Problem, description: dict[str, Any], said: list[str]) -> None:
-    """Prints the data used for training and the assumptions made."""
+def announce(case: Case) -> Iterator[str]:
+    """Lines on the data used for training and the assumptions made."""
+    problem, description = case.problem, case.description
     data = problem.fitted
     trajectories = len(np.unique(data.trajectory))
     needs = needs_from_json(description["needs"])
     terms = " and ".join(name for name in ("gravity", "friction") if getattr(needs, name)) or "no potential"
-    print(f"{problem.name}: {len(data.t)} samples of {trajectories} segments for training and validation")
-    print(f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64")
+    yield f"{problem.name}: {len(data.t)} samples of {trajectories} segments for training and validation"
+    yield f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64"
     unused = ("qdd",) if problem.noise is None else ("p", "pd")
     missing = [key for key in data.estimated if key not in ("tau", *unused)]
     if missing:
         of = "finite differences" if problem.noise is None else "local polynomials, not finite differences,"
-        print(f"not in the data: {', '.join(missing)}; {of} start the fit to motions")
-    print("".join(f"{line}\n" for line in said), end="")
+        yield f"not in the data: {', '.join(missing)}; {of} start the fit to motions"
+    yield from case.findings
     if in_velocities(problem, description):
-        q = ", ".join(f"{each:.3g}" for each in gauge_of(problem).q)
-        print(f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1")
+        q = ", ".join(f"{coordinate:.3g}" for coordinate in gauge_of(problem).q)
+        yield f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1"
     elif problem.name == REAL or problem.noise is not None:
-        print("momenta p are taken as qd, per unit of inertia")
-    for each in (*assumptions(problem, description), *device_lines("f64")):
-        print(each)
+        yield "momenta p are taken as qd, per unit of inertia"
+    yield from assumptions(problem, description)
+    yield from device_lines("f64")
 
 
 def assumptions(problem: Problem, description: dict[str, Any]) -> list[str]:
     """Assumptions inferred from measurements rather than stated."""
-    found = []
+    lines = []
     if problem.assumed:
-        found.append("nothing states the needs: joints, potential and friction above are assumed; --needs states them")
+        lines.append("nothing states the needs: joints, potential and friction above are assumed; --needs states them")
     if problem.name == MEASURED and description["name"] == PAIRWISE:
         example = {"bodies": "x1, y1, x2, y2", "axes": "x1, x2, y1, y2"}[description["order"]]
-        found.append(f"coordinates are taken as {example}, .. with {description['dimension']} axes; --order states it")
+        lines.append(f"coordinates are taken as {example}, .. with {description['dimension']} axes; --order states it")
     if problem.trust is not None and problem.noise is None:
-        noise = ", ".join(f"{each:.2g}" for each in np.ravel(problem.trust.weights.state))
+        noise = ", ".join(f"{sd:.2g}" for sd in np.ravel(problem.trust.weights.state))
         small = (
             "states are free of noise" if problem.trust.free_of_noise else f"motions are weighed by noise of {noise}"
         )
-        found.append(f"(q, p): {small}")
+        lines.append(f"(q, p): {small}")
     if problem.gaps and problem.tests is not None:
-        found.append(f"test recordings have {problem.gaps} gap(s); predictions go on across them by time stamps")
-    return found
+        lines.append(f"test recordings have {problem.gaps} gap(s); predictions go on across them by time stamps")
+    return lines
+
+
+PHASE_SPACE = Kind(prepare, announce, fit, judge)

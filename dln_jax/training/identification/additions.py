@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.figures.uncertainty import torque_bands
-from dln_jax.files import write_figure
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.residual import Candidate, ResidualFit, fit_residual
 from dln_jax.learning.uncertainty import estimate
@@ -22,6 +21,7 @@ from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.training.identification.task import Case, for_residual
+from dln_jax.training.pipeline import png
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import Description, describe
 from dln_jax.zoo.run import load
@@ -82,11 +82,11 @@ def judge_residual(case: Case, added: ResidualFit, metrics: dict[str, float | in
 
 def shape_lines(case: Case) -> list[str]:
     """Fitted shape parameters of friction, in addition to its coefficients."""
-    found = {name: case.description[name] for name in shape_of(case.laws) if isinstance(case.description[name], list)}
+    shapes = {name: case.description[name] for name in shape_of(case.laws) if isinstance(case.description[name], list)}
     units = {"sigmoid_slope": "s"}
     return [
         f"{name.replace('_', ' ')}: {', '.join(f'{value:.3g}' for value in values)} {units.get(name, 'rad/s or m/s')}"
-        for name, values in found.items()
+        for name, values in shapes.items()
     ]
 
 
@@ -103,15 +103,17 @@ def _named(candidate: Candidate) -> str:
 
 
 def store_uncertainty(
-    folder: Path, case: Case, found: Identification, added: ResidualFit | None, *, figures: bool
-) -> dict[str, float | int]:
-    """Stores the uncertainty with the run, draws it, and returns the coverage of the 95 % bands on held-out torques.
+    folder: Path, case: Case, solution: Identification, added: ResidualFit | None
+) -> tuple[dict[str, float | int], dict[str, Callable[[Path], None]]]:
+    """Stores the uncertainty with the run; returns the coverage of the 95 % bands on held-out torques, and its figure.
 
     The calibration includes the motions that the tree's few parameters were fitted to, as if each had been left out.
     """
     extended = added is not None and bool(added.settings)
     model, parameters = (
-        (added.model, added.parameters) if added and extended else (case.model, parameters_of(found.theta, case.known))
+        (added.model, added.parameters)
+        if added and extended
+        else (case.model, parameters_of(solution.theta, case.known))
     )
     try:
         train, validation = for_residual(case.sets.train)
@@ -121,28 +123,26 @@ def store_uncertainty(
             train,
             validation,
             ridge=None if extended else 0.0,
-            unit=found.fit.noise,
+            unit=solution.fit.noise,
             negligible=1e-12,
         )
     except (InputError, np.linalg.LinAlgError) as error:
         print(f"the run does not say what it does not know: {error}")
-        return {}
+        return {}, {}
     facts = {"ridge": known.ridge, "degrees_of_freedom": known.degrees_of_freedom.tolist(), "torque": case.torque}
     save_uncertainty(folder, known.uncertainty, **facts)
     print(f"bands are of {case.torque}, for one more motion of the kind that was recorded")
     run, test = load(folder), case.sets.test
     state = tuple(map(jnp.asarray, (test.q, test.qd, test.qdd)))
     inverse = run.dynamics.inverse_dynamics
-    predicted, std, outside = (
-        np.asarray(jax.jit(jax.vmap(each), compiler_options=quick_compilation())(*state))
-        for each in (inverse, run.torque_std, run.outside)
+    predicted, std, out_of_distribution = (
+        np.asarray(jax.jit(jax.vmap(function), compiler_options=quick_compilation())(*state))
+        for function in (inverse, run.torque_std, run.outside)
     )
     shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
-    if figures:
-        name = case.description["name"]
-        write_figure(folder / "uncertainty.png", torque_bands(test, predicted, std, outside, model=name))
+    drawn = png(torque_bands, test, predicted, std, out_of_distribution, model=case.description["name"])
     return {
         "coverage_95_share": float(shares.mean()),
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
-        "outside_share": float(outside.mean()),
-    }
+        "outside_share": float(out_of_distribution.mean()),
+    }, {"uncertainty.png": drawn}

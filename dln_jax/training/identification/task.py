@@ -1,80 +1,33 @@
 """Builds an identification task from options: the robot's file, its data, and the held-out part."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.arguments import (
-    Unstated,
-    choice,
-    names_in,
-    names_listed,
-    numbers_of,
-    require_positive_if_given,
-)
-from dln_jax.cli.encoders import Filtered, checked, fitted_torque, preparation, smoothed
-from dln_jax.cli.options import Drawn, Folder
+from dln_jax.cli.arguments import names_in, names_listed, numbers_of, require_positive_if_given
+from dln_jax.cli.encoders import checked, fitted_torque, preparation, smoothed
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select
-from dln_jax.identification.consistent import REGULARISATION
 from dln_jax.learning.friction import fit_friction
-from dln_jax.mechanics.friction import LAWS, FrictionShape, require_laws, shape_of
+from dln_jax.mechanics.friction import FrictionShape, require_laws, shape_of
 from dln_jax.mechanics.trees import tree_to_json
 from dln_jax.models.model import Parameters
-from dln_jax.models.rigid_tree import USUAL
+from dln_jax.training.identification.options import IDENTIFIED, NO_FRICTION, Options
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
 
-IDENTIFIED = tuple(law for law in LAWS if law != "load")
-"""Friction laws in whose coefficients forces are linear."""
-NO_FRICTION = "none"
 SETTLED = ("split", "friction", "condition")
 """Checks of a log that the robot's file and this command make unnecessary."""
 MOST_SAMPLES = 4_000
 """Largest number of samples used to fit the shapes of friction."""
 HELD_OUT = slice(2, None, 5)
 """Trajectories or blocks held out: the third of every five."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Options(Folder, Drawn, Filtered):
-    """The robot, the data, and how it is identified."""
-
-    robot: Path
-    """URDF or MJCF file: the kinematics, and values to start from. It stays as it is."""
-    data: Path
-    """Trajectories as npz or CSV, with tau; joint_names are matched with the robot's where they are there."""
-    test: Unstated[str] = None
-    """Labels of the held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
-    blocks of time)."""
-    lock: Unstated[str] = None
-    """Joints of the file that do not move, such as those of a gripper, comma separated; "*finger*" names all with
-    finger in their name (default: all joints move)."""
-    friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = ",".join(USUAL)
-    """Laws of friction of each joint, whose coefficients are identified, too (default: viscous,coulomb,offset)."""
-    velocity_scale: Unstated[float] = None
-    """rad/s or m/s at which dry friction has three quarters of its force (default: fitted, one for each joint; so are
-    the other numbers that friction is not linear in)."""
-    uncertainty: bool = True
-    """Say of any state how uncertain its torque is, and whether it is outside the data."""
-    residual: bool = False
-    """Add a small network for what the rigid robot leaves unexplained, if held-out motions ask for one."""
-    noise: Unstated[str] = None
-    """Standard deviation of each joint's torque, N m or N, comma separated (default: estimated)."""
-    robust: bool = False
-    """Huber's estimate, for torques with spikes."""
-    consistent: bool = True
-    """Keep bodies physically consistent, with positive armature and friction; else what least squares gives."""
-    regularisation: float = REGULARISATION
-    """Of consistent parameters towards those of the robot's file; dimensionless, 1 is about one measurement."""
 
 
 class Sets(NamedTuple):
@@ -98,12 +51,14 @@ class Case(NamedTuple):
     """Parameters in the robot's file."""
     noise: np.ndarray | None
     """Noise of the torques, if stated."""
-    held: tuple[str, ...]
+    locked: tuple[str, ...]
     """Names of the locked joints."""
-    said: tuple[str, ...]
+    lines: tuple[str, ...]
     """Lines for the user: the origin of the rates, and findings about the log."""
     torque: str = "measured torques"
     """The torques that the fit and its uncertainty bands refer to."""
+    robot_file: str = ""
+    data_file: str = ""
 
     @property
     def laws(self) -> tuple[FrictionLaw, ...]:
@@ -111,32 +66,34 @@ class Case(NamedTuple):
         return tuple(self.description["needs"]["joint_friction"])
 
 
-def prepare(given: Options) -> Case:
+def prepare(options: Options) -> Case:
     """Reads and checks everything that the options name, before anything is written."""
-    held = names_listed(given.lock)
-    robot = read_robot(given.robot, lock=held)
-    laws = () if given.friction == NO_FRICTION else tuple(names_in("--friction", given.friction, IDENTIFIED))
+    locked = names_listed(options.lock)
+    robot = read_robot(options.robot, lock=locked)
+    laws = () if options.friction == NO_FRICTION else tuple(names_in("--friction", options.friction, IDENTIFIED))
     require_laws(laws, "--friction")
-    require_positive_if_given(given, ["velocity_scale"])
+    require_positive_if_given(options, ["velocity_scale"])
     try:
-        data = with_joints(schema.load(given.data, rate=given.rate, units=given.units), robot.tree.names)
+        data = with_joints(schema.load(options.data, rate=options.rate, units=options.units), robot.tree.names)
     except InputError as error:
-        raise InputError(str(error) if str(given.data) in str(error) else f"{given.data}: {error}") from None
+        raise InputError(str(error) if str(options.data) in str(error) else f"{options.data}: {error}") from None
     if "tau" in data.estimated:
-        raise InputError(f"{given.data}: the data have no tau; identification takes measured torques")
-    found = smoothed(given, data)
-    said = (*preparation(data, found), *checked(given, data, given.data, robot=robot, without=SETTLED))
-    labels = [label.strip() for label in given.test.split(",")] if given.test else None
-    if found is not None:
-        labels = labels and labels_of_parts(found.data, labels)
-        data = found.data._replace(joint_names=data.joint_names)
+        raise InputError(f"{options.data}: the data have no tau; identification takes measured torques")
+    filtered = smoothed(options, data)
+    lines = (*preparation(data, filtered), *checked(options, data, options.data, robot=robot, without=SETTLED))
+    labels = [label.strip() for label in options.test.split(",")] if options.test else None
+    if filtered is not None:
+        labels = labels and labels_of_parts(filtered.data, labels)
+        data = filtered.data._replace(joint_names=data.joint_names)
     needs = robot.tree.needs._replace(joint_friction=cast(tuple[FrictionLaw, ...], laws))
-    scale = {} if given.velocity_scale is None else {"velocity_scale": given.velocity_scale}
+    scale = {} if options.velocity_scale is None else {"velocity_scale": options.velocity_scale}
     description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **scale)
-    noise = noises(given.noise, robot.tree.degrees_of_freedom)
+    noise = noises(options.noise, robot.tree.degrees_of_freedom)
     sets = split(data, labels)
-    torque = fitted_torque(found)
-    return with_description(Case(robot, robot.tree.names, sets, description, None, None, noise, held, said, torque))
+    torque = fitted_torque(filtered)
+    files = {"robot_file": options.robot.name, "data_file": options.data.name}
+    case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque, **files)
+    return with_description(case)
 
 
 def with_description(case: Case, **changes: Any) -> Case:

@@ -27,13 +27,13 @@ SPIKES = 5e-4
 
 
 def judged(
-    case: Case, found: Identification, predict: Predict, torques: dict[str, np.ndarray], kept: str, *, robust: bool
+    case: Case, solution: Identification, predict: Predict, torques: dict[str, np.ndarray], kept: str, *, robust: bool
 ) -> tuple[Verdict, dict[str, float | int]]:
     """The verdict on an identified robot, and its entries of metrics.json.
 
     Args:
         case: the robot and its data.
-        found: the fit.
+        solution: the fit.
         predict: torques by parameters.
         torques: torques on the held-out motions [N, d], by "file", "least_squares" and `kept`.
         kept: key of the torques of the model that the run keeps.
@@ -44,8 +44,8 @@ def judged(
     rows = ~peaks.any(axis=1) if robust else np.ones(len(test.t), bool)
     noise = torque_noise(case.sets.train) if case.noise is None else case.noise
     errors = held_out(torques[kept][rows], test.tau[rows], noise=noise, file=torques["file"][rows])
-    every = [judge(errors, case.names), existing(found, torques, kept, test.tau)]
-    mine = parameters_of(found.theta, case.known)
+    every = [judge(errors, case.names), existing(solution, torques, kept, test.tau)]
+    mine = parameters_of(solution.theta, case.known)
     still = np.zeros_like(test.q)
     friction = predict(mine, still, test.qd, still).friction
     scales = case.description.get("velocity_scale") if {"coulomb", "stribeck"} & set(case.laws) else None
@@ -73,18 +73,17 @@ def spikes(tau: Float[np.ndarray, "N d"]) -> np.ndarray:
     return away > np.maximum(SPIKE * usual, 2 * size)
 
 
-def existing(found: Identification, torques: dict[str, np.ndarray], kept: str, tau: np.ndarray) -> Verdict:
+def existing(solution: Identification, torques: dict[str, np.ndarray], kept: str, tau: np.ndarray) -> Verdict:
     """Whether physically consistent bodies explain the torques as well as unconstrained least squares."""
-    if found.consistent is None:
+    if solution.consistent is None:
         return Verdict("good", "")
     mine, free = (np.nanmean(normalised_error(torques[name], tau)) for name in (kept, "least_squares"))
     if mine <= 2 * free + WORSE:
         return Verdict("good", "")
     level = "refused" if mine > free + IMPOSSIBLE else "doubtful"
     reason = f"physically consistent bodies have an nMSE of {mine:.3g}, least squares without that bound {free:.3g}"
-    reason += (
-        f", not converged after {found.consistent.iterations} iterations" if not found.consistent.converged else ""
-    )
+    if not solution.consistent.converged:
+        reason += f", not converged after {solution.consistent.iterations} iterations"
     remedy = "check the signs and units of tau and the robot's file: no robot has such torques"
     return Verdict(level, reason, remedy)
 
