@@ -26,7 +26,7 @@ _rules = ConstructorRegistry()
 @_rules.primitive_rule
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Reads int and float, and says what was expected in the words of every other message."""
-    kinds = {int: "a whole number of fewer than 4,300 digits", float: "a number"}
+    kinds = {int: "a whole number", float: "a number"}
     if info.type not in kinds:
         return None
     kind, wanted = info.type, kinds[info.type]
@@ -35,7 +35,8 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         try:
             return kind(words[0])
         except ValueError:
-            raise ValueError(f"must be {wanted}; got {words[0]!r:.60}") from None
+            few = " of fewer than 4,300 digits" * words[0].isdecimal()
+            raise ValueError(f"must be {wanted}{few}; got {words[0]!r:.60}") from None
 
     return PrimitiveConstructorSpec(
         nargs=1,

@@ -4,6 +4,7 @@ import jax
 import pytest
 from calls import refused
 
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan, train_diffnet, train_hnn, train_locomotion, train_value
 from dln_jax.cli.options import Scaled
 from dln_jax.cli.scaled import mesh_of
@@ -45,5 +46,5 @@ def test_more_devices_than_there_are_are_refused():
 
 
 def test_a_run_does_not_remember_where_it_was_computed():
-    there = train_diffnet.Arguments(devices=4, processes=2, coordinator="node1:61440", process_id=1)
-    assert stored_arguments(there) == stored_arguments(train_diffnet.Arguments())
+    there = arguments_of(train_diffnet.Arguments, devices=4, processes=2, coordinator="node1:61440", process_id=1)
+    assert stored_arguments(there) == stored_arguments(arguments_of(train_diffnet.Arguments))

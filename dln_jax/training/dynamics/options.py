@@ -3,6 +3,7 @@
 Importing this module does not import JAX, so that `--help` is quick.
 """
 
+import dataclasses
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -190,8 +191,20 @@ def options_of(stated: Mapping[str, Any]) -> tuple[type, ...]:
 
 
 def model_of(stated: Mapping[str, Any]) -> str:
-    """The model of a command line: for files the default is model selection."""
-    return stated.get("model") or (NETWORK if stated.get("data") is None else AUTO)
+    """The model of a command line: for files model selection, unless an option of networks is stated."""
+    if stated.get("model"):
+        return stated["model"]
+    return NETWORK if stated.get("data") is None or network_option(stated) else AUTO
+
+
+def network_option(stated: Mapping[str, Any]) -> str | None:
+    """An option that only networks have and that is stated, if there is one."""
+    shared = {field.name for field in dataclasses.fields(SelectionOptions)}
+    for kind in (NetworkOptions, AdamOptions, GaussNewtonOptions, GrownOptions):
+        for field in dataclasses.fields(kind):
+            if field.name not in shared and stated.get(field.name) not in (None, field.default):
+                return f"--{field.name.replace('_', '-')}"
+    return None
 
 
 VARIANTS = Variants(

@@ -15,7 +15,7 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.scale.devices import device_lines
 from dln_jax.time_limit import deadline
-from dln_jax.training.dynamics.options import model_of
+from dln_jax.training.dynamics.options import NETWORK, model_of, network_option
 from dln_jax.training.dynamics.programs import Programs, programs_ahead, programs_of
 from dln_jax.training.dynamics.recorded import read
 from dln_jax.training.dynamics.results import best_seed, definiteness_of, evaluate, table
@@ -40,7 +40,13 @@ class Outcome(NamedTuple):
 
 def run(options: Any, command: str) -> None:
     """Trains, evaluates and writes a run folder; errors as `training.pipeline.train`."""
-    train(DYNAMICS, dataclasses.replace(options, model=model_of(vars(options))), command)
+    model = model_of(vars(options))
+    if options.model is None and model == NETWORK and options.data is not None:
+        print(
+            f"{network_option(vars(options))} is for networks, so the model is {NETWORK}; without it several models are "
+            "tried (--model auto)"
+        )
+    train(DYNAMICS, dataclasses.replace(options, model=model), command)
 
 
 def prepare(options: Any) -> Task:

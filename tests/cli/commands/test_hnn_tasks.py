@@ -8,6 +8,7 @@ from calls import command, refused
 from motions import quick_motion
 from safetensors.numpy import load_file
 
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_hnn, train_hnn_task
 from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.data import schema
@@ -239,25 +240,25 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         (("--task", "pixels"), "task 'pixels' is unknown"),
         (("--task", "measured"), "needs its data"),
         (("--task", "measured", "--data", "forced.npz"), "applied forces"),
-        (("--task", "spring", "--data", "positions.npz"), "generates its data"),
+        (("--task", "spring", "--data", "positions.npz"), "--data is an option of --task measured"),
         ((*OWN, "--model", "pairwise-hnn"), "positions of bodies"),
-        ((*OWN, "--precision", "f32"), "Unrecognized options: --precision"),
-        ((*OWN, "--seeds", "3"), "Unrecognized options: --seeds"),
-        ((*OWN, "--target", "1e-6"), "Unrecognized options: --target"),
+        ((*OWN, "--precision", "f32"), "unrecognised option: --precision"),
+        ((*OWN, "--seeds", "3"), "unrecognised option: --seeds"),
+        ((*OWN, "--target", "1e-6"), "unrecognised option: --target"),
         ((*OWN, "--steps", "0"), "steps is 0"),
         ((*OWN[:4], "--needs", "{"), "--needs is not JSON"),
         ((*OWN[:4], "--needs", '{"joints": ["revolute", "revolute"]}'), "have 2 joints"),
         ((*OWN, "--seed", "-1"), "seed is -1"),
         ((*OWN, "--seconds", "nan"), "--seconds is nan"),
-        ((*OWN, "--batch", "-1"), "Unrecognized options: --batch"),
-        ((*OWN, "--patience", "4"), "Unrecognized options: --patience"),
-        ((*OWN, "--weight-decay", "0.1"), "Unrecognized options: --weight-decay"),
-        ((*OWN, "--learning-rate", "0.1"), "add --optimizer adam"),
+        ((*OWN, "--batch", "-1"), "unrecognised option: --batch"),
+        ((*OWN, "--patience", "4"), "unrecognised option: --patience"),
+        ((*OWN, "--weight-decay", "0.1"), "unrecognised option: --weight-decay"),
+        ((*OWN, "--learning-rate", "0.1"), "an option of --optimizer adam"),
         ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "--learning-rate is nan"),
-        ((*OWN, "--degree", "3"), "--degree is for polynomial-hamiltonian"),
-        ((*OWN, "--model", "polynomial-hamiltonian", "--width", "3"), "--width is for networks"),
-        ((*OWN, "--trajectories", "3"), "--trajectories is for generated data"),
-        (("--task", "spring", "--needs", '{"joints": ["prismatic"]}'), "--needs is what the task 'spring' decides"),
+        ((*OWN, "--degree", "3"), "--degree is an option of --model polynomial-hamiltonian"),
+        ((*OWN, "--model", "polynomial-hamiltonian", "--width", "3"), "--width is an option of networks"),
+        ((*OWN, "--trajectories", "3"), "--trajectories is an option of tasks that generate their data"),
+        (("--task", "spring", "--needs", '{"joints": ["prismatic"]}'), "--needs is an option of --task measured"),
         (("--task", "measured", "--data", "marked.npz"), "q has numbers of up to 1.0e+308"),
         (("--task", "measured", "--data", "points.npz"), "no trajectory has two samples"),
     ]
@@ -268,14 +269,16 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
 
 def test_options_and_models_of_other_commands_are_refused(positions, capsys):
     cases = [
-        (("--model", "baseline"), "invalid choice 'baseline'"),
-        (("--trajectories", "5"), "Unrecognized options: --trajectories"),
+        (("--model", "baseline"), "--model is 'baseline'"),
+        (("--trajectories", "5"), "unrecognised option: --trajectories"),
     ]
     for options, message in cases:
         assert message in refused(capsys, train_hnn, *options, "--out", "none")
     old = positions.parent / "old"
     old.mkdir()
-    (old / "config.json").write_text(json.dumps({**stored_arguments(train_hnn.Arguments()), "task": "spring"}))
+    (old / "config.json").write_text(
+        json.dumps({**stored_arguments(arguments_of(train_hnn.Arguments)), "task": "spring"})
+    )
     assert "'task' is no argument of this release" in refused(capsys, train_hnn, "--out", str(old), "--resume")
 
 

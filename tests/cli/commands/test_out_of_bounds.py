@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from calls import command, refused
 
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
     check_data,
     excite,
@@ -166,7 +167,7 @@ def test_damaged_value_functions_are_refused(tmp_path):
 def interrupted_run(folder):
     """The folder of a run that was started with data.npz, and got no further."""
     (folder / "run").mkdir()
-    given = train_delan.Arguments(data=Path("data.npz"), out=folder / "run")
+    given = arguments_of(train_delan.Arguments, data=Path("data.npz"), out=folder / "run")
     write_config(folder / "run", given)
     return type(given)(out=Path("run"), resume=True)
 

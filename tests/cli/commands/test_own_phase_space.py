@@ -114,7 +114,9 @@ def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
     assert "state --order bodies (x1, y1, x2, y2) or --order axes" in refused(capsys, train_hnn_task, *options)
     problem = problem_of(MEASURED, data=files / "orbits.npz")
     assert description_of(problem, "pairwise-hnn", order="bodies")["order"] == "bodies"
-    assert "--order is for measured" in refused(capsys, train_hnn_task, "--order", "axes", "--out", "none")
+    assert "--order is an option of --task measured" in refused(
+        capsys, train_hnn_task, "--order", "axes", "--out", "none"
+    )
 
 
 @pytest.mark.slow

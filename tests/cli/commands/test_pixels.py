@@ -325,8 +325,8 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     assert system.decode(q, p).shape == pair.shape and isinstance(system.field, PlainFlow)
     qd, pd = system.field.rates(q, p)
     assert np.isfinite([qd, pd]).all()
-    assert "Unrecognized options: --width" in refused(capsys, train_hnn_pixels, "--width", "8", "--out", "no")
-    assert "invalid choice 'pairwise'" in refused(capsys, train_hnn_pixels, "--model", "pairwise", "--out", "no")
+    assert "unrecognised option: --width" in refused(capsys, train_hnn_pixels, "--width", "8", "--out", "no")
+    assert "--model is 'pairwise'" in refused(capsys, train_hnn_pixels, "--model", "pairwise", "--out", "no")
     assert "steps is 0" in refused(capsys, train_hnn_pixels, "--steps", "0", "--out", "no")
     pixel_task.pixel_data.cache_clear()
 

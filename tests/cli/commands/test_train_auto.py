@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from calls import command, refused
 
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.data.mjcf import mjcf
 from dln_jax.data.robots import Robot
@@ -16,10 +17,9 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
-from dln_jax.training.dynamics.methods import learned_tree
-from dln_jax.training.dynamics.model_selection import train_selected
-from dln_jax.training.dynamics.planning import check_options
+from dln_jax.training.dynamics.methods import learned_tree, selection
 from dln_jax.training.dynamics.recorded import read
+from dln_jax.training.dynamics.run import prepare
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load
@@ -76,8 +76,9 @@ def workplace(tmp_path_factory):
 
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
     pytest.importorskip("mujoco")
-    given = train_delan.Arguments(model="auto", data=Path("rigid.npz"), robot=Path("arm.xml"), velocity_scale=0.01)
-    task, training = train_selected(given, read(given), workplace, mesh=None)
+    options = {"data": Path("rigid.npz"), "robot": Path("arm.xml"), "velocity_scale": 0.01}
+    typed = arguments_of(train_delan.Arguments, model="auto", **options)
+    task, training = selection.fit(prepare(typed), typed, workplace, None)
     said, stored = capsys.readouterr().out, json.loads((workplace / "model_selection.json").read_text())
     assert stored["kept"] == task.kind == "rigid-tree" and "are the noise" in stored["ended"]
     assert "│ rigid-tree " in said and [candidate["tried"] for candidate in stored["candidates"]].count(True) == 1
@@ -132,27 +133,27 @@ def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monke
 def test_one_trajectory_is_cut_into_blocks_of_time(workplace):
     one = {key: values[:60] for key, values in motions().items()}
     np.savez("one.npz", **one)
-    recorded = read(train_delan.Arguments(model="auto", data=Path("one.npz")))
+    recorded = read(arguments_of(train_delan.Arguments, model="auto", data=Path("one.npz")))
     assert [len(np.unique(part.trajectory)) for part in recorded.sets] == [8, 1, 1]
     assert recorded.needs.joint_friction
     assert (
-        recorded.said[-1] == "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test"
+        recorded.lines[-1] == "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test"
     )
 
 
 MISTAKES = {
-    "width": ((*AUTO, "--width", "4"), "model selection chooses by validation"),
-    "degree": ((*AUTO, "--degree", "2"), "model selection chooses by validation"),
+    "width": ((*AUTO, "--width", "4"), "--width is an option of networks"),
+    "degree": ((*AUTO, "--degree", "2"), "--degree is an option of --model trigonometric"),
     "lock": ((*AUTO, "--lock", "x"), "--lock is for joints of --robot"),
     "robot of a network": (
         ("--model", "structured-delan", "--data", "rigid.npz", "--robot", "arm.xml"),
-        "--robot is for --model auto",
+        "--robot is an option of --model auto",
     ),
     "robot that is not there": ((*AUTO, "--robot", "none.urdf"), "none.urdf"),
     "parents": ((*TREE, "--parents", "0,3"), "--parents is '0,3'"),
     "parents of a network": (
         ("--data", "rigid.npz", "--width", "4", "--parents", "0,1"),
-        "--parents is for --model auto",
+        "--parents is an option of --model auto",
     ),
     "kinematic prior that is not there": ((*TREE, "--kinematic-prior", "none.json"), "none.json: no such file"),
     "kinematic prior of something else": ((*TREE, "--kinematic-prior", "wrong.json"), "wrong.json: expected"),
@@ -180,5 +181,5 @@ def test_a_mistake_is_one_line(workplace, capsys, mistake):
 
 @pytest.mark.parametrize("model", ["auto", "trigonometric", "trigonometric-kernel", "learned-tree"])
 def test_a_fit_that_processes_do_not_share_is_refused(model):
-    with pytest.raises(InputError, match="--processes is for networks"):
-        check_options(train_delan.Arguments(model=model, processes=2), model)
+    with pytest.raises(InputError, match="--processes is an option of networks"):
+        arguments_of(train_delan.Arguments, model=model, processes=2)

@@ -56,8 +56,8 @@ def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
     assert "descents" in capsys.readouterr().out
     assert metrics_of(workplace / "tree")["torque_mse"] < 1e-12
     assert load(workplace / "tree").description["name"] == "learned-tree"
-    assert "has a search of its own" in refused(capsys, train_delan, *options, "--width", "3")
-    assert "has no seeds" in refused(capsys, train_delan, *options, "--seeds", "2")
+    assert "--width is an option of networks" in refused(capsys, train_delan, *options, "--width", "3")
+    assert "--seeds is an option of networks" in refused(capsys, train_delan, *options, "--seeds", "2")
 
 
 @pytest.mark.slow
@@ -68,7 +68,7 @@ def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workp
     assert re.search(r"kernel: 40 of \d+ samples", said) and "by order of the bodies: a chain: " in said
     assert metrics_of(workplace / "kernel")["torque_mse"] < 1e-4
     assert load(workplace / "kernel").description["samples"] == 40
-    assert "is one linear problem" in refused(capsys, train_delan, *options, "--width", "3")
+    assert "--width is an option of networks" in refused(capsys, train_delan, *options, "--width", "3")
     assert "samples is 0" in refused(capsys, train_delan, *options, "--samples", "0")
     linear = ("--data", "swing.npz", "--model", "trigonometric", "--samples", "9")
     assert "--samples" in refused(capsys, train_delan, *linear)
