@@ -4,7 +4,7 @@ A kind of training (dynamics, phase spaces, images, functions, identification, v
 that `train` calls in this order. Nothing is written before the data and options have been checked.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,12 +36,14 @@ class Judged(NamedTuple):
     """What is known of a fitted model once it has been evaluated."""
 
     metrics: dict[str, float | int]
-    """Contents of metrics.json."""
-    rows: Iterable[Iterable[str]]
-    """Rows of the printed table."""
+    """Contents of metrics.json, apart from those that are still being measured."""
+    rows: Callable[[dict[str, float | int]], Iterable[Sequence[str]]]
+    """All metrics -> rows of the printed table."""
     title: str
     """Title of the table."""
     columns: tuple[str, ...] = ("quantity", "value", "unit")
+    measured: Callable[[], dict[str, float]] = dict
+    """Waits for metrics that another process measures while the figures are drawn."""
     verdict: Verdict | None = None
     """Whether the model may be used; `None` where nothing decides it."""
     figures: Mapping[str, Callable[[Path], None]] = {}
@@ -91,13 +93,14 @@ def train(kind: Kind, options: Any, command: str) -> None:
         fitted = kind.fit(case, options, folder, mesh)
         kind.save(folder, fitted)
         judged = kind.judge(case, fitted, options, folder)
-        write_json(folder / "metrics.json", judged.metrics)
-        verdict = {} if judged.verdict is None else {"verdict": judged.verdict._asdict()}
-        write_config(folder, options, **judged.chosen, **verdict)
         if options.figures:
             for name, draw in judged.figures.items():
                 draw(folder / name)
-        print_numbers(judged.rows, title=judged.title, columns=judged.columns)
+        metrics = {**judged.metrics, **judged.measured()}
+        write_json(folder / "metrics.json", metrics)
+        verdict = {} if judged.verdict is None else {"verdict": judged.verdict._asdict()}
+        write_config(folder, options, **judged.chosen, **verdict)
+        print_numbers(judged.rows(metrics), title=judged.title, columns=judged.columns)
         for text in judged.lines:
             print(text)
         print(f"run folder: {folder}")

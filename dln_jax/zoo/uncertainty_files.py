@@ -54,32 +54,19 @@ def load_uncertainty(directory: Path) -> Uncertainty | None:
     if manifest.get("of") != of.get("sha256"):
         raise InputError(f"{path}: belongs to other parameters than the model's; delete it, {REMEDY}")
     try:
-        stated = {key: tuple(each["shape"]) for key, each in manifest["tensors"].items()}
+        stated = {key: tuple(tensor["shape"]) for key, tensor in manifest["tensors"].items()}
         (P, K), (d,), u = stated["factor"], stated["noise"], stated["domain/undetermined"][1]
-        # Releases before `harmless` stored no range for models that are linear in their parameters.
-        old = "domain/harmless" not in stated
-        reach = (0,) if old and stated["domain/reach"] == (0,) else (3 * d,)
         dtype = data_type(str(of["model"]["precision"]))
     except (KeyError, TypeError, ValueError, IndexError):
         raise InputError(f"{path}: does not state its arrays; {REMEDY}") from None
-    domain = Domain((d,), (P,), (P, u), reach, reach, None if old else (d,))
+    domain = Domain((d,), (P,), (P, u), (3 * d,), (3 * d,), (d,))
     shapes = Uncertainty((P, K), (d,), (d,), domain)
     like = jax.tree.map(
         lambda shape: jax.ShapeDtypeStruct(shape, dtype),
         shapes,
-        is_leaf=lambda each: type(each) is tuple,
+        is_leaf=lambda leaf: type(leaf) is tuple,
     )
-    known = load_tree(directory, UNCERTAINTY, like)
-    return _with_harmless(known) if old else known
-
-
-def _with_harmless(known: Uncertainty) -> Uncertainty:
-    """Converts an uncertainty of an earlier release, with the out-of-distribution flags of that release."""
-    domain, d = known.domain, len(known.noise)
-    if not len(domain.reach):
-        everywhere = np.full(3 * d, np.finfo(domain.reach.dtype).max)
-        domain = domain._replace(centre=np.zeros_like(everywhere), reach=everywhere)
-    return known._replace(domain=domain._replace(harmless=np.zeros_like(known.noise)))
+    return load_tree(directory, UNCERTAINTY, like)
 
 
 def discard_uncertainty(directory: Path) -> None:
@@ -90,4 +77,4 @@ def discard_uncertainty(directory: Path) -> None:
 
 
 def _parameters(manifest: dict[str, Any]) -> int:
-    return sum(int(np.prod(each["shape"])) for each in manifest["tensors"].values())
+    return sum(int(np.prod(tensor["shape"])) for tensor in manifest["tensors"].values())

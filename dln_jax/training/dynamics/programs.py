@@ -18,11 +18,9 @@ from dln_jax.metrics.rollouts import Records, metrics_of_motions, motion_program
 from dln_jax.models.model import Model
 from dln_jax.precision import data_type
 from dln_jax.training.dynamics.task import Task
+from dln_jax.training.uncertainty import CHUNK
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
-
-CHUNK = 256
-"""Number of samples per call of the program that linearises the torques in the parameters."""
 
 
 class Programs(NamedTuple):

@@ -21,11 +21,11 @@ from dln_jax.metrics.rollouts import TORQUES, Motion, by_trajectory, metrics_of_
 from dln_jax.precision import data_type
 from dln_jax.training.dynamics.programs import Programs, judged_data
 from dln_jax.training.dynamics.task import Task
-from dln_jax.training.dynamics.uncertainty import uncertainty_metrics
 from dln_jax.training.dynamics.verdict import TorqueVerdict, judge_torques
 from dln_jax.training.low_latency_calls import low_latency_metrics
 from dln_jax.training.pipeline import png
 from dln_jax.training.results import cost_metrics, unit_of
+from dln_jax.training.uncertainty import uncertainty_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.run import load
@@ -78,6 +78,8 @@ class Evaluation(NamedTuple):
     metrics: dict[str, float | int]
     judged: TorqueVerdict
     figures: dict[str, Callable[[Path], None]]
+    measured: Callable[[], dict[str, float]]
+    """Waits for the time of single calls in low-latency mode, which another process measures."""
 
 
 def evaluate(
@@ -87,7 +89,7 @@ def evaluate(
     run = load(folder)
     functions, test = run.dynamics, task.sets.test
     latency = latency_of(functions, task)
-    # Another process times the low-latency mode while this one evaluates.
+    # Another process times the low-latency mode while this one evaluates and draws.
     timed = in_background(low_latency_metrics, folder, latency_states(task), print) if low_latency else dict
     samples = samples_of(judged_data(task), data_type(task.precision))
     answers = as_arrays(programs.predict(run.parameters, samples))
@@ -99,7 +101,7 @@ def evaluate(
         answers = [programs.predict(parameters_of(training, index), samples) for index in range(seeds)]
         of_seeds = [mean_square(np.asarray(answer["tau"], float)[: len(test.t)] - test.tau) for answer in answers]
         spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
-    of_bands, bands = uncertainty_metrics(run, task, programs, predicted["tau"])
+    of_bands, bands = uncertainty_metrics(folder, programs.double, test, predicted["tau"], task.kind)
     metrics = {
         **errors(predicted, test),
         **judged.metrics,
@@ -114,9 +116,8 @@ def evaluate(
             parameters=sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
             best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
         ),
-        **timed(),
     }
-    return Evaluation(metrics, judged, {**figures_of(task, training, motions, predicted), **bands})
+    return Evaluation(metrics, judged, {**figures_of(task, training, motions, predicted), **bands}, timed)
 
 
 def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
@@ -203,24 +204,29 @@ def figures_of(
     return figures
 
 
-def table(metrics: dict[str, float | int], task: Task) -> dict[str, Any]:
-    """Rows, title and columns of the printed table; next to rollout metrics stand the true plant's values."""
+def columns(metrics: dict[str, float | int]) -> tuple[str, ...]:
+    """Columns of the printed table; a known true plant has one."""
+    known = any(ceiling in metrics for ceiling in CEILINGS.values())
+    return ("quantity", "value", *["true plant"] * known, "unit")
+
+
+def rows(metrics: dict[str, float | int], task: Task) -> list[tuple[str, ...]]:
+    """Rows of the printed table; next to rollout metrics stand the true plant's values."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
     units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
     units |= {key: "1" for key in metrics if key.endswith("_nmse")}
     units |= {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J", "normalised_state_error": "1"}
     units["validation_error"] = f"({force})²" if task.objective.selects_by == "torque" else "1"
-    known = any(ceiling in metrics for ceiling in CEILINGS.values())
-    rows = []
+    known = len(columns(metrics)) == 4
+    lines = []
     for key, value in metrics.items():
         if key not in CEILINGS.values() and key != "verdict":
             ceiling = metrics.get(CEILINGS.get(key, ""))
             beside = ["" if ceiling is None else number(key, ceiling)] * known
-            rows.append((MEANINGS.get(key, key.replace("_", " ")), number(key, value), *beside, unit_of(key, units)))
+            lines.append((MEANINGS.get(key, key.replace("_", " ")), number(key, value), *beside, unit_of(key, units)))
     calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
-    rows.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
-    columns = ("quantity", "value", *["true plant"] * known, "unit")
-    return {"rows": rows, "title": f"test on {task.name}, {task.precision}", "columns": columns}
+    lines.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
+    return lines
 
 
 def number(metric: str, value: int | float) -> str:

@@ -13,16 +13,17 @@ from dln_jax.data.splits import merged
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
+from dln_jax.models.model import Model, Parameters
 from dln_jax.scale.devices import device_lines
 from dln_jax.time_limit import deadline
 from dln_jax.training.dynamics.options import NETWORK, model_of, network_option
 from dln_jax.training.dynamics.programs import Programs, programs_ahead, programs_of
 from dln_jax.training.dynamics.recorded import read
-from dln_jax.training.dynamics.results import best_seed, definiteness_of, evaluate, table
+from dln_jax.training.dynamics.results import best_seed, columns, definiteness_of, evaluate, rows
 from dln_jax.training.dynamics.task import Task, method_of, planned
-from dln_jax.training.dynamics.uncertainty import store_uncertainty
 from dln_jax.training.pipeline import Fitted, Judged, Kind, train
 from dln_jax.training.results import settings_of
+from dln_jax.training.uncertainty import store_uncertainty
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.run import load
@@ -42,10 +43,8 @@ def run(options: Any, command: str) -> None:
     """Trains, evaluates and writes a run folder; errors as `training.pipeline.train`."""
     model = model_of(vars(options))
     if options.model is None and model == NETWORK and options.data is not None:
-        print(
-            f"{network_option(vars(options))} is for networks, so the model is {NETWORK}; without it several models are "
-            "tried (--model auto)"
-        )
+        option = network_option(vars(options))
+        print(f"{option} is for networks, so the model is {NETWORK}; without it several are tried (--model auto)")
     train(DYNAMICS, dataclasses.replace(options, model=model), command)
 
 
@@ -89,7 +88,7 @@ def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
     """Errors, speed, uncertainty and verdict of the stored model, with the figures that apply."""
     task, training, programs, best = fitted.outcome
     if options.uncertainty:
-        store_uncertainty(folder, task, programs.double, fitted.parameters)
+        store_bands(folder, task, programs.double, fitted.parameters)
     seeds = getattr(options, "seeds", 1)
     evaluation = evaluate(folder, task, training, programs, seeds=seeds, low_latency=options.low_latency)
     unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
@@ -103,7 +102,10 @@ def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
     limits = [getattr(options, name, None) for name in ("steps", "seconds")]
     return Judged(
         metrics=evaluation.metrics,
-        **table(evaluation.metrics, task),
+        rows=lambda metrics: rows(metrics, task),
+        title=f"test on {task.name}, {task.precision}",
+        columns=columns(evaluation.metrics),
+        measured=evaluation.measured,
         verdict=evaluation.judged.verdict,
         figures=evaluation.figures,
         chosen=chosen,
@@ -111,6 +113,21 @@ def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
         ended_by_user=task.solver is not None and limits != [None, None],
         error=failure(task, training, folder),
     )
+
+
+def store_bands(folder: Path, task: Task, model: Model, parameters: Parameters) -> None:
+    """Stores the uncertainty of a model fitted to torques alone, with as many parameters as its structure asks for."""
+    properties = CATALOGUE[task.kind].properties
+    if not task.objective.of_torques:
+        print(f"no uncertainty is stored: a {task.kind} is not fitted to torques alone")
+        return
+    if properties.kernel:
+        print(f"no uncertainty is stored: a {task.kind} has as many parameters as data")
+        return
+    sets, ridge = task.sets, 0.0 if properties.linear else None
+    negligible = 1e-12 if "tree" in task.description else 0.0
+    options = {"ridge": ridge, "negligible": negligible}
+    store_uncertainty(folder, model, parameters, sets.train, sets.validation, task.recorded.torque, **options)
 
 
 def warnings(task: Task, training: Training, folder: Path) -> Iterator[str]:

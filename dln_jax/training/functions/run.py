@@ -121,7 +121,9 @@ def judge(task: Task, fitted: Fitted, options: Options, folder: Path) -> Judged:
         lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
     return Judged(
         metrics=metrics,
-        rows=[(key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()],
+        rows=lambda metrics: [
+            (key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()
+        ],
         title=f"test on {task.name}, {network.precision}",
         figures=drawings(task, shown, training, trials),
         chosen={**network._asdict(), **settings_of(task.optimiser), **of_named(options)},

@@ -71,7 +71,7 @@ def judge(case: Case, fitted: Fitted, options: ImageOptions, folder: Path) -> Ju
     best = min(seen.history, key=lambda at: at.validation).step
     return Judged(
         metrics={key: value for key, value in numbers.items() if np.isfinite(value)},
-        rows=[(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
+        rows=lambda _: [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
         title=f"test films, {case.kind}",
         columns=("quantity", "value"),
         figures={

@@ -17,7 +17,6 @@ from dln_jax.metrics.verdict import Verdict
 from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, units_of
 from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.training.hamiltonian.training import MOTIONS, RATES, Trained
-from dln_jax.training.low_latency_calls import low_latency_metrics
 from dln_jax.training.pipeline import png
 from dln_jax.training.results import OF_LOSSES, one_step_metrics, unit_of
 from dln_jax.zoo.run import load
@@ -30,9 +29,7 @@ LOSSES = {
 """Label of the loss of every stage."""
 
 
-def evaluate(
-    folder: Path, problem: Problem, trained: Trained, *, low_latency: bool
-) -> tuple[dict[str, float | int], Seen, Verdict]:
+def evaluate(folder: Path, problem: Problem, trained: Trained) -> tuple[dict[str, float | int], Seen, Verdict]:
     """Entries of metrics.json, what figures show, and the verdict on the predicted test motions."""
     truth = problem.truth[0]
     metrics, seen, predicted = measured_once(problem, trained)
@@ -42,8 +39,6 @@ def evaluate(
     if problem.noise is not None:
         metrics |= {f"q{joint}_noise": float(sd) for joint, sd in enumerate(np.ravel(problem.noise.q), start=1)}
     metrics["validation_error"] = float(trained.result.validation)
-    if low_latency:
-        metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), print, function="rates")
     metrics = {key: value for key, value in metrics.items() if np.isfinite(value)}
     return metrics | {"verdict": verdict.number}, seen, verdict
 

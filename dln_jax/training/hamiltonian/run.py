@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.sharding import Mesh
 
+from dln_jax.background import in_background
 from dln_jax.cli.arguments import numbers_of, require_positive_if_given
 from dln_jax.cli.encoders import checked, needs_from_option
 from dln_jax.cli.optimisers import optimiser_named
@@ -24,6 +25,7 @@ from dln_jax.training.hamiltonian.results import evaluate, figures_of, line
 from dln_jax.training.hamiltonian.stages import gauge_of, in_velocities
 from dln_jax.training.hamiltonian.tasks import Problem, Stated, problem_of
 from dln_jax.training.hamiltonian.training import MOTIONS, Trained, check, stages_of, train
+from dln_jax.training.low_latency_calls import low_latency_metrics
 from dln_jax.training.pipeline import Fitted, Judged, Kind
 from dln_jax.training.results import losses
 from dln_jax.types import InputError, require_seed
@@ -121,14 +123,19 @@ def fit(case: Case, options: Any, folder: Path, mesh: Mesh | None) -> Fitted:
 def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
     """Errors, speed and verdict on the predicted test motions."""
     problem, trained = case.problem, fitted.outcome
-    metrics, seen, verdict = evaluate(folder, problem, trained, low_latency=options.low_latency)
+    timed = dict
+    if options.low_latency:
+        truth = problem.truth[0]
+        timed = in_background(low_latency_metrics, folder, (truth.q[0], truth.p[0]), print, function="rates")
+    metrics, seen, verdict = evaluate(folder, problem, trained)
     return Judged(
         metrics=metrics,
-        rows=[line(name, value) for name, value in metrics.items() if name != "verdict"],  # it has its own line
+        rows=lambda metrics: [line(name, value) for name, value in metrics.items() if name != "verdict"],
         title=f"test motions of {problem.name}, f64",
         verdict=verdict,
         figures=figures_of(problem, case.description["name"], seen, trained),
         chosen=case.description,
+        measured=timed,
         lines=(trained.stopped,) if trained.stopped and not trained.diverged else (),
         ended_by_user=options.steps is not None or trained.out_of_time,
         error=f"{trained.stopped}; {folder} holds the best model before that" if trained.diverged else "",

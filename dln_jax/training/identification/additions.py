@@ -5,27 +5,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.figures.uncertainty import torque_bands
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.residual import Candidate, ResidualFit, fit_residual
-from dln_jax.learning.uncertainty import estimate
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import shape_of
-from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.training.identification.task import Case, for_residual
-from dln_jax.training.pipeline import png
-from dln_jax.types import InputError
+from dln_jax.training.uncertainty import store_uncertainty
 from dln_jax.zoo.descriptions import Description, describe
-from dln_jax.zoo.run import load
-from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 ADDED = "with_residual"
 """Key of predictions with the residual network."""
@@ -102,47 +95,14 @@ def _named(candidate: Candidate) -> str:
     return f"{'+'.join(candidate.terms)} {candidate.width}" if candidate.terms else "none"
 
 
-def store_uncertainty(
-    folder: Path, case: Case, solution: Identification, added: ResidualFit | None
-) -> tuple[dict[str, float | int], dict[str, Callable[[Path], None]]]:
-    """Stores the uncertainty with the run; returns the coverage of the 95 % bands on held-out torques, and its figure.
+def store_bands(folder: Path, case: Case, solution: Identification, added: ResidualFit | None) -> Model:
+    """Stores the uncertainty of the run's model, and returns the model.
 
     The calibration includes the motions that the tree's few parameters were fitted to, as if each had been left out.
     """
-    extended = added is not None and bool(added.settings)
-    model, parameters = (
-        (added.model, added.parameters)
-        if added and extended
-        else (case.model, parameters_of(solution.theta, case.known))
-    )
-    try:
-        train, validation = for_residual(case.sets.train)
-        known = estimate(
-            model,
-            parameters,
-            train,
-            validation,
-            ridge=None if extended else 0.0,
-            unit=solution.fit.noise,
-            negligible=1e-12,
-        )
-    except (InputError, np.linalg.LinAlgError) as error:
-        print(f"the run does not say what it does not know: {error}")
-        return {}, {}
-    facts = {"ridge": known.ridge, "degrees_of_freedom": known.degrees_of_freedom.tolist(), "torque": case.torque}
-    save_uncertainty(folder, known.uncertainty, **facts)
-    print(f"bands are of {case.torque}, for one more motion of the kind that was recorded")
-    run, test = load(folder), case.sets.test
-    state = tuple(map(jnp.asarray, (test.q, test.qd, test.qdd)))
-    inverse = run.dynamics.inverse_dynamics
-    predicted, std, out_of_distribution = (
-        np.asarray(jax.jit(jax.vmap(function), compiler_options=quick_compilation())(*state))
-        for function in (inverse, run.torque_std, run.outside)
-    )
-    shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
-    drawn = png(torque_bands, test, predicted, std, out_of_distribution, model=case.description["name"])
-    return {
-        "coverage_95_share": float(shares.mean()),
-        "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
-        "outside_share": float(out_of_distribution.mean()),
-    }, {"uncertainty.png": drawn}
+    model, parameters, ridge = case.model, parameters_of(solution.theta, case.known), 0.0
+    if added is not None and added.settings:
+        model, parameters, ridge = added.model, added.parameters, None
+    options = {"ridge": ridge, "unit": solution.fit.noise, "negligible": 1e-12}
+    store_uncertainty(folder, model, parameters, *for_residual(case.sets.train), case.torque, **options)
+    return model

@@ -27,13 +27,14 @@ from dln_jax.training.identification.additions import (
     predictor,
     residual_lines,
     shape_lines,
-    store_uncertainty,
+    store_bands,
     stored_description,
 )
 from dln_jax.training.identification.options import Options
 from dln_jax.training.identification.task import Case, prepare, with_shapes
 from dln_jax.training.identification.verdict import judged
 from dln_jax.training.pipeline import Fitted, Judged, Kind, png
+from dln_jax.training.uncertainty import uncertainty_metrics
 from dln_jax.types import InputError
 
 KEPT = "identified"
@@ -97,7 +98,8 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     metrics |= of_verdict
     figures = figures_of(case, solution, predict, predicted[KEPT])
     if options.uncertainty:
-        of_bands, bands = store_uncertainty(folder, case, solution, residual)
+        model = store_bands(folder, case, solution, residual)
+        of_bands, bands = uncertainty_metrics(folder, model, case.sets.test, torques[kept], case.description["name"])
         metrics |= of_bands
         figures |= bands
     write_json(folder / "parameters.json", {"base": base_rows(solution), "parameters": parameter_rows(solution)})
@@ -105,7 +107,9 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     lines = [*findings(solution, case.sets.train, case.names), *write_file(folder, options, case, solution, verdict)]
     return Judged(
         metrics={**metrics, "identify_seconds": seconds},
-        **table(case, solution, predicted),
+        rows=lambda _: rows(case, solution, predicted),
+        title="held out: nMSE by parameters, rms error, and noise of the fit",
+        columns=("joint", *(name.replace("_", " ") for name in predicted), "rms", "noise", "unit"),
         verdict=verdict,
         figures=figures,
         chosen=fitted.description,
@@ -194,18 +198,16 @@ def units_of(case: Case) -> list[str]:
     return ["N m" if kind == "revolute" else "N" for kind in case.robot.tree.joints]
 
 
-def table(case: Case, solution: Identification, predicted: dict[str, Predictions]) -> dict[str, Any]:
-    """Rows, title and columns of the held-out errors of every joint."""
+def rows(case: Case, solution: Identification, predicted: dict[str, Predictions]) -> list[tuple[str, ...]]:
+    """Held-out errors of every joint."""
     tau = case.sets.test.tau
     errors = {name: normalised_error(prediction.torque, tau) for name, prediction in predicted.items()}
     rms = np.sqrt(np.mean((predicted[KEPT].torque - tau) ** 2, axis=0))
-    rows = [
+    lines = [
         (name, *(f"{error[k]:.3g}" for error in errors.values()), f"{rms[k]:.3g}", f"{solution.fit.noise[k]:.3g}", unit)
         for k, (name, unit) in enumerate(zip(case.names, units_of(case), strict=True))
     ]
-    rows.append(("mean", *(f"{np.nanmean(error):.3g}" for error in errors.values()), "", "", ""))
-    columns = ("joint", *(name.replace("_", " ") for name in errors), "rms", "noise", "unit")
-    return {"rows": rows, "title": "held out: nMSE by parameters, rms error, and noise of the fit", "columns": columns}
+    return [*lines, ("mean", *(f"{np.nanmean(error):.3g}" for error in errors.values()), "", "", "")]
 
 
 IDENTIFICATION = Kind(prepare, announce, fit, judge)

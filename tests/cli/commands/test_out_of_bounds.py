@@ -175,18 +175,18 @@ def interrupted_run(folder):
 def test_a_run_is_resumed_where_its_data_have_moved(here, monkeypatch):
     """By their new path; where they are where they were, relative to where the command is called, by none."""
     asked = interrupted_run(here)
-    assert with_stored_arguments(asked).data == Path("data.npz")
+    assert with_stored_arguments(asked, train_delan.Arguments).data == Path("data.npz")
     moved = here / "moved"
     moved.mkdir()
     (here / "run").rename(moved / "run")
     monkeypatch.chdir(moved)
     with pytest.raises(InputError, match=r"data\.npz, which is not here; give its new path by --data"):
-        with_stored_arguments(asked)
+        with_stored_arguments(asked, train_delan.Arguments)
     for path in (Path("../data.npz"), here / "data.npz"):
-        assert with_stored_arguments(dataclasses.replace(asked, data=path)).data == path
+        assert with_stored_arguments(dataclasses.replace(asked, data=path), train_delan.Arguments).data == path
     np.savez("other.npz", **{**np.load(here / "data.npz"), "t": np.arange(20.0)})
     with pytest.raises(InputError, match="started with other data"):
-        with_stored_arguments(dataclasses.replace(asked, data=Path("other.npz")))
+        with_stored_arguments(dataclasses.replace(asked, data=Path("other.npz")), train_delan.Arguments)
 
 
 # processes

@@ -258,7 +258,7 @@ MISTAKES = {
     "patience": (
         arrays(),
         ["--patience", "3", "--optimizer", "gauss-newton"],
-        "--patience is an option of --optimizer adam",
+        "--patience is an option of",
     ),
     "batch of adam": (arrays(), ["--batch", "-1", "--optimizer", "adam"], "batch is -1"),
     "rate": (arrays(), ["--learning-rate", "nan", "--optimizer", "adam"], "--learning-rate is nan"),
@@ -268,17 +268,17 @@ MISTAKES = {
     "width of a linear model": (
         arrays(),
         ["--model", "trigonometric", "--width", "4"],
-        "--width is an option of networks",
+        "--width is an option of",
     ),
     "optimizer of a linear model": (
         arrays(),
         ["--model", "trigonometric", "--optimizer", "adam"],
-        "--optimizer is an option of networks",
+        "--optimizer is an option of",
     ),
     "seeds of a linear model": (
         arrays(),
         ["--model", "trigonometric", "--seeds", "2"],
-        "--seeds is an option of networks",
+        "--seeds is an option of",
     ),
     "width of a target": (arrays(), ["--target", "1", "--width", "4"], "--width is what --target grows"),
 }

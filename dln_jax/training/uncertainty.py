@@ -1,4 +1,4 @@
-"""Uncertainty of a trained model of dynamics: estimated, stored with the run, tested and drawn."""
+"""Uncertainty of a trained model's torques: estimated, stored with the run, tested and drawn."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,65 +13,73 @@ from dln_jax.figures.uncertainty import torque_bands
 from dln_jax.learning.linear import linearised_chunks
 from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.models.model import Model
+from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Uncertainty, highest, scores_of_rows, torque_deviation
-from dln_jax.training.dynamics.programs import CHUNK, Programs
-from dln_jax.training.dynamics.task import Task
 from dln_jax.training.pipeline import png
 from dln_jax.types import InputError
-from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.run import Run
+from dln_jax.zoo.run import load
 from dln_jax.zoo.uncertainty_files import save_uncertainty
 
+CHUNK = 256
+"""Number of samples per call of the program that linearises the torques in the parameters."""
 
-def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -> None:
-    """Estimates and stores the uncertainty of a model fitted to torques alone, from training and validation data.
 
-    `model` is the task's model in float64.
+def store_uncertainty(
+    folder: Path,
+    model: Model,
+    parameters: Parameters,
+    train: Trajectories,
+    validation: Trajectories,
+    torque: str,
+    **options: Any,
+) -> None:
+    """Estimates the uncertainty of a model fitted to torques, and stores it in the run's folder.
+
+    Args:
+        folder: folder of the run, with its model.
+        model: the model in float64.
+        parameters: fitted parameters.
+        train: data that the parameters were fitted to.
+        validation: data that calibrate the bands.
+        torque: the torques that the bands are of, in words.
+        options: as for `learning.uncertainty.estimate`.
     """
-    if not task.objective.of_torques:
-        print(f"a {task.kind} is not fitted to torques alone: the run does not say what it does not know")
-        return
-    properties, tree = CATALOGUE[task.kind].properties, "tree" in task.description
-    if properties.kernel:
-        print(f"a {task.kind} has as many parameters as data: the run does not say what it does not know")
-        return
     try:
-        solution = estimate(
-            model,
-            parameters,
-            task.sets.train,
-            task.sets.validation,
-            ridge=0.0 if properties.linear else None,
-            negligible=1e-12 * tree,
-        )
+        solution = estimate(model, parameters, train, validation, **options)
     except (InputError, np.linalg.LinAlgError) as error:
         # The model is trained, so an estimate that its data cannot provide is left out instead of refused.
-        print(f"the run does not say what it does not know: {error}")
+        print(f"no uncertainty is stored: {error}")
         return
     facts = {"ridge": solution.ridge, "degrees_of_freedom": solution.degrees_of_freedom.tolist()}
-    save_uncertainty(folder, solution.uncertainty, **facts, torque=task.recorded.torque)
-    print(f"bands are of {task.recorded.torque}, for one more motion of the kind that was recorded")
+    save_uncertainty(folder, solution.uncertainty, **facts, torque=torque)
+    print(f"bands are of {torque}, for one more motion of the kind that was recorded")
 
 
 def uncertainty_metrics(
-    run: Run, task: Task, programs: Programs, predicted: np.ndarray
+    folder: Path, model: Model, test: Trajectories, predicted: np.ndarray, name: str
 ) -> tuple[dict[str, float], dict[str, Callable[[Path], None]]]:
-    """Coverage of the 95 % bands on test torques (mean, worst joint), the share of test states out of distribution,
-    and the figure of both. Empty for a run without uncertainty.
+    """Coverage of the stored 95 % bands on test torques, the share of test states out of distribution, and their figure.
+
+    Empty for a run without uncertainty.
+
+    Args:
+        folder: folder of the run.
+        model: its model in float64.
+        test: test data.
+        predicted: the model's torques on them [N, d].
+        name: name of the model in the figure.
     """
+    run = load(folder)
     if run.uncertainty is None:
         return {}, {}
-    test = task.sets.test
-    std, out_of_distribution = bands(programs.double, run.parameters, run.uncertainty, test)
+    std, out_of_distribution = bands(model, run.parameters, run.uncertainty, test)
     shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
     metrics = {
         "coverage_95_share": float(shares.mean()),
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
         "outside_share": float(out_of_distribution.mean()),
     }
-    drawn = png(torque_bands, test, predicted, std, out_of_distribution, model=task.kind)
-    return metrics, {"uncertainty.png": drawn}
+    return metrics, {"uncertainty.png": png(torque_bands, test, predicted, std, out_of_distribution, model=name)}
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
