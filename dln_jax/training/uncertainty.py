@@ -58,7 +58,7 @@ def store_uncertainty(
 def uncertainty_metrics(
     folder: Path, model: Model, test: Trajectories, predicted: np.ndarray, name: str
 ) -> tuple[dict[str, float], dict[str, Callable[[Path], None]]]:
-    """Coverage of the stored 95 % bands on test torques, the share of test states out of distribution, and their figure.
+    """Coverage of the stored 95 % bands on test torques, share of test states out of distribution, and their figure.
 
     Empty for a run without uncertainty.
 

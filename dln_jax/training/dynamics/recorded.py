@@ -145,9 +145,10 @@ def _needs_and_origin(
 
 def robot_of(options: Options) -> Robot | None:
     """Reads the robot of --robot."""
-    if not isinstance(options, ArmOptions) or options.robot is None:
-        if isinstance(options, ArmOptions):
-            refuse_given(options, ["lock"], "for joints of --robot")
+    if not isinstance(options, SelectionOptions):
+        return None
+    if options.robot is None:
+        refuse_given(options, ["lock"], "for joints of --robot")
         return None
     return read_robot(options.robot, lock=names_listed(options.lock))
 

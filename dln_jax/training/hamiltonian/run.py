@@ -126,7 +126,7 @@ def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
     timed = dict
     if options.low_latency:
         truth = problem.truth[0]
-        timed = in_background(low_latency_metrics, folder, (truth.q[0], truth.p[0]), print, function="rates")
+        timed = in_background(partial(low_latency_metrics, folder, (truth.q[0], truth.p[0]), print, function="rates"))
     metrics, seen, verdict = evaluate(folder, problem, trained)
     return Judged(
         metrics=metrics,

@@ -37,7 +37,7 @@ def plan(options: TreeOptions, kind: str, recorded: Recorded, objective: Objecti
     ), None
 
 
-def fit(task: Task, options: TreeOptions, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """Joint frames by Gauss-Newton from random starts, or near the stated kinematics; all else by elimination."""
     needs, kinematic_prior = needs_of_tree(task.needs), task.recorded.kinematic_prior
     near = (
