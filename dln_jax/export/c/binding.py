@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from dln_jax.export.c.interface import KINDS, Leaf, Signature
-from dln_jax.export.c.kinds import NUMPY_TYPES
-from dln_jax.export.c.text import PRECISIONS
+from dln_jax.export.c.text import NUMPY_TYPES, PRECISIONS
 from dln_jax.export.low_latency import as_shaped
 from dln_jax.types import InputError
 

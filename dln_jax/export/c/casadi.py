@@ -270,8 +270,7 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
     region(body, ())
     writers = result_writers(body, results, apart=False)
     for j, write in zip((j for j, output in enumerate(outputs) if output.dense), writers, strict=True):
-        body.opened(f"if (res[{j}])")
-        write(f"res[{j}]")
-        body.closed()
+        with body.block(f"if (res[{j}])"):
+            write(f"res[{j}]")
     body.line("return 0;")
     return body

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.export.c.kinds import C_TYPES, kind_of
-from dln_jax.export.c.text import PRECISIONS, check_name
+from dln_jax.export.c.text import C_TYPES, PRECISIONS, check_name, kind_of
 from dln_jax.export.exports import AGAIN, read_export
 from dln_jax.types import InputError
 

@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 from jax.dtypes import float0
 
-from dln_jax.export.c import indexing, linear_algebra, primitives, reductions
+from dln_jax.export.c import indexing, linear_algebra, primitives
 from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at, scanned
-from dln_jax.export.c.kinds import NUMPY_TYPES, kind_of
 from dln_jax.export.c.nodes import Loop, Node, is_constant, values
 from dln_jax.export.c.program import Part, Program
-from dln_jax.export.c.text import PRECISIONS
+from dln_jax.export.c.text import PRECISIONS, kind_of, limit
 from dln_jax.types import InputError
 
 _CALLS = {
@@ -26,8 +25,7 @@ _REFUSED = {
     "callback": "a callback into Python, which C cannot call",
     "debug_print": "printing, a side effect",
 }
-_RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_algebra.RULES}
-_TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
+_RULES = {**primitives.RULES, **indexing.RULES, **linear_algebra.RULES}
 
 
 def program_of(
@@ -98,29 +96,25 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         return _inline(program, closed_jaxpr(inner), args)
     if name == "call_hi_primitive":
         return _inline(program, expanded(parameters["_prim"]), args)
-    if name == "scan":
-        parameters = {**parameters, **scanned(equation)}
     if is_error_of_equinox(equation):
         return [_failed(program, variable.aval) for variable in equation.outvars]
     if name in _CONTROL:
+        parameters = {**parameters, **scanned(equation)} if name == "scan" else parameters
         return _CONTROL[name](program, parameters, args)
-    if name in _TYPED_RULES:
-        dtype = kind_of(equation.outvars[0].aval.dtype)
-        return [_TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
     if name not in _RULES:
         why = next((reason for part, reason in _REFUSED.items() if part in name), None)
         inner = None if why else implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
         if inner is not None:
             return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
         raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
-    results = _RULES[name](program, parameters, *args)
+    results = _RULES[name](program, {**parameters, "kind": kind_of(equation.outvars[0].aval.dtype)}, *args)
     return list(results) if isinstance(results, list | tuple) else [results]
 
 
 def _failed(program: Program, aval: Any) -> Node:
     """Returns the value for an error that C cannot raise: NaN, the largest integer or true (EQX_ON_ERROR=nan)."""
     kind = kind_of(aval.dtype)
-    value = np.nan if kind == "real" else kind == "bool" or np.iinfo(NUMPY_TYPES[kind]).max
+    value = np.nan if kind == "real" else limit(kind, upper=True)
     return program.broadcast(program.constant(value, kind), aval.shape)
 
 
@@ -197,7 +191,7 @@ def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     for array in stacked:
         size = array.size // max(length, 1)
         offsets = program.constant(np.arange(size).reshape(array.shape[1:]), "index")
-        first = program.elementwise("mul", turn, program.constant(size, "index"))
+        first = program.elementwise("mul", turn, size)
         slices.append(indexing.take(program, array, program.elementwise("add", first, offsets)))
     results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
     program.loops[number] = Loop(carries, [], results, length, reverse)

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from dln_jax.export.c import casadi as external
-from dln_jax.export.c import factorisations, integers, ordering
+from dln_jax.export.c import factorisations, kernels, operations
 from dln_jax.export.c.body import Source
 from dln_jax.export.c.demo import cmake, demo
 from dln_jax.export.c.elementary import definitions
@@ -29,9 +29,8 @@ from dln_jax.export.c.interface import (
     result_leaves,
 )
 from dln_jax.export.c.jaxprs import repeated_calls, traced
-from dln_jax.export.c.kinds import kind_of
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.text import PRECISIONS, check_name, comment, table
+from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of, table
 from dln_jax.export.exports import described, write_exports
 from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
@@ -258,7 +257,7 @@ def _preamble(source: Source, name: str) -> str:
         f"#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"
         "#ifdef __cplusplus\n#define RESTRICT\n#else\n#define RESTRICT restrict\n#endif\n\n"
         f"{tables}{definitions(source.functions, source.precision, arrays=source.arrays)}"
-        f"{integers.definitions(source.integers, source.precision)}{ordering.definitions(source.orders)}"
+        f"{operations.definitions(source.integers, source.precision)}{kernels.orderings(source.orders)}"
         f"{factorisations.definitions(source.kernels, suffix)}"
     )
 
