@@ -60,22 +60,24 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
     return _checked(leaves, "result")
 
 
+def array_of(leaf: Any) -> Any:
+    """Returns a leaf as an array, if it is none."""
+    return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
+
+
 def _leaves(name: str, tree: Any) -> list[Leaf]:
     leaves = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         parts = [str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", "")))) for key in path]
         whole = "_".join(part for part in (name, *parts) if part)
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
-        array = leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
+        array = array_of(leaf)
         leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
     return leaves
 
 
 def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
-    names = [
-        check_name(leaf.name, f"the name of an {what}" if what == "argument" else f"the name of a {what}")
-        for leaf in leaves
-    ]
+    names = [check_name(leaf.name, f"the name of {'an' if what == 'argument' else 'a'} {what}") for leaf in leaves]
     if len(set(names)) < len(names):
         raise InputError(f"two {what}s have one name among {', '.join(names)}; rename one")
     return leaves
@@ -103,15 +105,8 @@ def _length(shape: tuple[int, ...]) -> int:
 
 def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
     """Returns the JSON description of an export, without digests."""
-    stated = {
-        key: {
-            "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.arguments],
-            "results": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.results],
-            "stack_bytes": function.stack_bytes,
-            "operations": function.operations,
-        }
-        for key, function in functions.items()
-    }
+    # JSON makes lists of leaves and shapes, which are tuples.
+    stated = {key: function._asdict() for key, function in functions.items()}
     return {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
 
 

@@ -135,17 +135,3 @@ def made_at(equation: Any) -> str:
     frames = [] if traceback is None else list(traceback.frames)
     users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]
     return f" (made at {users[0].file_name}:{users[0].line_num})" if users else ""
-
-
-def scanned(equation: Any) -> dict[str, int]:
-    """Returns how many arguments of a scan are constant ("fixed") and how many are carried.
-
-    Releases of JAX store these numbers differently, so they are counted: stacked arguments differ in shape inside.
-    """
-    inner = closed_jaxpr(equation.params["jaxpr"]).jaxpr
-
-    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
-        return sum(a.aval.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
-
-    carried = alike(equation.outvars, inner.outvars)
-    return {"fixed": alike(equation.invars, inner.invars) - carried, "carried": carried}
