@@ -35,11 +35,8 @@ import numpy as np
 
 from dln_jax.export.c.nodes import Loop, Node, Region, is_all, is_constant, is_uniform, values, without_unused
 from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, on_kind
-from dln_jax.export.c.text import NUMPY_TYPES, UNSIGNED, limit
+from dln_jax.export.c.text import LARGEST, NUMPY_TYPES, UNSIGNED, limit
 from dln_jax.types import InputError
-
-LARGEST = 1 << 22
-"""Largest number of elements of an array."""
 
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "integer_div": 1, "or": 0, "xor": 0, "and": ...}
 """Number that leaves the other argument unchanged; for `and`, all bits of its kind are set."""

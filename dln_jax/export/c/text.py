@@ -38,6 +38,8 @@ _KINDS = {np.dtype(numpy_type).name: kind for kind, numpy_type in NUMPY_TYPES.it
 _KINDS |= {"float32": "real", "float64": "real", str(jax.dtypes.float0): "bool"}
 PRECISIONS = {"f32": (np.float32, "float", "f"), "f64": (np.float64, "double", "")}
 """NumPy type, C type, and the suffix of its literals and of the functions of <math.h>."""
+LARGEST = 1 << 22
+"""Largest number of elements of an array."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _FUNCTIONS = """
 acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc exp exp2 expm1 fabs fdim floor fma fmax fmin
