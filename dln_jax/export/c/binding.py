@@ -1,26 +1,23 @@
 """A generated C source that makes exported functions callable from Python.
 
-It replaces ctypes, whose calls take longer than the dynamics of a small arm. It declares the few functions of Python's
-stable interface (PEP 384, which includes buffers from 3.11 on) that it calls, so that no Python headers are needed.
+It replaces ctypes, whose calls take longer than the dynamics of a small arm. It declares the few functions of Python
+(3.11 and later) that it calls, so that no Python headers are needed.
 """
 
 import collections
 import ctypes
-import functools
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from string import Template
 from typing import Any
 
 import numpy as np
 
 from dln_jax.export.c.interface import KINDS, Leaf, Signature
-from dln_jax.export.c.kinds import NUMPY_TYPES
-from dln_jax.export.c.text import PRECISIONS
+from dln_jax.export.c.text import NUMPY_TYPES, PRECISIONS
 from dln_jax.export.low_latency import as_shaped
 from dln_jax.types import InputError
 
-_C = {**KINDS, "real": "real"}
-_TYPES = {**NUMPY_TYPES, "bool": np.int32}
 _GIVES = {"real": "PyFloat_FromDouble((double){})", "unsigned_long": "PyLong_FromUnsignedLongLong({})"}
 _START = Template("""\
 #include <stddef.h>
@@ -60,13 +57,12 @@ PyObject *PyFloat_FromDouble(double);
 PyObject *PyLong_FromLongLong(long long);
 PyObject *PyLong_FromUnsignedLongLong(unsigned long long);
 PyObject *PyCMethod_New(PyMethodDef *, PyObject *, PyObject *, PyObject *);
-PyObject *PyObject_CallFunctionObjArgs(PyObject *, ...);
 PyObject *PyObject_CallObject(PyObject *, PyObject *);
 int PyObject_IsInstance(PyObject *, PyObject *);
 PyObject *PyTuple_GetItem(PyObject *, Py_ssize_t);
 PyObject *PyTuple_New(Py_ssize_t);
 int PyTuple_SetItem(PyObject *, Py_ssize_t, PyObject *);
-Py_ssize_t PyTuple_Size(PyObject *);
+PyObject *PyObject_Vectorcall(PyObject *, PyObject *const *, size_t, PyObject *);
 
 typedef struct {
     char format;
@@ -125,27 +121,13 @@ static PyObject *results_of(const function *f, PyObject *self, PyObject *const *
     return result;
 }
 
-/* A call; `self` holds the function that converts arguments, the class of results, and makers of result arrays */
+/* A call; `self` holds a function that converts arguments and calls again, the class of results, and their makers */
 static PyObject *called(
     const function *f, PyObject *self, PyObject *const *arguments, Py_ssize_t count, PyObject *names)
 {
-    PyObject *result = names || count != f->arguments ? NULL : results_of(f, self, arguments), *all, *converted = NULL;
+    PyObject *result = names || count != f->arguments ? NULL : results_of(f, self, arguments);
     if (result || PyErr_Occurred()) return result;
-    if (names) count += PyTuple_Size(names);
-    all = PyTuple_New(count);
-    for (Py_ssize_t k = 0; all && k < count; ++k) {
-        Py_IncRef(arguments[k]);
-        (void)PyTuple_SetItem(all, k, arguments[k]);
-    }
-    if (all) converted = PyObject_CallFunctionObjArgs(PyTuple_GetItem(self, 0), all, names, NULL);
-    if (converted) {
-        PyObject *fitting[MAXIMUM];
-        for (int k = 0; k < f->arguments; ++k) fitting[k] = PyTuple_GetItem(converted, k);
-        result = results_of(f, self, fitting);
-        Py_DecRef(converted);
-    }
-    if (all) Py_DecRef(all);
-    return result;
+    return PyObject_Vectorcall(PyTuple_GetItem(self, 0), arguments, (size_t)count, names);
 }
 """)
 
@@ -175,21 +157,43 @@ def bound(library: ctypes.PyDLL, name: str, functions: Mapping[str, Signature], 
     """Returns a named tuple of the functions of a library that was built with the binding."""
     make = library[f"{name}_python"]
     make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
-    made = {}
+    made: dict[str, Callable[..., Any]] = {}
     for number, (key, signature) in enumerate(functions.items()):
         group = collections.namedtuple(f"{key}_results", [leaf.name for leaf in signature.results])
-        results = (
-            ()
-            if signature.returns
-            else [np.zeros(leaf.shape, _type(leaf.kind, precision)) for leaf in signature.results]
-        )
-        convert = functools.partial(_converted, key, signature.arguments, precision)
-        made[key] = make(number, (convert, group, *(array.copy for array in results)))
+        results = () if signature.returns else signature.results
+        arrays = (np.zeros(leaf.shape, _type(leaf.kind, precision)) for leaf in results)
+        converting = _converting(key, signature.arguments, precision, made)
+        made[key] = make(number, (converting, group, *(array.copy for array in arrays)))
     return collections.namedtuple("Functions", made)(**made)
 
 
+def _converting(
+    name: str, leaves: tuple[Leaf, ...], precision: str, made: Mapping[str, Callable[..., Any]]
+) -> Callable[..., Any]:
+    """Returns a function that converts arguments to arrays and calls a function in `made` with them."""
+    parameters = [inspect.Parameter(leaf.name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for leaf in leaves]
+    expected = inspect.Signature(parameters)
+
+    def converting(*arguments: Any, **keywords: Any) -> Any:
+        try:
+            values = expected.bind(*arguments, **keywords).args
+        except TypeError as error:
+            raise InputError(f"{name} takes {', '.join(leaf.name for leaf in leaves)}; {error}") from error
+        arrays = (_array(leaf, value, precision) for leaf, value in zip(leaves, values, strict=True))
+        return made[name](*arrays)
+
+    return converting
+
+
+def _array(leaf: Leaf, argument: Any, precision: str) -> np.ndarray:
+    if leaf.kind == "bool":
+        argument = np.asarray(argument)
+        argument = argument.astype(np.int32) if argument.dtype == bool else argument
+    return np.array(as_shaped(leaf.name, argument, leaf.shape), _type(leaf.kind, precision), order="C")
+
+
 def _type(kind: str, precision: str) -> Any:
-    return {**_TYPES, "real": PRECISIONS[precision][0]}[kind]
+    return {**NUMPY_TYPES, "bool": np.int32, "real": PRECISIONS[precision][0]}[kind]
 
 
 def _format(kind: str, precision: str) -> str:
@@ -197,16 +201,28 @@ def _format(kind: str, precision: str) -> str:
     return np.zeros(1, _type(kind, precision)).data.format
 
 
+_FUNCTION = Template("""
+static PyObject *run_$number(void **memory)
+{
+    $call
+}
+
+static PyObject *call_$number(PyObject *self, PyObject *const *arguments, Py_ssize_t count, PyObject *names)
+{
+    static const function f = {$arguments, $results, run_$number, {$leaves}};
+    return called(&f, self, arguments, count, names);
+}
+""")
+
+
 def _function(number: int, name: str, signature: Signature, precision: str) -> str:
     """Returns a C function that passes pointers to an exported function, and one that Python calls."""
+    results = () if signature.returns else signature.results
+    leaves = [*signature.arguments, *results]
     passed = [
-        f"memory[{k}]" if leaf.shape else f"*(const {_C[leaf.kind]} *)memory[{k}]"
-        for k, leaf in enumerate(signature.arguments)
+        f"memory[{k}]" if leaf.shape or k >= len(signature.arguments) else f"*(const {KINDS[leaf.kind]} *)memory[{k}]"
+        for k, leaf in enumerate(leaves)
     ]
-    leaves = [*signature.arguments]
-    if not signature.returns:
-        passed += [f"memory[{len(leaves) + k}]" for k in range(len(signature.results))]
-        leaves += signature.results
     call = f"{name}({', '.join(passed)})"
     if signature.returns:
         call = f"return {_GIVES.get(signature.results[0].kind, 'PyLong_FromLongLong({})').format(call)};"
@@ -216,20 +232,9 @@ def _function(number: int, name: str, signature: Signature, precision: str) -> s
         f"{{'{_format(leaf.kind, precision)}', {len(leaf.shape)}, {{{', '.join(map(str, leaf.shape or (0,)))}}}}}"
         for leaf in leaves
     )
-    results = len(leaves) - len(signature.arguments)
-    about = f"{{{len(signature.arguments)}, {results}, run_{number}, {{{described}}}}}"
-    return f"""
-static PyObject *run_{number}(void **memory)
-{{
-    {call}
-}}
-
-static PyObject *call_{number}(PyObject *self, PyObject *const *arguments, Py_ssize_t count, PyObject *names)
-{{
-    static const function f = {about};
-    return called(&f, self, arguments, count, names);
-}}
-"""
+    return _FUNCTION.substitute(
+        number=number, call=call, arguments=len(signature.arguments), results=len(results), leaves=described
+    )
 
 
 def _described(key: str, signature: Signature) -> str:
@@ -238,24 +243,3 @@ def _described(key: str, signature: Signature) -> str:
         for leaves in (signature.arguments, signature.results)
     )
     return f"{key}({arguments}) -> {results}"
-
-
-def _converted(
-    name: str, leaves: tuple[Leaf, ...], precision: str, arguments: tuple[Any, ...], names: tuple[str, ...] = ()
-) -> tuple[np.ndarray, ...]:
-    """Converts positional and keyword arguments to arrays in order, and raises InputError if that fails."""
-    expected = [leaf.name for leaf in leaves]
-    placed = dict(zip([*expected[: len(arguments) - len(names)], *names], arguments, strict=False))
-    if len(placed) < len(arguments) or set(placed) != set(expected):
-        others = len(arguments) - len(set(placed) & set(expected))
-        raise InputError(
-            f"{name} takes {', '.join(expected)}; got {len(arguments)} of them{' and others' * bool(others)}"
-        )
-    return tuple(_array(leaf, placed[leaf.name], precision) for leaf in leaves)
-
-
-def _array(leaf: Leaf, argument: Any, precision: str) -> np.ndarray:
-    if leaf.kind == "bool":
-        argument = np.asarray(argument)
-        argument = argument.astype(np.int32) if argument.dtype == bool else argument
-    return np.array(as_shaped(leaf.name, argument, leaf.shape), _type(leaf.kind, precision), order="C")

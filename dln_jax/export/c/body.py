@@ -4,18 +4,18 @@ A reading takes an integer array of positions, with one axis for each loop aroun
 transposes and gathers become indexing of that integer array, and constants are stored in the order of their reading.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from copy import copy
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.kinds import C_TYPES
 from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, values
 from dln_jax.export.c.plan import Plan, strides
 from dln_jax.export.c.program import Program
-from dln_jax.export.c.text import integer, literal
+from dln_jax.export.c.text import C_TYPES, PRECISIONS, literal
 
 
 class Called(NamedTuple):
@@ -54,7 +54,7 @@ class Source:
     @property
     def suffix(self) -> str:
         """Suffix of literals and of functions of <math.h>."""
-        return "f" if self.precision == "f32" else ""
+        return PRECISIONS[self.precision][2]
 
     def copy(self) -> "Source":
         """Returns a copy with containers of its own, to discard if a function is refused."""
@@ -64,7 +64,7 @@ class Source:
         """Returns the name of a constant array; equal arrays share one."""
         array = np.ascontiguousarray(numbers)
         if dtype == "real":
-            array = array.astype(np.float32 if self.precision == "f32" else np.float64)
+            array = array.astype(PRECISIONS[self.precision][0])
         key = dtype, array.tobytes() + str(array.size).encode()
         return self.tables.setdefault(key, (f"table_{len(self.tables)}", array))[0]
 
@@ -94,26 +94,32 @@ class Body:
         """Appends a line at the current depth."""
         self.lines.append("    " * self._depth + text)
 
-    def opened(self, text: str, turns: int = 1) -> None:
-        """Opens a block that runs `turns` times."""
-        self.line(text + " {")
-        self._depth += 1
-        self._turns *= turns
-
-    def closed(self, turns: int = 1) -> None:
-        """Closes the innermost block."""
-        self._depth -= 1
-        self._turns //= max(turns, 1)
+    @contextmanager
+    def block(self, text: str, turns: int = 1) -> Iterator[None]:
+        """Opens a block that runs `turns` times, and closes it."""
+        turns_outside = self._turns
+        self.line(f"{text} {{")
+        self._depth, self._turns = self._depth + 1, turns_outside * turns
+        yield
+        self._depth, self._turns = self._depth - 1, turns_outside
         self.line("}")
+
+    @contextmanager
+    def loops(self, extents: Mapping[str, int]) -> Iterator[None]:
+        """Opens nested loops over variables, each from 0 to below its extent, and closes them."""
+        with ExitStack() as stack:
+            for name, extent in extents.items():
+                stack.enter_context(self.block(f"for (int {name} = 0; {name} < {extent}; ++{name})", extent))
+            yield
 
     def spend(self, operations: int) -> None:
         """Counts floating-point operations."""
         self.operations += operations * self._turns
 
-    def declared(self, name: str, dtype: str, size: int, value: str = "") -> None:
+    def declared(self, name: str, dtype: str, size: int) -> None:
         """Declares an array, or a scalar if the size is 0."""
         self.bytes += max(size, 1) * (4 if self.source.precision == "f32" and dtype == "real" else 8)
-        self.line(f"{C_TYPES[dtype]} {name}{f'[{size}]' if size else ''}{value};")
+        self.line(f"{C_TYPES[dtype]} {name}{f'[{size}]' if size else ''};")
 
     def kept(self, node: Node) -> str:
         """Returns the name of an array for a node: one that is free again, or a new one."""
@@ -130,15 +136,6 @@ class Body:
             left.discard(step)
             if not left and source in self.names:
                 self._free.setdefault((source.region, source.dtype, source.size), []).append(self.names[source])
-
-    def looped(self, shape: Sequence[int], inside: Callable[[list[str]], None]) -> None:
-        """Opens a loop for each axis of a shape, and calls `inside` with the names of the loop variables."""
-        names = [f"i{axis}_" for axis in range(len(shape))]
-        for name, extent in zip(names, shape, strict=True):
-            self.opened(f"for (int {name} = 0; {name} < {extent}; ++{name})", extent)
-        inside(names)
-        for extent in reversed(shape):
-            self.closed(extent)
 
     def name(self, node: Node) -> str:
         """Returns the name of the array or scalar that holds a node."""
@@ -157,12 +154,10 @@ class Body:
 
     def read(self, node: Node, positions: np.ndarray, names: Sequence[str] = ()) -> str:
         """Returns the C expression of the elements at these positions, inside loops over these variables."""
-        if node.op == "gather" and node not in self.plan.arrays:
-            if is_constant(node):
-                return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
-            return self.read(*read_source(node, positions), names)
-        if node.op == "const":
+        if is_constant(node) and node not in self.plan.arrays:
             return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
+        if node.op == "gather" and node not in self.plan.arrays:
+            return self.read(*read_source(node, positions), names)
         name = self.name(node)
         if node.op == "input":
             return name if self.inputs[node.attribute][1] else f"{name}[{self.index(positions, names)}]"
@@ -195,27 +190,18 @@ class Body:
 
     def literal(self, numbers: np.ndarray, dtype: str, names: Sequence[str]) -> str:
         """Returns the C expression of constants, inside loops over these variables."""
-        if numbers.size and same(numbers).all():
-            return self.number(numbers.flat[0], dtype)
+        if numbers.size and ((numbers == numbers.flat[0]).all() or (numbers != numbers).all()):
+            return literal(numbers.flat[0], self.source.precision, dtype)
         # The table leaves out axes along which the numbers are equal.
         kept = [axis for axis in range(numbers.ndim) if not (numbers == numbers.take([0], axis=axis)).all()]
         stored = numbers[tuple(slice(None) if axis in kept else 0 for axis in range(numbers.ndim))]
         index = self.index(np.arange(stored.size).reshape(stored.shape), [names[axis] for axis in kept])
         return f"{self.source.table(stored, dtype)}[{index}]"
 
-    def number(self, value, dtype: str) -> str:
-        """Returns a literal."""
-        if dtype == "real":
-            return literal(value, self.source.precision)
-        text = integer(int(value), dtype)
-        return f"({text})" if value < 0 else text
-
     def pointer(self, node: Node) -> str:
         """Returns a pointer to the memory of a node."""
-        name = self.name(node)
-        return (
-            name if node in self.plan.arrays or node.op != "input" or not self.inputs[node.attribute][1] else f"&{name}"
-        )
+        by_value = node not in self.plan.arrays and node.op == "input" and self.inputs[node.attribute][1]
+        return f"{'&' if by_value else ''}{self.name(node)}"
 
     def projected(self, loop: Node) -> set[int]:
         """Returns the indices of the results of a loop that something reads."""
@@ -234,9 +220,3 @@ def _step(positions: np.ndarray, axis: int) -> int | None:
     """Returns the common step of all positions along an axis, or None if there is none."""
     steps = np.diff(positions, axis=axis)
     return None if steps.size and np.ptp(steps) else int(steps.flat[0]) if steps.size else 0
-
-
-def same(numbers: np.ndarray) -> np.ndarray:
-    """Returns where numbers equal the first one, NaN included."""
-    first = numbers.flat[0]
-    return np.asarray((numbers == first) | ((numbers != numbers) & bool(first != first)))

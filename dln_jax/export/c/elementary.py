@@ -13,7 +13,6 @@ A number is rounded to an integer n by adding 1.5 2⁵² (float: 1.5 2²³), whi
 needs IEEE arithmetic rounded to the nearest, so no -ffast-math.
 """
 
-import functools
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -28,25 +27,17 @@ from dln_jax.export.c.text import PRECISIONS, fill, number
 #   log  (2 artanh(r)/r - 2) / r², r <= 3 - 2 sqrt(2) tanh      (tanh(r)/r - 1) / r² = tanh / tanh_below, r <= 0.56
 _POLYNOMIALS = {
     "f64": {
-        "exp": (
-            *(0.5000000000000001, 0.16666666666666669, 0.041666666666623824, 0.008333333333330039),
-            *(0.0013888888917367081, 0.00019841269863171557, 2.4801521057868204e-05, 2.7557268276905696e-06),
-            *(2.7620201591031547e-07, 2.5100472505694996e-08),
-        ),
+        "exp": (0.5000000000000001, 0.16666666666666669, 0.041666666666623824, 0.008333333333330039,
+                0.0013888888917367081, 0.00019841269863171557, 2.4801521057868204e-05, 2.7557268276905696e-06,
+                2.7620201591031547e-07, 2.5100472505694996e-08),
         "tanh": (-0.3333333333333333, -0.020501566345638482, -0.00019930065261747755),
         "tanh_below": (1.0, 0.46150469903691427, 0.023295019667899867, 0.00020666505951855979),
-        "sin": (
-            *(-0.16666666666666666, 0.008333333333330925, -0.00019841269836722418),
-            *(2.755731608381636e-06, -2.5051127944014188e-08, 1.5917848524808262e-10),
-        ),
-        "cos": (
-            *(0.041666666666666664, -0.0013888888888887382, 2.480158729874307e-05),
-            *(-2.7557317260008837e-07, 2.0876143827993133e-09, -1.1382456778061306e-11),
-        ),
-        "log": (
-            *(0.666666666666667, 0.3999999999989827, 0.2857142862653362, 0.22222211043776857),
-            *(0.18182895750119193, 0.1533150161114533, 0.1461916613488797),
-        ),
+        "sin": (-0.16666666666666666, 0.008333333333330925, -0.00019841269836722418, 2.755731608381636e-06,
+                -2.5051127944014188e-08, 1.5917848524808262e-10),
+        "cos": (0.041666666666666664, -0.0013888888888887382, 2.480158729874307e-05, -2.7557317260008837e-07,
+                2.0876143827993133e-09, -1.1382456778061306e-11),
+        "log": (0.666666666666667, 0.3999999999989827, 0.2857142862653362, 0.22222211043776857, 0.18182895750119193,
+                0.1533150161114533, 0.1461916613488797),
     },
     "f32": {
         "exp": (0.5, 0.16666667, 0.041666463, 0.0083333105, 0.0013933731, 0.0001989108),
@@ -56,7 +47,7 @@ _POLYNOMIALS = {
         "cos": (0.041666664, -0.00138883, 2.4547437e-05),
         "log": (0.66666687, 0.39988735, 0.29582024),
     },
-}
+}  # fmt: skip
 # ln 2 and pi/2 in parts: all but the last are short enough for exact products with the n that occur.
 _LN2 = {"f64": (0.6931471805598903, 5.497923018708371e-14), "f32": (0.69314575, 1.4286068e-06)}
 _HALF_PI = {
@@ -245,22 +236,30 @@ def _values(precision: str) -> dict[str, str]:
     numpy_type = PRECISIONS[precision][0]
     mantissa, bias = np.finfo(numpy_type).nmant, np.finfo(numpy_type).maxexp - 1
     word, suffix = {"f64": ("uint64_t", "ULL"), "f32": ("uint32_t", "U")}[precision]
-    root_half = int(numpy_type(math.sqrt(0.5)).view({"f64": np.uint64, "f32": np.uint32}[precision]))
-    words = {"one": bias << mantissa, "one_half": (bias - 1) << mantissa, "root_half": root_half}
-    words |= {"fraction_mask": (1 << mantissa) - 1, "exponent_mask": 2 * bias + 1, "sign": (2 * bias + 2) << mantissa}
-    words["counting"] = (bias + mantissa) << mantissa  # 2^mantissa, to which the low bits add what they count
-    numbers = {"magic": 1.5 * 2.0**mantissa, "half": 0.5, "split": 0.55}
-    numbers |= {"log2e": 1 / math.log(2), "two_over_pi": 2 / math.pi}
-    numbers |= dict(zip(("ln2_high", "ln2_low"), _LN2[precision], strict=True))
-    numbers |= dict(zip(("exp_smallest", "exp_largest"), _EXP_RANGE[precision], strict=True))
-    numbers |= {"bias": 2.0**mantissa + bias, "grown_bias": 2.0**mantissa + bias + mantissa + 2}
-    numbers |= {"smallest": 2.0 ** (1 - bias), "growth": 2.0 ** (mantissa + 2)}
-    values = {"word": word, "mantissa": str(mantissa), "to_sign": str(mantissa + bias.bit_length())}
-    values |= {"exponent_bits": str(bias.bit_length() + 1), "bias_of_exponent": str(bias)}
-    values |= {key: f"{value:#x}{suffix}" for key, value in words.items()}
-    values |= {key: number(value, precision) for key, value in numbers.items()}
-    *first_parts, values["next_part"], values["last_part"] = (number(part, precision) for part in _HALF_PI[precision])
-    values["head"] = functools.reduce(lambda rest, part: f"MULTIPLY_ADD(-n, {part}, {rest})", first_parts, "a")
+    words = {
+        "one": bias << mantissa, "one_half": (bias - 1) << mantissa, "fraction_mask": (1 << mantissa) - 1,
+        "root_half": int(numpy_type(math.sqrt(0.5)).view(f"u{numpy_type().itemsize}")),
+        "exponent_mask": 2 * bias + 1, "sign": (2 * bias + 2) << mantissa,
+        "counting": (bias + mantissa) << mantissa,  # 2^mantissa, to which the low bits add what they count
+    }  # fmt: skip
+    *first_parts, next_part, last_part = _HALF_PI[precision]
+    numbers = {
+        "magic": 1.5 * 2.0**mantissa, "half": 0.5, "split": 0.55, "log2e": 1 / math.log(2), "two_over_pi": 2 / math.pi,
+        "ln2_high": _LN2[precision][0], "ln2_low": _LN2[precision][1], "next_part": next_part, "last_part": last_part,
+        "exp_smallest": _EXP_RANGE[precision][0], "exp_largest": _EXP_RANGE[precision][1],
+        "bias": 2.0**mantissa + bias, "grown_bias": 2.0**mantissa + bias + mantissa + 2,
+        "smallest": 2.0 ** (1 - bias), "growth": 2.0 ** (mantissa + 2),
+    }  # fmt: skip
+    head = "a"
+    for part in first_parts:
+        head = f"MULTIPLY_ADD(-n, {number(part, precision)}, {head})"
+    exponent_bits = bias.bit_length() + 1
+    values = {
+        "word": word, "mantissa": str(mantissa), "to_sign": str(mantissa + exponent_bits - 1), "head": head,
+        "exponent_bits": str(exponent_bits), "bias_of_exponent": str(bias),
+        **{key: f"{value:#x}{suffix}" for key, value in words.items()},
+        **{key: number(value, precision) for key, value in numbers.items()},
+    }  # fmt: skip
     for name, coefficients in _POLYNOMIALS[precision].items():
         x, degree = "r" if name == "exp" else "z", len(coefficients) - 1
         values[name] = _polynomial(x, [number(coefficient, precision) for coefficient in coefficients])

@@ -1,14 +1,17 @@
-"""C of elementwise operations, small products and short sums: unrolled, or in loops over arrays."""
+"""C of elementwise operations, small products, short sums and copies: unrolled, or in loops over arrays."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
-from dln_jax.export.c import kernels, products
+from dln_jax.export.c import products
 from dln_jax.export.c.body import Body
-from dln_jax.export.c.kinds import C_TYPES, NUMPY_TYPES
-from dln_jax.export.c.moves import merged
-from dln_jax.export.c.nodes import Node, is_constant, values
+from dln_jax.export.c.nodes import Node, is_constant, owners, read_source, values
 from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
-from dln_jax.export.c.plan import strides
+from dln_jax.export.c.plan import UNROLL_LIMIT, strides
+from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES
 
 _CHOICES = {
     "select": "elementary_choice({0}, {1}, {2})",
@@ -16,11 +19,12 @@ _CHOICES = {
     "min": "elementary_choice(({0} < {1}) | ({0} != {0}), {0}, {1})",
 }
 """C without a branch, for loops, since a branch would prevent vectorisation."""
+_BOXES = 6
+"""Largest number of boxes that become loops of their own; more are read through tables of positions."""
 
 
 def unrolled(body: Body, node: Node) -> None:
     """Writes the elements of a node that something reads, one statement for every element."""
-    dtype = C_TYPES[node.dtype]
     name = body.kept(node) if node in body.plan.arrays else body.name(node)
     for k in np.flatnonzero(body.plan.needed[node]):
         text = _element(body, node, int(k))
@@ -28,7 +32,7 @@ def unrolled(body: Body, node: Node) -> None:
             body.line(f"{name}[{k}] = {text};")
         else:
             body.bytes += 8
-            body.line(f"const {dtype} {name}{f'_{k}' if node.size > 1 else ''} = {text};")
+            body.line(f"const {C_TYPES[node.dtype]} {name}{f'_{k}' if node.size > 1 else ''} = {text};")
 
 
 def _element(body: Body, node: Node, k: int) -> str:
@@ -41,13 +45,32 @@ def _element(body: Body, node: Node, k: int) -> str:
         body.spend((2 * count - 1) * (node.dtype == "real"))
         return products.chain(list(zip(first, second, strict=True)), node.dtype)
     if node.op.startswith("reduce_"):
-        (a,) = node.args
-        count = a.shape[1]
-        terms = [body.read(a, np.array(k * count + term)) for term in range(count)]
-        return kernels.combined(body, node, k, terms)
+        count = node.args[0].shape[1]
+        return _combined(body, node, k, [body.read(node.args[0], np.array(k * count + term)) for term in range(count)])
     if node.op == "take":
         return f"{body.name(node.args[0])}[{body.read(node.args[1], np.array(k))}]"
     return _expression(body, node, [body.read(arg, np.array(k if arg.size > 1 else 0)) for arg in node.args])
+
+
+def combination(node: Node) -> tuple[Callable[..., str], int]:
+    """Returns a function that gives the C of two combined terms, and its floating-point operations."""
+    op = node.op.partition("_")[2]
+    return partial(expression, op, node.dtype), OPERATIONS[op].cost * (node.dtype == "real")
+
+
+def _combined(body: Body, node: Node, k: int, terms: list[str]) -> str:
+    """Returns the C of an unrolled reduction."""
+    combine, cost = combination(node)
+    body.spend(cost * (len(terms) - 1))
+    text = terms[0]
+    for place, term in enumerate(terms[1:]):
+        text = combine(text, term)
+        # The C of max and min repeats its operands: without a variable, the text would double with every term.
+        if node.op in ("reduce_max", "reduce_min") and place < len(terms) - 2:
+            name = f"v{node.number}_{k}_{place}"
+            body.line(f"const {C_TYPES[node.dtype]} {name} = {text};")
+            text = name
+    return text
 
 
 def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False) -> str:
@@ -62,14 +85,14 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
         return _CHOICES[node.op].format(*args)
     if node.op in ("rounded", "lt_to", "le_to"):
         body.source.functions.add("rounded" if node.op == "rounded" else "ordered")
-    if name := _checked(node):
+    if name := _guarded(node):
         body.source.integers.add(name)
         return f"elementary_{name}({', '.join(args)})"
     # The kind of the operands decides: that of a comparison's result is bool.
     return expression(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
 
 
-def _checked(node: Node) -> str | None:
+def _guarded(node: Node) -> str | None:
     """Returns the name of the integer function that keeps an operation from trapping, or None if none is needed."""
     if node.op.startswith("shift_"):
         return f"{node.op}_{node.dtype}"
@@ -94,15 +117,15 @@ def looped(body: Body, node: Node) -> None:
         for arg in member.args[1:] if member.op == "take" else member.args:
             if arg not in inside:
                 where[arg] = index if arg.size == node.size else np.zeros_like(index)
-    name = body.kept(node)
+    target = body.kept(node)
     if node.op in VECTORISED and not body.source.libm:
         body.spend(OPERATIONS[node.op].cost * node.size)
         body.source.arrays.add(node.op)
-        body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {name});")
+        body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")
         return
-    shape = merged(node.shape, [_steps(body, arg, positions) for arg, positions in where.items()])
-
-    def statements(names: list[str]) -> None:
+    shape = _merged(node.shape, [_steps(body, arg, positions) for arg, positions in where.items()])
+    names = _variables(shape)
+    with body.loops(dict(zip(names, shape, strict=True))):
         text = {arg: body.read(arg, positions.reshape(shape), names) for arg, positions in where.items()}
         for member in inside:
             if member.op == "take":
@@ -111,13 +134,15 @@ def looped(body: Body, node: Node) -> None:
                 written = _expression(body, member, [text[arg] for arg in member.args], looped=True)
             text[member] = f"v{member.number}"
             if member is node:
-                body.line(f"{name}[{body.index(index.reshape(shape), names)}] = {written};")
+                body.line(f"{target}[{body.index(index.reshape(shape), names)}] = {written};")
             elif member.dtype == "bool":
                 text[member] = written
             else:
                 body.line(f"const {C_TYPES[member.dtype]} v{member.number} = {written};")
 
-    body.looped(shape, statements)
+
+def _variables(shape: Sequence[int]) -> list[str]:
+    return [f"i{axis}_" for axis in range(len(shape))]
 
 
 def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | None:
@@ -126,3 +151,89 @@ def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | N
         positions = np.asarray(np.asarray(node.value).ravel()[positions])
     linear = strides(positions)
     return None if linear is None else linear[1]
+
+
+def _merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
+    """Returns the shape with neighbouring axes merged where all readings allow it; at least one axis remains."""
+    result: list[int] = []
+    kept: list[int] = []
+    for axis, extent in enumerate(shape):
+        if extent == 1 and len(shape) > 1 and (result or axis + 1 < len(shape)):
+            continue
+        if kept and all(step is not None and step[kept[-1]] == step[axis] * extent for step in steps):
+            result[-1] *= extent
+            kept[-1] = axis
+        else:
+            result.append(extent)
+            kept.append(axis)
+    return result or [1]
+
+
+def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
+    """Writes a copy of a node to an array; with `own`, the array that is to hold a gather.
+
+    Large gathers are split into boxes, each of which one loop nest reads from one source.
+    """
+    index = np.arange(node.size).reshape(node.shape)
+    stored = node in body.plan.arrays and not own
+    if node.size <= UNROLL_LIMIT and not stored:
+        for k in range(node.size):
+            body.line(f"{target}[{k}] = {_moved(body, node, np.array(k), own)};")
+        return
+    boxes = [index] if stored else _boxes(node, index)
+    for box in boxes if len(boxes) <= _BOXES else _by_source(node, index):
+        box = box.reshape(box.shape or (1,))
+        names = _variables(box.shape)
+        with body.loops(dict(zip(names, box.shape, strict=True))):
+            body.line(f"{target}[{body.index(box, names)}] = {_moved(body, node, box, own, names)};")
+
+
+def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequence[str] = ()) -> str:
+    """Returns the C expression of elements; with `own`, of the sources of a gather that an array will hold."""
+    return body.read(*(read_source(node, positions) if own and node.op == "gather" else (node, positions)), names)
+
+
+def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
+    """Splits the elements into boxes, such that one loop nest reads a box from one source."""
+    if node.op != "gather" or node.value is None:
+        return [index]
+    owner = owners(node.args, node.value)[0].ravel()
+    flat = node.value.ravel()
+
+    def split(box: np.ndarray) -> list[np.ndarray]:
+        at, of = flat[box], owner[box]
+        if strides(at) is not None and (of == of.flat[0]).all():
+            return [box]
+        cuts = {axis: _runs(np.moveaxis(at, axis, 0), np.moveaxis(of, axis, 0)) for axis in range(at.ndim)}
+        axis = min(
+            (choice for choice in cuts if len(cuts[choice]) > 2), key=lambda choice: len(cuts[choice]), default=-1
+        )
+        if axis < 0:
+            axis = next(choice for choice in range(at.ndim) if at.shape[choice] > 1)
+            cuts[axis] = list(range(at.shape[axis] + 1))
+        parts = (box[(slice(None),) * axis + (slice(*ends),)] for ends in pairwise(cuts[axis]))
+        return [smaller for part in parts for smaller in split(part)]
+
+    return split(index)
+
+
+def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
+    """Returns the elements of every source, as [axes along which the source does not change, the rest as one axis]."""
+    owner, _ = owners(node.args, np.asarray(node.value))
+    leading = []
+    while len(leading) < index.ndim - 1 and (owner == owner[:1]).all():
+        leading.append(index.shape[len(leading)])
+        owner = owner[0]
+    rows = index.reshape(*leading, -1)
+    return [rows[..., owner.ravel() == source] for source in np.unique(owner)]
+
+
+def _runs(at: np.ndarray, owner: np.ndarray) -> list[int]:
+    """Returns the starts, and the end, of the runs of rows with the same sources and equal steps."""
+    steps, cuts = np.diff(at, axis=0), [0]
+    for row in range(1, len(at)):
+        first = cuts[-1]
+        uneven = row > first + 1 and not np.array_equal(steps[row - 1], steps[first])
+        if uneven or not np.array_equal(owner[row], owner[first]):
+            cuts.append(row)
+    return [*cuts, len(at)]

@@ -2,18 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from dln_jax.export.c import elements, kernels, products
 from dln_jax.export.c.body import Body, Called, Source
-from dln_jax.export.c.kinds import C_TYPES
-from dln_jax.export.c.moves import copied
+from dln_jax.export.c.elements import copied
 from dln_jax.export.c.nodes import Loop, Node
 from dln_jax.export.c.operations import OPERATIONS
-from dln_jax.export.c.plan import UNROLL_LIMIT, plan_of
+from dln_jax.export.c.plan import plan_of
 from dln_jax.export.c.program import Program
+from dln_jax.export.c.text import C_TYPES
 
 
 def body_of(
@@ -58,11 +57,7 @@ def _moved_from_argument(body: Body, node: Node) -> bool:
 
 
 def _from_array(body: Body, source: str, size: int, target: str) -> None:
-    if size <= UNROLL_LIMIT:
-        for k in range(size):
-            body.line(f"{target}[{k}] = {source}[{k}];")
-    else:
-        body.line(f"for (int k_ = 0; k_ < {size}; ++k_) {target}[k_] = {source}[k_];")
+    body.line(f"for (int k_ = 0; k_ < {size}; ++k_) {target}[k_] = {source}[k_];")
 
 
 def region(body: Body, region: tuple[int, ...], done: set[Node] | None = None, only: set[Node] | None = None) -> None:
@@ -112,32 +107,13 @@ def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -
         (_CONTROL.get(node.op) or kernels.WRITERS[node.op])(body, node)
 
 
-def part(caller: Body, key: Any) -> Called:
-    """Returns the C function for a called program, written on first use."""
-    source = caller.source
-    if key not in source.parts:
-        program, results = caller.program.parts[key]
-        inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda argument: argument.attribute)
-        named = {argument.attribute: (f"a{argument.attribute}_", False) for argument in inputs}
-        targets = [f"r{k}_" for k in range(len(results))]
-        body = body_of(source, program, results, named, targets, apart=True)
-        parameters = [f"const {C_TYPES[argument.dtype]} *RESTRICT a{argument.attribute}_" for argument in inputs]
-        parameters += [
-            f"{C_TYPES[result.dtype]} *RESTRICT {target}" for result, target in zip(results, targets, strict=True)
-        ]
-        unused = [f"    (void)a{argument.attribute}_;" for argument in inputs if not body.uses(argument)]
-        lines = "\n".join([*unused, *body.lines])
-        text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
-        name = source.names.setdefault(text, f"part_{len(source.names)}")
-        text = f"\nstatic void {name}{text}"
-        source.parts[key] = Called(name, results, text, body.operations, body.bytes, body.calls)
-    called = source.parts[key]
-    caller.calls |= {key, *called.calls}
-    return called
-
-
 def _call(body: Body, node: Node) -> None:
-    called = part(body, node.attribute)
+    """Writes a call of the C function of another program, and on first use that function."""
+    source, key = body.source, node.attribute
+    if key not in source.parts:
+        source.parts[key] = _part(source, *body.program.parts[key])
+    called = source.parts[key]
+    body.calls |= {key, *called.calls}
     names = [f"v{node.number}_{k}" for k in range(len(called.results))]
     for name, result in zip(names, called.results, strict=True):
         body.declared(name, result.dtype, max(result.size, 1))
@@ -145,19 +121,38 @@ def _call(body: Body, node: Node) -> None:
     body.spend(called.operations)
 
 
-def _stored(body: Body, node: Node, handed_on: list[Node], turns: list[int] | None = None) -> list[str]:
-    """Declares the arrays of carries and stacked outputs of control flow, read or not, and returns their names."""
+def _part(source: Source, program: Program, results: list[Node]) -> Called:
+    inputs = {node.attribute: node for node in program.nodes if node.op == "input"}
+    targets = [f"r{k}_" for k in range(len(results))]
+    body = body_of(source, program, results, {k: (f"a{k}_", False) for k in inputs}, targets, apart=True)
+    parameters = [f"const {C_TYPES[inputs[k].dtype]} *RESTRICT a{k}_" for k in sorted(inputs)]
+    parameters += [f"{C_TYPES[node.dtype]} *RESTRICT {target}" for node, target in zip(results, targets, strict=True)]
+    unused = [f"    (void)a{k}_;" for k in sorted(inputs) if not body.uses(inputs[k])]
+    lines = "\n".join([*unused, *body.lines])
+    text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
+    name = source.names.setdefault(text, f"part_{len(source.names)}")
+    return Called(name, results, f"\nstatic void {name}{text}", body.operations, body.bytes, body.calls)
+
+
+def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> list[str]:
+    """Declares the arrays of a control flow's results, read or not, and returns their names.
+
+    Those of a loop are the carries, which start as its arguments, then the outputs of all its `turns`.
+    """
     number = np.ravel(node.attribute)[0]
-    read = body.projected(node)
-    names = [f"c{number}_{index}" for index in range(len(handed_on))]
-    for name, result, count in zip(names, handed_on, turns or [1] * len(names), strict=True):
-        body.declared(name, result.dtype, max(result.size * count, 1))
-    for name in (name for index, name in enumerate(names) if index not in read):
+    carried = len(node.args) if node.op != "branch" else len(results)
+    names = [f"c{number}_{index}" for index in range(len(results))]
+    for index, (name, result) in enumerate(zip(names, results, strict=True)):
+        body.declared(name, result.dtype, max(result.size * (turns if index >= carried else 1), 1))
+    for name in (name for index, name in enumerate(names) if index not in body.projected(node)):
         body.line(f"(void){name};")
+    if node.op != "branch":
+        for name, start in zip(names[:carried], node.args, strict=True):
+            copied(body, start, name)
     return names
 
 
-def _handed_on(body: Body, loop: Loop, names: list[str], number: int) -> None:
+def _carry_over(body: Body, loop: Loop, names: list[str], number: int) -> None:
     """Writes the new carries, through temporaries: results of an iteration may be the old carries in another order."""
     moved = loop.results[: len(names)]
     temporary = [f"n{number}_{index}" for index in range(len(moved))]
@@ -165,48 +160,34 @@ def _handed_on(body: Body, loop: Loop, names: list[str], number: int) -> None:
         body.declared(name, node.dtype, max(node.size, 1))
         copied(body, node, name)
     for name, old, node in zip(names, temporary, moved, strict=True):
-        body.line(f"for (int k_ = 0; k_ < {node.size}; ++k_) {name}[k_] = {old}[k_];")
+        _from_array(body, old, node.size, name)
 
 
 def _while(body: Body, node: Node) -> None:
     number, loop = node.attribute, body.program.loops[node.attribute]
-    names = _stored(body, node, loop.carries)
-    for name, start in zip(names, node.args, strict=True):
-        copied(body, start, name)
-    inside = (*node.region, number)
-    body.opened("for (;;)")
-    done: set[Node] = set()
-    region(body, inside, done, ancestors(body, loop.conditions))
-    body.line(f"if (!{body.read(loop.conditions[0], np.array(0))}) break;")
-    region(body, inside, done)
-    _handed_on(body, loop, names, number)
-    body.closed()
+    names, inside = _stored(body, node, loop.carries), (*node.region, number)
+    with body.block("for (;;)"):
+        done: set[Node] = set()
+        region(body, inside, done, ancestors(body, loop.conditions))
+        body.line(f"if (!{body.read(loop.conditions[0], np.array(0))}) break;")
+        region(body, inside, done)
+        _carry_over(body, loop, names, number)
 
 
 def _repeat(body: Body, node: Node) -> None:
     number, loop = node.attribute, body.program.loops[node.attribute]
     length, carried = int(loop.length or 0), len(loop.carries)
-    stacked = loop.results[carried:]
-    names = _stored(body, node, [*loop.carries, *stacked], [1] * carried + [length] * len(stacked))[:carried]
-    for name, start in zip(names, node.args, strict=True):
-        copied(body, start, name)
-    read = body.projected(node)
-    stacked = {carried + k: result for k, result in enumerate(loop.results[carried:]) if carried + k in read}
+    names = _stored(body, node, [*loop.carries, *loop.results[carried:]], length)
+    stacked = [index for index in sorted(body.projected(node)) if index >= carried]
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
-    body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
-    counters = (counter for counter in body.plan.needed if counter.op == "counter" and counter.attribute == number)
-    if stacked or any(map(body.uses, counters)):
-        body.line(f"const long long i_{number} = {turn};")
-    region(body, (*node.region, number))
-    for index, result in stacked.items():
-        body.opened("")
-        body.declared(f"n{number}_{index}", result.dtype, max(result.size, 1))
-        copied(body, result, f"n{number}_{index}")
-        target = f"c{number}_{index}[i_{number} * {result.size} + k_]"
-        body.line(f"for (int k_ = 0; k_ < {result.size}; ++k_) {target} = n{number}_{index}[k_];")
-        body.closed()
-    _handed_on(body, loop, names, number)
-    body.closed(max(length, 1))
+    with body.loops({f"t{number}": length}):
+        counters = (counter for counter in body.plan.needed if counter.op == "counter" and counter.attribute == number)
+        if stacked or any(map(body.uses, counters)):
+            body.line(f"const long long i_{number} = {turn};")
+        region(body, (*node.region, number))
+        for index in stacked:
+            copied(body, loop.results[index], f"({names[index]} + i_{number} * {loop.results[index].size})")
+        _carry_over(body, loop, names[:carried], number)
 
 
 def _branch(body: Body, node: Node) -> None:
@@ -214,14 +195,12 @@ def _branch(body: Body, node: Node) -> None:
     names = _stored(body, node, body.program.loops[numbers[0]].results)
     which = body.read(node.args[0], np.array(0))
     for place, number in enumerate(numbers):
-        last = place == len(numbers) - 1
-        test = f"if ({which} {'<=' if place == 0 else '=='} {place})"
-        body.opened(("else " if place else "") + ("" if last else test))
-        region(body, (*node.region, number))
-        for index, (name, result) in enumerate(zip(names, body.program.loops[number].results, strict=True)):
-            if index in body.projected(node):
-                copied(body, result, name)
-        body.closed()
+        test = f"if ({which} {'<=' if place == 0 else '=='} {place})" if place < len(numbers) - 1 else ""
+        with body.block(("else " if place else "") + test):
+            region(body, (*node.region, number))
+            for index, (name, result) in enumerate(zip(names, body.program.loops[number].results, strict=True)):
+                if index in body.projected(node):
+                    copied(body, result, name)
 
 
 _CONTROL = {"call": _call, "while": _while, "repeat": _repeat, "branch": _branch}

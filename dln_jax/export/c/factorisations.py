@@ -1,10 +1,9 @@
 """C of factorisations of small dense matrices, and of triangular solves."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from textwrap import dedent
 
 from dln_jax.export.c.body import Body
-from dln_jax.export.c.moves import copied
 from dln_jax.export.c.nodes import Node
 
 _SWEEPS = 7
@@ -132,14 +131,15 @@ FUNCTIONS = {
     """,
     "eigh": """
     /* Eigenvectors of a symmetric matrix as columns [n, n], then ascending eigenvalues [n], by Jacobi's rotations;
-       all NaN where an element is not finite, or after 60 sweeps. `left` is a copy of the matrix, which is used up */
-    static void elementary_eigh(int n, real *left, real *found)
+       all NaN where an element is not finite, or after 60 sweeps. `left` is a workspace of n n numbers */
+    static void elementary_eigh(int n, const real *a, real *left, real *vectors)
     {
-        real *values = found + n * n;
+        real *values = vectors + n * n;
         int rotated = 1, finite = 1;
         for (int i = 0; i < n * n; ++i) {
-            found[i] = i / n == i % n ? (real)1 : 0;
-            finite &= left[i] - left[i] == 0;
+            left[i] = a[i];
+            vectors[i] = i / n == i % n ? (real)1 : 0;
+            finite &= a[i] - a[i] == 0;
         }
         for (int sweep = 0; finite && rotated && sweep < 60; ++sweep) {
             rotated = 0;
@@ -152,13 +152,13 @@ FUNCTIONS = {
                     const real c = 1 / SQRT(1 + tangent * tangent), s = tangent * c;
                     rotated = 1;
                     for (int i = 0; i < n; ++i) {
-                        const real u = found[i * n + p], v = found[i * n + q];
-                        found[i * n + p] = c * u - s * v;
-                        found[i * n + q] = s * u + c * v;
+                        const real u = vectors[i * n + p], v = vectors[i * n + q];
+                        vectors[i * n + p] = c * u - s * v;
+                        vectors[i * n + q] = s * u + c * v;
                         if (i == p || i == q) continue;
-                        const real a = left[i * n + p], b = left[i * n + q];
-                        left[i * n + p] = left[p * n + i] = c * a - s * b;
-                        left[i * n + q] = left[q * n + i] = s * a + c * b;
+                        const real e = left[i * n + p], f = left[i * n + q];
+                        left[i * n + p] = left[p * n + i] = c * e - s * f;
+                        left[i * n + q] = left[q * n + i] = s * e + c * f;
                     }
                     left[p * n + p] = x - tangent * z;
                     left[q * n + q] = y + tangent * z;
@@ -167,18 +167,18 @@ FUNCTIONS = {
         }
         for (int i = 0; i < n; ++i) values[i] = left[i * n + i];
         for (int k = 0; k < n; ++k) {
-            int least = k;
-            for (int i = k + 1; i < n; ++i) least = values[i] < values[least] ? i : least;
+            int lowest = k;
+            for (int i = k + 1; i < n; ++i) lowest = values[i] < values[lowest] ? i : lowest;
             const real moved = values[k];
-            values[k] = values[least];
-            values[least] = moved;
-            for (int i = 0; i < n && least != k; ++i) {
-                const real swapped = found[i * n + k];
-                found[i * n + k] = found[i * n + least];
-                found[i * n + least] = swapped;
+            values[k] = values[lowest];
+            values[lowest] = moved;
+            for (int i = 0; i < n && lowest != k; ++i) {
+                const real swapped = vectors[i * n + k];
+                vectors[i * n + k] = vectors[i * n + lowest];
+                vectors[i * n + lowest] = swapped;
             }
         }
-        for (int i = 0; (rotated || !finite) && i < n * n + n; ++i) found[i] = (real)NAN;
+        for (int i = 0; (rotated || !finite) && i < n * n + n; ++i) vectors[i] = (real)NAN;
     }
     """,
 }
@@ -191,69 +191,36 @@ def definitions(names: Collection[str], suffix: str) -> str:
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
-def _call(body: Body, node: Node, sizes: Sequence[int], operations: int = 0) -> None:
-    """Writes a call of the node's C function with sizes, pointers to the arguments, and the array for the result."""
+_SIZES = {
+    "cholesky": lambda a, _: (a[0], a[0] * (a[0] + 1) * (a[0] + 2) // 3),
+    "triangular_solve": lambda a, b, _: (*b, a[0] ** 2 * b[1]),
+    "lu": lambda a, _: (*a, 2 * a[0] ** 2 * a[1] // 3),
+    "permutation": lambda pivots, order: (*order, *pivots, 0),
+    "geqrf": lambda a, _: (*a, 2 * a[0] * a[1] * min(a)),
+    "householder_product": lambda a, tau, _: (*a, *tau, 2 * a[0] * a[1] * tau[0]),
+    "eigh": lambda a, _: (a[0], _SWEEPS * a[0] * (a[0] - 1) // 2 * (12 * a[0] + 20)),
+}
+"""The sizes that a C function takes, and its floating-point operations, from the shapes of arguments and result."""
+
+
+def _call(body: Body, node: Node) -> None:
+    """Writes a call of a node's C function: with sizes, pointers to the arguments, and arrays for the results."""
     body.source.kernels.add(node.op)
-    target = body.kept(node)
-    prefix = "" if node.op in ("cholesky", "triangular_solve") else "elementary_"
-    arguments = [*map(str, sizes), *map(body.pointer, node.args), target]
-    body.line(f"{prefix}{node.op}({', '.join(arguments)});")
+    *sizes, operations = _SIZES[node.op](*(arg.shape for arg in node.args), node.shape)
+    a, arrays = node.args[0], []
+    if node.op == "lu":  # results of two types, which `project` nodes read
+        arrays = [("real", a.size), ("int", min(a.shape)), ("int", a.shape[0])]
+    elif node.op == "eigh":  # a workspace
+        arrays = [("real", a.size)]
+    targets = [f"v{node.number}_{place}" for place in range(len(arrays))]
+    for target, (kind, size) in zip(targets, arrays, strict=True):
+        body.declared(target, kind, size)
+    targets += [body.kept(node)] if node.op != "lu" else []
+    prefix = "" if node.op in ("cholesky", "triangular_solve", "lu") else "elementary_"
+    values = [*sizes, *map(int, node.attribute or ()), *map(body.pointer, node.args), *targets]
+    body.line(f"{prefix}{node.op}({', '.join(map(str, values))});")
     body.spend(operations)
 
 
-def _cholesky(body: Body, node: Node) -> None:
-    n, _ = node.shape
-    _call(body, node, [n], n * (n + 1) * (n + 2) // 3)
-
-
-def _triangular_solve(body: Body, node: Node) -> None:
-    n, columns = node.shape
-    _call(body, node, [n, columns, *map(int, node.attribute)], n * n * columns)
-
-
-def _lu(body: Body, node: Node) -> None:
-    (a,) = node.args
-    n, m = a.shape
-    body.source.kernels.add("lu")
-    names = [f"v{node.number}_{part}" for part in range(3)]
-    for name, dtype, size in zip(names, ("real", "int", "int"), (n * m, min(n, m), n), strict=True):
-        body.declared(name, dtype, size)
-    body.line(f"lu({n}, {m}, {body.pointer(a)}, {', '.join(names)});")
-    body.spend(2 * n * n * m // 3)
-
-
-def _permutation(body: Body, node: Node) -> None:
-    _call(body, node, [node.size, node.args[0].size])
-
-
-def _geqrf(body: Body, node: Node) -> None:
-    m, n = node.args[0].shape
-    _call(body, node, [m, n], 2 * m * n * min(m, n))
-
-
-def _householder_product(body: Body, node: Node) -> None:
-    (m, n), k = node.shape, node.args[1].size
-    _call(body, node, [m, n, k], 2 * m * n * k)
-
-
-def _eigh(body: Body, node: Node) -> None:
-    (a,) = node.args
-    n, left = a.shape[0], f"v{node.number}_left"
-    body.source.kernels.add("eigh")
-    body.declared(left, "real", n * n)
-    copied(body, a, left)
-    target = body.kept(node)
-    body.line(f"elementary_eigh({n}, {left}, {target});")
-    body.spend(_SWEEPS * n * (n - 1) // 2 * (12 * n + 20))
-
-
-WRITERS = {
-    "cholesky": _cholesky,
-    "triangular_solve": _triangular_solve,
-    "lu": _lu,
-    "permutation": _permutation,
-    "geqrf": _geqrf,
-    "householder_product": _householder_product,
-    "eigh": _eigh,
-}
+WRITERS = dict.fromkeys(FUNCTIONS, _call)
 """Functions that write a node, by its operation."""

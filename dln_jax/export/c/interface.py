@@ -2,21 +2,19 @@
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from dln_jax.export.c.kinds import C_TYPES, kind_of
-from dln_jax.export.c.text import PRECISIONS, check_name
+from dln_jax.export.c.text import C_TYPES, LARGEST, PRECISIONS, check_name, kind_of
 from dln_jax.export.exports import AGAIN, read_export
 from dln_jax.types import InputError
 
 FORMAT = 4
 """Version of the names and signatures in exported sources and of the JSON description."""
-LARGEST = 1 << 22
-"""Largest number of elements of an argument or result."""
 KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
 
@@ -61,22 +59,24 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
     return _checked(leaves, "result")
 
 
+def array_of(leaf: Any) -> Any:
+    """Returns a leaf as an array, if it is none."""
+    return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
+
+
 def _leaves(name: str, tree: Any) -> list[Leaf]:
     leaves = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         parts = [str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", "")))) for key in path]
         whole = "_".join(part for part in (name, *parts) if part)
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
-        array = leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
+        array = array_of(leaf)
         leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
     return leaves
 
 
 def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
-    names = [
-        check_name(leaf.name, f"the name of an {what}" if what == "argument" else f"the name of a {what}")
-        for leaf in leaves
-    ]
+    names = [check_name(leaf.name, f"the name of {'an' if what == 'argument' else 'a'} {what}") for leaf in leaves]
     if len(set(names)) < len(names):
         raise InputError(f"two {what}s have one name among {', '.join(names)}; rename one")
     return leaves
@@ -84,35 +84,25 @@ def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
 
 def declaration(name: str, function: str, signature: Signature, real: str) -> str:
     """Returns the prototype of a function, without the semicolon."""
-    kinds = {**KINDS, "real": real}
+    kinds, returned = {**KINDS, "real": real}, "void"
+
+    def array(leaf: Leaf) -> str:
+        return f"{kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}]"  # C has no empty arrays
+
     parameters = [
-        f"{kinds[kind]} {argument}" if shape == () else f"const {kinds[kind]} {argument}[{_length(shape)}]"
-        for argument, kind, shape in signature.arguments
+        f"const {array(leaf)}" if leaf.shape else f"{kinds[leaf.kind]} {leaf.name}" for leaf in signature.arguments
     ]
-    result = "void"
     if signature.returns:
-        result = str(kinds[signature.results[0].kind])
+        returned = kinds[signature.results[0].kind]
     else:
-        parameters += [f"{kinds[kind]} {result}[{_length(shape)}]" for result, kind, shape in signature.results]
-    return f"{result} {name}_{function}({', '.join(parameters) or 'void'})"
-
-
-def _length(shape: tuple[int, ...]) -> int:
-    """Returns the length of an array in C, at least 1, because C has no empty arrays."""
-    return max(int(np.prod(shape)), 1)
+        parameters += map(array, signature.results)
+    return f"{returned} {name}_{function}({', '.join(parameters) or 'void'})"
 
 
 def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
     """Returns the JSON description of an export, without digests."""
-    stated = {
-        key: {
-            "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.arguments],
-            "results": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.results],
-            "stack_bytes": function.stack_bytes,
-            "operations": function.operations,
-        }
-        for key, function in functions.items()
-    }
+    # JSON makes lists of leaves and shapes, which are tuples.
+    stated = {key: function._asdict() for key, function in functions.items()}
     return {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
 
 
@@ -140,12 +130,11 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
 
 
 def _signature(stated: Any) -> Signature:
-    def leaves(key: str) -> tuple[Leaf, ...]:
-        known = tuple(Leaf(check_name(name), kind, tuple(shape)) for name, kind, shape in stated[key])
-        for leaf in known:
-            counts = all(type(size) is int and size >= 0 for size in leaf.shape)
-            if leaf.kind not in KINDS or not counts or np.prod(leaf.shape, dtype=float) > LARGEST:
-                raise InputError(f"{leaf.name} is {leaf}")
-        return known
+    def checked(name: str, kind: str, shape: list[int]) -> Leaf:
+        leaf = Leaf(check_name(name), kind, tuple(shape))
+        counts = all(type(size) is int and size >= 0 for size in shape)
+        if kind not in KINDS or not counts or prod(shape) > LARGEST:
+            raise InputError(f"{name} is {leaf}")
+        return leaf
 
-    return Signature(leaves("arguments"), leaves("results"))
+    return Signature(*(tuple(checked(*leaf) for leaf in stated[key]) for key in ("arguments", "results")))

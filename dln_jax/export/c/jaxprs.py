@@ -38,40 +38,28 @@ def repeated_calls(every: Sequence[Any]) -> set[int]:
     known: dict[int, tuple[int, bytes]] = {}
     counts: Counter[bytes] = Counter()
 
-    def visit(jaxpr: Any, consts: Sequence[Any]) -> tuple[int, bytes]:
+    def visit(jaxpr: Any) -> tuple[int, bytes]:
         """Returns the number of equations, calls included, and a digest of primitives, types and constants."""
-        size, digest = 0, hashlib.sha256()
-        for const in consts:
+        if id(jaxpr) in known:
+            return known[id(jaxpr)]
+        closed, size, digest = closed_jaxpr(jaxpr), 0, hashlib.sha256()
+        for const in closed.consts:
             digest.update(np.asarray(const).tobytes())
-        for equation in jaxpr.eqns:
-            within = 0
-            literals = [variable.val for variable in equation.invars if hasattr(variable, "val")]
-            types = [
-                (variable.aval.shape, str(variable.aval.dtype))
-                for variable in equation.outvars
-                if hasattr(variable.aval, "dtype")
-            ]
-            digest.update(repr((equation.primitive.name, types)).encode())
-            digest.update(b"".join(np.asarray(literal).tobytes() for literal in literals))
+        for equation in closed.jaxpr.eqns:
+            avals = [variable.aval for variable in equation.outvars if hasattr(variable.aval, "dtype")]
+            digest.update(repr((equation.primitive.name, [(aval.shape, str(aval.dtype)) for aval in avals])).encode())
+            for literal in (variable.val for variable in equation.invars if hasattr(variable, "val")):
+                digest.update(np.asarray(literal).tobytes())
             values = equation.params.values() if _of_jax(equation.primitive) else ()
-            for inner in (nested for value in values for nested in _jaxprs(value)):
-                inside, likeness = called(inner)
-                within += inside
-                digest.update(likeness)
-            size += max(1, within)
-        return size, digest.digest()
-
-    def called(inner: Any) -> tuple[int, bytes]:
-        if id(inner) not in known:
-            closed = closed_jaxpr(inner)
-            known[id(inner)] = visit(closed.jaxpr, closed.consts)
-        size, likeness = known[id(inner)]
-        if size >= _LARGE_CALL:
-            counts[likeness] += 1
-        return size, likeness
+            calls = [visit(inner) for value in values for inner in _jaxprs(value)]
+            counts.update(likeness for count, likeness in calls if count >= _LARGE_CALL)
+            digest.update(b"".join(likeness for _, likeness in calls))
+            size += max(1, sum(count for count, _ in calls))
+        known[id(jaxpr)] = size, digest.digest()
+        return known[id(jaxpr)]
 
     for closed in every:
-        visit(closed.jaxpr, closed.consts)
+        visit(closed)
     return {identity for identity, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
 
 
@@ -135,17 +123,3 @@ def made_at(equation: Any) -> str:
     frames = [] if traceback is None else list(traceback.frames)
     users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]
     return f" (made at {users[0].file_name}:{users[0].line_num})" if users else ""
-
-
-def scanned(equation: Any) -> dict[str, int]:
-    """Returns how many arguments of a scan are constant ("fixed") and how many are carried.
-
-    Releases of JAX store these numbers differently, so they are counted: stacked arguments differ in shape inside.
-    """
-    inner = closed_jaxpr(equation.params["jaxpr"]).jaxpr
-
-    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
-        return sum(a.aval.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
-
-    carried = alike(equation.outvars, inner.outvars)
-    return {"fixed": alike(equation.invars, inner.invars) - carried, "carried": carried}

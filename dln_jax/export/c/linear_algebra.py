@@ -1,87 +1,66 @@
 """Rules for factorisations and triangular solves, which C computes in functions of its own."""
 
+from collections.abc import Sequence
 from math import prod
 from typing import Any
 
 import numpy as np
 
 from dln_jax.export.c.nodes import Node
+from dln_jax.export.c.primitives import Parameters
 from dln_jax.export.c.program import Program
 from dln_jax.types import InputError
 
 
-def _matrices(program: Program, node: Node) -> list[Node]:
-    """Returns the matrices of a batch."""
-    index = np.arange(node.size).reshape(-1, *node.shape[-2:])
+def _items(program: Program, node: Node, rank: int = 2) -> list[Node]:
+    """Returns the matrices of a batch; for rank 1, the vectors."""
+    index = np.arange(node.size).reshape(-1, *node.shape[len(node.shape) - rank :])
     return [program.gather([node], positions) for positions in index]
 
 
-def _stacked(program: Program, nodes: list[Node], shape: Any) -> Node:
-    return program.gather(nodes, np.arange(sum(node.size for node in nodes)).reshape(shape))
+def _applied(
+    program: Program, op: str, *arrays: Node, shapes: Sequence[Sequence[int]], ranks: Sequence[int] = (2, 2),
+    kind: str = "real", attribute: Any = None,
+) -> list[Node]:  # fmt: skip
+    """Returns the results of an operation on every item of a batch; those of one item lie end to end in one array."""
+    batch, sizes = arrays[0].shape[: len(arrays[0].shape) - ranks[0]], [prod(shape) for shape in shapes]
+    items = zip(*(_items(program, array, rank) for array, rank in zip(arrays, ranks, strict=False)), strict=True)
+    nodes = [program.make(op, (sum(sizes),), kind, item, attribute) for item in items]
+    firsts = np.arange(len(nodes))[:, None] * sum(sizes)
+    parts = np.split(firsts + np.arange(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
+    return [program.gather(nodes, part.reshape(*batch, *shape)) for part, shape in zip(parts, shapes, strict=True)]
 
 
-def _cholesky(program: Program, _, a: Node) -> Node:
-    factors = [program.make("cholesky", one.shape, "real", [one]) for one in _matrices(program, a)]
-    return _stacked(program, factors, a.shape)
-
-
-def _triangular_solve(program: Program, parameters: dict[str, Any], a: Node, b: Node) -> Node:
-    results = []
-    for matrix, right in zip(_matrices(program, a), _matrices(program, b), strict=True):
-        lower, transposed = parameters["lower"], parameters["transpose_a"]
-        if not parameters["left_side"]:  # X A = B is A^T X^T = B^T
-            transposed, right = not transposed, program.transpose(right)
-        if transposed:
-            matrix, lower = program.transpose(matrix), not lower
-        attribute = (bool(lower), bool(parameters["unit_diagonal"]))
-        solved = program.make("triangular_solve", right.shape, "real", [matrix, right], attribute)
-        results.append(solved if parameters["left_side"] else program.transpose(solved))
-    return _stacked(program, results, b.shape)
+def _triangular_solve(program: Program, parameters: Parameters, a: Node, b: Node) -> Node:
+    lower, transposed = parameters["lower"], parameters["transpose_a"]
+    if not parameters["left_side"]:  # X A = B is A^T X^T = B^T
+        transposed, b = not transposed, program.transpose(b)
+    if transposed:
+        a, lower = program.transpose(a), not lower
+    attribute = (bool(lower), bool(parameters["unit_diagonal"]))
+    (x,) = _applied(program, "triangular_solve", a, b, shapes=[b.shape[-2:]], attribute=attribute)
+    return x if parameters["left_side"] else program.transpose(x)
 
 
 def _lu(program: Program, _, a: Node) -> list[Node]:
-    rows, columns = a.shape[-2:]
-    factors, pivots, orders = [], [], []
-    for matrix in _matrices(program, a):
-        node = program.make("lu", (), "int", [matrix])
-        factors.append(program.make("project", (rows, columns), "real", [node], 0))
-        pivots.append(program.make("project", (min(rows, columns),), "int", [node], 1))
-        orders.append(program.make("project", (rows,), "int", [node], 2))
-    batch = a.shape[:-2]
-    return [
-        _stacked(program, factors, a.shape),
-        _stacked(program, pivots, (*batch, min(rows, columns))),
-        _stacked(program, orders, (*batch, rows)),
-    ]
-
-
-def _permutation(program: Program, parameters: dict[str, Any], pivots: Node) -> Node:
-    size = parameters["permutation_size"]
-    index = np.arange(pivots.size).reshape(-1, pivots.shape[-1])
-    orders = [program.make("permutation", (size,), "int", [program.gather([pivots], row)]) for row in index]
-    return _stacked(program, orders, (*pivots.shape[:-1], size))
-
-
-def _parts(program: Program, nodes: list[Node], first: int, shape: tuple[int, ...], batch: list[int]) -> Node:
-    """Returns a batch of arrays of this shape, read from flat nodes starting at element `first`."""
-    index = first + np.arange(prod(shape))
-    return _stacked(program, [program.gather([node], index) for node in nodes], (*batch, *shape))
+    *batch, rows, columns = a.shape
+    nodes = [program.make("lu", (), "int", [matrix]) for matrix in _items(program, a)]
+    results = []
+    for place, shape in enumerate([(rows, columns), (min(rows, columns),), (rows,)]):
+        parts = [program.make("project", shape, "int" if place else "real", [node], place) for node in nodes]
+        results.append(program.gather(parts, np.arange(len(parts) * prod(shape)).reshape(*batch, *shape)))
+    return results
 
 
 def _geqrf(program: Program, _, a: Node) -> list[Node]:
-    (*batch, m, n), k = a.shape, min(a.shape[-2:])
-    nodes = [program.make("geqrf", (m * n + k,), "real", [matrix]) for matrix in _matrices(program, a)]
-    return [_parts(program, nodes, 0, (m, n), batch), _parts(program, nodes, m * n, (k,), batch)]
+    return _applied(program, "geqrf", a, shapes=[a.shape[-2:], (min(a.shape[-2:]),)])
 
 
-def _householder_product(program: Program, _, a: Node, tau: Node) -> Node:
-    rows = program.reshape(tau, (-1, tau.shape[-1]))
-    factors = [program.gather([rows], row) for row in np.arange(rows.size).reshape(rows.shape)]
-    pairs = zip(_matrices(program, a), factors, strict=True)
-    return _stacked(program, [program.make("householder_product", x.shape, "real", [x, t]) for x, t in pairs], a.shape)
+def _householder_product(program: Program, _, a: Node, tau: Node) -> list[Node]:
+    return _applied(program, "householder_product", a, tau, shapes=[a.shape[-2:]], ranks=(2, 1))
 
 
-def _qr(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
+def _qr(program: Program, parameters: Parameters, a: Node) -> list[Node]:
     """Applies `qr` by the two rules above, as JAX does."""
     (*batch, m, n), full = a.shape, parameters["full_matrices"]
     if parameters["pivoting"]:
@@ -92,20 +71,19 @@ def _qr(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
     zero, rows, columns = program.constant(0.0, "real"), m if full else min(m, n), m if full or m < n else n
     index = np.arange(a.size).reshape(a.shape)
     wide = np.pad(index, [(0, 0)] * (len(batch) + 1) + [(0, max(columns - n, 0))], constant_values=a.size)
-    q = _householder_product(program, {}, program.gather([packed, zero], wide[..., :columns]), tau)
+    (q,) = _householder_product(program, {}, program.gather([packed, zero], wide[..., :columns]), tau)
     upper = np.where(np.arange(rows)[:, None] <= np.arange(n), index[..., :rows, :], a.size)
     return [q, program.gather([packed, zero], upper)]
 
 
-def _eigh(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
+def _eigh(program: Program, parameters: Parameters, a: Node) -> list[Node]:
     """Applies `eigh` to the lower or upper triangle; the signs of eigenvectors may differ from LAPACK's."""
-    *batch, n, _ = a.shape
+    n = a.shape[-1]
     if parameters["subset_by_index"] not in (None, (0, n)):
         raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
     row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if parameters["lower"] else 1]
-    matrices = [program.gather([matrix], row * n + column) for matrix in _matrices(program, a)]
-    nodes = [program.make("eigh", (n * n + n,), "real", [matrix]) for matrix in matrices]
-    return [_parts(program, nodes, 0, (n, n), batch), _parts(program, nodes, n * n, (n,), batch)]
+    symmetric = program.gather([a], np.arange(a.size).reshape(a.shape)[..., row, column])
+    return _applied(program, "eigh", symmetric, shapes=[(n, n), (n,)])
 
 
 RULES = {
@@ -113,9 +91,11 @@ RULES = {
     "householder_product": _householder_product,
     "qr": _qr,
     "eigh": _eigh,
-    "cholesky": _cholesky,
+    "cholesky": lambda program, _, a: _applied(program, "cholesky", a, shapes=[a.shape[-2:]]),
     "triangular_solve": _triangular_solve,
     "lu": _lu,
-    "lu_pivots_to_permutation": _permutation,
+    "lu_pivots_to_permutation": lambda program, parameters, pivots: _applied(
+        program, "permutation", pivots, shapes=[(parameters["permutation_size"],)], ranks=(1,), kind="int"
+    ),
 }
 """Rules by the name of the primitive."""

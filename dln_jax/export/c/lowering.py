@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from jax.dtypes import float0
 
-from dln_jax.export.c import indexing, linear_algebra, primitives, reductions
-from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at, scanned
-from dln_jax.export.c.kinds import NUMPY_TYPES, kind_of
-from dln_jax.export.c.nodes import Loop, Node, is_constant, values
+from dln_jax.export.c import indexing, linear_algebra, primitives
+from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at
+from dln_jax.export.c.nodes import Loop, Node, Region, is_constant, values
+from dln_jax.export.c.primitives import Parameters
 from dln_jax.export.c.program import Part, Program
-from dln_jax.export.c.text import PRECISIONS
+from dln_jax.export.c.text import PRECISIONS, kind_of, limit
 from dln_jax.types import InputError
 
 _CALLS = {
@@ -26,8 +26,6 @@ _REFUSED = {
     "callback": "a callback into Python, which C cannot call",
     "debug_print": "printing, a side effect",
 }
-_RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_algebra.RULES}
-_TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
 
 
 def program_of(
@@ -55,23 +53,19 @@ def program_of(
 def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
     """Returns the results of a closed jaxpr."""
     jaxpr = closed.jaxpr
-    known: dict[Any, Node] = {}
+    known: dict[Any, Node] = dict(zip(jaxpr.invars, args, strict=True))
 
     def read(variable: Any) -> Node:
-        if hasattr(variable, "val"):
-            return _constant(program, variable.val, variable.aval)
-        return known[variable]
+        return _constant(program, variable.val, variable.aval) if hasattr(variable, "val") else known[variable]
 
-    known.update(zip(jaxpr.invars, args, strict=True))
     for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
         known[variable] = _constant(program, value, variable.aval)
     for equation in jaxpr.eqns:
         try:
             results = _apply(program, equation, [read(variable) for variable in equation.invars])
         except InputError as error:
-            text = str(error)
-            where = "" if " (made at " in text else made_at(equation)
-            raise InputError(text + where) from error
+            where = "" if " (made at " in str(error) else made_at(equation)
+            raise InputError(f"{error}{where}") from error
         for variable, result in zip(equation.outvars, results, strict=True):
             expected = tuple(variable.aval.shape), kind_of(variable.aval.dtype)
             assert (result.shape, result.dtype) == expected, f"{equation.primitive.name} became {result}"
@@ -98,29 +92,25 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         return _inline(program, closed_jaxpr(inner), args)
     if name == "call_hi_primitive":
         return _inline(program, expanded(parameters["_prim"]), args)
-    if name == "scan":
-        parameters = {**parameters, **scanned(equation)}
+    results = [variable.aval for variable in equation.outvars]
     if is_error_of_equinox(equation):
-        return [_failed(program, variable.aval) for variable in equation.outvars]
-    if name in _CONTROL:
-        return _CONTROL[name](program, parameters, args)
-    if name in _TYPED_RULES:
-        dtype = kind_of(equation.outvars[0].aval.dtype)
-        return [_TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
-    if name not in _RULES:
-        why = next((reason for part, reason in _REFUSED.items() if part in name), None)
-        inner = None if why else implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
-        if inner is not None:
-            return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
-        raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
-    results = _RULES[name](program, parameters, *args)
-    return list(results) if isinstance(results, list | tuple) else [results]
+        return [_failed(program, aval) for aval in results]
+    if name in _RULES:
+        parameters = {**parameters, "results": results, "kind": kind_of(results[0].dtype) if results else None}
+        nodes = _RULES[name](program, parameters, *args)
+        return list(nodes) if isinstance(nodes, list | tuple) else [nodes]
+    if why := next((reason for part, reason in _REFUSED.items() if part in name), None):
+        raise InputError(f"'{name}' is {why}")
+    inner = implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
+    if inner is None:
+        raise InputError(f"the primitive '{name}' has no C")
+    return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
 
 
 def _failed(program: Program, aval: Any) -> Node:
     """Returns the value for an error that C cannot raise: NaN, the largest integer or true (EQX_ON_ERROR=nan)."""
     kind = kind_of(aval.dtype)
-    value = np.nan if kind == "real" else kind == "bool" or np.iinfo(NUMPY_TYPES[kind]).max
+    value = np.nan if kind == "real" else limit(kind, upper=True)
     return program.broadcast(program.constant(value, kind), aval.shape)
 
 
@@ -145,37 +135,36 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     return _projections(program, program.make("call", (), "int", passed, attribute=key), shapes)
 
 
-def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+def _custom_linear_solve(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
     lengths, jaxprs = parameters["const_lengths"], parameters["jaxprs"]
     before = lengths.matvec + lengths.vecmat
     constants, right = args[before : before + lengths.solve], args[sum(lengths) :]
     return _inline(program, jaxprs.solve, [*constants, *right])
 
 
-def _region(program: Program, nodes: Sequence[Node]) -> tuple[tuple[int, ...], int]:
-    """Returns the region of a loop over these nodes, and its number."""
+def _opened(program: Program, nodes: Sequence[Node], start: Sequence[Node] = ()) -> tuple[Region, int, list[Node]]:
+    """Returns the region around a new loop or branch that reads these nodes, its number, and its carries."""
     number = len(program.loops)
     program.loops[number] = Loop([], [], [])
-    return max((program.floor, *(node.region for node in nodes)), key=len), number
-
-
-def _carries(program: Program, number: int, outer: tuple[int, ...], start: Sequence[Node]) -> list[Node]:
-    region = (*outer, number)
-    return [
-        program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=region)
-        for index, carry in enumerate(start)
-    ]
+    outer = max((program.floor, *(node.region for node in nodes)), key=len)
+    return (
+        outer,
+        number,
+        [
+            program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=(*outer, number))
+            for index, carry in enumerate(start)
+        ],
+    )
 
 
 def _projections(program: Program, node: Node, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
     return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
 
 
-def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+def _while(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
     split = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
     of_condition, of_body, start = args[: split[0]], args[split[0] : split[1]], args[split[1] :]
-    outer, number = _region(program, args)
-    carries = _carries(program, number, outer, start)
+    outer, number, carries = _opened(program, args, start)
     (condition,) = _inline(program, parameters["cond_jaxpr"], [*of_condition, *carries])
     results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
     program.loops[number] = Loop(carries, [condition], results)
@@ -183,55 +172,65 @@ def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> li
     return _projections(program, loop, [(carry.shape, carry.dtype) for carry in start])
 
 
-def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
-    constants, count = parameters["fixed"], parameters["carried"]
+def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
+    length, inner = parameters["length"], parameters["jaxpr"].jaxpr
+
+    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+        return sum(a.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
+
+    # Counted, because releases of JAX store these numbers differently; stacked arrays differ in shape inside.
+    count = alike(parameters["results"], inner.outvars)
+    constants = alike(args, inner.invars) - count
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
-    length, reverse = parameters["length"], parameters["reverse"]
     if length == 0:
-        left = parameters["jaxpr"].out_avals[count:]
-        return [*start, *(program.constant(np.zeros((0, *aval.shape)), kind_of(aval.dtype)) for aval in left)]
-    outer, number = _region(program, args)
-    carries = _carries(program, number, outer, start)
+        left = parameters["results"][count:]
+        return [*start, *(program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in left)]
+    outer, number, carries = _opened(program, args, start)
     turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
     slices = []
     for array in stacked:
-        size = array.size // max(length, 1)
+        size = array.size // length
         offsets = program.constant(np.arange(size).reshape(array.shape[1:]), "index")
-        first = program.elementwise("mul", turn, program.constant(size, "index"))
+        first = program.elementwise("mul", turn, size)
         slices.append(indexing.take(program, array, program.elementwise("add", first, offsets)))
     results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
-    program.loops[number] = Loop(carries, [], results, length, reverse)
-    shapes = [(carry.shape, carry.dtype) for carry in start]
-    shapes += [((length, *result.shape), result.dtype) for result in results[count:]]
-    return _projections(program, program.make("repeat", (), "int", start, attribute=number, region=outer), shapes)
+    program.loops[number] = Loop(carries, [], results, length, parameters["reverse"])
+    loop = program.make("repeat", (), "int", start, attribute=number, region=outer)
+    return _projections(program, loop, [(aval.shape, kind_of(aval.dtype)) for aval in parameters["results"]])
 
 
-def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
-    which, *operands = args
+def _cond(program: Program, parameters: Parameters, which: Node, *operands: Node) -> list[Node]:
     branches = parameters["branches"]
     if len(branches) == 1 or which.op == "const":
         chosen = int(np.clip(which.value, 0, len(branches) - 1)) if which.value is not None else 0
         return _inline(program, branches[chosen], operands)
-    outer, number = _region(program, args)
-    floor, every = program.floor, []
-    for branch, closed in enumerate(branches):
-        inside = number if branch == 0 else _region(program, [])[1]
-        program.floor = (*outer, inside)
-        every.append((inside, _inline(program, closed, operands)))
+    floor, outer = program.floor, max((program.floor, which.region, *(node.region for node in operands)), key=len)
+    numbers, every = [], []
+    for closed in branches:
+        _, number, _ = _opened(program, [])
+        program.floor = (*outer, number)
+        numbers.append(number)
+        every.append(_inline(program, closed, operands))
     program.floor = floor
-    for inside, results in every:
-        program.loops[inside] = Loop([], [], results)
-    shapes = [(result.shape, result.dtype) for result in every[0][1]]
-    numbers = tuple(inside for inside, _ in every)
-    branch = program.make("branch", (), "int", [which], attribute=numbers, region=outer)
-    return _projections(program, branch, shapes)
+    for number, results in zip(numbers, every, strict=True):
+        program.loops[number] = Loop([], [], results)
+    branch = program.make("branch", (), "int", [which], attribute=tuple(numbers), region=outer)
+    return _projections(program, branch, [(result.shape, result.dtype) for result in every[0]])
 
 
-def _platform(program: Program, parameters: dict[str, Any], _) -> list[Node]:
+def _platform(program: Program, parameters: Parameters) -> Node:
     """Returns the index of the branch for the CPU: its own, or the default."""
     places = [k for k, parameter in enumerate(parameters["platforms"]) if parameter is None or "cpu" in parameter]
-    return [program.constant(np.int32(places[0]), "int")]
+    return program.constant(np.int32(places[0]), "int")
 
 
-_CONTROL = {"platform_index": _platform, "while": _while, "scan": _scan, "cond": _cond}
-_CONTROL["custom_linear_solve"] = _custom_linear_solve
+_RULES = {
+    **primitives.RULES,
+    **indexing.RULES,
+    **linear_algebra.RULES,
+    "platform_index": _platform,
+    "while": _while,
+    "scan": _scan,
+    "cond": _cond,
+    "custom_linear_solve": _custom_linear_solve,
+}

@@ -1,16 +1,56 @@
-"""Elementwise operations: their C, their NumPy function for constants, and their cost."""
+"""Elementwise operations: their C, their NumPy function for constants, and their cost.
+
+Integer arithmetic in C has XLA's results: sums wrap around, divisions never trap, conversions saturate. C leaves
+undefined: signed overflow, division by zero, the lowest number over -1, the conversion of a real number that does not
+fit, and shifts by at least the number of bits. XLA defines them all (x / 0 is -1, or the largest unsigned number;
+x % 0 is x; NaN becomes 0; all bits are shifted out), and so does this C.
+"""
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c import integers
 from dln_jax.export.c.elementary import OPERATIONS as COSTS
 from dln_jax.export.c.elementary import VECTORISED as _VECTORISED
-from dln_jax.export.c.kinds import C_TYPES, NUMPY_TYPES, UNSIGNED
+from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES, SIGNED, UNSIGNED, number
+
+
+def _quotient(a, b):
+    """Returns `a / b` for integer arrays, rounded towards zero."""
+    safe = np.where(b == 0, np.ones_like(b), b)
+    whole = a // safe
+    if a.dtype.kind == "i":
+        whole = whole + ((whole * safe != a) & ((a < 0) != (safe < 0)))
+    return np.where(b == 0, a.dtype.type(-1) if a.dtype.kind == "i" else np.iinfo(a.dtype).max, whole)
+
+
+def _remainder(a, b):
+    """Returns `a % b` for integer arrays, with the sign of a."""
+    safe = np.where((b == 0) | (b == -1), np.ones_like(b), b) if b.dtype.kind == "i" else np.where(b == 0, 1, b)
+    return np.where(b == 0, a, np.fmod(a, safe))
+
+
+def _converted(x, kind: str):
+    """Converts an array to a kind; real numbers are rounded towards zero and saturate."""
+    to = NUMPY_TYPES[kind]
+    if x.dtype.kind != "f":
+        return x.astype(to)
+    low, high = np.iinfo(to).min, np.iinfo(to).max
+    representable = (x > float(low)) & (x < float(high))
+    whole = np.where(representable, x, 0).astype(to)
+    return np.where(representable | (x != x), whole, np.where(x > 0, to(high), to(low)))
+
+
+def _shifted_right(a, b, *, kind: str):
+    """Returns `a >> b` for arrays, with zeros (kind "u") or copies of the sign bit (kind "i") shifted in.
+
+    NumPy shifts as XLA does: a negative amount, or one of at least the number of bits, shifts all bits out.
+    """
+    typed = np.dtype(f"{kind}{a.dtype.itemsize}")
+    return np.right_shift(a.view(typed), b.view(typed)).view(a.dtype)
 
 
 class Operation(NamedTuple):
@@ -37,54 +77,28 @@ def _comparison(symbol: str, fold: Callable[..., Any]) -> Operation:
     return Operation(f"({{0}} {symbol} {{1}})", fold, 0, "bool")
 
 
+_AS_IN_NUMPY = (
+    "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh",
+    "cosh", "tanh", "asinh", "acosh", "atanh", "floor", "ceil", "rint", "trunc",
+)  # fmt: skip
+"""Functions of <math.h> that NumPy has by the same name."""
 OPERATIONS = {
     "add": Operation("({0} + {1})", np.add),
     "sub": Operation("({0} - {1})", np.subtract),
     "mul": Operation("({0} * {1})", np.multiply),
     "div": Operation("({0} / {1})", np.divide),
-    "integer_div": Operation("({0} / {1})", integers.quotient),
+    "integer_div": Operation("({0} / {1})", _quotient),
     "neg": Operation("(-{0})", np.negative, 0),
     "abs": Operation("fabs{f}({0})", np.abs, 0),
     "integer_abs": Operation("({0} < 0 ? -{0} : {0})", np.abs, 0),
     "max": Operation("(({0} > {1} || {0} != {0}) ? {0} : {1})", np.maximum, 0),
     "min": Operation("(({0} < {1} || {0} != {0}) ? {0} : {1})", np.minimum, 0),
-    "integer_rem": Operation("({0} % {1})", integers.remainder, 0),
+    "integer_rem": Operation("({0} % {1})", _remainder, 0),
     "rem": _function("fmod", np.fmod, arguments=2),
-    "sqrt": _function("sqrt", np.sqrt),
-    "pow": _function("pow", np.power, arguments=2),
-    "atan2": _function("atan2", np.arctan2, arguments=2),
-    "nextafter": _function("nextafter", np.nextafter, arguments=2),
-    **{
-        name: _function(name, fold)
-        for name, fold in {
-            "cbrt": np.cbrt,
-            "exp": np.exp,
-            "exp2": np.exp2,
-            "expm1": np.expm1,
-            "log": np.log,
-            "log1p": np.log1p,
-            "log2": np.log2,
-            "sin": np.sin,
-            "cos": np.cos,
-            "tan": np.tan,
-            "asin": np.arcsin,
-            "acos": np.arccos,
-            "atan": np.arctan,
-            "sinh": np.sinh,
-            "cosh": np.cosh,
-            "tanh": np.tanh,
-            "asinh": np.arcsinh,
-            "acosh": np.arccosh,
-            "atanh": np.arctanh,
-            "erf": np.vectorize(math.erf, otypes=[float]),
-            "erfc": np.vectorize(math.erfc, otypes=[float]),
-            "lgamma": None,
-            "floor": np.floor,
-            "ceil": np.ceil,
-            "rint": np.rint,
-            "trunc": np.trunc,
-        }.items()
-    },
+    **{name: _function(name, getattr(np, name), arguments=2) for name in ("pow", "atan2", "nextafter")},
+    **{name: _function(name, getattr(np, name)) for name in _AS_IN_NUMPY},
+    **{name: _function(name, np.vectorize(getattr(math, name), otypes=[float])) for name in ("erf", "erfc")},
+    "lgamma": _function("lgamma", None),
     "round": _function("round", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
     "is_finite": Operation("({0} - {0} == 0)", np.isfinite, 0, "bool"),
     # Arguments: a number, bits of the exponent, bits of the mantissa.
@@ -105,17 +119,54 @@ OPERATIONS = {
     "integer_not": Operation("(~{0})", np.invert, 0),
     **{
         f"shift_{name}": Operation(f"elementary_shift_{name}({{0}}, {{1}})", fold, 0)
-        for name, fold in integers.SHIFTS.items()
+        for name, fold in {
+            "left": np.left_shift,
+            "right_logical": functools.partial(_shifted_right, kind="u"),
+            "right_arithmetic": functools.partial(_shifted_right, kind="i"),
+        }.items()
     },
     "select": Operation("({0} ? {1} : {2})", lambda c, a, b: np.where(c, a, b), 0),
     **{
-        f"to_{kind}": Operation(f"(({C_TYPES[kind]}){{0}})", functools.partial(integers.converted, kind=kind), 0, kind)
+        f"to_{kind}": Operation(f"(({C_TYPES[kind]}){{0}})", functools.partial(_converted, kind=kind), 0, kind)
         for kind in NUMPY_TYPES
     },
     "to_real": Operation("((real){0})", lambda x: x, 0, "real"),
     "to_bool": Operation("({0} != 0)", lambda x: x != 0, 0, "bool"),
 }
 """Operations by name."""
+COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
+"""Operations that commute bit for bit, also in floating point."""
+TRANSCENDENTAL = frozenset(name for name, operation in OPERATIONS.items() if operation.function and name != "sqrt")
+"""Operations that call a function of <math.h>, but for sqrt."""
+VECTORISED = frozenset(_VECTORISED)
+"""Operations whose C vectorises in loops."""
+_ON_BOOL = {"add": "or", "mul": "and", "max": "or", "min": "and", "ne": "xor"}
+
+
+def on_kind(op: str, kind: str) -> str:
+    """Returns the name of an operation for numbers of a kind: integers and booleans have operations of their own."""
+    if kind == "bool":
+        return _ON_BOOL.get(op, op)
+    return f"integer_{op}" if kind != "real" and f"integer_{op}" in OPERATIONS else op
+
+
+_WRAPPED = {
+    "add": "({c})(({u}){{0}} + ({u}){{1}})",
+    "sub": "({c})(({u}){{0}} - ({u}){{1}})",
+    "mul": "({c})(({u}){{0}} * ({u}){{1}})",
+    "neg": "({c})(0 - ({u}){{0}})",
+    "integer_abs": "({{0}} < 0 ? ({c})(0 - ({u}){{0}}) : {{0}})",
+}
+_ON_INTEGERS = {"max": "({0} > {1} ? {0} : {1})", "min": "({0} < {1} ? {0} : {1})"}
+_ON_UNSIGNED = {"neg": "(0 - {0})", "integer_abs": "{0}"}
+
+
+def _pattern(op: str, kind: str) -> str:
+    """Returns the C of an operation on arguments {0}, {1}, ... of a kind."""
+    if kind in SIGNED and op in _WRAPPED:
+        return f"({_WRAPPED[op].format(c=C_TYPES[kind], u='u' + C_TYPES[kind])})"
+    special = {} if kind == "real" else _ON_INTEGERS | (_ON_UNSIGNED if kind in UNSIGNED else {})
+    return special.get(op, OPERATIONS[op].c)
 
 
 def expression(op: str, dtype: str, *args: str, suffix: str = "") -> str:
@@ -127,8 +178,7 @@ def expression(op: str, dtype: str, *args: str, suffix: str = "") -> str:
         return args[0]
     if dtype in UNSIGNED and (known := _beside_zero(op, args)):
         return known
-    text = integers.pattern(op, dtype) if dtype != "real" else None
-    return (text or OPERATIONS[op].c).format(*args, f=suffix)
+    return _pattern(op, dtype).format(*args, f=suffix)
 
 
 def _beside_zero(op: str, args: Sequence[str]) -> str | None:
@@ -143,11 +193,38 @@ def _beside_zero(op: str, args: Sequence[str]) -> str | None:
     return None
 
 
-COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
-"""Operations that commute bit for bit, also in floating point."""
-TRANSCENDENTAL = frozenset(
-    name for name, operation in OPERATIONS.items() if operation.function and name not in ("sqrt",)
-)
-"""Operations that call a function of <math.h>, but for sqrt."""
-VECTORISED = frozenset(_VECTORISED)
-"""Operations whose C vectorises in loops."""
+_GUARDED = {
+    "quotient_{kind}({c} a, {c} b)": ("b == 0", "{at_zero}", "{quotient_of_lowest}a / b"),
+    "remainder_{kind}({c} a, {c} b)": ("b == 0", "a", "{remainder_of_lowest}a % b"),
+    "shift_left_{kind}({c} a, {c} b)": ("({u})b >= {bits}", "0", "({c})(({u})a << b)"),
+    "shift_right_logical_{kind}({c} a, {c} b)": ("({u})b >= {bits}", "0", "({c})(({u})a >> b)"),
+    "shift_right_arithmetic_{kind}({c} a, {c} b)": (
+        "({u})b >= {bits}",
+        "({s})a < 0 ? ({c})-1 : 0",
+        "({s})a < 0 ? ({c})~(~({u})a >> b) : ({c})(({u})a >> b)",
+    ),
+    "{kind}_of(real x)": ("x != x", "0", "x <= {low} ? {lower} : x >= {high} ? {upper} : ({c})x"),
+}
+"""Prototype, condition, result if the condition holds, and result otherwise, of the C functions on integers."""
+
+
+def definitions(names: Collection[str], precision: str) -> str:
+    """Returns the C functions `quotient_KIND`, `remainder_KIND`, `shift_NAME_KIND` and `KIND_of` (a real number)."""
+    text = ""
+    for kind in (*SIGNED, *UNSIGNED):
+        c, signed, limits = C_TYPES[kind], kind in SIGNED, np.iinfo(NUMPY_TYPES[kind])
+        name = c.removesuffix("_t").upper()
+        facts = {
+            "kind": kind, "c": c, "u": f"u{c.removeprefix('u')}", "s": c.removeprefix("u"), "bits": limits.bits,
+            "low": number(float(limits.min), precision), "high": number(float(limits.max), precision),
+            "lower": f"{name}_MIN" if signed else "0", "upper": f"{name}_MAX",
+            "at_zero": "-1" if signed else f"{name}_MAX",
+            "quotient_of_lowest": f"b == -1 ? ({c})(0 - (u{c})a) : " if signed else "",
+            "remainder_of_lowest": "b == -1 ? 0 : " if signed else "",
+        }  # fmt: skip
+        for parts in _GUARDED.items():
+            prototype, condition, then, otherwise = (part.format(**facts) for part in (parts[0], *parts[1]))
+            if prototype.partition("(")[0] in names:
+                text += f"\nstatic inline {c} elementary_{prototype}\n{{\n    if ({condition}) return {then};\n"
+                text += f"    return {otherwise};\n}}\n"
+    return text

@@ -17,7 +17,7 @@ UNROLL_LIMIT = 64
 """Largest number of elements of a result, or of products of a sum, that may be unrolled."""
 _VECTOR = 8
 _VECTOR_OF_FUNCTIONS = 4
-_FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product")
+_FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """Operations that read arguments through a pointer."""
 

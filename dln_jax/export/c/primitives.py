@@ -1,43 +1,60 @@
-"""Rules that turn JAX's elementwise and shape primitives into nodes of a program.
+"""Rules that turn JAX's elementwise and shape primitives, products and reductions into nodes of a program.
 
-A rule takes the program, the equation's parameters and its arguments, and returns the result or a list of results.
+A rule takes the program, the equation's parameters and its arguments, and returns the result or a list of results. The
+parameters include `kind`, the kind of the first result.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from math import prod
 from typing import Any
 
 import numpy as np
 
-from dln_jax.export.c.kinds import UNSIGNED
 from dln_jax.export.c.nodes import Node
-from dln_jax.export.c.program import Program
+from dln_jax.export.c.operations import on_kind
+from dln_jax.export.c.program import Program, neutral
+from dln_jax.export.c.text import UNSIGNED
 
 Rule = Callable[..., Any]
-
-_RENAMED = {
-    "add_any": "add",
-    "stop_gradient": None,
-    "copy": None,
-    "copy_p": None,
-    "optimization_barrier": None,
-}
+Parameters = Mapping[str, Any]
 _AS_NAMED = (
-    "add", "sub", "mul", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
-    "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf",
-    "erfc", "lgamma", "floor", "ceil", "is_finite", "and", "or", "xor", "nextafter", "shift_left",
+    "add", "sub", "mul", "div", "rem", "max", "min", "neg", "abs", "not", "and", "or", "xor", "atan2", "sqrt", "cbrt",
+    "exp", "exp2", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
+    "asinh", "acosh", "atanh", "erf", "erfc", "lgamma", "floor", "ceil", "is_finite", "nextafter", "shift_left",
     "shift_right_logical", "shift_right_arithmetic",
 )  # fmt: skip
+
+
+def convert(program: Program, node: Node, kind: str) -> Node:
+    """Returns the node converted to a kind."""
+    return node if node.dtype == kind else program.elementwise(f"to_{kind}", node)
+
+
+def rows_of(program: Program, node: Node, axes: tuple[int, ...]) -> Node:
+    """Returns the node as a matrix [o, r], its columns the elements along `axes`."""
+    kept = [axis for axis in range(len(node.shape)) if axis not in axes]
+    index = np.arange(node.size).reshape(node.shape).transpose([*kept, *axes])
+    return program.gather([node], index.reshape(prod(node.shape[axis] for axis in kept), -1))
 
 
 def _elementwise(name: str) -> Rule:
     return lambda program, _, *args: program.elementwise(name, *args)
 
 
-def _moved(move: Callable[..., np.ndarray]) -> Rule:
-    """Returns the rule of a primitive that only moves elements; `move` does so to an array of their indices."""
+def _moved(move: Callable[..., Any]) -> Rule:
+    """Returns the rule of a primitive that only moves elements.
 
-    def rule(program: Program, parameters: dict[str, Any], node: Node, *_: Node) -> Node:
-        return program.gather([node], move(np.arange(node.size).reshape(node.shape), parameters))
+    `move` takes arrays of the indices of all elements, one array for each argument, and the parameters, and returns the
+    array of a result or a list of arrays.
+    """
+
+    def rule(program: Program, parameters: Parameters, *nodes: Node) -> Any:
+        starts = np.cumsum([0, *(node.size for node in nodes)])
+        indices = [np.arange(node.size).reshape(node.shape) + k for node, k in zip(nodes, starts, strict=False)]
+        moved = move(*indices, parameters)
+        if isinstance(moved, list):
+            return [program.gather(nodes, positions) for positions in moved]
+        return program.gather(nodes, moved)
 
     return rule
 
@@ -56,19 +73,28 @@ def _slice(index, parameters):
     return index[tuple(slice(int(start), int(limit), int(stride)) for start, limit, stride in limits)]
 
 
-def _power(program: Program, _, x: Node, exponent: Node, *, dtype: str) -> Node:
-    return program.elementwise("pow", convert(program, x, dtype), convert(program, exponent, dtype))
+def _pad(index, padding, parameters):
+    for axis, (low, high, interior) in enumerate(parameters["padding_config"]):
+        step, extent = int(interior) + 1, index.shape[axis]
+        place = np.arange(-int(low), max((extent - 1) * step + 1, 0) + int(high))
+        chosen = np.where((place % step == 0) & (place >= 0), np.minimum(place // step, extent), extent)
+        sides = [(0, int(other == axis)) for other in range(index.ndim)]
+        index = np.pad(index, sides, constant_values=padding).take(chosen, axis)
+    return index
+
+
+def _split(index, parameters):
+    return list(np.split(index, np.cumsum(parameters["sizes"])[:-1], axis=parameters["axis"]))
 
 
 def _comparison(name: str) -> Rule:
     """Returns the rule of a comparison; booleans are compared by logic, since compilers warn of comparing them."""
 
     def rule(program: Program, _, a: Node, b: Node) -> Node:
-        if a.dtype != "bool":
+        if a.dtype != "bool" or name == "ne":
             return program.elementwise(name, a, b)
-        if name in ("eq", "ne"):
-            different = program.elementwise("xor", a, b)
-            return different if name == "ne" else program.elementwise("not", different)
+        if name == "eq":
+            return program.elementwise("not", program.elementwise("xor", a, b))
         # a < b is (not a) and b; a <= b is (not a) or b
         low, high = (a, b) if name in ("lt", "le") else (b, a)
         return program.elementwise("and" if name in ("lt", "gt") else "or", program.elementwise("not", low), high)
@@ -86,12 +112,11 @@ def _total_order(name: str) -> Rule:
     return rule
 
 
-def _extreme(name: str) -> Rule:
-    on_truths = "or" if name == "max" else "and"
-    return lambda program, _, *args: program.elementwise(on_truths if args[0].dtype == "bool" else name, *args)
+def _power(program: Program, parameters: Parameters, x: Node, exponent: Node) -> Node:
+    return program.elementwise("pow", *(convert(program, node, parameters["kind"]) for node in (x, exponent)))
 
 
-def _integer_power(program: Program, parameters, x: Node) -> Node:
+def _integer_power(program: Program, parameters: Parameters, x: Node) -> Node:
     exponent, result = parameters["y"], None
     power, left = x, abs(exponent)
     while left:
@@ -106,24 +131,21 @@ def _integer_power(program: Program, parameters, x: Node) -> Node:
 
 
 def _sign(program: Program, _, x: Node) -> Node:
-    zero, one = (program.constant(number, x.dtype) for number in (0, 1))
     if x.dtype in UNSIGNED:
-        return program.elementwise("min", x, one)
-    minus = program.constant(-1, x.dtype)
-    positive, negative = (program.elementwise(name, x, zero) for name in ("gt", "lt"))
+        return program.elementwise("min", x, 1)
+    minus, one = (program.constant(number, x.dtype) for number in (-1, 1))
+    positive, negative = (program.elementwise(name, x, 0) for name in ("gt", "lt"))
     # 0 and NaN are their own sign.
     return program.select(positive, program.select(negative, x, minus), one)
 
 
 def _logistic(program: Program, _, x: Node) -> Node:
-    one = program.constant(1.0, "real")
     decay = program.elementwise("exp", program.elementwise("neg", x))
-    return program.elementwise("div", one, program.elementwise("add", one, decay))
+    return program.elementwise("div", 1, program.elementwise("add", 1, decay))
 
 
 def _one_minus_square(program: Program, _, x: Node) -> Node:
-    one = program.constant(1.0, "real")
-    return program.elementwise("mul", program.elementwise("sub", one, x), program.elementwise("add", one, x))
+    return program.elementwise("mul", program.elementwise("sub", 1, x), program.elementwise("add", 1, x))
 
 
 def _clamp(program: Program, _, low: Node, x: Node, high: Node) -> Node:
@@ -135,112 +157,103 @@ def _select_n(program: Program, _, which: Node, *cases: Node) -> Node:
         return program.select(which, *cases)
     result = cases[-1]
     for number, case in reversed(list(enumerate(cases[:-1]))):
-        result = program.select(program.elementwise("eq", which, program.constant(number, which.dtype)), result, case)
+        result = program.select(program.elementwise("eq", which, number), result, case)
     return result
 
 
-def _by_kind(real: str, integer: str) -> Rule:
-    def rule(program: Program, _, *args: Node, dtype: str) -> Node:
-        return program.elementwise(real if dtype == "real" else integer, *args)
-
-    return rule
+def _iota(program: Program, parameters: Parameters) -> Node:
+    return program.constant(np.indices(parameters["shape"])[parameters["dimension"]], parameters["kind"])
 
 
-def _not(program: Program, _, x: Node) -> Node:
-    return program.elementwise("not" if x.dtype == "bool" else "integer_not", x)
-
-
-def _round(program: Program, parameters, x: Node) -> Node:
-    return program.elementwise("rint" if int(parameters["rounding_method"]) else "round", x)
-
-
-def convert(program: Program, node: Node, dtype: str) -> Node:
-    """Returns the node converted to a kind."""
-    if node.dtype == dtype:
-        return node
-    return program.elementwise(f"to_{dtype}", node)
-
-
-def _pad(program: Program, parameters, x: Node, padding: Node) -> Node:
-    index = np.arange(x.size).reshape(x.shape)
-    for axis, (low, high, interior) in enumerate(parameters["padding_config"]):
-        low, high, interior, extent = int(low), int(high), int(interior), index.shape[axis]
-        inner = extent + max(extent - 1, 0) * interior
-        shape = list(index.shape)
-        shape[axis] = inner
-        spread = np.full(shape, x.size)
-        np.moveaxis(spread, axis, 0)[:: interior + 1] = np.moveaxis(index, axis, 0)
-        wide = [(max(low, 0), max(high, 0)) if other == axis else (0, 0) for other in range(index.ndim)]
-        index = np.pad(spread, wide, constant_values=x.size)
-        cut = slice(max(-low, 0), index.shape[axis] - max(-high, 0))
-        index = index[(slice(None),) * axis + (cut,)]
-    return program.gather([x, padding], index)
-
-
-def _concatenate(program: Program, parameters, *nodes: Node) -> Node:
-    starts = np.cumsum([0, *(node.size for node in nodes)])
-    pieces = [np.arange(node.size).reshape(node.shape) + start for node, start in zip(nodes, starts, strict=False)]
-    return program.gather(nodes, np.concatenate(pieces, axis=parameters["dimension"]))
-
-
-def _stack(program: Program, parameters, *nodes: Node) -> Node:
-    pieces = np.arange(sum(node.size for node in nodes)).reshape(len(nodes), *nodes[0].shape)
-    return program.gather(nodes, np.moveaxis(pieces, 0, parameters["axis"]))
-
-
-def _unstack(program: Program, parameters, node: Node) -> list[Node]:
-    index = np.moveaxis(np.arange(node.size).reshape(node.shape), parameters["axis"], 0)
-    return [program.gather([node], piece) for piece in index]
-
-
-def _split(program: Program, parameters, node: Node) -> list[Node]:
-    index = np.arange(node.size).reshape(node.shape)
-    pieces = np.split(index, np.cumsum(parameters["sizes"])[:-1], axis=parameters["axis"])
-    return [program.gather([node], piece) for piece in pieces]
-
-
-def _iota(program: Program, parameters, dtype: str) -> Node:
-    shape, dimension = parameters["shape"], parameters["dimension"]
-    expanded = [-1 if axis == dimension else 1 for axis in range(len(shape))]
-    numbers = np.broadcast_to(np.arange(shape[dimension]).reshape(expanded), shape)
-    return program.constant(numbers, dtype)
-
-
-def _reciprocal_root(program: Program, _, x: Node) -> Node:
-    return program.elementwise("div", program.constant(1.0, "real"), program.elementwise("sqrt", x))
-
-
-def _reduce_precision(program: Program, parameters, x: Node) -> Node:
+def _reduce_precision(program: Program, parameters: Parameters, x: Node) -> Node:
     exponent, mantissa = parameters["exponent_bits"], parameters["mantissa_bits"]
     own = np.finfo(program.real)
     if exponent >= own.nexp and mantissa >= own.nmant:
         return x
-    bits = [program.constant(min(*pair), "real") for pair in ((exponent, own.nexp), (mantissa, own.nmant))]
-    return program.elementwise("rounded", x, *bits)
+    return program.elementwise("rounded", x, min(exponent, own.nexp), min(mantissa, own.nmant))
 
 
-def _identity(_, __, *nodes: Node) -> Any:
-    return list(nodes)
+def _dot_general(program: Program, parameters: Parameters, a: Node, b: Node) -> Node:
+    a, b = (convert(program, node, parameters["kind"]) for node in (a, b))
+    (a_sum, b_sum), (a_batch, b_batch) = parameters["dimension_numbers"]
+    a_free = [axis for axis in range(len(a.shape)) if axis not in (*a_sum, *a_batch)]
+    b_free = [axis for axis in range(len(b.shape)) if axis not in (*b_sum, *b_batch)]
+
+    def ordered(node: Node, *groups) -> Node:
+        index = np.arange(node.size).reshape(node.shape).transpose([axis for group in groups for axis in group])
+        return program.gather([node], index.reshape([prod(node.shape[axis] for axis in group) for group in groups]))
+
+    product = program.dot_general(ordered(a, a_batch, a_free, a_sum), ordered(b, b_batch, b_sum, b_free))
+    shape = [a.shape[axis] for axis in (*a_batch, *a_free)] + [b.shape[axis] for axis in b_free]
+    return program.reshape(product, shape)
 
 
+def _reduction(name: str) -> Rule:
+    def rule(program: Program, parameters: Parameters, node: Node) -> Node:
+        op, axes = on_kind(name, node.dtype), tuple(map(int, parameters["axes"]))
+        shape = [size for axis, size in enumerate(node.shape) if axis not in axes]
+        if node.size == 0:
+            return program.broadcast(program.constant(neutral(op, node.dtype), node.dtype), shape)
+        rows = rows_of(program, node, axes)
+        if rows.shape[1] == 2:
+            first, second = (program.gather([rows], np.arange(rows.size).reshape(rows.shape)[:, k]) for k in range(2))
+            rows = program.elementwise(op, first, second)
+        elif rows.shape[1] > 2:
+            rows = program.make(f"reduce_{op}", rows.shape[:1], node.dtype, [rows])
+        return program.reshape(rows, shape)
+
+    return rule
+
+
+def _arg(name: str) -> Rule:
+    def rule(program: Program, parameters: Parameters, node: Node) -> Node:
+        (axis,) = map(int, parameters["axes"])
+        rows = rows_of(program, node, (axis,))
+        made = program.make(name, rows.shape[:1], parameters["kind"], [rows])
+        return program.reshape(made, node.shape[:axis] + node.shape[axis + 1 :])
+
+    return rule
+
+
+def _cumulative(op: str) -> Rule:
+    """Returns the rule of a cumulative operation, unrolled along the axis."""
+
+    def rule(program: Program, parameters: Parameters, node: Node) -> Node:
+        axis = parameters["axis"]
+        index = np.moveaxis(np.arange(node.size).reshape(node.shape), axis, 0)
+        index = index[::-1] if parameters["reverse"] else index
+        pieces: list[Node] = []
+        for positions in index:
+            piece = program.gather([node], positions)
+            pieces.append(program.elementwise(op, pieces[-1], piece) if pieces else piece)
+        if parameters["reverse"]:
+            pieces.reverse()
+        joined = np.arange(node.size).reshape(index.shape)
+        return program.gather(pieces, np.moveaxis(joined, 0, axis)) if pieces else node
+
+    return rule
+
+
+_OF_REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or", "xor": "xor"}
 RULES: dict[str, Rule] = {
     **{name: _elementwise(name) for name in _AS_NAMED},
-    **{name: _identity if op is None else _elementwise(op) for name, op in _RENAMED.items()},
+    "add_any": _elementwise("add"),
+    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "optimization_barrier"), lambda _, __, *nodes: nodes),
     "square": lambda program, _, x: program.elementwise("mul", x, x),
-    "neg": lambda program, _, x: program.elementwise("neg", x),
     **{name: _comparison(name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
     **{f"{name}_to": _total_order(name) for name in ("lt", "le")},
-    **{name: _extreme(name) for name in ("max", "min")},
     "reduce_precision": _reduce_precision,
-    "not": _not,
     "sign": _sign,
-    "rsqrt": _reciprocal_root,
+    "rsqrt": lambda program, _, x: program.elementwise("div", 1, program.elementwise("sqrt", x)),
+    "pow": _power,
     "integer_pow": _integer_power,
     "logistic": _logistic,
     "one_minus_square": _one_minus_square,
     "clamp": _clamp,
-    "round": _round,
+    "round": lambda program, p, x: program.elementwise("rint" if int(p["rounding_method"]) else "round", x),
     "select_n": _select_n,
+    "convert_element_type": lambda program, parameters, x: convert(program, x, parameters["kind"]),
+    "iota": _iota,
     "broadcast_in_dim": _moved(_broadcast_in_dim),
     "reshape": _moved(lambda index, parameters: index.reshape(parameters["new_sizes"])),
     "squeeze": _moved(lambda index, parameters: np.squeeze(index, tuple(parameters["dimensions"]))),
@@ -249,19 +262,14 @@ RULES: dict[str, Rule] = {
     "rev": _moved(lambda index, parameters: np.flip(index, parameters["dimensions"])),
     "slice": _moved(_slice),
     "tile": _moved(lambda index, parameters: np.tile(index, parameters["reps"])),
-    "pad": _pad,
-    "concatenate": _concatenate,
-    "stack": _stack,
-    "unstack": _unstack,
-    "split": _split,
+    "pad": _moved(_pad),
+    "concatenate": _moved(lambda *indices: np.concatenate(indices[:-1], axis=indices[-1]["dimension"])),
+    "stack": _moved(lambda *indices: np.stack(indices[:-1], indices[-1]["axis"])),
+    "unstack": _moved(lambda index, parameters: list(np.moveaxis(index, parameters["axis"], 0))),
+    "split": _moved(_split),
+    "dot_general": _dot_general,
+    **{f"reduce_{name}": _reduction(op) for name, op in _OF_REDUCTIONS.items()},
+    **{name: _arg(name) for name in ("argmax", "argmin")},
+    **{f"cum{name}": _cumulative(_OF_REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
 }
 """Rules by the name of the primitive."""
-TYPED_RULES: dict[str, Rule] = {
-    "abs": _by_kind("abs", "integer_abs"),
-    "div": _by_kind("div", "integer_div"),
-    "rem": _by_kind("rem", "integer_rem"),
-    "pow": _power,
-    "convert_element_type": lambda program, _, x, *, dtype: convert(program, x, dtype),
-    "iota": lambda program, parameters, *, dtype: _iota(program, parameters, dtype),
-}
-"""Rules that also take the kind of the result."""

@@ -33,13 +33,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.kinds import NUMPY_TYPES, UNSIGNED
 from dln_jax.export.c.nodes import Loop, Node, Region, is_all, is_constant, is_uniform, values, without_unused
-from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS
+from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, on_kind
+from dln_jax.export.c.text import LARGEST, NUMPY_TYPES, UNSIGNED, limit
 from dln_jax.types import InputError
-
-LARGEST = 1 << 22
-"""Largest number of elements of an array."""
 
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "integer_div": 1, "or": 0, "xor": 0, "and": ...}
 """Number that leaves the other argument unchanged; for `and`, all bits of its kind are set."""
@@ -149,14 +146,16 @@ class Program:
         """Returns the node broadcast as by NumPy."""
         return self.gather([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
 
-    def elementwise(self, op: str, *args: Node) -> Node:
-        """Returns an operation of `OPERATIONS` on arguments of one kind, broadcast as by NumPy."""
-        operation = OPERATIONS[op]
+    def elementwise(self, op: str, *operands: Node | float) -> Node:
+        """Returns an operation of `OPERATIONS` on nodes of one kind and numbers, broadcast as by NumPy."""
+        kinds = {arg.dtype for arg in (operands[1:] if op == "select" else operands) if isinstance(arg, Node)}
+        assert len(kinds) == 1, f"{op} of {', '.join(sorted(kinds))}"
+        (kind,) = kinds
+        args = tuple(arg if isinstance(arg, Node) else self.constant(arg, kind) for arg in operands)
         shape = np.broadcast_shapes(*(arg.shape for arg in args))
         args = tuple(arg if arg.shape in ((), shape) else self.broadcast(arg, shape) for arg in args)
-        kinds = {arg.dtype for arg in (args[1:] if op == "select" else args)}
-        assert len(kinds) == 1, f"{op} of {', '.join(sorted(kinds))}"
-        dtype = operation.dtype or kinds.pop()
+        operation = OPERATIONS[op := on_kind(op, kind)]
+        dtype = operation.dtype or kind
         # Repeated real numbers are not folded: a table of them would be read from memory.
         known = all(arg.op == "const" or (dtype != "real" and is_constant(arg)) for arg in args)
         if known and operation.fold is not None:
@@ -179,8 +178,7 @@ class Program:
         if k == 0:
             return self.constant(np.zeros((batch, m, n)), a.dtype)
         if k == 1:
-            product = "and" if a.dtype == "bool" else "mul"
-            return self.elementwise(product, self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
+            return self.elementwise("mul", self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
         if is_constant(a) and not is_constant(b):
             return self.transpose(self.dot_general(self.transpose(b), self.transpose(a)))
         return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
@@ -201,7 +199,7 @@ class Program:
 
     def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
         for kept, other in (args, args[::-1])[: 2 if op in COMMUTATIVE else 1] if op in _NEUTRAL else ():
-            if is_all(other, _neutral(op, kept.dtype)):
+            if is_all(other, neutral(op, kept.dtype)):
                 return self.broadcast(kept, shape)
         if (known := _comparison_known(op, args)) is not None:
             return self.broadcast(self.constant(known, "bool"), shape)
@@ -242,8 +240,10 @@ class Program:
         return node if node.shape == () else self.gather([node], np.zeros((), np.int64))
 
 
-def _neutral(op: str, dtype: str) -> Any:
+def neutral(op: str, dtype: str) -> Any:
     """Returns the number that leaves the other argument of an operation unchanged."""
+    if op in ("max", "min"):
+        return limit(dtype, upper=op == "min")
     return ~NUMPY_TYPES[dtype](0) if op == "and" else _NEUTRAL[op]
 
 

@@ -8,30 +8,29 @@ import importlib.metadata
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
 from dln_jax.export.c import casadi as external
-from dln_jax.export.c import factorisations, integers, ordering
+from dln_jax.export.c import factorisations, kernels, operations
 from dln_jax.export.c.body import Source
 from dln_jax.export.c.demo import cmake, demo
 from dln_jax.export.c.elementary import definitions
 from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import (
     FORMAT,
-    Leaf,
     Signature,
     argument_leaves,
+    array_of,
     declaration,
     description,
     result_leaves,
 )
 from dln_jax.export.c.jaxprs import repeated_calls, traced
-from dln_jax.export.c.kinds import kind_of
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.text import PRECISIONS, check_name, comment, table
+from dln_jax.export.c.text import PRECISIONS, check_name, comment, fill, kind_of, table
 from dln_jax.export.exports import described, write_exports
 from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
@@ -53,13 +52,55 @@ class TooLargeError(InputError):
 _PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
 Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
 written. What is not finite in a state is not hidden."""
-_RELIED_ON = """\
+_NEEDED = """C99; needs <math.h>, <float.h> and <stdint.h>, and nothing else. Fastest with -O3 for the processor at hand
+(gcc: -march=native); does not compile with -ffast-math, which gives wrong numbers."""
+_PREAMBLE = """\
+#include <float.h>
+#include <math.h>
+#include <stdint.h>
+
+#include "$name.h"
+
 #if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || defined _M_FP_FAST || __FINITE_MATH_ONLY__ + 0
 #error "NaN, infinities and rounding are relied on: leave out -ffast-math and what it stands for"
 #endif
+
+typedef $real real;
+
+/* Passes of gcc that take as long as all others here, and find nothing */
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("no-gcse", "no-gcse-after-reload")
+#endif
+
+/* Of two operations or of one, whichever the processor has */
+#ifdef FP_FAST_FMA$upper
+#define MULTIPLY_ADD(a, b, c) fma${f}(a, b, c)
+#else
+#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))
+#endif
+#ifdef __cplusplus
+#define RESTRICT
+#else
+#define RESTRICT restrict
+#endif
+
 """
-_NEEDED = """C99; needs <math.h>, <float.h> and <stdint.h>, and nothing else. Fastest with -O3 for the processor at hand
-(gcc: -march=native); does not compile with -ffast-math, which gives wrong numbers."""
+_HEADER = """\
+#ifndef $guard
+#define $guard
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+$declared
+#ifdef __cplusplus
+}
+#endif
+
+#endif
+"""
 
 
 def export_c(
@@ -123,27 +164,35 @@ def source_files(
         source, signatures, texts, left_out = _exported(
             functions, Source(precision, libm), name, leave_out_large, stack
         )
-    version, real = importlib.metadata.version("dln-jax"), PRECISIONS[precision][1]
-    written_by = f"Written by dln-jax {version}, C format {FORMAT}."
-    files = {
-        f"{name}.h": _header(name, written_by, signatures, real, left_out),
-        f"{name}.c": comment(f"{name}.c", written_by, _NEEDED)
-        + _preamble(source, name)
-        + "".join(dict.fromkeys(part.text for part in source.parts.values()))
-        + "".join(texts),
-        f"{name}_demo.c": demo(name, signatures, precision),
-        "CMakeLists.txt": cmake(name),
-    }
-    if casadi:
-        chosen = {
-            key: pair for key, pair in functions.items() if key in signatures and (casadi is True or key in casadi)
+        version = importlib.metadata.version("dln-jax")
+        written_by = f"Written by dln-jax {version}, C format {FORMAT}."
+        parts = dict.fromkeys(part.text for part in source.parts.values())
+        files = {
+            f"{name}.h": _header(name, written_by, signatures, precision, left_out),
+            f"{name}.c": comment(f"{name}.c", written_by, _NEEDED) + "".join([_preamble(source, name), *parts, *texts]),
+            f"{name}_demo.c": demo(name, signatures, precision),
+            "CMakeLists.txt": cmake(name),
         }
-        with computing_in(precision):
-            files |= _for_casadi(chosen, name, libm, precision, written_by, leave_out_large, stack)
+        if casadi:
+            if precision != "f64":
+                raise InputError("CasADi computes in double; export with precision f64")
+            chosen = {key: functions[key] for key in signatures if casadi is True or key in casadi}
+            source, text, left_out = external.external_functions(
+                name, chosen, libm=libm, stack=stack, leave_out=leave_out_large
+            )
+            about = _about(external.ABOUT.format(name=name, written_by=written_by), left_out=left_out)
+            files[f"{name}_casadi.c"] = about + _preamble(source, name) + text
+            files["CMakeLists.txt"] += external.BUILD.format(name=name)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
     return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
+
+
+def _precision(functions: Functions) -> str:
+    types = [array_of(leaf).dtype for leaf in jax.tree.leaves([examples for _, examples in functions.values()])]
+    sizes = {dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)}
+    return "f64" if max(sizes, default=8) == 8 else "f32"
 
 
 def _exported(
@@ -155,64 +204,47 @@ def _exported(
         check_name(key, "the name of a function"): _traced(key, *pair, source.precision)
         for key, pair in functions.items()
     }
-    repeated = repeated_calls([function.closed for function in every.values()])
-    for key, traced_function in every.items():
-        before = source.copy()
+    repeated = repeated_calls([closed for _, closed in every.values()])
+    for key, (signature, closed) in every.items():
+        with_function = source.copy()
         try:
-            signature, text, lines = _function(source, name, key, traced_function, repeated, stack)
+            signature, text, lines = _function(with_function, name, key, signature, closed, repeated, stack)
             if leave_out_large and lines > LINES:
                 raise TooLargeError(f"{key}, of {lines} lines")
         except TooLargeError as error:
             if not leave_out_large:
                 raise
-            left_out.append(str(error))
-            source = before
+            left_out.append(f"{error}; ask for it by name.")
             continue
-        signatures[key] = signature
+        source, signatures[key] = with_function, signature
         texts.append(text)
     return source, signatures, texts, left_out
 
 
-def _for_casadi(
-    functions: Functions, name: str, libm: bool, precision: str, written_by: str, leave_out: bool, stack: int
-) -> dict[str, str]:
-    if precision != "f64":
-        raise InputError("CasADi computes in double; export with precision f64")
-    source, text, left_out = external.external_functions(name, functions, libm=libm, stack=stack, leave_out=leave_out)
-    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
-    about = comment(external.ABOUT.format(name=name, written_by=written_by), *[absent] * bool(absent))
-    return {
-        f"{name}_casadi.c": about + _preamble(source, name) + text,
-        "CMakeLists.txt": cmake(name) + external.BUILD.format(name=name),
-    }
+def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], precision: str) -> tuple[Signature, Any]:
+    """Returns the signature, still without costs, and the closed jaxpr of a function."""
 
+    def cast(leaf: Any) -> np.ndarray:
+        array = array_of(leaf)
+        return np.asarray(array, PRECISIONS[precision][0] if kind_of(array.dtype) == "real" else None)
 
-class _Traced(NamedTuple):
-    arguments: list[Leaf]
-    results: list[Leaf]
-    closed: Any
-
-
-def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], precision: str) -> _Traced:
-    numpy_type = PRECISIONS[precision][0]
     try:
-        examples = jax.tree.map(lambda leaf: _at(leaf, numpy_type), tuple(examples))
+        examples = jax.tree.map(cast, tuple(examples))
         arguments = argument_leaves(function, examples)
         closed, shapes = traced(function, examples)
-        return _Traced(arguments, result_leaves(shapes, arguments), closed)
+        return Signature(tuple(arguments), tuple(result_leaves(shapes, arguments))), closed
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
 
 
 def _function(
-    source: Source, name: str, key: str, traced_function: _Traced, repeated: Collection[int], stack: int
+    source: Source, name: str, key: str, signature: Signature, closed: Any, repeated: Collection[int], stack: int
 ) -> tuple[Signature, str, int]:
-    """Returns the signature, the C text, and the number of lines, callees included, of a function."""
-    signature = Signature(tuple(traced_function.arguments), tuple(traced_function.results))
-    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(traced_function.arguments)}
+    """Returns the signature with costs, the C text, and the number of lines, callees included, of a function."""
+    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(signature.arguments)}
     targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
     try:
-        program, _, results = program_of(traced_function.closed, repeated, precision=source.precision)
+        program, _, results = program_of(closed, repeated, precision=source.precision)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
@@ -228,50 +260,34 @@ def _function(
     return signature._replace(stack_bytes=body.bytes, operations=body.operations), text, total
 
 
-def _at(leaf: Any, numpy_type: Any) -> np.ndarray:
-    return np.asarray(leaf, numpy_type if kind_of(_type(leaf)) == "real" else None)
-
-
-def _type(leaf: Any) -> Any:
-    return leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
-
-
-def _precision(functions: Functions) -> str:
-    leaves = jax.tree.leaves([examples for _, examples in functions.values()])
-    sizes = {_type(leaf).itemsize for leaf in leaves if jax.numpy.issubdtype(_type(leaf), np.floating)}
-    return "f64" if max(sizes, default=8) == 8 else "f32"
-
-
 def _preamble(source: Source, name: str) -> str:
     """Returns the part of a source before its functions."""
-    real, suffix = PRECISIONS[source.precision][1], source.suffix
-    tables = "\n".join(table(table_name, array, source.precision) for table_name, array in source.tables.values())
-    upper = suffix.upper()
-    return (
-        f'#include <float.h>\n#include <math.h>\n#include <stdint.h>\n\n#include "{name}.h"\n\n{_RELIED_ON}\n'
-        f"typedef {real} real;\n\n"
-        "/* Passes of gcc that take as long as all others here, and find nothing */\n"
-        "#if defined(__GNUC__) && !defined(__clang__)\n"
-        '#pragma GCC optimize("no-gcse", "no-gcse-after-reload")\n#endif\n\n'
-        f"/* Of two operations or of one, whichever the processor has */\n#ifdef FP_FAST_FMA{upper}\n"
-        f"#define MULTIPLY_ADD(a, b, c) fma{suffix}(a, b, c)\n#else\n"
-        f"#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"
-        "#ifdef __cplusplus\n#define RESTRICT\n#else\n#define RESTRICT restrict\n#endif\n\n"
-        f"{tables}{definitions(source.functions, source.precision, arrays=source.arrays)}"
-        f"{integers.definitions(source.integers, source.precision)}{ordering.definitions(source.orders)}"
-        f"{factorisations.definitions(source.kernels, suffix)}"
-    )
+    precision = source.precision
+    tables = "".join(f"{table(*named, precision)}\n" for named in source.tables.values())
+    return "".join((
+        fill(_PREAMBLE, precision, name=name, upper=source.suffix.upper()),
+        tables.removesuffix("\n"),
+        definitions(source.functions, precision, arrays=source.arrays),
+        operations.definitions(source.integers, precision),
+        kernels.orderings(source.orders),
+        factorisations.definitions(source.kernels, source.suffix),
+    ))  # fmt: skip
 
 
-def _header(name: str, written_by: str, signatures: Mapping[str, Signature], real: str, left_out: Sequence[str]) -> str:
-    absent = "\n".join(f"Left out: {reason}; ask for it by name." for reason in left_out)
-    about, guard = comment(f"{name}.h", written_by, _PROMISES, *[absent] * bool(absent)), f"{name.upper()}_H"
+def _header(
+    name: str, written_by: str, signatures: Mapping[str, Signature], precision: str, left_out: Sequence[str]
+) -> str:
     declared = ""
     for key, signature in signatures.items():
-        shapes = ", ".join(f"{leaf.name} {list(leaf.shape)}" for leaf in signature.results if leaf.shape)
+        shapes = "".join(f"{leaf.name} {list(leaf.shape)}, " for leaf in signature.results if leaf.shape)
         facts = f"{signature.operations} floating-point operations, {signature.stack_bytes} bytes of stack"
-        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{declaration(name, key, signature, real)};\n"
-    return (
-        f'{about}#ifndef {guard}\n#define {guard}\n\n#include <stdint.h>\n\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
-        f"{declared}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
-    )
+        prototype = declaration(name, key, signature, PRECISIONS[precision][1])
+        declared += f"\n/* {f'{shapes[:-2]}; ' if shapes else ''}{facts} */\n{prototype};\n"
+    about = _about(f"{name}.h", written_by, _PROMISES, left_out=left_out)
+    return about + fill(_HEADER, precision, guard=f"{name.upper()}_H", declared=declared)
+
+
+def _about(*paragraphs: str, left_out: Sequence[str]) -> str:
+    """Returns a comment that also lists the functions left out, and why."""
+    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
+    return comment(*paragraphs, *[absent] * bool(absent))

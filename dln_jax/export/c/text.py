@@ -1,16 +1,45 @@
-"""C text of numbers, tables, comments and names."""
+"""Number types of a program, and C text of numbers, tables, comments and names."""
 
 import re
+from collections.abc import Mapping
 from string import Template
 from textwrap import TextWrapper
+from typing import Any
 
+import jax
 import numpy as np
 
-from dln_jax.export.c.kinds import C_TYPES, kind_of
 from dln_jax.types import InputError
 
+C_TYPES: Mapping[str, str] = {
+    "real": "real",
+    "bool": "int",
+    "int": "int32_t",
+    "long": "int64_t",
+    "unsigned": "uint32_t",
+    "unsigned_long": "uint64_t",
+    "index": "long long",
+}
+"""C type of each kind. An `index` counts array elements; only the program computes it, so it cannot overflow."""
+NUMPY_TYPES: Mapping[str, Any] = {
+    "bool": np.bool_,
+    "int": np.int32,
+    "long": np.int64,
+    "unsigned": np.uint32,
+    "unsigned_long": np.uint64,
+    "index": np.int64,
+}
+"""NumPy type of each kind but `real`, which has the precision of the export."""
+SIGNED = ("int", "long")
+"""Integer kinds whose overflow C leaves undefined."""
+UNSIGNED = ("unsigned", "unsigned_long")
+_KINDS = {np.dtype(numpy_type).name: kind for kind, numpy_type in NUMPY_TYPES.items() if kind != "index"}
+# JAX gives tangents of integers the type float0; no program computes with them.
+_KINDS |= {"float32": "real", "float64": "real", str(jax.dtypes.float0): "bool"}
 PRECISIONS = {"f32": (np.float32, "float", "f"), "f64": (np.float64, "double", "")}
 """NumPy type, C type, and the suffix of its literals and of the functions of <math.h>."""
+LARGEST = 1 << 22
+"""Largest number of elements of an array."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _FUNCTIONS = """
 acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc exp exp2 expm1 fabs fdim floor fma fmax fmin
@@ -38,6 +67,22 @@ _RESERVED = frozenset(
 )
 
 
+def kind_of(dtype: Any) -> str:
+    """Returns the kind of a JAX dtype, and raises InputError if C has none."""
+    if str(dtype) not in _KINDS:
+        hint = "random numbers are drawn outside" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
+        raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")
+    return _KINDS[str(dtype)]
+
+
+def limit(kind: str, *, upper: bool) -> Any:
+    """Returns the lower or upper limit of the numbers of a kind."""
+    if kind in ("real", "bool"):
+        return upper if kind == "bool" else np.inf if upper else -np.inf
+    limits = np.iinfo(NUMPY_TYPES[kind])
+    return limits.max if upper else limits.min
+
+
 def check_name(name: str, what: str = "name") -> str:
     """Returns a valid name in C, and raises InputError for any other."""
     taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|i|table|part)_?\d\w*|elementary_.*|.*_", name)
@@ -54,8 +99,15 @@ def fill(text: str, precision: str, **values) -> str:
     return Template(text).substitute(f=PRECISIONS[precision][2], real=PRECISIONS[precision][1], **values)
 
 
-def number(value, precision: str) -> str:
-    """Returns the shortest literal of the same number; raises InputError if the precision cannot hold it."""
+def number(value, precision: str, kind: str = "real") -> str:
+    """Returns the shortest literal of the same number; raises InputError if the precision cannot hold it.
+
+    C has no literal for the lowest number of 32 and 64 bits, which have names.
+    """
+    if kind != "real":
+        lowest = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
+        suffix = {"unsigned": "U", "unsigned_long": "ULL"}.get(kind, "")
+        return lowest.get(int(value), f"{int(value)}{suffix}")
     numpy_type, _, suffix = PRECISIONS[precision]
     if not np.isfinite(value):
         return "(real)NAN" if value != value else "(real)INFINITY" if value > 0 else "-(real)INFINITY"
@@ -66,10 +118,10 @@ def number(value, precision: str) -> str:
     return f"{rounded!s}{suffix}"
 
 
-def literal(value, precision: str) -> str:
+def literal(value, precision: str, kind: str = "real") -> str:
     """Returns a number for use in an expression, in parentheses if negative."""
-    text = number(value, precision)
-    return f"({text})" if text.startswith("-") else text
+    text = number(value, precision, kind)
+    return f"({text})" if text.startswith(("-", "INT")) else text
 
 
 _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
@@ -78,17 +130,8 @@ _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="    ", bre
 def table(name: str, array: np.ndarray, precision: str) -> str:
     """Returns the definition of a constant array."""
     kind = "real" if array.dtype.kind == "f" else kind_of(array.dtype)
-    texts = (number(value, precision) if kind == "real" else integer(int(value), kind) for value in array.ravel())
-    lines = "\n".join(_wrapper.wrap(" ".join(f"{text}," for text in texts)))
+    lines = "\n".join(_wrapper.wrap(" ".join(f"{number(value, precision, kind)}," for value in array.ravel())))
     return f"static const {C_TYPES[kind]} {name}[{array.size}] = {{\n{lines}\n}};\n"
-
-
-def integer(value: int, kind: str) -> str:
-    """Returns a whole number as a literal; C has none for the lowest of 32 and 64 bits, which have names."""
-    lower = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
-    if value in lower:
-        return lower[value]
-    return str(value) + {"unsigned": "U", "unsigned_long": "ULL"}.get(kind, "")
 
 
 def comment(*paragraphs: str) -> str:
