@@ -15,13 +15,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from dln_jax.mechanics import closed_form, natural
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import friction_force, minus_potential, plus_potential
-from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
+from dln_jax.mechanics.dynamics import friction_of, minus_potential, plus_potential
+from dln_jax.mechanics.joint_friction import LoadedSystem, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.types import CholeskyFactor, Dissipation, Lagrangian, Potential, Scalar, Vector
 
 
@@ -71,14 +69,10 @@ def _recursive(system: RecursiveSystem | ClosedForm | NaturalSystem) -> Recursiv
     """Returns the same system as a recursive one."""
     if isinstance(system, RecursiveSystem):
         return system
-    D = system.dissipation
+    V, D, friction = system.potential, system.dissipation, friction_of(system)
     if isinstance(system, ClosedForm):
-        bare = system._replace(dissipation=None, friction=None)
-        forces = partial(closed_form.inverse_dynamics, bare)
-        return RecursiveSystem(system.mass_matrix, forces, system.potential, D, system.friction)
-    forces = partial(natural.inverse_dynamics, system._replace(dissipation=None))
-    friction = None if D is None else partial(friction_force, D)
-    return RecursiveSystem(partial(natural.mass_matrix, system), forces, system.potential, D, friction)
+        return RecursiveSystem(system.mass_matrix, partial(closed_form.forces, system), V, D, friction)
+    return RecursiveSystem(partial(natural.mass_matrix, system), partial(natural.forces, system), V, D, friction)
 
 
 def _with_potential(system: RecursiveSystem, V: Potential) -> RecursiveSystem:
@@ -91,7 +85,7 @@ def _with_potential(system: RecursiveSystem, V: Potential) -> RecursiveSystem:
 def _with_inertia(system: RecursiveSystem, moving: NaturalSystem) -> RecursiveSystem:
     return system._replace(
         mass_matrix=lambda q: system.mass_matrix(q) + natural.mass_matrix(moving, q),
-        forces=_plus(system.forces, lambda *state: natural.inverse_dynamics(moving, *state)),
+        forces=_plus(system.forces, lambda *state: natural.forces(moving, *state)),
     )
 
 

@@ -10,8 +10,7 @@ import pytest
 from dln_jax.mechanics import closed_form, hamiltonian
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, conjugate, legendre
-from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.scenes import scene as textbook
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain

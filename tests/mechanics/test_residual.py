@@ -7,9 +7,8 @@ import pytest
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.loaded import Load
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import inertial_parameters, lagrangian, serial, tree_system

@@ -16,8 +16,8 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
+from dln_jax.mechanics.closed_form import RecursiveSystem
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.metrics.report import Row
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
