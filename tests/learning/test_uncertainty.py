@@ -22,7 +22,7 @@ from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.uncertainty import outside, predictive, scores
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError, Needs
 
 FRAMES = dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0]])

@@ -12,9 +12,8 @@ from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, conjugate, legendre
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.scenes import scene as textbook
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import chain, two_link_arm
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError
 

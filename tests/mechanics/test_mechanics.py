@@ -14,12 +14,9 @@ from dln_jax.mechanics import closed_form, lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
-from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import chain, double_pendulum, pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
-from dln_jax.scenes.two_link_arm import two_link_arm
 
 SCENES = [
     two_link_arm(),

@@ -11,7 +11,7 @@ from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.models.hamiltonian import make_separable_hamiltonian
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.scenes.n_body import n_body
+from dln_jax.scenes.particles import n_body
 from dln_jax.types import InputError, Needs
 
 SMALL = {"width": 5, "depth": 1, "dtype": jnp.float64}

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics import closed_form, lagrangian
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
-from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import chain, double_pendulum, joint_angles, pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
 from dln_jax.scenes.scene import actuation_matrix
-from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
 from dln_jax.types import InputError
 
 

@@ -13,8 +13,8 @@ from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.mechanics.integrators import adaptive_rollout, rollout, second_order, symplectic_euler
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.letters import LETTERS, letter_path
+from dln_jax.scenes.pendulums import joint_angles, two_link_arm
 from dln_jax.scenes.scene import Scene, actuation_matrix, closed_form_forward_dynamics
-from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
 from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive, require_seed
 

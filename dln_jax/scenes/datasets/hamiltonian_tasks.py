@@ -40,11 +40,10 @@ import numpy as np
 from dln_jax.mechanics import hamiltonian
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.phase_samples import Task, make_task
-from dln_jax.scenes.double_pendulum import double_pendulum as double_pendulum_scene
-from dln_jax.scenes.n_body import n_body
-from dln_jax.scenes.oscillators import henon_heiles as henon_heiles_scene
-from dln_jax.scenes.oscillators import mass_spring
-from dln_jax.scenes.pendulum import pendulum as pendulum_scene
+from dln_jax.scenes.particles import henon_heiles as henon_heiles_scene
+from dln_jax.scenes.particles import mass_spring, n_body
+from dln_jax.scenes.pendulums import double_pendulum as double_pendulum_scene
+from dln_jax.scenes.pendulums import pendulum as pendulum_scene
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import Hamiltonian, InputError, Potential, Scalar, Vector
 

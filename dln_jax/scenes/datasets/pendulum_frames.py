@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.generators import rollouts
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 

@@ -18,7 +18,7 @@ from dln_jax.metrics.report import UNITS, Row, markdown_table, unit_of
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.scenes.datasets.generators import uniform_tests
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm.models import (
     TRIGONOMETRIC,

@@ -23,7 +23,7 @@ from dln_jax.data.mjcf import mjcf
 from dln_jax.files import read_json
 from dln_jax.metrics.report import Row, expect
 from dln_jax.metrics.verdict import LEVELS, FitRefused
-from dln_jax.scenes.robot_arms import Arm
+from dln_jax.scenes.datasets.robot_arms import Arm
 from dln_jax.training.identification.run import run
 from dln_jax.training.identification.task import Options
 from dln_jax.types import InputError, require_positive, require_seed

@@ -22,11 +22,10 @@ from dln_jax.metrics.report import Row
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.precision import in_float64
-from dln_jax.scenes.datasets.robot_arms import lip_trajectories
-from dln_jax.scenes.panda import panda
-from dln_jax.scenes.robot_arms import Arm, skew_arm, sliding_arm
+from dln_jax.scenes.datasets.robot_arms import Arm, lip_trajectories, panda
 from dln_jax.types import FrictionLaw
 from dln_jax.zoo.catalogue import CATALOGUE
+from scripts.reports.robots.skew_arms import skew_arm, sliding_arm
 
 ARMS: dict[str, Callable[[], Arm]] = {
     **{f"panda-{d}": (lambda d=d: panda(d)) for d in range(3, 8)},

@@ -19,7 +19,7 @@ from dln_jax.data.checks import quick
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
 from dln_jax.metrics.report import expect
-from dln_jax.scenes.panda import panda
+from dln_jax.scenes.datasets.robot_arms import panda
 from scripts.reports.case import Findings
 
 SOUND, FAULTY, QUICK = 60, 10, 6

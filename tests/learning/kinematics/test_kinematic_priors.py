@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dln_jax.learning.kinematics import frames_of_axes, kinematic_prior_from_json
-from dln_jax.scenes.panda import panda
+from dln_jax.scenes.datasets.robot_arms import panda
 from dln_jax.types import InputError
 
 TREE = panda(3).tree

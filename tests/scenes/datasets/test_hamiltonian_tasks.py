@@ -14,8 +14,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.scenes.datasets.phase_samples import reference_motion
-from dln_jax.scenes.n_body import n_body
-from dln_jax.scenes.oscillators import henon_heiles, mass_spring
+from dln_jax.scenes.particles import henon_heiles, mass_spring, n_body
 from dln_jax.types import InputError
 
 SCENES = [

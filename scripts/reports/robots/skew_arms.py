@@ -1,34 +1,10 @@
-"""Robot arms for learning: trees with friction and the limits of their motions, with round numbers in SI units.
-
-`skew_arm` and `sliding_arm` are our own designs, in which hardly any two axes meet at right angles.
-"""
-
-from typing import NamedTuple
+"""Two arms of our own design, in which hardly any two axes meet at right angles, with round numbers in SI units."""
 
 import numpy as np
-from jaxtyping import Float
 
-from dln_jax.mechanics.trees.description import Tree, dh_frames, serial
+from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-
-
-class Arm(NamedTuple):
-    """A tree of d joints, their friction, and limits of position, velocity and acceleration."""
-
-    name: str
-    tree: Tree
-    viscous: Float[np.ndarray, " d"]
-    """N m s or N s/m."""
-    coulomb: Float[np.ndarray, " d"]
-    """Dry friction, N m or N."""
-    offset: Float[np.ndarray, " d"]
-    """Constant torque, N m or N."""
-    limits: Float[np.ndarray, "d 2"]
-    """Limits of the coordinates, rad or m."""
-    rates: Float[np.ndarray, " d"]
-    """Largest rates, rad/s or m/s."""
-    accelerations: Float[np.ndarray, " d"]
-    """Largest accelerations, rad/s² or m/s²."""
+from dln_jax.scenes.datasets.robot_arms import Arm
 
 
 def skew_arm() -> Arm:
