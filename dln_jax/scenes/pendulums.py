@@ -178,7 +178,7 @@ def two_link_pendulum(
 def chain(
     d: int, *, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.81, friction: float = 0.0
 ) -> Scene:
-    """Planar chain of uniform rods, angles relative to the previous link, q = 0 hanging; kg and m per link, m/s², N m s.
+    """Planar chain of uniform rods, angles relative to the previous link, q = 0 hanging; kg, m (a link), m/s², N m s.
 
     In absolute angles θ = cumsum(q) the equations are short (a_ij cos(θ_i - θ_j) couples rods i and j). The constant
     matrix S of the sum transforms them to joint coordinates: M = Sᵀ M_θ S, and likewise for forces.

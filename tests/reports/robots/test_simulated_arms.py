@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics.trees import pseudo_inertia
-from dln_jax.scenes.datasets.robot_arms import arm_torques, lip_trajectories, panda, sum_of_sines
 from dln_jax.types import InputError
-from scripts.reports.robots.skew_arms import skew_arm, sliding_arm
+from scripts.reports.robots.simulated_arms import (
+    arm_torques,
+    lip_trajectories,
+    panda,
+    skew_arm,
+    sliding_arm,
+    sum_of_sines,
+)
 
 ARMS = {"panda": panda, "panda-3": lambda: panda(3), "skew": skew_arm, "sliding": sliding_arm}
 

@@ -3,9 +3,10 @@
 Giacomuzzo, Carli, Romeres and Dalla Libera, T-RO 2024 (arXiv 2310.06585; merlresearch/LIP4RobotInverseDynamics): 50 s,
 torque noise of 0.01 N m, seed 0 for training and 101 to 150 for the test; every tenth of 5,001 samples is fitted.
 
-The paper's Franka Panda has masses and centres after Gaz et al. (RA-L 2019). That paper's moments are taken about the
-links' frames, so some links are not physically consistent, which does not matter for comparing models that do not know
-the kinematics.
+`skew_arm` and `sliding_arm` are our own designs, in which hardly any two axes meet at right angles, with round numbers
+in SI units. The Franka Panda has masses and centres after Gaz et al. (RA-L 2019). That paper's moments are taken
+about the links' frames, so some links are not physically consistent, which does not matter for comparing models that do
+not know the kinematics.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.trees.description import Tree, dh_frames, serial, with_payload
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.precision import in_float64
 from dln_jax.types import InputError, require_positive, require_seed
@@ -104,6 +106,56 @@ def panda(active: int = 7) -> Arm:
         rates=np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])[:active],
         accelerations=np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])[:active],
     )
+
+
+def skew_arm() -> Arm:
+    """Seven revolute joints on a tilted base, no two neighbours parallel or perpendicular."""
+    rows = [  # alpha, a, d, theta
+        [0.35, 0.0, 0.3, 0.4], [-1.1, 0.05, 0.1, 0.2], [0.8, 0.12, 0.3, -0.5], [1.25, 0.25, -0.05, 0.3],
+        [-0.6, 0.1, 0.28, 0.0], [1.0, -0.06, 0.08, 0.7], [-1.3, 0.07, 0.1, -0.2],
+    ]  # fmt: skip
+    return Arm(
+        "skew-arm",
+        serial(*dh_frames(rows), _links(7), armature=np.linspace(0.2, 0.02, 7)),
+        viscous=np.linspace(0.3, 0.05, 7),
+        coulomb=np.linspace(0.6, 0.1, 7),
+        offset=np.array([0.1, -0.15, 0.05, 0.1, -0.05, 0.03, 0.02]),
+        limits=np.tile([-2.5, 2.5], (7, 1)),
+        rates=np.array([2.0, 2.0, 2.2, 2.2, 2.6, 2.6, 2.6]),
+        accelerations=np.array([10.0, 8.0, 10.0, 12.0, 15.0, 20.0, 20.0]),
+    )
+
+
+def sliding_arm() -> Arm:
+    """Six joints, the third prismatic; the first two are not perpendicular, the last four are skew."""
+    rows = [
+        [0.2, 0.0, 0.4, 0.0], [-1.3, 0.1, 0.0, 0.3], [1.0, 0.05, 0.2, 0.2],
+        [0.7, 0.15, 0.1, -0.4], [-1.2, 0.1, 0.25, 0.0], [0.9, 0.05, 0.1, 0.5],
+    ]  # fmt: skip
+    kinds = ["revolute", "revolute", "prismatic", "revolute", "revolute", "revolute"]
+    return Arm(
+        "sliding-arm",
+        serial(*dh_frames(rows), _links(6), joints=kinds, armature=np.array([0.2, 0.2, 1.0, 0.1, 0.05, 0.03])),
+        viscous=np.array([0.3, 0.3, 5.0, 0.2, 0.1, 0.05]),
+        coulomb=np.array([0.6, 0.5, 4.0, 0.4, 0.2, 0.1]),
+        offset=np.array([0.1, -0.15, 0.5, 0.1, -0.05, 0.03]),
+        limits=np.array([[-2.5, 2.5]] * 2 + [[-0.4, 0.4]] + [[-2.5, 2.5]] * 3),
+        rates=np.array([2.0, 2.0, 0.8, 2.2, 2.6, 2.6]),
+        accelerations=np.array([10.0, 8.0, 4.0, 12.0, 15.0, 20.0]),
+    )
+
+
+def _links(d: int) -> list[np.ndarray]:
+    """Physically consistent, asymmetric bodies, from 4 kg at the base to some 0.5 kg at the tip."""
+    links = []
+    for link in range(d):
+        mass = 4.0 * 0.72**link
+        centre = 0.12 * np.array([np.sin(1.0 + 2 * link), np.cos(2.0 + 3 * link), np.sin(3.0 + link)])
+        size = 0.1 + 0.02 * np.array([np.cos(link), np.sin(2 * link), np.cos(3 * link)])
+        turn, _ = np.linalg.qr(np.cos(np.arange(9.0) * (link + 1)).reshape(3, 3) + 2 * np.eye(3))
+        moments = mass / 3 * (size @ size * np.eye(3) - np.diag(size**2))
+        links.append(inertial_parameters(mass, centre, turn @ moments @ turn.T))
+    return links
 
 
 def sum_of_sines(arm: Arm, *, seed: int, duration: float = 50.0, dt: float = 0.01, span: float = 0.5) -> ArmMotion:
