@@ -177,7 +177,7 @@ def creature() -> Example:
     return Example(scene, TIME_STEP, 6.0, ground=0.0, control=control, muscles=body.muscles, moments=moments)
 
 
-EXAMPLES: dict[str, Callable[..., Example]] = {each.__name__: each for each in (beam, twist, slope, drop, creature)}
+EXAMPLES: dict[str, Callable[..., Example]] = {scene.__name__: scene for scene in (beam, twist, slope, drop, creature)}
 """Examples by name; their keyword arguments are their options."""
 
 

@@ -18,10 +18,10 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import Pattern, assemble, entries, gradient, pattern
-from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, project, square, value
-from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free
+from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.selection import by_size, least_work, search_takes_at_most
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
 from dln_jax.types import InputError
 
