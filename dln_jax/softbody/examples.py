@@ -20,10 +20,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from dln_jax.softbody.driven import Example
-from dln_jax.softbody.mesh.creatures import Creature, body_length, crawler
 from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses, vertices_where
+from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
-from dln_jax.softbody.mesh.shapes import box, disc
 from dln_jax.softbody.scene import SoftScene, make_scene
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.creature import MASS, TIME_STEP, creature_terms

@@ -16,10 +16,10 @@ from scipy.linalg import hilbert
 from dln_jax.locomotion.task import creature_named, make_task, run_episode
 from dln_jax.mechanics.natural import NaturalSystem, dynamics
 from dln_jax.solvers import lapack
-from dln_jax.solvers.bands import places, solve_bands
 from dln_jax.solvers.elements.energies import ElementEnergy, lower_triangles, project
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.symmetric_systems import places, solve_bands
 from dln_jax.solvers.elimination import solve, solve_lower, solve_lower_transposed
 
 ROOT = Path(__file__).parents[2]

@@ -22,10 +22,15 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from dln_jax.solvers.bands import places, solve_bands
 from dln_jax.solvers.elements.assembly import Pattern, assemble
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
-from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients, factorise_blocks, solve_blocks
+from dln_jax.solvers.elements.symmetric_systems import (
+    conjugate_gradients,
+    factorise_blocks,
+    places,
+    solve_bands,
+    solve_blocks,
+)
 from dln_jax.solvers.elimination import solve as eliminate
 from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 
