@@ -23,7 +23,7 @@ from dln_jax.softbody.mesh.shapes import body_length, crawler
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
 from dln_jax.softbody.verdict import Info
-from dln_jax.training.simulation_results import Motion, finite_moments, warn, with_slope
+from dln_jax.training.simulation_results import SimulatedMotion, finite_moments, warn, with_slope
 from dln_jax.types import InputError
 
 
@@ -150,7 +150,7 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     x = np.zeros((4, 3, 2))
     x[3, 0, 0] = np.nan
     info = Info(numbers, numbers, converged, energy_growth=-numbers, energy_at_hand=numbers, least_J=numbers)
-    motion = Motion(np.arange(4.0), x, np.zeros_like(x), info, 1.0, 1.0)
+    motion = SimulatedMotion(np.arange(4.0), x, np.zeros_like(x), info, 1.0, 1.0)
     assert finite_moments(motion) == 3
     warn(motion)
     said = capsys.readouterr().out
