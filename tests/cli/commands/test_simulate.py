@@ -225,8 +225,8 @@ def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys)
         "invalid choice 'wood'": ("--material", "wood"),
         "invalid choice 'half'": ("--precision", "half"),
         "invalid choice 'leapfrog'": ("--integrator", "leapfrog"),
-        "--friction is no choice of the beam scene": ("--friction", "0.1"),
-        "--mesh is no choice of the creature scene": ("--scene", "creature", "--mesh", tmp_path / "absent.npz"),
+        "the beam scene has no --friction": ("--friction", "0.1"),
+        "the creature scene has no --mesh": ("--scene", "creature", "--mesh", tmp_path / "absent.npz"),
         "seed is -1": ("--seed", "-1"),
         "dimension is 4": ("--dimension", "4"),
         "number of cells along x is 0": ("--cells", "0"),
@@ -258,7 +258,7 @@ def test_the_script_refuses_wrong_meshes(tmp_path, capsys):
     path.write_text("no archive")
     assert "not a readable npz" in refused(capsys, simulate, "--mesh", path, "--out", tmp_path / "run")
     np.savez(path, **good)
-    assert "--cells is for the scene's own mesh" in refused(capsys, simulate, "--mesh", path, "--cells", "2")
+    assert "--cells sets the scene's own mesh" in refused(capsys, simulate, "--mesh", path, "--cells", "2")
     assert not (tmp_path / "run").exists()
 
 
