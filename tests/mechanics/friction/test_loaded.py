@@ -66,8 +66,8 @@ def test_jacobians_are_differences(name):
     motion = dynamics(system)
     tau, h = jax.jit(motion.inverse_dynamics)(q, qd, qdd), 1e-6
     forward = jax.jit(motion.forward_dynamics)
-    found, by = jax.jit(functools.partial(jacobians.forward_dynamics_jacobians, system))(q, qd, tau)
-    np.testing.assert_allclose(found, qdd, rtol=1e-9)
+    qdd_again, by = jax.jit(functools.partial(jacobians.forward_dynamics_jacobians, system))(q, qd, tau)
+    np.testing.assert_allclose(qdd_again, qdd, rtol=1e-9)
     at = [q, qd, tau]
     for place in range(3):
         columns = []

@@ -59,10 +59,10 @@ def random_tree(seed, d=3, *, branched=True, kinds=("revolute", "prismatic"), ax
 
 
 TREES = {
-    "branched": random_tree(0, d=3),
-    "about x": random_tree(1, d=2, axes=0),
+    "branched": random_tree(7, d=3),
+    "about x": random_tree(4, d=2, axes=0),
     "arm": random_tree(2, d=2, branched=False, kinds=("revolute",), axes=2),
-    "from prismatic joints": random_tree(3, d=2, branched=False, kinds=("prismatic", "revolute")),
+    "from prismatic joints": random_tree(0, d=2, branched=False, kinds=("prismatic", "revolute")),
     "one weightless joint": random_tree(4, d=1)._replace(gravity=np.zeros(3)),
 }
 
