@@ -49,8 +49,8 @@ def henon_heiles(*, coupling: float = 1.0, friction: float = 0.0) -> Scene:
         x, y = q
         return jnp.array([x + 2 * coupling * x * y, y + coupling * (x**2 - y**2)])
 
-    joints, equations = ("prismatic", "prismatic"), (mass_matrix, no_coriolis, potential, gravity, lambda q: q)
-    return textbook("henon-heiles", joints, *equations, friction=friction)
+    equations = mass_matrix, no_coriolis, potential, gravity, lambda q: q
+    return textbook("henon-heiles", ("prismatic", "prismatic"), *equations, friction=friction)
 
 
 def n_body(

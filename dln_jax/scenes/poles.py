@@ -135,5 +135,5 @@ def rotary_pendulum(
     def tip(q: Vector) -> Vector:
         return pole_length * jnp.array([jnp.sin(q[1]), jnp.cos(q[1])])
 
-    joints, equations = ("revolute", "revolute"), (mass_matrix, coriolis, potential, gravity, tip)
-    return textbook("rotary-pendulum", joints, *equations, friction=friction, actuation=((1.0,), (0.0,)))
+    equations, actuation = (mass_matrix, coriolis, potential, gravity, tip), ((1.0,), (0.0,))
+    return textbook("rotary-pendulum", ("revolute", "revolute"), *equations, friction=friction, actuation=actuation)
