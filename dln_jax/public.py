@@ -10,16 +10,21 @@ from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, Training
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
+from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
+from dln_jax.mechanics.dynamics import (
+    Decomposition,
+    Dynamics,
+    Flow,
+    InverseForward,
+    PhaseRates,
+    PlainDynamics,
+    PlainFlow,
+)
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
-from dln_jax.mechanics.recursive import RecursiveSystem
+from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.mechanics.trees import Tree, tree_system
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.model import Model

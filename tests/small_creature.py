@@ -3,9 +3,8 @@
 import numpy as np
 
 from dln_jax.locomotion.task import make_task
-from dln_jax.softbody.mesh.creatures import Creature
 from dln_jax.softbody.mesh.mesh import make_mesh
-from dln_jax.softbody.mesh.shapes import lattice
+from dln_jax.softbody.mesh.shapes import Creature, lattice
 
 EPISODE = 12
 

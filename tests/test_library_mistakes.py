@@ -19,7 +19,7 @@ from dln_jax.learning.engine.sharing import sharing
 from dln_jax.mechanics.trees import make_tree
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.sizes import memory, require_memory, require_network
 from dln_jax.softbody import make_scene, with_parameters
 from dln_jax.softbody.mesh import beam, box

@@ -19,9 +19,9 @@ from interpreters import Program, interpreters
 
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.data import schema
-from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
+from dln_jax.scenes.poles import cart_pole
 
 ROOT = Path(__file__).parent.parent
 PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}

@@ -10,8 +10,8 @@ import pytest
 from dln_jax.cli.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.learning.engine.problem import Progress, Stop, Training
-from dln_jax.scenes.chain import chain
 from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.pendulums import chain
 from dln_jax.time_limit import SOON, counting_from, deadline, seconds_left
 from dln_jax.training.dynamics.methods import growth as dynamics_growth
 from dln_jax.training.dynamics.methods import network

@@ -2,7 +2,7 @@
 
 | | cart-pole | rotary pendulum |
 |---|---|---|
-| sizes | Quanser's (Lutter, Listmann and Peters 2019) | those of `scenes.rotary_pendulum`, QUBE-like |
+| sizes | Quanser's (Lutter, Listmann and Peters 2019) | those of `scenes.poles`, QUBE-like |
 | limit | 10 N | 0.05 N m |
 | dry friction of the driven joint | 0.3 N, 3 % of the limit, 0.4 N at rest | 1.5 mN m, 3 %, 2 mN m at rest |
 | viscous friction of it | 0.1 N s/m | 0.1 mN m s |
@@ -23,10 +23,8 @@ from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.energy_shaping import EnergyGains
 from dln_jax.control.swing_up import SwingUpNumbers
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.friction import with_friction
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
-from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.poles import cart_pole, rotary_pendulum
+from dln_jax.scenes.scene import Scene, with_friction
 from dln_jax.types import InputError
 
 TURN = 2 * np.pi / 2048

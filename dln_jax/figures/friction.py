@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.figures import style
 from dln_jax.mechanics.friction import FrictionShape, unit_force
-from dln_jax.mechanics.loaded import Load, carrying
+from dln_jax.mechanics.joint_friction import Load, carrying
 
 MOST_POINTS = 4000
 """Largest number of points drawn per joint."""

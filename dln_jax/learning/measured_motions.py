@@ -29,9 +29,10 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.segments import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.learning.starts import nearest, without_start
-from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
+from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.integrators import looped_rk4
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Scalar, require_positive
 

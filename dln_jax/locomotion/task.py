@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.examples import creature_scene
-from dln_jax.softbody.mesh.creatures import Creature, biped, body_length, crawler, quadruped
+from dln_jax.softbody.mesh.shapes import Creature, biped, body_length, crawler, quadruped
 from dln_jax.softbody.scene import SoftScene, State
 from dln_jax.softbody.step import Stepper, make_step
 from dln_jax.softbody.terms.creature import TIME_STEP

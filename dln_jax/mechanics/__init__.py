@@ -4,16 +4,21 @@
 """
 
 from dln_jax.mechanics import equations, integrators, trees
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
+from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
+from dln_jax.mechanics.dynamics import (
+    Decomposition,
+    Dynamics,
+    Flow,
+    InverseForward,
+    PhaseRates,
+    PlainDynamics,
+    PlainFlow,
+)
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
-from dln_jax.mechanics.recursive import RecursiveSystem
+from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 
 __all__ = [
     "ClosedForm",

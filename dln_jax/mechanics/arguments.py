@@ -19,19 +19,19 @@ from dln_jax.types import InputError
 Answer = TypeVar("Answer")
 
 
-def vectors(size: int | None = None, /, **given: Any) -> tuple[Array, ...]:
+def vectors(size: int | None = None, /, **arguments: Any) -> tuple[Array, ...]:
     """Converts the arguments to vectors [size] of one floating type, in order.
 
     The type is the widest floating one among them, and JAX's default for whole numbers.
 
     Args:
         size: of all vectors; by default that of the first.
-        given: the arguments by name; `types.VectorLike` is accepted.
+        arguments: by name; `types.VectorLike` is accepted.
 
     Raises:
         InputError: names the argument that holds no real numbers, or has another shape; use `jax.vmap` for a batch.
     """
-    arrays = {name: _real_array(name, value) for name, value in given.items()}
+    arrays = {name: _real_array(name, value) for name, value in arguments.items()}
     expected = None if size is None else (size,)
     for name, array in arrays.items():
         require_shape(name, array.shape, expected)
@@ -49,8 +49,8 @@ class OfSize:
 
     def __call__(self, *state: Array) -> Any:
         """Returns the function's value; raises `InputError` for vectors of another size."""
-        for each in state:
-            require_shape("a state of this model", each.shape, (self.size,))
+        for vector in state:
+            require_shape("a state of this model", vector.shape, (self.size,))
         return self.function(*state)
 
 

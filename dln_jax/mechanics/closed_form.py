@@ -2,16 +2,26 @@
 
     tau = M(q) qdd + c(q, qd) + g(q) [+ dD/dqd]
 
-Closed forms take less time than derivatives of the energy, in which M is a second derivative.
+`ClosedForm` has the terms one by one, `RecursiveSystem` their sum from one recursion over bodies. Both take less time
+than derivatives of the energy, in which M is a second derivative.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics, minus_potential, plus_potential
+from dln_jax.mechanics.dynamics import (
+    Decomposition,
+    Dynamics,
+    decompose_by_differences,
+    friction_of,
+    make_dynamics,
+    minus_potential,
+    plus_potential,
+)
 from dln_jax.solvers import elimination
 from dln_jax.types import Dissipation, Lagrangian, Potential, Scalar, Vector
 
@@ -30,16 +40,42 @@ class ClosedForm(NamedTuple):
     dissipation: Dissipation | None = None
     """(q, qd) -> Rayleigh function D, scalar."""
     friction: Callable[[Array, Array], Array] | None = None
-    """(q, qd) -> dD/dqd [d]; `None` exactly where there is no dissipation."""
+    """(q, qd) -> dD/dqd [d] in closed form; by default the derivative of the dissipation."""
 
 
-def lagrangian(system: ClosedForm) -> Lagrangian:
+class RecursiveSystem(NamedTuple):
+    """Energies of a natural system and the sum of the resulting forces, as functions of one state."""
+
+    mass_matrix: Callable[[Array], Array]
+    """q -> M [d, d]."""
+    forces: Callable[[Array, Array, Array], Array]
+    """(q, qd, qdd) -> tau [d], without friction."""
+    potential: Potential | None = None
+    """q -> V, scalar."""
+    dissipation: Dissipation | None = None
+    """(q, qd) -> Rayleigh function D, scalar."""
+    friction: Callable[[Array, Array], Array] | None = None
+    """(q, qd) -> dD/dqd [d] in closed form; by default the derivative of the dissipation."""
+
+
+Explicit = ClosedForm | RecursiveSystem
+"""Energies with a mass matrix as a function."""
+
+
+def lagrangian(system: Explicit) -> Lagrangian:
     """L(q, qd) = ½ qdᵀ M(q) qd - V(q), for the generic functions of `mechanics.lagrangian`."""
     return lambda q, qd: minus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
 
 
-def decompose(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
+def energy(system: Explicit, q: Vector, qd: Vector) -> Scalar:
+    """Energy T + V."""
+    return plus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
+
+
+def decompose(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
     """Inertial, Coriolis and gravity force, all [d]."""
+    if isinstance(system, RecursiveSystem):
+        return decompose_by_differences(system.forces, q, qd, qdd)
     return Decomposition(
         inertial=system.mass_matrix(q) @ qdd,
         coriolis=system.coriolis(q, qd),
@@ -47,33 +83,32 @@ def decompose(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Decompo
     )
 
 
-def inverse_dynamics(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] of a motion, friction included."""
+def forces(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Generalised force tau [d] of a motion, without friction."""
+    if isinstance(system, RecursiveSystem):
+        return system.forces(q, qd, qdd)
     tau = system.mass_matrix(q) @ qdd + system.coriolis(q, qd)
-    if system.gravity is not None:
-        tau += system.gravity(q)
-    return tau if system.friction is None else tau + system.friction(q, qd)
+    return tau if system.gravity is None else tau + system.gravity(q)
 
 
-def forward_dynamics(system: ClosedForm, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Acceleration qdd [d] under a generalised force: solves M qdd = tau - tau(q, qd, 0)."""
-    bias = inverse_dynamics(system, q, qd, jnp.zeros_like(qd))
-    return elimination.solve(system.mass_matrix(q), tau - bias)
+def inverse_dynamics(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Generalised force tau [d] of a motion, friction included."""
+    tau, friction = forces(system, q, qd, qdd), friction_of(system)
+    return tau if friction is None else tau + friction(q, qd)
 
 
-def energy(system: ClosedForm, q: Vector, qd: Vector) -> Scalar:
-    """Energy T + V."""
-    return plus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
+def dynamics(system: Explicit, *, degrees_of_freedom: int | None = None) -> Dynamics:
+    """Returns all functions of the system; the forward model solves M qdd = tau - tau(q, qd, 0)."""
 
+    def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
+        return elimination.solve(system.mass_matrix(q), tau - forces(system, q, qd, jnp.zeros_like(qd)))
 
-def dynamics(system: ClosedForm, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size."""
     return make_dynamics(
-        inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(system, q, qd, qdd),
-        forward_dynamics=lambda q, qd, tau: forward_dynamics(system, q, qd, tau),
-        energy=lambda q, qd: energy(system, q, qd),
-        mass_matrix=lambda q, qd: system.mass_matrix(q),
-        decompose=lambda q, qd, qdd: decompose(system, q, qd, qdd),
-        dissipation=system.dissipation,
+        system,
+        partial(forces, system),
+        accelerate,
+        partial(decompose, system),
+        partial(energy, system),
+        lambda q, qd: system.mass_matrix(q),
         degrees_of_freedom=degrees_of_freedom,
     )

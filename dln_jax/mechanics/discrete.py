@@ -1,4 +1,6 @@
-"""Dynamics in discrete time for controllers: x_next = F(x, u, dt), with A = dF/dx and B = dF/du.
+"""Dynamics in discrete time for controllers, and motions under recorded torques.
+
+A step for controllers is x_next = F(x, u, dt), with A = dF/dx and B = dF/du:
 
     x = (q, qd) [2 d],   qdd = forward_dynamics(q, qd, tau),   tau = actuation u, held over the step
     x = (q, p) [2 d] in a phase space, without u
@@ -10,7 +12,7 @@ function theorem at the last iterate) and share the Jacobians of `mechanics.jaco
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +22,17 @@ from jaxtyping import Float
 
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.dynamics import Rates
+from dln_jax.mechanics.integrators import Field, State, advance
+from dln_jax.rollout import rollout
 from dln_jax.solvers.elimination import solve
-from dln_jax.types import require_positive
+from dln_jax.types import InputError, require_positive
 
 ITERATIONS = 3
 """Newton steps of the implicit midpoint rule."""
 Step = Callable[[Any, Any, Any], Any]
 """(x, u, dt) -> x_next."""
+Torque = Literal["held", "interpolated"]
+"""Torque between its samples."""
 PhaseStep = Callable[[Any, Any, Any], Any]
 """(q, p, dt) -> (q, p) after the step."""
 Actuation = Sequence[Sequence[float]] | Float[np.ndarray, "d u"] | None
@@ -110,6 +116,52 @@ def linearised(step: Callable[[Any, Any, Any], Any]) -> Callable[[Array, Array, 
         return x_next, derivatives
 
     return function
+
+
+def torque_slopes(tau: Float[Array, "T d"], t: Float[Array, " T"], torque: Torque) -> Float[Array, "T-1 d"]:
+    """Rates of the torque within the intervals; zero if it is held, and for intervals of length zero.
+
+    Raises:
+        InputError: a `torque` of another name.
+    """
+    if torque not in ("held", "interpolated"):
+        raise InputError(f"torque is {torque!r}; expected 'held' or 'interpolated'")
+    changes = jnp.diff(tau, axis=0)
+    if torque == "held":
+        return jnp.zeros_like(changes)
+    durations = jnp.diff(t)[:, None]
+    return jnp.where(durations > 0, changes / jnp.where(durations > 0, durations, 1.0), 0.0)
+
+
+def driven(
+    rate: Callable[[Any, Array], Any],
+    start: State,
+    tau: Array,
+    slopes: Array,
+    durations: Array,
+    *,
+    substeps: int,
+    method: Callable[[Field], integrators.Step] = integrators.rk4,
+) -> State:
+    """Integrates y' = rate(y, tau(t)) and returns the states at the samples; leaves get a leading axis T.
+
+    Args:
+        rate: (state, tau) -> rate of the state.
+        start: state at the first sample.
+        tau: [T - 1, d], torque at the start of every interval; within it the torque is tau + slopes s.
+        slopes: [T - 1, d], from `torque_slopes`.
+        durations: [T - 1] in s; over a duration of zero the state stays.
+        substeps: per interval.
+        method: field -> step; `integrators.looped_rk4` compiles faster.
+    """
+
+    def interval(state: State, drive: tuple[Array, Array, Array]) -> tuple[State, None]:
+        tau, slope, duration = drive
+        step = method(lambda s, state: rate(state, tau + s * slope))
+        return advance(step, jnp.zeros_like(duration), state, duration, substeps=substeps), None
+
+    _, later = rollout(interval, start, (tau, slopes, durations))
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, later)
 
 
 def _force(actuation: Actuation, u: Array) -> Array:

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from dln_jax.mechanics.arguments import answer, vectors
-from dln_jax.types import Dissipation, Potential, Scalar, Vector, VectorLike
+from dln_jax.types import Dissipation, Hamiltonian, Potential, Scalar, Vector, VectorLike
 
 
 class Decomposition(NamedTuple):
@@ -75,22 +75,47 @@ class PlainFlow(NamedTuple):
     rates: Rates
 
 
+class InverseForward(NamedTuple):
+    """A system without energy: two functions of one state that need not invert each other."""
+
+    inverse_dynamics: Callable[[Array, Array, Array], Array]
+    """(q, qd, qdd) -> tau [d]."""
+    forward_dynamics: Callable[[Array, Array, Array], Array]
+    """(q, qd, tau) -> qdd [d]."""
+
+
+class PhaseRates(NamedTuple):
+    """Rates of a state of a phase space."""
+
+    rates: Callable[[Array, Array], tuple[Array, Array]]
+    """(q, p) -> (qd, pd), both [d]."""
+    hamiltonian: Hamiltonian | None = None
+    """(q, p) -> energy of a part of the field; `None` for a field without one."""
+
+
 def make_dynamics(
+    system: Any,
     inverse_dynamics: Callable[..., Array],
     forward_dynamics: Callable[..., Array],
     decompose: Callable[..., Decomposition],
     energy: Callable[..., Array],
     mass_matrix: Callable[..., Array],
     *,
-    dissipation: Dissipation | None = None,
     degrees_of_freedom: int | None = None,
 ) -> Dynamics:
-    """Builds `Dynamics` from functions of vectors [d] of one type; its functions convert or refuse their arguments.
+    """Builds `Dynamics` from frictionless functions of vectors [d] of one type, and the friction of a record.
 
-    Without `degrees_of_freedom` the arguments of a call only need to agree with one another; `mass_matrix` is called
-    with both q and qd.
+    Its functions convert or refuse their arguments: without `degrees_of_freedom` the arguments of a call only need to
+    agree with one another. `mass_matrix` is called with both q and qd.
     """
-    d = degrees_of_freedom
+    d, force = degrees_of_freedom, friction_of(system)
+
+    def inverse_with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        tau = inverse_dynamics(q, qd, qdd)
+        return tau if force is None else tau + force(q, qd)
+
+    def forward_with_friction(q: Vector, qd: Vector, tau: Vector) -> Vector:
+        return forward_dynamics(q, qd, tau if force is None else tau - force(q, qd))
 
     def mass_matrix_or_at_rest(q, qd=None):
         if qd is None:
@@ -100,10 +125,11 @@ def make_dynamics(
 
     def friction(q, qd):
         q, qd = vectors(d, q=q, qd=qd)
-        return jnp.zeros_like(qd) if dissipation is None else answer(partial(friction_force, dissipation), q, qd)
+        return jnp.zeros_like(qd) if force is None else answer(force, q, qd)
 
+    plain = make_plain_dynamics(inverse_with_friction, forward_with_friction, decompose, degrees_of_freedom=d)
     return Dynamics(
-        **make_plain_dynamics(inverse_dynamics, forward_dynamics, decompose, degrees_of_freedom=d)._asdict(),
+        **plain._asdict(),
         energy=lambda q, qd: answer(energy, *vectors(d, q=q, qd=qd)),
         mass_matrix=mass_matrix_or_at_rest,
         friction=friction,
@@ -117,7 +143,7 @@ def make_plain_dynamics(
     *,
     degrees_of_freedom: int | None = None,
 ) -> PlainDynamics:
-    """Builds dynamics without an energy; arguments as those of `make_dynamics`."""
+    """Builds dynamics without an energy; its functions convert or refuse their arguments."""
     d = degrees_of_freedom
     return PlainDynamics(
         lambda q, qd, qdd: answer(inverse_dynamics, *vectors(d, q=q, qd=qd, qdd=qdd)),
@@ -139,6 +165,14 @@ def minus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:
 def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
     """Generalised force dD/dqd [d] that overcomes friction, for a Rayleigh function D(q, qd)."""
     return jax.grad(D, argnums=1)(q, qd)
+
+
+def friction_of(system: Any) -> Callable[[Array, Array], Array] | None:
+    """(q, qd) -> friction force [d] of a record, in closed form where it has one; `None` without friction."""
+    force = getattr(system, "friction", None)
+    if force is not None or system.dissipation is None:
+        return force
+    return partial(friction_force, system.dissipation)
 
 
 def decompose_by_differences(

@@ -3,42 +3,41 @@
 | record | energies | module |
 |---|---|---|
 | `NaturalSystem` | factor of M, V, D | `mechanics.natural` |
+| `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural` |
 | `ClosedForm` | M, V, D, and the forces that follow | `mechanics.closed_form` |
-| `RecursiveSystem` | M, V, D, and all forces by a recursion | `mechanics.recursive` |
+| `RecursiveSystem` | M, V, D, and all forces by a recursion | `mechanics.closed_form` |
 | `LagrangianSystem` | L, D | `mechanics.lagrangian` |
-| `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural_hamiltonian` |
 | `HamiltonianSystem` | H, D | `mechanics.hamiltonian` |
-| `LoadedSystem` | any of these, and friction by load | `mechanics.loaded` |
-| `InverseForward` | none: tau and qdd | `mechanics.plain` |
-| `PhaseRates` | none: (qd, pd) | `mechanics.plain` |
+| `LoadedSystem` | any of these, and friction by load | `mechanics.joint_friction` |
+| `InverseForward` | none: tau and qdd | `mechanics.dynamics` |
+| `PhaseRates` | none: (qd, pd) | `mechanics.dynamics` |
 
 All energies have both; `InverseForward` has dynamics only, and `PhaseRates` a flow only.
 """
 
+from functools import partial
 from typing import Any, overload
 
 import jax.numpy as jnp
 
-from dln_jax.mechanics import (
-    closed_form,
-    hamiltonian,
-    lagrangian,
-    loaded,
-    natural,
-    natural_hamiltonian,
-    plain,
-    recursive,
-)
+from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural
 from dln_jax.mechanics.arguments import answer, vectors
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow, friction_force
+from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
+from dln_jax.mechanics.dynamics import (
+    Dynamics,
+    Flow,
+    InverseForward,
+    PhaseRates,
+    PlainDynamics,
+    PlainFlow,
+    decompose_by_differences,
+    friction_of,
+    make_plain_dynamics,
+)
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.joint_friction import LoadedSystem, link_force, loaded_dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.loaded import LoadedSystem
-from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
-from dln_jax.mechanics.recursive import RecursiveSystem
+from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.types import Hamiltonian, InputError, Vector
 
 Canonical = NaturalHamiltonian | HamiltonianSystem
@@ -49,20 +48,26 @@ Driven = Energies | InverseForward
 System = Driven | PhaseRates
 
 
-def _loaded_dynamics(system: LoadedSystem, *, degrees_of_freedom: int | None = None) -> Dynamics | PlainDynamics:
+def _dynamics_of_loaded(system: LoadedSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
     link = dynamics(system.link, degrees_of_freedom=degrees_of_freedom)
-    return loaded.dynamics(system, link, degrees_of_freedom=degrees_of_freedom)
+    return loaded_dynamics(system, link, degrees_of_freedom=degrees_of_freedom)
+
+
+def _dynamics_of_functions(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics:
+    # The decomposition takes differences of the inverse function, so friction counts as Coriolis force.
+    decompose = partial(decompose_by_differences, system.inverse_dynamics)
+    return make_plain_dynamics(*system, decompose, degrees_of_freedom=degrees_of_freedom)
 
 
 _DYNAMICS: dict[type, Any] = {
     NaturalSystem: natural.dynamics,
     ClosedForm: closed_form.dynamics,
-    RecursiveSystem: recursive.dynamics,
+    RecursiveSystem: closed_form.dynamics,
     LagrangianSystem: lagrangian.dynamics,
-    NaturalHamiltonian: natural_hamiltonian.dynamics,
+    NaturalHamiltonian: natural.hamiltonian_dynamics,
     HamiltonianSystem: hamiltonian.dynamics,
-    LoadedSystem: _loaded_dynamics,
-    InverseForward: plain.dynamics,
+    LoadedSystem: _dynamics_of_loaded,
+    InverseForward: _dynamics_of_functions,
 }
 
 
@@ -100,7 +105,7 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     """
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
-        rates, energy = system.rates, system.hamiltonian
+        rates, energy = system
         checked_rates = PlainFlow(lambda q, p: answer(rates, *vectors(d, q=q, p=p)))
         if energy is None:
             return checked_rates
@@ -123,8 +128,9 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
 def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:
     """Generalised force [d] that remains to move the system after friction."""
     if isinstance(system, LoadedSystem):
-        return loaded.link_force(system, q, qd, tau)
-    return tau if system.dissipation is None else tau - friction_force(system.dissipation, q, qd)
+        return link_force(system, q, qd, tau)
+    force = friction_of(system)
+    return tau if force is None else tau - force(q, qd)
 
 
 def hamiltonian_of(system: Energies) -> Hamiltonian:
@@ -132,14 +138,10 @@ def hamiltonian_of(system: Energies) -> Hamiltonian:
     match system:
         case HamiltonianSystem():
             return system.hamiltonian
-        case NaturalHamiltonian():
-            return natural_hamiltonian.hamiltonian(system)
-        case NaturalSystem():
+        case NaturalHamiltonian() | NaturalSystem():
             return natural.hamiltonian(system)
-        case ClosedForm():
+        case ClosedForm() | RecursiveSystem():
             return hamiltonian.legendre(closed_form.lagrangian(system), iterations=1)
-        case RecursiveSystem():
-            return hamiltonian.legendre(recursive.lagrangian(system), iterations=1)
         case LagrangianSystem():
             return hamiltonian.legendre(system.lagrangian)
         case LoadedSystem():
@@ -147,4 +149,4 @@ def hamiltonian_of(system: Energies) -> Hamiltonian:
 
 
 def _names(*types: type) -> str:
-    return ", ".join(each.__name__ for each in types)
+    return ", ".join(record.__name__ for record in types)

@@ -8,7 +8,7 @@ In coordinates and velocities, with qdd = H_pq qd + H_pp dp/dt along the motion,
     forward:  dp/dt from Hamilton,          qdd = d/dt dH/dp
 
 The momentum p(q, qd) comes from the Legendre transform (`legendre`), in general with a Newton iteration. A natural
-system with a factor of the inverse mass matrix needs two triangular solves instead (`mechanics.natural_hamiltonian`).
+system with a factor of the inverse mass matrix needs two triangular solves instead (`mechanics.natural`).
 Nothing is regularised: a singular H_pp gives non-finite values.
 """
 
@@ -163,8 +163,8 @@ def _require_iterations(iterations: int | None) -> None:
 
 
 def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system in (q, qd); with `degrees_of_freedom` they refuse states of another size."""
-    H, dissipation, iterations, initial_guess = system
+    """Returns all functions of the system in coordinates and velocities."""
+    H, _, iterations, initial_guess = system
     _require_iterations(iterations)
 
     def momentum(q: Vector, qd: Vector) -> Vector:
@@ -173,26 +173,21 @@ def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None
     def inverse_mass(q: Vector, p: Vector):
         return jax.jacfwd(lambda momentum: velocity(H, q, momentum))(p)
 
-    def frictionless(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    def forces(q: Vector, qd: Vector, qdd: Vector) -> Vector:
         p = momentum(q, qd)
         _, drift = jax.jvp(lambda position: velocity(H, position, p), (q,), (qd,))
         return inverse(H, q, p, solve(inverse_mass(q, p), qdd - drift))
 
-    def with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        tau = frictionless(q, qd, qdd)
-        return tau if dissipation is None else tau + friction_force(dissipation, q, qd)
-
     def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
         p = momentum(q, qd)
-        _, pd = time_derivative(H, q, p, tau, dissipation=dissipation)
-        return jax.jvp(lambda *state: velocity(H, *state), (q, p), (qd, pd))[1]
+        return jax.jvp(lambda *state: velocity(H, *state), (q, p), time_derivative(H, q, p, tau))[1]
 
     return make_dynamics(
-        with_friction,
+        system,
+        forces,
         accelerate,
-        functools.partial(decompose_by_differences, frictionless),
+        functools.partial(decompose_by_differences, forces),
         lambda q, qd: H(q, momentum(q, qd)),
         lambda q, qd: solve(inverse_mass(q, momentum(q, qd)), jnp.eye(q.shape[0], dtype=q.dtype)),
-        dissipation=dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

@@ -21,15 +21,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import friction_force
+from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
+from dln_jax.mechanics.dynamics import InverseForward, friction_force
 from dln_jax.mechanics.equations import Driven, Energies, dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
-from dln_jax.mechanics.loaded import LoadedSystem
-from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.mechanics.plain import InverseForward
-from dln_jax.mechanics.recursive import RecursiveSystem
+from dln_jax.mechanics.joint_friction import LoadedSystem
+from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.solvers.elimination import solve, solve_lower
 from dln_jax.types import Matrix, Vector
 
@@ -86,8 +83,7 @@ def differentiable_forward_dynamics(
     """(q, qd, tau) -> qdd [d], with derivatives that are products with its Jacobians; and `forward_dynamics_jacobians`.
 
     For derivatives in many directions, such as those of a step by its whole state, which then share one Jacobian. Both
-    are
-    jitted: a step that calls them several times traces, compiles and exports them once.
+    are jitted: a step that calls them several times traces, compiles and exports them once.
     """
     forward_dynamics = jax.custom_jvp(jax.jit(dynamics(system, degrees_of_freedom=degrees_of_freedom).forward_dynamics))
     jacobians = jax.jit(functools.partial(forward_dynamics_jacobians, system))
@@ -118,9 +114,9 @@ def _momentum(system: Natural, q: Vector, qd: Vector) -> Vector:
     if isinstance(system, NaturalSystem):
         factor = system.cholesky(q)
         return factor @ (factor.T @ qd)  # two small products; M would take a large one
-    if isinstance(system, RecursiveSystem):
-        return system.mass_matrix(q) @ qd  # decompose would take differences of recursions
-    return dynamics(system).decompose(q, jnp.zeros_like(qd), qd).inertial
+    if isinstance(system, NaturalHamiltonian):
+        return dynamics(system).decompose(q, jnp.zeros_like(qd), qd).inertial
+    return system.mass_matrix(q) @ qd
 
 
 def _inverse_mass(system: Energies, q: Vector, qd: Vector) -> Matrix:

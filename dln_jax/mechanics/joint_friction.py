@@ -1,17 +1,52 @@
-"""Adds friction of joints to any record of energies, or to a system without energy."""
+"""Friction in the joints of any system, and friction of transmissions proportional to the force that they carry.
 
-from typing import Any
+    tau = tau_link + μ |tau_link| tanh(u / v) + dD/dqd,   tau_link = M qdd + c + g
+
+joint by joint, u the joint's rate. Friction by load is no Rayleigh function of qd, because the carried force depends on
+the acceleration. But for μ < 1 the map from tau_link to tau is piecewise linear with positive slopes 1 ± μ tanh, and
+its inverse keeps the sign:
+
+    tau_link = y / (1 + sign(y) μ tanh(u / v)),   y = tau - dD/dqd
+
+The corner at tau_link = 0 remains: derivatives there are those of μ = 0, the mean of both sides. Free motion (tau = 0)
+loses nothing by load unless other friction loads the transmission.
+"""
+
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from dln_jax.mechanics import loaded
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import friction_force
-from dln_jax.mechanics.loaded import Load, LoadedSystem
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
-from dln_jax.mechanics.recursive import RecursiveSystem
-from dln_jax.types import Dissipation, Scalar, Vector
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PhaseRates, friction_force, make_dynamics
+from dln_jax.mechanics.friction import joint_rates
+from dln_jax.types import Dissipation, Potential, Scalar, Vector
+
+
+class Load(NamedTuple):
+    """Friction proportional to the force that a transmission carries."""
+
+    share: Any
+    """μ, one per joint [d] or one for all, 0 <= μ < 1."""
+    velocity_scale: Any = 0.01
+    """v, 1/s or m/s."""
+    joint_map: Any = None
+    """Known matrix J [d, d] of joint rates J qd; `None` if the coordinates are those of the joints."""
+
+
+class LoadedSystem(NamedTuple):
+    """Any energies behind transmissions with friction that depends on load."""
+
+    link: Any
+    """The record without dissipation."""
+    load: Load
+    dissipation: Dissipation | None = None
+    """(q, qd) -> Rayleigh function D, scalar, of the other friction that the motors overcome."""
+
+    @property
+    def potential(self) -> Potential | None:
+        """Potential of the links."""
+        return getattr(self.link, "potential", None)
 
 
 def with_friction(system: Any, dissipation: Dissipation | None, load: Load | None = None) -> Any:
@@ -33,20 +68,14 @@ def with_friction(system: Any, dissipation: Dissipation | None, load: Load | Non
     if isinstance(system, InverseForward | PhaseRates):
         return _plain(system, LoadedSystem(None, load or Load(0.0), dissipation))
     if dissipation is not None:
-        system = _dissipating(system, _sum(system.dissipation, dissipation))
+        system = _dissipating(system, sum_of(system.dissipation, dissipation))
     if load is None:
         return system
     return LoadedSystem(_dissipating(system, None), load, system.dissipation)
 
 
-def _dissipating(system: Any, dissipation: Dissipation | None) -> Any:
-    if not isinstance(system, ClosedForm | RecursiveSystem):
-        return system._replace(dissipation=dissipation)
-    force = None if dissipation is None else (lambda q, qd: friction_force(dissipation, q, qd))
-    return system._replace(dissipation=dissipation, friction=force)
-
-
-def _sum(first: Dissipation | None, second: Dissipation) -> Dissipation:
+def sum_of(first: Dissipation | None, second: Dissipation) -> Dissipation:
+    """Sum of two Rayleigh functions."""
     if first is None:
         return second
 
@@ -56,19 +85,76 @@ def _sum(first: Dissipation | None, second: Dissipation) -> Dissipation:
     return both
 
 
+def carrying(load: Load, qd: Vector, tau_link: Vector) -> Vector:
+    """Generalised force tau [d] before the transmissions, from tau_link behind them."""
+    at_joints = _to_joints(load, tau_link)
+    # By the sign, whose derivative is 0; that of the absolute value is one-sided.
+    return _from_joints(load, at_joints * (1 + jnp.sign(at_joints) * _slope(load, qd)))
+
+
+def carried(load: Load, qd: Vector, tau: Vector) -> Vector:
+    """Generalised force tau_link [d] behind the transmissions, from tau before them: the inverse of `carrying`."""
+    at_joints = _to_joints(load, tau)
+    return _from_joints(load, at_joints / (1 + jnp.sign(at_joints) * _slope(load, qd)))
+
+
+def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vector:
+    """Part of a generalised force that moves the links [d]."""
+    if system.dissipation is not None:
+        tau = tau - friction_force(system.dissipation, q, qd)
+    return carried(system.load, qd, tau)
+
+
+def loaded_dynamics(system: LoadedSystem, link: Dynamics, *, degrees_of_freedom: int | None = None) -> Dynamics:
+    """Returns all functions of the system from those of its links.
+
+    `friction(q, qd)` is that of the dissipation alone, and `decompose` is of the links.
+    """
+    return make_dynamics(
+        system,
+        lambda q, qd, qdd: carrying(system.load, qd, link.inverse_dynamics(q, qd, qdd)),
+        lambda q, qd, tau: link.forward_dynamics(q, qd, carried(system.load, qd, tau)),
+        link.decompose,
+        link.energy,
+        link.mass_matrix,
+        degrees_of_freedom=degrees_of_freedom,
+    )
+
+
+def _dissipating(system: Any, dissipation: Dissipation | None) -> Any:
+    """Replaces the dissipation, and with it a friction force in closed form."""
+    return system._replace(dissipation=dissipation, **({"friction": None} if "friction" in system._fields else {}))
+
+
 def _plain(system: InverseForward | PhaseRates, friction: LoadedSystem) -> InverseForward | PhaseRates:
     def before(q: Vector, qd: Vector, tau_link: Vector) -> Vector:
-        tau = loaded.carrying(friction.load, qd, tau_link)
+        tau = carrying(friction.load, qd, tau_link)
         return tau if friction.dissipation is None else tau + friction_force(friction.dissipation, q, qd)
 
     if isinstance(system, PhaseRates):
 
         def rates(q: Vector, p: Vector) -> tuple[Array, Array]:
             qd, pd = system.rates(q, p)
-            return qd, pd + loaded.link_force(friction, q, qd, jnp.zeros_like(qd))
+            return qd, pd + link_force(friction, q, qd, jnp.zeros_like(qd))
 
         return PhaseRates(rates)
     return InverseForward(
         lambda q, qd, qdd: before(q, qd, system.inverse_dynamics(q, qd, qdd)),
-        lambda q, qd, tau: system.forward_dynamics(q, qd, loaded.link_force(friction, q, qd, tau)),
+        lambda q, qd, tau: system.forward_dynamics(q, qd, link_force(friction, q, qd, tau)),
     )
+
+
+def _slope(load: Load, qd: Vector) -> Vector:
+    """μ tanh(u / v), within (-1, 1)."""
+    return jnp.asarray(load.share, qd.dtype) * jnp.tanh(joint_rates(load.joint_map, qd) / load.velocity_scale)
+
+
+def _to_joints(load: Load, tau: Vector) -> Vector:
+    """Forces at the joints; Jᵀ maps them to generalised forces."""
+    if load.joint_map is None:
+        return tau
+    return jnp.asarray(np.linalg.inv(np.asarray(load.joint_map, float)).T, tau.dtype) @ tau
+
+
+def _from_joints(load: Load, force: Vector) -> Vector:
+    return force if load.joint_map is None else jnp.asarray(load.joint_map, force.dtype).T @ force

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from dln_jax.mechanics.arguments import OfSize, require_size_of
-from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, friction_force, make_dynamics
+from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, make_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
@@ -64,30 +64,21 @@ def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None)
 
     Without it, they refuse states that lack entries that L reads, or have rates that L ignores.
     """
-    given, dissipation = system
-    right = set() if degrees_of_freedom is None else {degrees_of_freedom}
+    accepted = set() if degrees_of_freedom is None else {degrees_of_freedom}
 
     def L(q: Vector, qd: Vector) -> Scalar:
         size = q.shape[0]
-        if size not in right and not isinstance(given, OfSize):
-            require_size_of(given, size)
-            right.add(size)
-        return given(q, qd)
-
-    def with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        tau = inverse_dynamics(L, q, qd, qdd)
-        return tau if dissipation is None else tau + friction_force(dissipation, q, qd)
-
-    def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
-        driving = tau if dissipation is None else tau - friction_force(dissipation, q, qd)
-        return forward_dynamics(L, q, qd, driving)
+        if size not in accepted and not isinstance(system.lagrangian, OfSize):
+            require_size_of(system.lagrangian, size)
+            accepted.add(size)
+        return system.lagrangian(q, qd)
 
     return make_dynamics(
-        with_friction,
-        accelerate,
+        system,
+        partial(inverse_dynamics, L),
+        partial(forward_dynamics, L),
         partial(decompose_by_differences, partial(inverse_dynamics, L)),
         partial(energy, L),
         partial(mass_matrix, L),
-        dissipation=dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

@@ -1,9 +1,10 @@
-"""Equations of motion of natural systems, T = ½ qdᵀ M(q) qd with M = L Lᵀ and a Cholesky factor L.
+"""Equations of motion of natural systems with a factor of the mass matrix or of its inverse, for one state.
 
     tau = M qdd + dM/dt qd - dT/dq + dV/dq
 
-The factor makes M definite by construction, gives the momentum without a derivative, and turns the forward model
-into two triangular solves. An absent potential is `None` and is never traced.
+`NaturalSystem` has T = ½ |Lᵀ qd|² with M = L Lᵀ, `NaturalHamiltonian` T = ½ |Lᵀ p|² with M⁻¹ = L Lᵀ. The factor makes M
+definite by construction and gives the momentum without a derivative or a Newton iteration; only triangular systems
+are solved. An absent potential is `None` and is never traced.
 """
 
 from functools import partial
@@ -12,20 +13,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import (
-    Decomposition,
-    Dynamics,
-    friction_force,
-    make_dynamics,
-    minus_potential,
-    plus_potential,
-)
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics, minus_potential, plus_potential
 from dln_jax.solvers.elimination import solve_lower, solve_lower_transposed
 from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Lagrangian, Matrix, Potential, Scalar, Vector
 
 
 class NaturalSystem(NamedTuple):
-    """Energies of a natural system, as functions of one state."""
+    """Energies of a natural system with a factor of the mass matrix, as functions of one state."""
 
     cholesky: CholeskyFactor
     """q -> lower triangular L [d, d], M = L Lᵀ."""
@@ -35,29 +29,37 @@ class NaturalSystem(NamedTuple):
     """(q, qd) -> Rayleigh function D, scalar."""
 
 
+class NaturalHamiltonian(NamedTuple):
+    """Energies of a natural system with a factor of the inverse mass matrix, as functions of one state."""
+
+    inverse_factor: CholeskyFactor
+    """q -> lower triangular L [d, d], M⁻¹ = L Lᵀ."""
+    potential: Potential | None = None
+    """q -> V, scalar."""
+    dissipation: Dissipation | None = None
+    """(q, qd) -> Rayleigh function D, scalar."""
+
+
 def lagrangian(system: NaturalSystem) -> Lagrangian:
     """L(q, qd) = ½ |Lᵀ qd|² - V(q), for the generic functions of `mechanics.lagrangian`."""
-    return lambda q, qd: minus_potential(_kinetic(system.cholesky(q), qd), system.potential, q)
+    return lambda q, qd: minus_potential(_half_square(system.cholesky(q).T @ qd), system.potential, q)
 
 
-def hamiltonian(system: NaturalSystem) -> Hamiltonian:
-    """H(q, p) = ½ |L⁻¹ p|² + V(q) of a natural system with M = L Lᵀ."""
-    return lambda q, p: plus_potential(0.5 * jnp.sum(solve_lower(system.cholesky(q), p) ** 2), system.potential, q)
+def hamiltonian(system: NaturalSystem | NaturalHamiltonian) -> Hamiltonian:
+    """H(q, p) = T + V: ½ |L⁻¹ p|² + V(q) with the factor of M, ½ |Lᵀ p|² + V(q) with that of M⁻¹."""
+    if isinstance(system, NaturalHamiltonian):
+        return lambda q, p: plus_potential(_half_square(system.inverse_factor(q).T @ p), system.potential, q)
+    return lambda q, p: plus_potential(_half_square(solve_lower(system.cholesky(q), p)), system.potential, q)
 
 
-def energy(system: NaturalSystem, q: Vector, qd: Vector) -> Scalar:
-    """Energy T + V."""
-    return plus_potential(_kinetic(system.cholesky(q), qd), system.potential, q)
-
-
-def mass_matrix(system: NaturalSystem, q: Vector, qd: Vector | None = None) -> Matrix:
-    """Mass matrix M = L Lᵀ [d, d]; the velocity is accepted but not used."""
+def mass_matrix(system: NaturalSystem, q: Vector) -> Matrix:
+    """Mass matrix M = L Lᵀ [d, d]."""
     factor = system.cholesky(q)
     return factor @ factor.T
 
 
-def inverse_dynamics(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] of a motion, friction included.
+def forces(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Generalised force tau [d] of a motion, without friction.
 
     With y = Lᵀ qd: dp/dt = L (Lᵀ qdd + dL/dtᵀ qd) + dL/dt y, and dT/dq_k = qdᵀ dL/dq_k y.
     """
@@ -73,40 +75,83 @@ def inverse_dynamics(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) 
         (kinetic_force,) = pull_back(jnp.outer(qd, factor.T @ qd))
     momentum_rate = factor @ (factor.T @ qdd + factor_rate.T @ qd) + factor_rate @ (factor.T @ qd)
     tau = momentum_rate - kinetic_force
-    if system.potential is not None:
-        tau += jax.grad(system.potential)(q)
-    return tau if system.dissipation is None else tau + friction_force(system.dissipation, q, qd)
-
-
-def forward_dynamics(system: NaturalSystem, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Acceleration qdd [d] under a generalised force, by two triangular solves with the factor."""
-    bias = inverse_dynamics(system, q, qd, jnp.zeros_like(qd))
-    factor = system.cholesky(q)
-    return solve_lower_transposed(factor, solve_lower(factor, tau - bias))
-
-
-def decompose(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-    """Inertial M qdd, Coriolis dM/dt qd - dT/dq and gravity dV/dq, all [d]."""
-    inertial_only = NaturalSystem(system.cholesky)
-    return Decomposition(
-        inertial=mass_matrix(system, q) @ qdd,
-        coriolis=inverse_dynamics(inertial_only, q, qd, jnp.zeros_like(qd)),
-        gravity=jnp.zeros_like(q) if system.potential is None else jax.grad(system.potential)(q),
-    )
+    return tau if system.potential is None else tau + jax.grad(system.potential)(q)
 
 
 def dynamics(system: NaturalSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size."""
+    """Returns all functions of the system; two triangular solves with the factor give the forward model."""
+
+    def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
+        bias, factor = forces(system, q, qd, jnp.zeros_like(qd)), system.cholesky(q)
+        return solve_lower_transposed(factor, solve_lower(factor, tau - bias))
+
+    def decompose(q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
+        return Decomposition(
+            inertial=mass_matrix(system, q) @ qdd,
+            coriolis=forces(NaturalSystem(system.cholesky), q, qd, jnp.zeros_like(qd)),
+            gravity=_gravity(system.potential, q),
+        )
+
     return make_dynamics(
-        partial(inverse_dynamics, system),
-        partial(forward_dynamics, system),
-        partial(decompose, system),
-        partial(energy, system),
-        partial(mass_matrix, system),
-        dissipation=system.dissipation,
+        system,
+        partial(forces, system),
+        accelerate,
+        decompose,
+        lambda q, qd: plus_potential(_half_square(system.cholesky(q).T @ qd), system.potential, q),
+        lambda q, qd: mass_matrix(system, q),
         degrees_of_freedom=degrees_of_freedom,
     )
 
 
-def _kinetic(factor: Matrix, qd: Vector) -> Scalar:
-    return 0.5 * jnp.sum((factor.T @ qd) ** 2)
+def hamiltonian_dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = None) -> Dynamics:
+    """Returns all functions of the system in coordinates and velocities.
+
+    With y = L⁻¹ qd, p = L⁻ᵀ y: qdd = dL/dt y + L (dL/dtᵀ p + Lᵀ dp/dt), and dT/dq_k = pᵀ dL/dq_k y.
+    """
+
+    def motion(q: Vector, qd: Vector):
+        """L, dL/dt y, dL/dtᵀ p and dT/dq."""
+        factor, factor_rate = jax.jvp(system.inverse_factor, (q,), (qd,))
+        _, pull_back = jax.vjp(system.inverse_factor, q)
+        y = solve_lower(factor, qd)
+        p = solve_lower_transposed(factor, y)
+        return factor, factor_rate @ y, factor_rate.T @ p, pull_back(jnp.outer(p, y))[0]
+
+    def kinetic_force(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        factor, drift, momentum_drift, slope = motion(q, qd)
+        return solve_lower_transposed(factor, solve_lower(factor, qdd - drift) - momentum_drift) + slope
+
+    def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
+        factor, drift, momentum_drift, slope = motion(q, qd)
+        driving = tau if system.potential is None else tau - jax.grad(system.potential)(q)
+        return drift + factor @ (momentum_drift + factor.T @ (driving - slope))
+
+    def mass_times(q: Vector, vector: Vector) -> Vector:
+        factor = system.inverse_factor(q)
+        return solve_lower_transposed(factor, solve_lower(factor, vector))
+
+    def decompose(q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
+        coriolis = kinetic_force(q, qd, jnp.zeros_like(qd))
+        return Decomposition(mass_times(q, qdd), coriolis, _gravity(system.potential, q))
+
+    def tau(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        force = kinetic_force(q, qd, qdd)
+        return force if system.potential is None else force + jax.grad(system.potential)(q)
+
+    return make_dynamics(
+        system,
+        tau,
+        accelerate,
+        decompose,
+        lambda q, qd: plus_potential(_half_square(solve_lower(system.inverse_factor(q), qd)), system.potential, q),
+        lambda q, qd: jax.vmap(partial(mass_times, q))(jnp.eye(q.shape[0], dtype=q.dtype)),
+        degrees_of_freedom=degrees_of_freedom,
+    )
+
+
+def _half_square(vector: Vector) -> Scalar:
+    return 0.5 * jnp.sum(vector**2)
+
+
+def _gravity(V: Potential | None, q: Vector) -> Vector:
+    return jnp.zeros_like(q) if V is None else jax.grad(V)(q)

@@ -15,14 +15,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from dln_jax.mechanics import closed_form, natural
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import friction_force, minus_potential, plus_potential
-from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
+from dln_jax.mechanics.dynamics import friction_of
+from dln_jax.mechanics.joint_friction import LoadedSystem, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.recursive import RecursiveSystem
-from dln_jax.types import CholeskyFactor, Dissipation, Lagrangian, Potential, Scalar, Vector
+from dln_jax.types import CholeskyFactor, Dissipation, Potential
 
 
 class Residual(NamedTuple):
@@ -45,55 +43,39 @@ def with_residual(system: Any, residual: Residual) -> RecursiveSystem | Lagrangi
         system: any record of a natural system, a Lagrangian, or one of them behind transmissions.
         residual: the added energies.
     """
+    V, D, factor = residual
     if isinstance(system, LoadedSystem):
-        behind = with_residual(system.link, residual._replace(dissipation=None))
-        return with_friction(system._replace(link=behind), residual.dissipation)
+        link = with_residual(system.link, residual._replace(dissipation=None))
+        return with_friction(system._replace(link=link), D)
     if isinstance(system, LagrangianSystem):
-        L = _sum(system.lagrangian, residual)
-        return with_friction(system._replace(lagrangian=L), residual.dissipation)
+        L = system.lagrangian
+        if factor is not None:
+            L = _sum(L, natural.lagrangian(NaturalSystem(factor)))
+        if V is not None:
+            L = _sum(L, lambda q, qd: -V(q))
+        return with_friction(system._replace(lagrangian=L), D)
     system = _recursive(system)
-    if residual.potential is not None:
-        system = _with_potential(system, residual.potential)
-    if residual.cholesky is not None:
-        system = _with_inertia(system, NaturalSystem(residual.cholesky))
-    return with_friction(system, residual.dissipation)
-
-
-def _sum(L: Lagrangian, residual: Residual) -> Lagrangian:
-    def both(q: Vector, qd: Vector) -> Scalar:
-        total = minus_potential(L(q, qd), residual.potential, q)
-        return total if residual.cholesky is None else total + 0.5 * jnp.sum((residual.cholesky(q).T @ qd) ** 2)
-
-    return both
+    if V is not None:
+        forces = _sum(system.forces, lambda q, qd, qdd: jax.grad(V)(q))
+        system = system._replace(forces=forces, potential=V if system.potential is None else _sum(V, system.potential))
+    if factor is not None:
+        moving = NaturalSystem(factor)
+        system = system._replace(
+            mass_matrix=_sum(system.mass_matrix, partial(natural.mass_matrix, moving)),
+            forces=_sum(system.forces, partial(natural.forces, moving)),
+        )
+    return with_friction(system, D)
 
 
 def _recursive(system: RecursiveSystem | ClosedForm | NaturalSystem) -> RecursiveSystem:
     """Returns the same system as a recursive one."""
     if isinstance(system, RecursiveSystem):
         return system
-    D = system.dissipation
+    V, D, friction = system.potential, system.dissipation, friction_of(system)
     if isinstance(system, ClosedForm):
-        bare = system._replace(dissipation=None, friction=None)
-        forces = partial(closed_form.inverse_dynamics, bare)
-        return RecursiveSystem(system.mass_matrix, forces, system.potential, D, system.friction)
-    forces = partial(natural.inverse_dynamics, system._replace(dissipation=None))
-    friction = None if D is None else partial(friction_force, D)
-    return RecursiveSystem(partial(natural.mass_matrix, system), forces, system.potential, D, friction)
+        return RecursiveSystem(system.mass_matrix, partial(closed_form.forces, system), V, D, friction)
+    return RecursiveSystem(partial(natural.mass_matrix, system), partial(natural.forces, system), V, D, friction)
 
 
-def _with_potential(system: RecursiveSystem, V: Potential) -> RecursiveSystem:
-    return system._replace(
-        forces=_plus(system.forces, lambda q, qd, qdd: jax.grad(V)(q)),
-        potential=lambda q: plus_potential(V(q), system.potential, q),
-    )
-
-
-def _with_inertia(system: RecursiveSystem, moving: NaturalSystem) -> RecursiveSystem:
-    return system._replace(
-        mass_matrix=lambda q: system.mass_matrix(q) + natural.mass_matrix(moving, q),
-        forces=_plus(system.forces, lambda *state: natural.inverse_dynamics(moving, *state)),
-    )
-
-
-def _plus(first: Callable[..., Array], second: Callable[..., Array]) -> Callable[[Vector, Vector, Vector], Vector]:
-    return lambda q, qd, qdd: jnp.add(first(q, qd, qdd), second(q, qd, qdd))
+def _sum(first: Callable[..., Array], second: Callable[..., Array]) -> Callable[..., Array]:
+    return lambda *state: jnp.add(first(*state), second(*state))

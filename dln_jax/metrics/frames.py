@@ -23,7 +23,7 @@ from dln_jax.metrics.phase_space import Motions, finite_or_infinite, predict, su
 from dln_jax.models.latent_phase import LatentModel
 from dln_jax.models.model import Parameters
 from dln_jax.precision import in_float64, with_float64
-from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, images, render, rod
+from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, RodFrames, energy, images, render, rod
 from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_positive
 
@@ -119,19 +119,19 @@ def decoded(model: LatentModel, parameters: Parameters, latent: Motions) -> Floa
     return np.asarray(pairs).reshape(*latent.q.shape[:2], -1)
 
 
-def recoded(model: LatentModel, parameters: Parameters, truth: Frames) -> Float[np.ndarray, "K T input"]:
+def recoded(model: LatentModel, parameters: Parameters, truth: RodFrames) -> Float[np.ndarray, "K T input"]:
     """Encodes and decodes true pairs of frames, which shows the error of the autoencoder alone."""
     return decoded(model, parameters, Motions(truth.t[:-1], *encoded(model, parameters, truth.pairs)))
 
 
-def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: Frames) -> Float[np.ndarray, " K"]:
+def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: RodFrames) -> Float[np.ndarray, " K"]:
     """Mean over times of (H - H_true)² of the motions, in J²; infinite for motions that are not finite."""
     q, qd = physical_states(pairs)
     true = physical_energy(truth.q, truth.qd)[:, : q.shape[1]]
     return finite_or_infinite(np.mean((physical_energy(q, qd) - true) ** 2, axis=1))
 
 
-def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tuple[dict[str, float], FrameMotions]:
+def frame_errors(model: LatentModel, parameters: Parameters, test: RodFrames) -> tuple[dict[str, float], FrameMotions]:
     """Predicts motions from the first pairs; returns their errors and the motions.
 
     The errors are `energy_mse` and `frame_mse`, both by `phase_space.summary`.
@@ -143,7 +143,7 @@ def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tu
 
 
 @in_float64
-def late_energy_errors(model: LatentModel, parameters: Parameters, test: Frames) -> Float[np.ndarray, " K"]:
+def late_energy_errors(model: LatentModel, parameters: Parameters, test: RodFrames) -> Float[np.ndarray, " K"]:
     """`energy_errors` of the `LATE` frames, which show a drift of the energy."""
     parameters = with_float64(parameters)
     frames = np.concatenate([[0.0], LATE])
@@ -153,7 +153,7 @@ def late_energy_errors(model: LatentModel, parameters: Parameters, test: Frames)
     return finite_or_infinite(np.mean((found - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1))
 
 
-def energy_floor(test: Frames) -> float:
+def energy_floor(test: RodFrames) -> float:
     """Mean square error of the energy estimate on true frames, in J²."""
     return float(np.mean(energy_errors(test.pairs, test)))
 

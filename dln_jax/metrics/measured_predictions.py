@@ -21,10 +21,10 @@ from dln_jax.data.segments import GAP
 from dln_jax.learning import motions, starts
 from dln_jax.learning.measured_motions import MeasuredWindows, motion
 from dln_jax.learning.starts import nearest
-from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.plain import InverseForward
+from dln_jax.mechanics.integrators import looped_rk4
 from dln_jax.metrics.rollouts import valid_prediction_time
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError

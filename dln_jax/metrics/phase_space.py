@@ -22,7 +22,7 @@ from dln_jax.data.schema import momenta
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.integrators import adaptive_rollout
 from dln_jax.models.model import Model, Parameters
-from dln_jax.scenes.datasets.phase_samples import Part
+from dln_jax.scenes.datasets.phase_samples import PhaseSamples
 from dln_jax.types import Hamiltonian
 
 MOST_STEPS = 5_000
@@ -45,7 +45,7 @@ def field_rates(
     return np.asarray(qd), np.asarray(pd)
 
 
-def field_errors(model: Model, parameters: Parameters, part: Part) -> dict[str, float]:
+def field_errors(model: Model, parameters: Parameters, part: PhaseSamples) -> dict[str, float]:
     """`loss`, against the measured rates, and `clean_field_mse`, against the exact field at the measured states."""
     data = part.data
     p, measured = momenta(data)

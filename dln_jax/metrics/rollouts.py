@@ -20,8 +20,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
+from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.integrators import looped_rk4
 from dln_jax.types import InputError, Vector, require_positive
 
 TORQUES: tuple[Torque, ...] = ("held", "interpolated")

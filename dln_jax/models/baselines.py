@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, unsaturated
 from dln_jax.nn.activations import Activation, tanh

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.natural import NaturalHamiltonian
 from dln_jax.models.lagrangian import one_network, structured_networks
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.mechanics.dynamics import PhaseRates
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron
 from dln_jax.nn.activations import Activation, tanh

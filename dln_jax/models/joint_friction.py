@@ -27,8 +27,7 @@ from dln_jax.mechanics.friction import (
     require_shape,
     shape_of,
 )
-from dln_jax.mechanics.joint_friction import with_friction
-from dln_jax.mechanics.loaded import Load
+from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Needs
 

@@ -27,10 +27,9 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from dln_jax.mechanics.dynamics import Flow, PlainFlow
+from dln_jax.mechanics.dynamics import Flow, PhaseRates, PlainFlow
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
-from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.models.model import Model, Parameters

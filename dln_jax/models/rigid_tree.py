@@ -23,10 +23,9 @@ from dln_jax.mechanics.friction import (
     require_laws,
     require_shape,
 )
-from dln_jax.mechanics.joint_friction import with_friction
-from dln_jax.mechanics.loaded import Load
+from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.trees.description import Tree
-from dln_jax.mechanics.trees.energies import tree_system
+from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.models.model import Model
 from dln_jax.types import FrictionLaw, InputError
 

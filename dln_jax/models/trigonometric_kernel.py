@@ -32,8 +32,8 @@ from jax import Array, lax
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.closed_form import RecursiveSystem
 from dln_jax.mechanics.dynamics import minus_potential
-from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 

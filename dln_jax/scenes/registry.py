@@ -2,17 +2,10 @@
 
 from collections.abc import Callable
 
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
-from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
-from dln_jax.scenes.n_body import n_body
-from dln_jax.scenes.oscillators import henon_heiles, mass_spring
-from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.particles import henon_heiles, mass_spring, n_body
+from dln_jax.scenes.pendulums import chain, double_pendulum, pendulum, two_link_arm, two_link_pendulum
+from dln_jax.scenes.poles import cart_pole, flexible_cart_pole, rotary_pendulum
 from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.scenes.two_link_pendulum import two_link_pendulum
 from dln_jax.types import InputError
 
 SCENES: dict[str, Callable[[], Scene]] = {

@@ -1,6 +1,5 @@
-"""Record of a textbook system: its `Needs`, exact energies, and equations of motion in closed form."""
+"""Record of a textbook system: its `Needs`, exact energies, equations of motion in closed form, and joint friction."""
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,9 +8,13 @@ from jaxtyping import Array, Float
 
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import friction_force
+from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape, joint_dissipation
+from dln_jax.mechanics.joint_friction import sum_of
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.types import Dissipation, Lagrangian, Needs, Potential, Vector
+from dln_jax.types import Dissipation, FrictionLaw, InputError, JointKind, Lagrangian, Needs, Potential, Vector
+
+LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "stribeck")
+"""Friction laws available for a scene; the others of `mechanics.friction.laws` apply to gears."""
 
 
 class Scene(NamedTuple):
@@ -39,9 +42,7 @@ class Scene(NamedTuple):
     @property
     def closed_form(self) -> ClosedForm:
         """The energies and hand-written forces, for the functions of `mechanics.closed_form`."""
-        D = self.dissipation
-        friction = None if D is None else functools.partial(friction_force, D)
-        return ClosedForm(self.mass_matrix, self.coriolis, self.potential, self.gravity, D, friction)
+        return ClosedForm(self.mass_matrix, self.coriolis, self.potential, self.gravity, self.dissipation)
 
     @property
     def lagrangian(self) -> Lagrangian:
@@ -52,6 +53,27 @@ class Scene(NamedTuple):
     def energies(self) -> LagrangianSystem:
         """The energies in the record that mechanics takes, as for models."""
         return LagrangianSystem(self.lagrangian, self.dissipation)
+
+
+def textbook(
+    name: str,
+    joints: tuple[JointKind, ...],
+    mass_matrix: Callable[[Array], Array],
+    coriolis: Callable[[Array, Array], Array],
+    potential: Potential | None,
+    gravity: Potential | None,
+    tip: Callable[[Array], Array] | None,
+    *,
+    friction: float = 0.0,
+    actuation: tuple[tuple[float, ...], ...] | None = None,
+) -> Scene:
+    """Builds a scene from its equations and what moves it.
+
+    The friction is viscous, D = ½ b |qd|² with the torque b qd; there is none if b (N m s or N s/m) is zero.
+    """
+    needs = Needs(joints, gravity=potential is not None, friction=friction != 0, actuation=actuation)
+    dissipation = None if friction == 0 else (lambda q, qd: 0.5 * friction * jnp.sum(qd**2))
+    return Scene(name, needs, mass_matrix, coriolis, potential, gravity, dissipation, tip)
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
@@ -75,8 +97,30 @@ def actuation_matrix(needs: Needs) -> Float[Array, "d u"]:
     return jnp.asarray(needs.actuation)
 
 
-def viscous_dissipation(coefficient: float) -> Dissipation | None:
-    """D = ½ b |qd|², friction torque b qd; `None` if b (N m s or N s/m) is zero."""
-    if coefficient == 0.0:
-        return None
-    return lambda q, qd: 0.5 * coefficient * jnp.sum(qd**2)
+def with_friction(
+    scene: Scene,
+    coefficients: FrictionCoefficients,
+    shape: FrictionShape = FrictionShape(),  # noqa: B008
+) -> Scene:
+    """Adds friction to the joints of a scene, in addition to any it already has.
+
+    Dry friction is c tanh(u / v) with a small v, `shape.velocity_scale`: a joint "at rest" creeps more slowly than v.
+    An explicit integrator is stable for steps below some 2.8 m v / c, where m is the smallest inertia at the joint.
+
+    Args:
+        scene: a scene with any joints.
+        coefficients: viscous, coulomb and stribeck, one number per joint or one for all.
+        shape: velocity scale and Stribeck velocity.
+
+    Raises:
+        InputError: no coefficient, one of another law, or a negative one.
+    """
+    present = {name: value for name, value in coefficients._asdict().items() if value is not None}
+    if others := [name for name in present if name not in LAWS]:
+        raise InputError(f"a scene has no {others[0]} friction; expected some of {', '.join(LAWS)}")
+    dissipation = joint_dissipation(**present, **shape._asdict())
+    if dissipation is None:
+        raise InputError("there is no friction to add; give a coefficient that is not zero, or take the scene as it is")
+    laws = tuple(law for law in LAWS if law in present)
+    needs = scene.needs._replace(joint_friction=laws)
+    return scene._replace(needs=needs, dissipation=sum_of(scene.dissipation, dissipation))

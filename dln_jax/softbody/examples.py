@@ -20,10 +20,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from dln_jax.softbody.driven import Example
-from dln_jax.softbody.mesh.creatures import Creature, body_length, crawler
 from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses, vertices_where
+from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
-from dln_jax.softbody.mesh.shapes import box, disc
 from dln_jax.softbody.scene import SoftScene, make_scene
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.creature import MASS, TIME_STEP, creature_terms
@@ -177,7 +176,7 @@ def creature() -> Example:
     return Example(scene, TIME_STEP, 6.0, ground=0.0, control=control, muscles=body.muscles, moments=moments)
 
 
-EXAMPLES: dict[str, Callable[..., Example]] = {each.__name__: each for each in (beam, twist, slope, drop, creature)}
+EXAMPLES: dict[str, Callable[..., Example]] = {scene.__name__: scene for scene in (beam, twist, slope, drop, creature)}
 """Examples by name; their keyword arguments are their options."""
 
 

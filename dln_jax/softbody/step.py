@@ -24,12 +24,13 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
-from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, Motion, energy_balance, least_J, trusted
+from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, energy_balance, least_J, trusted
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
-from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size, by_stiffness
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.newton import Info as SolverInfo
+from dln_jax.solvers.elements.selection import by_size, by_stiffness
+from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
 
 Step = Callable[[Params, State, Any], tuple[State, Info]]
@@ -140,12 +141,12 @@ def make_step(
     )
 
     def init(x: Any = None, v: Any = None) -> State:
-        given = {"x": scene.mesh.vertices if x is None else x, "v": 0.0 if v is None else v}
-        for name, values in given.items():
+        x, v = scene.mesh.vertices if x is None else x, 0.0 if v is None else v
+        for name, values in (("x", x), ("v", v)):
             known = not isinstance(values, Tracer)
             if known and len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), free.shape)))):
                 raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
-        x, v = (jnp.broadcast_to(jnp.asarray(values, float), free.shape) for values in given.values())
+        x, v = (jnp.broadcast_to(jnp.asarray(values, float), free.shape) for values in (x, v))
         return State(x, v, Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None)
 
     def step(params: Params, state: State, control: Any = None) -> tuple[State, Info]:
@@ -157,20 +158,21 @@ def make_step(
         # The better of two starts: the present positions, or those of motion without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
         start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
-        balanced, found = solve(energies, start, data, scale=params.masses, at=at)
+        balanced, outcome = solve(energies, start, data, scale=params.masses, at=at)
         x, v = integrator.finish(state, balanced, dt)
         x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
-        info = judged(params, state, x, v, (balanced, found, data[1:]))
+        info = judged(params, state, x, v, (balanced, outcome, data[1:]))
         x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
         return State(x, v, before), info
 
     def judged(params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any]) -> Info:
         # The verdict has no derivatives.
-        params, state, x, v, (balanced, found, data) = jax.lax.stop_gradient((params, state, x, v, solution))
-        motion = Motion((state.x, x), (state.v, v), balanced)
-        growth, at_hand = energy_balance(scene, energies[1:], params.masses, data, motion, found)
-        info = _of_positions(scene, params, x, found, overlaps)
+        params, state, x, v, (balanced, outcome, data) = jax.lax.stop_gradient((params, state, x, v, solution))
+        growth, at_hand = energy_balance(
+            scene, energies[1:], params.masses, data, (state.x, x), (state.v, v), balanced, outcome
+        )
+        info = _of_positions(scene, params, x, outcome, overlaps)
         return info._replace(
             converged=info.converged & (growth <= LARGEST_GROWTH * at_hand),
             energy_growth=growth,
@@ -211,10 +213,9 @@ def static_solve(
     at = pattern(energies, count, dimension, scene.free)
     known = _known((params, x, control), lambda: data)
     chosen = _linear_solver(linear_solver, energies, at, x, known)
-    options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": chosen, "at": at}
-    options |= {"free": scene.free, "scale": params.masses, "definite": definite}
-    x, found = minimise(energies, x, data, **options)
-    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, found)), count_overlaps(scene.mesh))
+    solve = partial(minimise, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite)
+    x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
+    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), count_overlaps(scene.mesh))
     return trusted(x, info.converged), info
 
 
@@ -230,25 +231,23 @@ def _known(values: Any, data: Callable[[], Any]) -> Any | None:
 
 
 def _linear_solver(
-    given: LinearSolverFactory | None, energies: Sequence[ElementEnergy], at: Pattern, x: Array, data: Any | None
+    requested: LinearSolverFactory | None, energies: Sequence[ElementEnergy], at: Pattern, x: Array, data: Any | None
 ) -> LinearSolverFactory:
     """Returns the requested linear solver, or the one with the least work, chosen once."""
-    if given is not None:
-        return given
+    if requested is not None:
+        return requested
     solver = by_size(energies, at) if data is None else by_stiffness(energies, at, x=x, data=data)
     return lambda *_: solver
 
 
 def _of_positions(
-    scene: SoftScene, params: Params, x: Array, found: SolverInfo, overlaps: Callable[[Array], Array] | None
+    scene: SoftScene, params: Params, x: Array, outcome: SolverInfo, overlaps: Callable[[Array], Array] | None
 ) -> Info:
     """Combines the solver's verdict with that on the positions: no element is inverted."""
     least = least_J(scene, params, x)
-    upright = True if least is None else least > 0
+    converged = outcome.converged if least is None else outcome.converged & (least > 0)
     pairs = None if overlaps is None else overlaps(x)
-    return Info(
-        found.residual, found.iterations, found.converged & upright, found.definite, least_J=least, overlaps=pairs
-    )
+    return Info(outcome.residual, outcome.iterations, converged, outcome.definite, least_J=least, overlaps=pairs)
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

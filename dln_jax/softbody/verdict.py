@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dln_jax.softbody.mesh.simplices import simplex_volumes
 from dln_jax.softbody.scene import Params, SoftScene
 from dln_jax.solvers.elements.energies import ElementEnergy, value
-from dln_jax.solvers.newton import Info as SolverInfo
+from dln_jax.solvers.newton import SolverInfo
 
 LARGEST_GROWTH = 0.1
 """Share of the energy at hand. The example scenes stay below 0.01 with backward Euler and BDF2, and smooth motions
@@ -52,21 +52,15 @@ class Info(NamedTuple):
     for a mesh of one component. It does not affect `converged`."""
 
 
-class Motion(NamedTuple):
-    """Positions and velocities at the start and the end of a step, and the positions at which forces were balanced."""
-
-    x: tuple[Array, Array]
-    v: tuple[Array, Array]
-    balanced: Array
-
-
 def energy_balance(
     scene: SoftScene,
     energies: Sequence[ElementEnergy],
     masses: Float[Array, " n"],
     data: Sequence[Any],
-    motion: Motion,
-    found: SolverInfo,
+    x: tuple[Array, Array],
+    v: tuple[Array, Array],
+    balanced: Array,
+    outcome: SolverInfo,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(growth, energy at hand) of a step, in J.
 
@@ -74,17 +68,18 @@ def energy_balance(
         scene: its held vertices do work.
         energies, data: its terms and the data of their elements in this step.
         masses: in kg.
-        motion: of the step.
-        found: outcome of the minimisation.
+        x, v: positions and velocities at the start and the end of the step.
+        balanced: the positions at which forces were balanced.
+        outcome: of the minimisation.
     """
     free = jnp.asarray(scene.free)
-    kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * v**2, 0)) for v in motion.v)
-    stored, stored_after = (value(energies, x, data) for x in motion.x)
-    moved = motion.x[1] - motion.x[0]
-    work = _work(scene.held, energies, data, motion.balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
+    kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * velocity**2, 0)) for velocity in v)
+    stored, stored_after = (value(energies, position, data) for position in x)
+    moved = x[1] - x[0]
+    work = _work(scene.held, energies, data, balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
     # Residual forces do work, and rounding hides some of the energy.
-    noise = 0.0 if found.energy_noise is None else found.energy_noise
-    unclear = noise + found.residual * jnp.sum(masses[:, None] * jnp.abs(moved))
+    noise = 0.0 if outcome.energy_noise is None else outcome.energy_noise
+    unclear = noise + outcome.residual * jnp.sum(masses[:, None] * jnp.abs(moved))
     growth = after - kinetic + (stored_after - stored) - work
     return growth, kinetic + jnp.maximum(stored - stored_after, 0) + jnp.abs(work) + unclear
 

@@ -1,10 +1,10 @@
 """Linear and nonlinear solvers that know no physics."""
 
 from dln_jax.solvers import elimination, least_squares, levenberg_marquardt, normal_equations
-from dln_jax.solvers.newton import Info, find_root
+from dln_jax.solvers.newton import SolverInfo, find_root
 
 __all__ = [
-    "Info",
+    "SolverInfo",
     "elimination",
     "find_root",
     "least_squares",

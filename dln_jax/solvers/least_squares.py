@@ -67,16 +67,11 @@ def solve(
         if not 0 <= value < 1:
             raise InputError(f"{name} is {value}; expected a number in [0, 1)")
 
-    norms = np.linalg.norm(A, axis=0)
-    seen = norms > negligible * norms.max(initial=0.0)
-    scale = np.where(seen, norms, 1.0)
-    scaled, rhs = np.where(seen, A, 0.0) / scale, b
+    (scaled, scale), rhs = scaled_columns(A, negligible), b
     if A.shape[0] > A.shape[1] + 1:
         triangle = triangular_factor(scaled, rhs)
         scaled, rhs = triangle[:, :-1], triangle[:, -1]
-    left, sizes, right = np.linalg.svd(scaled, full_matrices=False)
-    counts = sizes > rank_tolerance * sizes.max(initial=0.0)
-    left, sizes, right = left[:, counts], sizes[counts], right[counts]
+    left, sizes, right = truncated_svd(scaled, rank_tolerance)
     x = right.T @ (sizes / (sizes**2 + ridge) * (left.T @ rhs)) / scale
     return Solution(
         x=x,
@@ -108,6 +103,21 @@ def solve_chunks(
     if rank_tolerance is None:
         rank_tolerance = float(np.finfo(np.float64).eps * max(rows, triangle.shape[1] - 1))
     return solve(triangle[:, :-1], triangle[:, -1], ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible)
+
+
+def scaled_columns(A: np.ndarray, negligible: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns A D⁻¹ and D, with zeros for negligible columns."""
+    norms = np.linalg.norm(A, axis=0)
+    seen = norms > negligible * norms.max(initial=0.0)
+    scale = np.where(seen, norms, 1.0)
+    return np.where(seen, A, 0.0) / scale, scale
+
+
+def truncated_svd(A: np.ndarray, rank_tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns U, S and Vᵀ without singular values up to the tolerance, which is relative to the largest."""
+    left, sizes, right = np.linalg.svd(A, full_matrices=False)
+    counts = sizes > rank_tolerance * sizes.max(initial=0.0)
+    return left[:, counts], sizes[counts], right[counts]
 
 
 def triangular_factor(A: Float[np.ndarray, "N P"], b: Float[np.ndarray, " N"]) -> Float[np.ndarray, "K P_and_1"]:

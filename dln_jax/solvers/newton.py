@@ -23,7 +23,7 @@ Root = Float[Array, " n"]
 _ROUNDING_UNITS = 16
 
 
-class Info(NamedTuple):
+class SolverInfo(NamedTuple):
     """Outcome of a search for a root or a minimum."""
 
     residual: Float[Array, ""]
@@ -49,10 +49,10 @@ class _RootIterate(NamedTuple):
 
 def find_root(
     function: Callable[..., Array], start: Root, *arguments: Any, tolerance: float = 0.0, iterations: int = 30
-) -> tuple[Root, Info]:
+) -> tuple[Root, SolverInfo]:
     """Returns x [n] with function(x, *arguments) = 0, for up to about twenty equations and a start near the root.
 
-    There is no line search: from a start too far from the root the iteration may diverge, which `Info.converged`
+    There is no line search: from a start too far from the root the iteration may diverge, which `SolverInfo.converged`
     reports; x is then the last iterate. Derivatives are those of the root, with respect to the arguments and to
     arrays that the function closes over; the start has none.
 
@@ -80,7 +80,7 @@ def find_root(
     root, (residual, count, converged) = jax.lax.custom_root(
         lambda x: function(x, *arguments), start, search, solve_linearised, has_aux=True
     )
-    return root, Info(residual, count.astype(int), converged > 0)
+    return root, SolverInfo(residual, count.astype(int), converged > 0)
 
 
 def _newton(

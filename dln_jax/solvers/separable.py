@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
+from dln_jax.solvers.least_squares import scaled_columns, truncated_svd
 from dln_jax.types import InputError, require_positive
 
 FIRST_DAMPING, LOWER_DAMPING, TRIALS = 1e-3, 1e-12, 30
@@ -166,14 +167,11 @@ def _svd(
     A: np.ndarray, rank_tolerance: float | None = None, negligible: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Returns U, S, Vᵀ of the columns of A scaled to norm 1, without singular values of rounding, and the norms."""
-    norms = np.linalg.norm(A, axis=0)
-    seen = norms > negligible * norms.max(initial=0.0)
-    scale = np.where(seen, norms, 1.0)
-    orthogonal, triangle = np.linalg.qr(np.where(seen, A, 0.0) / scale)
-    left, sizes, right = np.linalg.svd(triangle, full_matrices=False)
+    scaled, scale = scaled_columns(A, negligible)
+    orthogonal, triangle = np.linalg.qr(scaled)
     lower = np.finfo(float).eps * max(A.shape) if rank_tolerance is None else rank_tolerance
-    counts = sizes > lower * sizes.max(initial=0.0)
-    return orthogonal @ left[:, counts], sizes[counts], right[counts], scale
+    left, sizes, right = truncated_svd(triangle, lower)
+    return orthogonal @ left, sizes, right, scale
 
 
 def _covariance(G: np.ndarray, at: _Projected, rank_tolerance: float | None, negligible: float) -> np.ndarray:

@@ -29,7 +29,7 @@ STACKED = ("twist", "creature")
 FRAMES_PER_SECOND, MOST_FRAMES = 20.0, 100
 
 
-class Motion(NamedTuple):
+class SimulatedMotion(NamedTuple):
     """A motion of T steps; t, x and v include the start."""
 
     t: np.ndarray
@@ -40,7 +40,7 @@ class Motion(NamedTuple):
     steps_per_second: float
 
 
-def results(scene: str, mesh: Mesh, motion: Motion) -> list[Row]:
+def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
     """Rows of the table."""
     info, iterations = motion.info, motion.info.iterations
     ratios = np.stack([simplex_volumes(x.astype(np.float64), mesh.elements) for x in motion.x]) / volumes(mesh)
@@ -74,7 +74,7 @@ def line(row: Row) -> tuple[str, str, str]:
     return label, f"{row.value:.4g}", "" if row.unit == "1" else row.unit
 
 
-def warn(motion: Motion) -> None:
+def warn(motion: SimulatedMotion) -> None:
     """Warns about steps that failed, overlapping components and non-finite motions."""
     info, steps = motion.info, len(motion.t) - 1
     growth, at_hand = np.asarray(info.energy_growth), np.asarray(info.energy_at_hand)
@@ -91,7 +91,7 @@ def warn(motion: Motion) -> None:
             first = motion.t[np.argmax(missed) + 1]
             print(
                 f"warning: {missed.sum()} of {steps} steps {what}, the first at t = {first:.4g} s: "
-                f"the motion is not to be trusted from there; {remedy}"
+                f"do not trust the motion from there on; {remedy}"
             )
     if info.overlaps is not None and (meeting := info.overlaps > 0).any():
         first = motion.t[np.argmax(meeting) + 1]
@@ -103,13 +103,13 @@ def warn(motion: Motion) -> None:
         print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")
 
 
-def finite_moments(motion: Motion) -> int:
+def finite_moments(motion: SimulatedMotion) -> int:
     """Number of moments before the first that is not finite."""
     bad = np.array([not np.isfinite(x + v).all() for x, v in zip(motion.x, motion.v, strict=True)])
     return int(np.argmax(bad)) if bad.any() else len(bad)
 
 
-def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: str, figures: bool) -> Moments:
+def draw(scene: str, example: Example, motion: SimulatedMotion, folder: Path, *, title: str, figures: bool) -> Moments:
     """Writes the figures and the GIF; returns the moments drawn."""
     shown = finite_moments(motion)
     dt = float(motion.t[1])

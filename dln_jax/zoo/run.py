@@ -13,8 +13,7 @@ from jax import Array
 
 from dln_jax.files import is_file
 from dln_jax.mechanics import equations
-from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Uncertainty, outside, predictive

@@ -24,10 +24,10 @@ from dln_jax.mechanics.integrators import gauss_legendre4, rk4, rollout, second_
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.nn.activations import tanh
-from dln_jax.scenes.datasets.default_data import default_data
+from dln_jax.scenes.datasets.generators import default_data
 from dln_jax.scenes.datasets.hamiltonian_tasks import three_body
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
-from dln_jax.scenes.two_link_arm import LINK_LENGTH, two_link_arm
+from dln_jax.scenes.pendulums import LINK_LENGTH, two_link_arm
+from dln_jax.scenes.poles import rotary_pendulum
 
 Film = Callable[[Axes], Callable[[int], None]]
 """Prepares an axis and returns the function that draws a frame."""

@@ -18,7 +18,7 @@ from dln_jax.control import (
     with_differences,
 )
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.types import InputError
 
 FIELD = lambda x, u: jnp.concatenate([x[1:], u])  # noqa: E731  a mass of 1 kg

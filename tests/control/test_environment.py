@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from dln_jax.control import Controller, Hardware, field_of, simulate
 from dln_jax.control.environment import PlantEnvironment, register
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError
 
 SCENE = cart_pole()

@@ -32,7 +32,7 @@ from dln_jax.control import (
 )
 from dln_jax.control.state_space import field_of
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.poles import rotary_pendulum
 
 SCENE = rotary_pendulum(friction=1e-5)
 PLANT, B, JOINTS = dynamics(SCENE.closed_form), np.asarray(SCENE.needs.actuation), SCENE.needs.joints

@@ -7,7 +7,7 @@ import numpy as np
 from dln_jax.control import error, field_of, linearise, lqr, regulated, simulate, stateless
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
+from dln_jax.scenes.poles import flexible_cart_pole
 
 SCENE = flexible_cart_pole()
 B = np.asarray(SCENE.needs.actuation)

@@ -11,8 +11,8 @@ from dln_jax.control.desktop_plants import desktop_cart_pole
 from dln_jax.control.friction_compensation import friction_compensation, without_friction
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients
-from dln_jax.scenes.friction import with_friction
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
+from dln_jax.scenes.scene import with_friction
 from dln_jax.types import InputError
 
 SCENE = desktop_cart_pole().scene

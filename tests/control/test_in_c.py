@@ -21,7 +21,7 @@ from dln_jax.control import (
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.poles import rotary_pendulum
 
 
 def test_laws_are_the_same_in_c(tmp_path):

@@ -10,8 +10,7 @@ import pytest
 from dln_jax.control import Problem, field_of, integrated, mpc, shoot, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
+from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
 from dln_jax.types import InputError
 
 RANDOM = np.random.default_rng(0)

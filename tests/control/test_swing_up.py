@@ -26,9 +26,8 @@ from dln_jax.control import (
 )
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
-from dln_jax.scenes.two_link_pendulum import two_link_pendulum
+from dln_jax.scenes.pendulums import two_link_pendulum
+from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from dln_jax.types import InputError, JointKind
 
 SCENES = [

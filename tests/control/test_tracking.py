@@ -18,7 +18,7 @@ from dln_jax.control import (
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, rollout, runge_kutta, second_order
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 
 ARM = dynamics(two_link_arm().energies)
 P, D = np.array([36.0, 16.0]), np.array([12.0, 8.0])

@@ -10,7 +10,7 @@ import pytest
 from dln_jax.control import Problem, field_of, first_plan, improve, mpc, optimise, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
-from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.solvers.ending import reason
 from dln_jax.types import InputError
 

@@ -11,10 +11,9 @@ from dln_jax.data import schema
 from dln_jax.data.schema import time_derivative
 from dln_jax.data.splits import PER_SAMPLE, merged, select, split
 from dln_jax.data.stated_needs import needs_from_json
-from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import double_pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError, Needs
 
 

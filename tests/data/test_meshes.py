@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, Delaunay
 
-from dln_jax.softbody.mesh.creatures import biped, body_length, crawler, quadruped
 from dln_jax.softbody.mesh.mesh import (
     boundary,
     boundary_vertices,
@@ -19,7 +18,7 @@ from dln_jax.softbody.mesh.mesh import (
     vertices_where,
     volumes,
 )
-from dln_jax.softbody.mesh.shapes import beam, box, disc, lattice
+from dln_jax.softbody.mesh.shapes import beam, biped, body_length, box, crawler, disc, lattice, quadruped
 from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
 from dln_jax.types import InputError
 

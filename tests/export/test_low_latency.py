@@ -14,7 +14,7 @@ from dln_jax.export.exports import described
 from dln_jax.export.low_latency import low_latency
 from dln_jax.mechanics.dynamics import Decomposition
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import save_tree
 

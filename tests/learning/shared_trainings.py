@@ -24,7 +24,7 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.metrics.errors import predictions
 from dln_jax.scale.mesh import batch_mesh, of_first_process
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError
 

@@ -18,10 +18,9 @@ from dln_jax.learning.engine.problem import Problem, Stop
 from dln_jax.learning.engine.sharing import Sharing
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError, Needs
 
 X = jnp.linspace(-1, 1, 50)

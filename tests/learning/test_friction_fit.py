@@ -9,8 +9,7 @@ from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionShape, joint_dissipation
-from dln_jax.mechanics.joint_friction import with_friction
-from dln_jax.mechanics.loaded import Load
+from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.types import InputError
 
 LINK = trees.inertial_parameters(2.0, [0.05, 0.02, 0.1], np.diag([0.02, 0.03, 0.01]))

@@ -12,8 +12,7 @@ from dln_jax.learning.marginal_likelihood import Equations, Unknowns, likelihood
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.torque_covariance import States
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 

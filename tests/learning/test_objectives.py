@@ -16,9 +16,9 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import STATED, arrays, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
-from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe_for
 

@@ -17,7 +17,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 
 NEEDS = two_link_arm().needs

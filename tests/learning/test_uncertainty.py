@@ -11,8 +11,8 @@ from dln_jax.learning import uncertainty as learning
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
 from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
+from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.plain import InverseForward
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.coverage import coverage
 from dln_jax.models.lagrangian import make_delan
@@ -22,7 +22,7 @@ from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.uncertainty import outside, predictive, scores
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError, Needs
 
 FRAMES = dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0]])

@@ -15,7 +15,7 @@ from dln_jax.learning.weak_forms import energy_and_loss, fit_energy, fit_momentu
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 
 RATE, SAMPLES, RUNS = 125.0, 500, 3

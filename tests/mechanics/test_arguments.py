@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics.arguments import require_size_of
-from dln_jax.mechanics.lagrangian import LagrangianSystem, dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.types import InputError
 
 STATE = np.array([0.1, 0.2]), np.array([0.5, -0.3]), np.array([1.0, 2.0])
@@ -63,7 +64,7 @@ def test_masses_may_be_traced(transform):
 def test_traced_masses_do_not_hide_a_state_that_is_too_short():
     def torque(mass):
         system = LagrangianSystem(lambda q, qd: mass * pendulums(q, qd), None)
-        return dynamics(system).inverse_dynamics(*(each[:1] for each in STATE))[0]
+        return dynamics(system).inverse_dynamics(*(vector[:1] for vector in STATE))[0]
 
     with pytest.raises(InputError, match="takes no states of size 1"):
         jax.grad(torque)(2.0)

@@ -17,8 +17,8 @@ from dln_jax.mechanics.integrators import (
     stormer_verlet,
     symplectic_euler,
 )
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.scene import closed_form_forward_dynamics
-from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.solvers.newton import find_root
 from dln_jax.types import InputError
 

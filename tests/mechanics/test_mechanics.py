@@ -14,22 +14,17 @@ from dln_jax.mechanics import closed_form, lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
-from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import chain, double_pendulum, pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
-from dln_jax.scenes.two_link_arm import two_link_arm
 
 SCENES = [
     two_link_arm(),
-    two_link_arm(zero="hanging"),
-    pendulum(),
     pendulum(acceleration=0.0, friction=0.3),
     double_pendulum(friction=0.2),
     cart_pole(),
     chain(1),
-    chain(12),
+    chain(4),
 ]
 
 
@@ -59,15 +54,15 @@ def natural_twin(scene: Scene) -> Dynamics:
     def cholesky(q):
         return jnp.linalg.cholesky(scene.mass_matrix(q))
 
-    return natural.dynamics(natural.NaturalSystem(cholesky, scene.potential, scene.dissipation))
+    return dynamics(natural.NaturalSystem(cholesky, scene.potential, scene.dissipation))
 
 
 @pytest.fixture(scope="module", params=SCENES, ids=lambda scene: scene.name + scene.needs.friction * "-friction")
 def answers(request):
-    """A scene, 1000 random states, and the answers of both paths to them."""
+    """A scene, 50 random states, and the answers of both paths to them."""
     scene = request.param
     d = scene.needs.degrees_of_freedom
-    q, qd, qdd, tau = 2 * jax.random.normal(jax.random.key(0), (4, 1000, d))
+    q, qd, qdd, tau = 2 * jax.random.normal(jax.random.key(0), (4, 50, d))
 
     # Two programs: batched LAPACK calls that run side by side in one can deadlock on two cores.
     paths = (
@@ -143,15 +138,15 @@ def round_trip(d):
 
         system = natural.NaturalSystem(cholesky, lambda q: jnp.sum(jnp.sin(q) ** 2))
         L = natural.lagrangian(system)
-        paths = natural.dynamics(system), lagrangian.dynamics(LagrangianSystem(L))
+        paths = dynamics(system), dynamics(LagrangianSystem(L))
         residuals = [path.inverse_dynamics(q, qd, path.forward_dynamics(q, qd, tau)) - tau for path in paths]
         return jnp.stack([*residuals, lagrangian.momentum(L, q, qd) - natural.mass_matrix(system, q) @ qd])
 
     return residuals
 
 
-@settings(max_examples=60, deadline=None)
-@given(d=st.sampled_from([1, 2, 3, 6]), seed=st.integers(0, 2**16))
+@settings(max_examples=30, deadline=None)
+@given(d=st.sampled_from([1, 3]), seed=st.integers(0, 2**16))
 def test_inverse_after_forward_is_the_identity(d, seed):
     """Random energies of every size, not only textbook ones."""
     random = np.random.default_rng(seed)
@@ -166,7 +161,7 @@ def test_generic_functions_take_any_lagrangian():
         return 0.5 * jnp.sum(qd**2) + 0.5 * 1.7 * (q[0] * qd[1] - q[1] * qd[0])
 
     q, qd = jnp.array([[0.2, 0.9], [1.0, -0.5]])
-    acceleration = lagrangian.forward_dynamics(L, q, qd, jnp.zeros(2))
+    acceleration = jax.jit(lambda: lagrangian.forward_dynamics(L, q, qd, jnp.zeros(2)))()
     np.testing.assert_allclose(acceleration, 1.7 * jnp.array([qd[1], -qd[0]]), rtol=1e-13)
     assert lagrangian.energy(L, q, qd) == pytest.approx(0.5 * float(qd @ qd), rel=1e-14)
 
@@ -175,5 +170,5 @@ def test_a_singular_mass_matrix_is_not_hidden():
     def L(q, qd):
         return 0.5 * qd[0] ** 2 - jnp.sum(q**2)
 
-    acceleration = lagrangian.forward_dynamics(L, jnp.ones(2), jnp.ones(2), jnp.zeros(2))
+    acceleration = jax.jit(lambda: lagrangian.forward_dynamics(L, jnp.ones(2), jnp.ones(2), jnp.zeros(2)))()
     assert not jnp.isfinite(acceleration).all()

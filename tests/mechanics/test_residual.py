@@ -7,13 +7,12 @@ import pytest
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.loaded import Load
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import inertial_parameters, lagrangian, serial, tree_system
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 
 TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 ARM = serial([np.eye(3), TURN], [[0, 0, 0.1], [0.3, 0, 0]], [inertial_parameters(2, [0.1, 0.2, 0], np.eye(3))] * 2)

@@ -9,8 +9,7 @@ from dln_jax.data.schema import from_arrays
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.friction import LAWS, FrictionShape, joint_dissipation
-from dln_jax.mechanics.joint_friction import with_friction
-from dln_jax.mechanics.loaded import Load
+from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.models.joint_friction import friction_of, with_joint_friction
 from dln_jax.scenes import double_pendulum
 from dln_jax.types import InputError, Needs

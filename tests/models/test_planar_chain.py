@@ -11,7 +11,7 @@ from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.closed_form import lagrangian as scalar
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
-from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulums import double_pendulum
 from dln_jax.types import InputError, Needs
 
 NEEDS = Needs(joints=("revolute", "revolute"), friction=True)

@@ -18,12 +18,10 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import chain, pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.solvers.least_squares import solve, solve_chunks
 from dln_jax.types import InputError, Needs
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from dln_jax import dynamics
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from scripts.reports.walks import walk_of
 
 

@@ -23,8 +23,8 @@ from dln_jax.locomotion.learning import Goal, compile_learner, learn
 from dln_jax.locomotion.policy import make_policy
 from dln_jax.locomotion.task import make_task
 from dln_jax.scale.mesh import batch_mesh, program
-from dln_jax.softbody.mesh.creatures import Creature
 from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.shapes import Creature
 from dln_jax.softbody.scene import State
 from dln_jax.softbody.step import Stepper
 

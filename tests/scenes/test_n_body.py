@@ -11,7 +11,7 @@ from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.models.hamiltonian import make_separable_hamiltonian
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.scenes.n_body import n_body
+from dln_jax.scenes.particles import n_body
 from dln_jax.types import InputError, Needs
 
 SMALL = {"width": 5, "depth": 1, "dtype": jnp.float64}
@@ -92,15 +92,15 @@ def test_gravity_is_one_set_of_parameters(alike):
     )
     scene = n_body(3, masses=tuple(float(mass) for mass in masses), G=1.7)
     q, p, tau = jax.random.normal(jax.random.key(2), (3, 6))
-    each = jnp.repeat(masses, 2)
+    per_coordinate = jnp.repeat(masses, 2)
 
     @jax.jit
     def ask():
         system = dynamics(model.energies(parameters))
         H = flow(model.energies(parameters)).energy
         return (
-            (H(q, p), jnp.sum(p**2 / each) / 2 + scene.potential(q)),
-            (system.forward_dynamics(q, p / each, tau), (tau - scene.gravity(q)) / each),
+            (H(q, p), jnp.sum(p**2 / per_coordinate) / 2 + scene.potential(q)),
+            (system.forward_dynamics(q, p / per_coordinate, tau), (tau - scene.gravity(q)) / per_coordinate),
         )
 
     for got, expected in ask():
@@ -187,7 +187,7 @@ def test_separable_follows_its_energy_without_a_mixed_derivative():
 def test_the_momentum_scale_divides_momenta():
     q, p = jax.random.normal(jax.random.key(6), (2, 2))
     scale = (4.0, 0.5)
-    scaled, plain = (make_separable_hamiltonian(MIXED, **SMALL, **given) for given in ({"momentum_scale": scale}, {}))
+    scaled, plain = (make_separable_hamiltonian(MIXED, **SMALL, **scales) for scales in ({"momentum_scale": scale}, {}))
     parameters = parameters_of(plain)
     first, second = (jax.jit(flow(model.energies(parameters)).energy) for model in (scaled, plain))
     np.testing.assert_allclose(first(q, p * np.array(scale)), second(q, p), rtol=1e-13)

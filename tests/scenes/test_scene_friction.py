@@ -6,9 +6,9 @@ import pytest
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.friction import with_friction
-from dln_jax.scenes.two_link_pendulum import two_link_pendulum
+from dln_jax.scenes.pendulums import two_link_pendulum
+from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.scene import with_friction
 from dln_jax.types import InputError
 
 

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics import closed_form, lagrangian
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
-from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import chain, double_pendulum, joint_angles, pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
 from dln_jax.scenes.scene import actuation_matrix
-from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
 from dln_jax.types import InputError
 
 
@@ -68,7 +64,7 @@ CARTESIAN = {
             [0.57, 0.375, 0.127],
         ),
     ),
-    **{f"chain-{d}": (chain(d), *rod_energy(d)) for d in (1, 3, 12)},
+    **{f"chain-{d}": (chain(d), *rod_energy(d)) for d in (1, 4)},
 }
 
 
@@ -77,12 +73,17 @@ def test_energies_equal_those_of_the_moving_masses(name):
     scene, points, masses = CARTESIAN[name]
     d = scene.needs.degrees_of_freedom
     q, qd = jax.random.normal(jax.random.key(0), (2, d))
-    position, velocity = jax.jvp(points, (q,), (qd,))
-    kinetic = 0.5 * jnp.sum(masses[..., None] * velocity**2)
-    height = jnp.sum(masses * position[..., 1]) - jnp.sum(masses * points(jnp.zeros(d))[..., 1])
-    total = lagrangian.energy(scene.lagrangian, q, qd)
-    assert total - scene.potential(q) == pytest.approx(float(kinetic), rel=1e-12)
-    assert scene.potential(q) - scene.potential(jnp.zeros(d)) == pytest.approx(9.81 * float(height), rel=1e-11)
+
+    @jax.jit
+    def energies(q, qd):
+        position, velocity = jax.jvp(points, (q,), (qd,))
+        kinetic = 0.5 * jnp.sum(masses[..., None] * velocity**2)
+        height = jnp.sum(masses * position[..., 1]) - jnp.sum(masses * points(jnp.zeros(d))[..., 1])
+        V = scene.potential(q)
+        return kinetic, 9.81 * height, lagrangian.energy(scene.lagrangian, q, qd) - V, V - scene.potential(jnp.zeros(d))
+
+    kinetic, potential, *ours = map(float, energies(q, qd))
+    assert ours == [pytest.approx(kinetic, rel=1e-12), pytest.approx(potential, rel=1e-11)]
 
 
 def test_the_arm_is_a_chain_of_two_with_other_constants():

@@ -18,7 +18,7 @@ def depth_of_common_point(a, b):
     sums = np.zeros((2, 2 * corners + 1))
     sums[0, :corners] = sums[1, corners:-1] = 1.0
     at_least = np.hstack([-np.eye(2 * corners), np.ones((2 * corners, 1))])
-    found = linprog(
+    solution = linprog(
         objective,
         A_ub=at_least,
         b_ub=np.zeros(2 * corners),
@@ -26,7 +26,7 @@ def depth_of_common_point(a, b):
         b_eq=np.append(np.zeros(dimension), [1.0, 1.0]),
         bounds=[(None, None)] * (2 * corners + 1),
     )
-    return -found.fun if found.status == 0 else -np.inf
+    return -solution.fun if solution.status == 0 else -np.inf
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -34,10 +34,10 @@ def test_simplices_overlap_as_a_linear_program_says(dimension):
     random = np.random.default_rng(dimension)
     pairs = random.normal(size=(60, 2, dimension + 1, dimension))
     pairs[:, 1] += 0.8 * random.normal(size=(60, 1, dimension))
-    found = jax.jit(jax.vmap(lambda pair: simplices_overlap(pair[0], pair[1])))(pairs)
+    solution = jax.jit(jax.vmap(lambda pair: simplices_overlap(pair[0], pair[1])))(pairs)
     expected = np.array([depth_of_common_point(*pair) > 0 for pair in pairs])
     assert 10 < expected.sum() < 50
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(solution, expected)
 
 
 def beside(shape, *offsets):

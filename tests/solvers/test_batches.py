@@ -14,12 +14,13 @@ import pytest
 from scipy.linalg import hilbert
 
 from dln_jax.locomotion.task import creature_named, make_task, run_episode
-from dln_jax.mechanics.natural import NaturalSystem, dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.solvers import lapack
-from dln_jax.solvers.bands import places, solve_bands
 from dln_jax.solvers.elements.energies import ElementEnergy, lower_triangles, project
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.symmetric_systems import places, solve_bands
 from dln_jax.solvers.elimination import solve, solve_lower, solve_lower_transposed
 
 ROOT = Path(__file__).parents[2]
@@ -51,7 +52,7 @@ def of_bands(matrices, b, band):
 
 @pytest.mark.parametrize(
     ("size", "band", "condition"),
-    [(1, 0, 1.0), (2, 1, 1e3), (7, 3, 1e14), (56, 11, 10.0), (57, 12, 1e14), (9, 8, 1e8), (12, 0, 1e14)],
+    [(1, 0, 1.0), (2, 1, 1e3), (7, 3, 1e14), (25, 6, 10.0), (9, 8, 1e8), (12, 0, 1e14)],
 )
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 def test_systems_with_bands_are_solved_backward_stably(size, band, condition, precision):
@@ -103,14 +104,16 @@ def test_substitution_in_nested_batches(transposed, right):
     axes = [(0, 0), (None, 0), (0, None)]
     for outer, inner in itertools.product([(0, 0), (None, 0), (0, None)], axes):
         chosen = [
-            each[tuple(slice(None) if axis[i] == 0 else 0 for axis in (outer, inner))]
-            for i, each in enumerate((factor, b))
+            array[tuple(slice(None) if axis[i] == 0 else 0 for axis in (outer, inner))]
+            for i, array in enumerate((factor, b))
         ]
-        found = jax.jit(jax.vmap(jax.vmap(one, inner), outer))(*chosen)
+        solutions = jax.jit(jax.vmap(jax.vmap(one, inner), outer))(*chosen)
         for i, j in itertools.product(range(2), range(3)):
             place = [(i if outer[k] == 0 else 0, j if inner[k] == 0 else 0) for k in range(2)]
             known, wanted = inverse[place[0]], b[place[1]]
-            np.testing.assert_allclose(found[i, j], wanted @ known if right else known @ wanted, rtol=1e-10, atol=1e-13)
+            np.testing.assert_allclose(
+                solutions[i, j], wanted @ known if right else known @ wanted, rtol=1e-10, atol=1e-13
+            )
 
 
 def test_eigenvalues_in_clusters_and_zeros():
@@ -126,11 +129,11 @@ def test_projection_of_elements_of_several_sizes():
     """Against NumPy; the shift is relative to the largest eigenvalue of all, and NaN ends nowhere."""
     random = np.random.default_rng(2)
     wholes = [random.normal(size=(count, size, size)) for count, size in ((3, 2), (5, 6), (2, 12))]
-    wholes = [each + each.swapaxes(1, 2) for each in wholes]
-    found = jax.jit(project)(tuple(lower_triangles(jnp.asarray(each)) for each in wholes), 1e-3)
-    spectra = [np.linalg.eigh(each) for each in wholes]
+    wholes = [matrices + matrices.swapaxes(1, 2) for matrices in wholes]
+    projected = jax.jit(project)(tuple(lower_triangles(jnp.asarray(matrices)) for matrices in wholes), 1e-3)
+    spectra = [np.linalg.eigh(matrices) for matrices in wholes]
     largest = max(values.max() for values, _ in spectra)
-    for (values, vectors), lower in zip(spectra, found, strict=True):
+    for (values, vectors), lower in zip(spectra, projected, strict=True):
         raised = vectors * (np.maximum(values, 0) + 1e-3 * largest)[:, None] @ vectors.swapaxes(1, 2)
         np.testing.assert_allclose(lower, lower_triangles(jnp.asarray(raised)), atol=1e-12)
     assert np.isfinite(jax.jit(project)((jnp.full((3, 4), jnp.nan),), 1e-3)[0]).all()
@@ -150,7 +153,7 @@ def test_general_systems_in_batches_and_their_derivatives(size):
         (solve_lower_transposed, np.linalg.inv(np.tril(matrices)).swapaxes(1, 2)),
     ):
         # d(uᵀ x) = -(A⁻ᵀ u) xᵀ dA, of the lower triangle where only that is read.
-        slopes = jax.jit(jax.vmap(jax.grad(lambda *given, f=function: f(*given).sum())))(matrices, b)
+        slopes = jax.jit(jax.vmap(jax.grad(lambda *arguments, f=function: f(*arguments).sum())))(matrices, b)
         adjoint, x = inverse.sum(axis=1), (inverse @ b[..., None])[..., 0]
         outer = adjoint[:, :, None] * x[:, None]
         if function is solve_lower_transposed:
@@ -196,7 +199,7 @@ def test_minima_and_their_derivatives_in_batches(way, derived):
     every = derived(lambda stiffness, length: sag(stiffness, length, way))
     together, alone = jax.jit(jax.vmap(every))(*CHAINS), jax.jit(every)
     for lane in range(4):
-        expected = alone(*(each[lane] for each in CHAINS))
+        expected = alone(*(numbers[lane] for numbers in CHAINS))
         for left, right in zip(jax.tree.leaves(together), jax.tree.leaves(expected), strict=True):
             assert jnp.isfinite(right)
             np.testing.assert_allclose(left[lane], right, rtol=1e-7, atol=1e-12)
@@ -236,13 +239,13 @@ CALL = re.compile(r"custom_call @lapack_\w+\(.*-> \(?tensor<((?:\d+x)+)f")
 def test_no_batch_is_given_to_lapack(program):
     one, at = PROGRAMS[program]()
     text = jax.jit(jax.vmap(one)).lower(np.broadcast_to(at, (4, *at.shape))).as_text()
-    calls = [found.group(1) for found in map(CALL.search, text.splitlines()) if found]
+    calls = [call.group(1) for call in map(CALL.search, text.splitlines()) if call]
     assert calls and all(shape.count("x") <= 2 for shape in calls), calls
 
 
 def test_a_batch_that_is_given_to_lapack_would_be_seen():
     text = jax.jit(jnp.linalg.cholesky).lower(np.ones((3, 4, 4))).as_text()
-    assert [found.group(1) for found in map(CALL.search, text.splitlines()) if found] == ["3x4x4x"]
+    assert [call.group(1) for call in map(CALL.search, text.splitlines()) if call] == ["3x4x4x"]
 
 
 def test_elsewhere_a_batch_is_one_call():
@@ -273,12 +276,13 @@ assert mesh is not None and mesh.size == 4
 program = jax.jit(spread(lambda _, lanes: jax.vmap(one)(lanes), mesh)).lower(None, lanes).compile()
 first = jax.block_until_ready(program(None, lanes))
 for shift in range(100):
-    found = jax.block_until_ready(program(None, np.roll(lanes, shift, axis=0)))
-for left, right in zip(found, first):
+    rolled = jax.block_until_ready(program(None, np.roll(lanes, shift, axis=0)))
+for left, right in zip(rolled, first):
     np.testing.assert_allclose(left, np.roll(right, shift), rtol=1e-9)
 """
 
 
+@pytest.mark.slow
 def test_four_devices_do_not_wait_for_each_other():
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}

@@ -18,9 +18,9 @@ def in_chunks(A, b, **options):
 @pytest.mark.parametrize("way", [solve, in_chunks])
 def test_columns_of_any_unit_count_and_what_is_negligible_does_not(way):
     b = A @ X
-    found = way(A, b)
-    np.testing.assert_allclose(found.x, X, rtol=1e-7)
-    assert found.rank == 4
+    solution = way(A, b)
+    np.testing.assert_allclose(solution.x, X, rtol=1e-7)
+    assert solution.rank == 4
     # What terms leave that cancel: noise would project onto it and be divided by it.
     cancelled = 1e-14 * RANDOM.normal(size=(60, 1))
     noisy = b + 0.1 * RANDOM.normal(size=60)

@@ -118,14 +118,14 @@ def by_optimistix(name):
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_classic_problems_agree_with_optimistix(name):
     residual, start, data, minimum, tolerance = PROBLEMS[name]
-    found = solve(residual, start, data, 150)
+    final = solve(residual, start, data, 150)
     reference = by_optimistix(name)
     squares = jax.vmap(lambda *sample: residual(reference, *sample))(*map(jnp.asarray, data)) ** 2
-    total = float(found.loss) * len(data[0])
+    total = float(final.loss) * len(data[0])
     np.testing.assert_allclose(total, squares.sum(), rtol=1e-9, atol=1e-11)
     if minimum is not None:
         np.testing.assert_allclose(total, minimum, rtol=1e-5, atol=1e-11)
-    for ours, theirs in zip(jax.tree.leaves(found.parameters), jax.tree.leaves(reference), strict=True):
+    for ours, theirs in zip(jax.tree.leaves(final.parameters), jax.tree.leaves(reference), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=tolerance, atol=tolerance)
 
 
@@ -139,11 +139,11 @@ def linear_problem(samples, parameters, seed=0):
 
 def test_linear_least_squares_in_few_iterations():
     rows, y = linear_problem(60, 7)
-    found = solve(linear, jnp.zeros(7), (rows, y), 6)
+    final = solve(linear, jnp.zeros(7), (rows, y), 6)
     expected = np.linalg.lstsq(rows, y)[0]
-    np.testing.assert_allclose(found.parameters, expected, rtol=1e-9, atol=1e-10)
-    np.testing.assert_allclose(found.loss, np.mean((rows @ expected - y) ** 2), rtol=1e-9)
-    assert found.fallbacks == 0
+    np.testing.assert_allclose(final.parameters, expected, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(final.loss, np.mean((rows @ expected - y) ** 2), rtol=1e-9)
+    assert final.fallbacks == 0
 
 
 def test_a_linear_problem_has_no_acceleration(constants):
@@ -161,12 +161,12 @@ def test_a_linear_problem_has_no_acceleration(constants):
 def test_rank_deficient_problems_converge_and_fallbacks_are_counted(rank, damping, falls_back):
     basis, y = linear_problem(60, rank)
     rows = basis @ np.asarray(uniform(5, rank, 7)) if rank < 7 else basis
-    found = run(linear, init(jnp.ones(7))._replace(damping=jnp.array(damping)), (rows, y), 5)
+    final = run(linear, init(jnp.ones(7))._replace(damping=jnp.array(damping)), (rows, y), 5)
     floor = np.mean((rows @ np.linalg.lstsq(rows, y)[0] - y) ** 2)
-    np.testing.assert_allclose(found.loss, floor, rtol=1e-9)
-    assert (found.fallbacks > 0) == falls_back
+    np.testing.assert_allclose(final.loss, floor, rtol=1e-9)
+    assert (final.fallbacks > 0) == falls_back
     # The step has no part in the null space to speak of, though nothing but rounding defines it there.
-    assert np.abs(found.parameters).max() < 1e3
+    assert np.abs(final.parameters).max() < 1e3
 
 
 def test_ill_conditioned_problem(constants):
@@ -174,10 +174,10 @@ def test_ill_conditioned_problem(constants):
     t = np.linspace(0, 1, 50)
     rows, y = np.vander(t, 10), np.sin(5 * t)
     constants(LOWER_DAMPING=1e-18)
-    found = solve(linear, jnp.zeros(10), (rows, y), 60)
+    final = solve(linear, jnp.zeros(10), (rows, y), 60)
     floor = np.mean((rows @ np.linalg.lstsq(rows, y)[0] - y) ** 2)
     assert 1e-15 < floor < 1e-11
-    assert found.loss < 1.01 * floor
+    assert final.loss < 1.01 * floor
 
 
 def network(parameters, x, y):
@@ -325,15 +325,15 @@ def test_the_residual_is_traced_for_one_program_only():
 
 def test_no_improvement_to_speak_of_ends_a_run_that_then_holds_still():
     residual, start, data, minimum, _ = PROBLEMS["bard"]
-    found = solve(residual, start, data, 50, improvement=1e-3)
-    assert found.status == Status.IMPROVEMENT and 3 < found.iteration < 50
-    np.testing.assert_allclose(found.loss * 15, minimum, rtol=1e-3)
-    assert trees_equal(run(residual, found, data, 1, improvement=1e-3), found)
+    final = solve(residual, start, data, 50, improvement=1e-3)
+    assert final.status == Status.IMPROVEMENT and 3 < final.iteration < 50
+    np.testing.assert_allclose(final.loss * 15, minimum, rtol=1e-3)
+    assert trees_equal(run(residual, final, data, 1, improvement=1e-3), final)
 
 
 def test_a_zero_gradient_ends_a_run():
-    found = solve(lambda x, _: x**2, jnp.array(0.0), NO_DATA, 5)
-    assert found.status == Status.FLAT and found.iteration == 0
+    final = solve(lambda x, _: x**2, jnp.array(0.0), NO_DATA, 5)
+    assert final.status == Status.FLAT and final.iteration == 0
 
 
 @jax.custom_jvp
@@ -345,17 +345,17 @@ misleading.defjvp(lambda primals, tangents: (misleading(*primals), -tangents[0])
 
 
 def test_wrong_derivatives_stall():
-    found = solve(lambda x, _: misleading(x), jnp.array(0.0), NO_DATA, 9)
-    assert found.status == Status.STALLED
-    assert (int(found.trials), float(found.parameters), float(found.loss)) == (levenberg_marquardt.TRIALS, 0.0, 4.0)
+    final = solve(lambda x, _: misleading(x), jnp.array(0.0), NO_DATA, 9)
+    assert final.status == Status.STALLED
+    assert (int(final.trials), float(final.parameters), float(final.loss)) == (levenberg_marquardt.TRIALS, 0.0, 4.0)
 
 
 def test_a_non_finite_trial_is_a_failed_trial():
     """From 20 the undamped step for log(x) = 1 is to -20, where there is no logarithm."""
     start = init(jnp.array(20.0))._replace(damping=jnp.array(1e-12))
-    found = run(lambda x, _: jnp.log(x) - 1, start, NO_DATA, 50)
-    np.testing.assert_allclose(found.parameters, np.e, rtol=1e-8)
-    assert found.trials > found.iteration
+    final = run(lambda x, _: jnp.log(x) - 1, start, NO_DATA, 50)
+    np.testing.assert_allclose(final.parameters, np.e, rtol=1e-8)
+    assert final.trials > final.iteration
 
 
 @jax.custom_jvp
@@ -369,14 +369,14 @@ treacherous.defjvp(lambda primals, tangents: (primals[0], jnp.where(primals[0] <
 
 def test_what_is_not_finite_stops_with_the_last_good_state():
     start = init(jnp.array(1.0))._replace(damping=jnp.array(1.0))
-    found = run(lambda x, _: treacherous(x), start, NO_DATA, 50)
-    assert found.status == Status.NON_FINITE
-    assert 0 < found.parameters < 0.1 and found.iteration > 0
-    assert trees_equal(run(lambda x, _: treacherous(x), start, NO_DATA, found.iteration).parameters, found.parameters)
+    final = run(lambda x, _: treacherous(x), start, NO_DATA, 50)
+    assert final.status == Status.NON_FINITE
+    assert 0 < final.parameters < 0.1 and final.iteration > 0
+    assert trees_equal(run(lambda x, _: treacherous(x), start, NO_DATA, final.iteration).parameters, final.parameters)
     bad = jnp.asarray(NETWORK_DATA[1]).at[3].set(jnp.nan)
-    found = solve(network, network_parameters(0), (NETWORK_DATA[0], bad), 5)
-    assert (found.status, found.iteration) == (Status.NON_FINITE, 0)
-    assert trees_equal(found.parameters, network_parameters(0))
+    final = solve(network, network_parameters(0), (NETWORK_DATA[0], bad), 5)
+    assert (final.status, final.iteration) == (Status.NON_FINITE, 0)
+    assert trees_equal(final.parameters, network_parameters(0))
 
 
 REFUSED = {

@@ -16,12 +16,12 @@ from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.solvers.elements import linear_solvers
+from dln_jax.solvers.elements import selection
 from dln_jax.solvers.elements.assembly import Pattern, assemble, entries, gradient, pattern
-from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, project, square, value
-from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free
+from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.selection import by_size, least_work, search_takes_at_most
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
 from dln_jax.types import InputError
 
@@ -102,11 +102,11 @@ def chosen(scene, dt):
     seen = []
 
     def observed(way):
-        return lambda *given: seen.append(way.__name__) or way(*given)
+        return lambda *arguments: seen.append(way.__name__) or way(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:
         for way in (dense, block_tridiagonal, matrix_free):
-            patch.setattr(linear_solvers, way.__name__, observed(way))
+            patch.setattr(selection, way.__name__, observed(way))
         make_step(scene, dt)
     return seen[0]
 
@@ -169,18 +169,18 @@ def test_every_linear_solver_finds_the_minimum_of_an_independent_optimiser(name)
 @pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd], ids=["reverse", "forward"])
 def test_derivatives_are_those_of_the_minimum(sag, mode):
     derivatives = jax.jit(mode(lambda *arguments: hanging_chain(*arguments)[0][:, 1].mean(), argnums=(0, 1, 2)))
-    found = derivatives(*ARGUMENTS)
+    slopes = derivatives(*ARGUMENTS)
     step = 1e-6
     for number, scale in ((0, 1e2), (1, 1.0)):
         moved = [[*ARGUMENTS], [*ARGUMENTS]]
         moved[0][number] += scale * step
         moved[1][number] -= scale * step
         difference = (sag(*moved[0]) - sag(*moved[1])) / (2 * scale * step)
-        np.testing.assert_allclose(found[number], difference, rtol=1e-6)
+        np.testing.assert_allclose(slopes[number], difference, rtol=1e-6)
     for axis in range(2):
         e = step * jnp.eye(2)[axis]
         difference = (sag(*ARGUMENTS[:2], ARGUMENTS[2] + e) - sag(*ARGUMENTS[:2], ARGUMENTS[2] - e)) / (2 * step)
-        np.testing.assert_allclose(found[2][axis], difference, rtol=1e-6)
+        np.testing.assert_allclose(slopes[2][axis], difference, rtol=1e-6)
 
 
 def test_second_derivatives_nest(sag):

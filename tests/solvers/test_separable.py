@@ -26,16 +26,16 @@ def noisy(seed, noise):
 
 
 def test_both_kinds_of_unknowns_are_found():
-    found = solve_separable(design, np.log([1.0, 2.0]), T, noisy(0, 0.0), improvement=1e-15)
-    assert found.converged and found.rank == 3
-    np.testing.assert_allclose(np.exp(found.nonlinear), RATES, rtol=1e-7)
-    np.testing.assert_allclose(found.linear, SIZES, rtol=1e-6)
+    solution = solve_separable(design, np.log([1.0, 2.0]), T, noisy(0, 0.0), improvement=1e-15)
+    assert solution.converged and solution.rank == 3
+    np.testing.assert_allclose(np.exp(solution.nonlinear), RATES, rtol=1e-7)
+    np.testing.assert_allclose(solution.linear, SIZES, rtol=1e-6)
 
 
 def test_errors_are_those_of_repetition():
     noise = 0.01
     every = [solve_separable(design, np.log([1.0, 2.0]), T, noisy(seed, noise)) for seed in range(60)]
-    spread = np.std([np.append(each.linear, each.nonlinear) for each in every], axis=0)
+    spread = np.std([np.append(fit.linear, fit.nonlinear) for fit in every], axis=0)
     stated = np.sqrt(np.diagonal(every[0].covariance))
     np.testing.assert_allclose(stated, spread, rtol=0.35)
 
@@ -64,25 +64,25 @@ def test_what_no_equation_shows_has_no_part():
         A = columns(n, t)
         return jnp.concatenate([A, A[:, :1], jnp.zeros((len(t), 1))], axis=1), b
 
-    found = solve_separable(twice, np.log([1.0, 2.0]), T, noisy(0, 0.0), rank_tolerance=1e-10)
-    assert found.rank == 3 and found.linear[4] == 0
-    np.testing.assert_allclose(found.linear[[0, 3]], [1.0, 1.0], rtol=1e-5)
+    solution = solve_separable(twice, np.log([1.0, 2.0]), T, noisy(0, 0.0), rank_tolerance=1e-10)
+    assert solution.rank == 3 and solution.linear[4] == 0
+    np.testing.assert_allclose(solution.linear[[0, 3]], [1.0, 1.0], rtol=1e-5)
 
 
 def test_a_bound_on_steps_keeps_a_start_in_its_valley():
     start = np.log([0.05, 80.0])
-    found = solve_separable(design, start, T, noisy(0, 1e-3), longest_step=0.3, iterations=1)
-    assert 0 < np.abs(found.nonlinear - start).max() <= 0.3
+    solution = solve_separable(design, start, T, noisy(0, 1e-3), longest_step=0.3, iterations=1)
+    assert 0 < np.abs(solution.nonlinear - start).max() <= 0.3
 
 
 @pytest.mark.parametrize(
-    "start, given, message",
+    "start, options, message",
     [
         (np.zeros((2, 1)), {}, "start has shape"),
         (np.full(2, np.nan), {}, "NaN or infinite entries at the start"),
         (np.zeros(2), {"iterations": 0}, "iterations is 0; expected a positive number"),
     ],
 )
-def test_what_is_no_problem_is_refused(start, given, message):
+def test_what_is_no_problem_is_refused(start, options, message):
     with pytest.raises(InputError, match=message):
-        solve_separable(design, start, T, noisy(0, 0.0), **given)
+        solve_separable(design, start, T, noisy(0, 0.0), **options)

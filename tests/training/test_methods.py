@@ -17,7 +17,7 @@ from dln_jax.data import schema
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.models.model import Model
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.options import AUTO, FITS, VARIANTS, Fit, Options
 from dln_jax.training.dynamics.run import run

@@ -12,9 +12,9 @@ import pytest
 
 import dln_jax
 from dln_jax.data.schema import from_arrays
+from dln_jax.mechanics.dynamics import PhaseRates
 from dln_jax.mechanics.equations import Canonical, Energies, dynamics, flow
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs

@@ -26,56 +26,56 @@ OF_KIND = {
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to generate."""
+    """What to generate, and where it goes."""
 
     out: Path
     """File to write; its name ends in .npz."""
     scene: SceneName = "two-link-arm"
-    """What moves."""
+    """The textbook system."""
     kind: Literal["characters", "uniform", "free-swing"] = "characters"
     """How to sample the scene."""
     samples: Unstated[int] = None
-    """uniform: states (default: 3000)."""
+    """uniform: number of states (default: 3000)."""
     position_bound: Unstated[float] = None
-    """uniform: half the box of q, rad or m (default: pi)."""
+    """uniform: largest |q|, rad or m (default: pi)."""
     rate_bound: Unstated[float] = None
-    """uniform: half the box of qd, 1/s (default: 5)."""
+    """uniform: largest |qd|, 1/s (default: 5)."""
     acceleration_bound: Unstated[float] = None
-    """uniform, fully actuated scenes: half the box of qdd, 1/s² (default: 20)."""
+    """uniform, fully actuated scenes: largest |qdd|, 1/s² (default: 20)."""
     control_bound: Unstated[float] = None
-    """uniform, under-actuated scenes: half the box of the controls, N m or N (default: 10)."""
+    """uniform, under-actuated scenes: largest control, N m or N (default: 10)."""
     trajectories: Unstated[int] = None
-    """free-swing: motions (default: 10)."""
+    """free-swing: number of motions (default: 10)."""
     steps: Unstated[int] = None
     """free-swing: samples per motion (default: 400)."""
     dt: Unstated[float] = None
     """characters, free-swing: time between samples, s (default: 0.04 for characters, 0.02 for free-swing)."""
     seed: Unstated[int] = None
-    """uniform, free-swing: of everything that is drawn (default: 0)."""
+    """uniform, free-swing: seed of all random numbers (default: 0)."""
     overwrite: bool = False
     """Replace the file if it exists."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Generates the trajectories, writes them and prints a summary."""
-    data = generate(given)
-    schema.save(given.out, data, overwrite=given.overwrite)
+    data = generate(options)
+    schema.save(options.out, data, overwrite=options.overwrite)
     count = len(set(data.trajectory.tolist()))
-    print(f"{given.out}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} degrees of freedom")
+    print(f"{options.out}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} degrees of freedom")
 
 
-def generate(given: Arguments) -> Trajectories:
+def generate(options: Arguments) -> Trajectories:
     """Generates the requested trajectories; `InputError` for options that the kind or the scene does not use."""
-    scene = scene_named(given.scene)
-    unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[given.kind])
-    refuse_given(given, sorted(unused), f"not used for --kind {given.kind}")
-    chosen = {name: getattr(given, name) for name in OF_KIND[given.kind] if getattr(given, name) is not None}
-    if given.kind == "characters":
+    scene = scene_named(options.scene)
+    unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[options.kind])
+    refuse_given(options, sorted(unused), f"not used for --kind {options.kind}")
+    chosen = {name: getattr(options, name) for name in OF_KIND[options.kind] if getattr(options, name) is not None}
+    if options.kind == "characters":
         if scene.name != "two-link-arm":
             raise InputError(f"characters are written by the two-link-arm, not by {scene.name}; choose another --kind")
         return generators.characters(**chosen)
-    if given.kind == "uniform":
+    if options.kind == "uniform":
         actuated = scene.needs.actuation is None
-        refuse_given(given, ["control_bound" if actuated else "acceleration_bound"], f"not used for {given.scene}")
+        refuse_given(options, ["control_bound" if actuated else "acceleration_bound"], f"not used for {options.scene}")
         return generators.uniform(scene, **chosen)
     return generators.free_swing(scene, **chosen)

@@ -1,12 +1,12 @@
 """Simulate a soft body by implicit time steps: a cantilever, a twisted bar, a sliding block, a falling body, a crawler.
 
 Prints the speed and how well the steps were solved, and writes a run folder: motion.gif, energy.png (energies against
-time: what the implicit step damps is seen), moments.png, metrics.json, report.json and config.json. Bodies have 1000
-kg/m³; in the plane they are 1 m thick.
+time, which show what the implicit step damps), moments.png, metrics.json, report.json and config.json. Bodies have
+1000 kg/m³; in the plane they are 1 m thick.
 
 Your own mesh: --mesh FILE.npz for the scenes beam and drop, with `vertices` [n, 2 or 3] in m, the last axis up,
 `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the beam, optionally `held` [k] (vertices;
-by default those of least x). Inverted elements are turned, and it says how many.
+by default those of the smallest x). The command reorients inverted elements and prints their number.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ from dln_jax.softbody.step import INTEGRATORS, Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.verdict import Info
 from dln_jax.training.results import print_numbers
-from dln_jax.training.simulation_results import Motion, draw, line, results, warn
+from dln_jax.training.simulation_results import SimulatedMotion, draw, line, results, warn
 from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
@@ -64,39 +64,39 @@ class Arguments(Folder, Drawn):
     """What to simulate, how, and where the results go. Unset options take the scene's defaults."""
 
     scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
-    """What to simulate; all: each in a folder of its own, with one figure of them."""
+    """The scene to simulate; all: every scene in its own subfolder, and one figure of all."""
     integrator: Literal["backward-euler", "bdf2", "midpoint"] = "backward-euler"
     """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp."""
     dt: Unstated[float] = None
     """Time step in s."""
     seconds: Unstated[float] = None
-    """Length of the motion in s."""
+    """Duration of the motion in s."""
     cells: Unstated[int] = None
     """Cells across the body (drop: rings of the disc); not for the creature."""
     dimension: Unstated[int] = None
-    """2 or 3, for beam and drop."""
+    """beam, drop: 2 or 3."""
     youngs_modulus: Unstated[float] = None
     """E in Pa; not for the creature."""
     poisson_ratio: Unstated[float] = None
     """Between -1 and 0.5; not for the creature."""
     friction: Unstated[float] = None
-    """Coulomb's coefficient, for slope and drop."""
+    """slope, drop: Coulomb's coefficient of friction."""
     turns: Unstated[float] = None
-    """Turns of one end against the other, for twist."""
+    """twist: turns of one end against the other."""
     material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
     """Not for the creature (default: stable-neo-hookean)."""
     mesh: Unstated[Path] = None
-    """Your own mesh, for beam and drop: see above."""
+    """beam, drop: your own mesh, as described above."""
     precision: Literal["f32", "f64"] = "f64"
     """Floating-point type."""
     seed: int = 0
-    """Of the turning rate in drop, and of its box's tilt; nothing else is random."""
+    """drop: seed of the rate of rotation and of the box's tilt."""
 
 
-class Prepared(NamedTuple):
+class PreparedScene(NamedTuple):
     """A scene with its stepper, ready to simulate."""
 
-    given: Arguments
+    options: Arguments
     example: Example
     stepper: Stepper
     dt: float
@@ -104,47 +104,49 @@ class Prepared(NamedTuple):
     steps: int
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Simulates one scene into the run folder, or all scenes into subfolders with a combined picture."""
-    several = given.scene == ALL
-    prepared = [prepare(dataclasses.replace(given, scene=name)) for name in (EXAMPLES if several else [given.scene])]
-    with run_folder(given.out, "simulate") as folder:
+    several = options.scene == ALL
+    prepared = [
+        prepare(dataclasses.replace(options, scene=name)) for name in (EXAMPLES if several else [options.scene])
+    ]
+    with run_folder(options.out, "simulate") as folder:
         pictures = []
-        for each in prepared:
-            own = folder / each.given.scene if several else folder
+        for scene in prepared:
+            own = folder / scene.options.scene if several else folder
             own.mkdir(exist_ok=True)
-            pictures.append(simulate(each, own))
-        if several and given.figures:
+            pictures.append(simulate(scene, own))
+        if several and options.figures:
             gallery = moments_figure([pictures[i] for i in GALLERY], columns=3)
             write_figure(folder / "soft-bodies.png", gallery)
         print(f"run folder: {folder}")
 
 
-def prepare(given: Arguments) -> Prepared:
+def prepare(options: Arguments) -> PreparedScene:
     """Builds the scene and its stepper; checks the whole command line before anything is written."""
-    example = example_of(given)
-    dt, seconds = resolved(given, {"dt": example.dt, "seconds": example.seconds}).values()
+    example = example_of(options)
+    dt, seconds = resolved(options, {"dt": example.dt, "seconds": example.seconds}).values()
     require_positive(dt=dt, seconds=seconds)
     if not dt <= seconds < math.inf:
-        raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite length of one time step or more")
+        raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite duration of at least one time step")
     steps = round(seconds / dt)
     require_within({"steps (--seconds / --dt)": steps})
     # Positions and velocities of every step in float64, held twice while chunks are concatenated.
     require_memory(f"a motion of {steps:,} steps", 32.0 * steps * example.scene.mesh.vertices.size)
-    stepper = driven_step(example, dt, INTEGRATORS[given.integrator])
-    return Prepared(given, example, stepper, dt, steps)
+    stepper = driven_step(example, dt, INTEGRATORS[options.integrator])
+    return PreparedScene(options, example, stepper, dt, steps)
 
 
-def simulate(prepared: Prepared, folder: Path) -> Moments:
+def simulate(prepared: PreparedScene, folder: Path) -> Moments:
     """Simulates one scene, writes its folder and returns its picture."""
-    given, example, _, dt, steps = prepared
-    write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
+    options, example, _, dt, steps = prepared
+    write_json(folder / CONFIG, {**stored_arguments(options), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh
     pieces, size = int(components(mesh).max()) + 1, np.ptp(mesh.vertices, axis=0)
     print(
-        f"{given.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements in {pieces} "
+        f"{options.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements in {pieces} "
         f"component{'s' * (pieces > 1)}, {' x '.join(f'{length:.4g}' for length in size)} m, "
-        f"{int(example.scene.free.sum())} unknowns; {given.integrator}, dt {dt:.4g} s, {given.precision}"
+        f"{int(example.scene.free.sum())} unknowns; {options.integrator}, dt {dt:.4g} s, {options.precision}"
     )
     if pieces > 1:
         loose = "no two elements share a vertex" if pieces == len(mesh.elements) else f"{pieces} parts share no vertex"
@@ -162,48 +164,48 @@ def simulate(prepared: Prepared, folder: Path) -> Moments:
     if count := len(overlaps(mesh)):
         print(f"elements overlap at {count} of their {FACETS[mesh.dimension]}: there, mass and stiffness add up")
     motion = run_motion(prepared)
-    rows = results(given.scene, mesh, motion)
+    rows = results(options.scene, mesh, motion)
     write_json(folder / "metrics.json", {row.quantity: row.value for row in rows if math.isfinite(row.value)})
-    dtype = jnp.dtype(data_type(given.precision)).name
-    facts = conditions(dtype=dtype, seeds=[given.seed], integrator=given.integrator, dt=dt)
+    dtype = jnp.dtype(data_type(options.precision)).name
+    facts = conditions(dtype=dtype, seeds=[options.seed], integrator=options.integrator, dt=dt)
     write_report(folder / "report.json", rows, facts)
     print_numbers(map(line, rows))
     warn(motion)
-    title = f"{given.scene}: {given.integrator}, dt = {dt:.4g} s"
-    return draw(given.scene, example, motion, folder, title=title, figures=given.figures)
+    title = f"{options.scene}: {options.integrator}, dt = {dt:.4g} s"
+    return draw(options.scene, example, motion, folder, title=title, figures=options.figures)
 
 
-def example_of(given: Arguments) -> Example:
+def example_of(options: Arguments) -> Example:
     """Builds the scene with the options set on the command line.
 
     Raises:
         InputError: an option that the scene does not have, options that exclude each other, or an invalid value.
     """
-    scene = EXAMPLES[given.scene]
+    scene = EXAMPLES[options.scene]
     names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
-    choices: dict[str, Any] = {name: getattr(given, name) for name in names}
-    choices["strain_energy"] = None if given.material is None else MATERIALS[given.material]
+    choices: dict[str, Any] = {name: getattr(options, name) for name in names}
+    choices["strain_energy"] = None if options.material is None else MATERIALS[options.material]
     choices = {name: value for name, value in choices.items() if value is not None}
     known = inspect.signature(scene).parameters
     for name in choices:
         if name not in known:
             option = "material" if name == "strain_energy" else name.replace("_", "-")
-            raise InputError(f"--{option} is no choice of the {given.scene} scene; leave it out")
-    if given.mesh is not None:
+            raise InputError(f"the {options.scene} scene has no --{option}; leave it out")
+    if options.mesh is not None:
         if beside := [name for name in ("cells", "dimension") if name in choices]:
-            raise InputError(f"--{beside[0]} is for the scene's own mesh; leave it or --mesh out")
+            raise InputError(f"--{beside[0]} sets the scene's own mesh; leave out either it or --mesh")
         try:
-            choices["mesh"], held = meshes.load(given.mesh)
+            choices["mesh"], held = meshes.load(options.mesh)
         except InputError as error:
             raise InputError(f"--mesh {error}") from None
         if held is not None and "held" in known:
             choices["held"] = held
-    if given.seed < 0:
-        raise InputError(f"--seed is {given.seed}; expected 0 or a positive integer")
+    if options.seed < 0:
+        raise InputError(f"--seed is {options.seed}; expected 0 or a positive integer")
     if "seed" in known:
-        choices["seed"] = given.seed
+        choices["seed"] = options.seed
     example = scene(**choices)
-    params = in_precision(example.scene.params, data_type(given.precision))
+    params = in_precision(example.scene.params, data_type(options.precision))
     return example._replace(scene=example.scene._replace(params=params))
 
 
@@ -212,12 +214,12 @@ def in_precision(tree: Any, precision: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
 
 
-def run_motion(prepared: Prepared) -> Motion:
+def run_motion(prepared: PreparedScene) -> SimulatedMotion:
     """Runs the motion in chunks of one compiled program; times compilation separately and waits for the results."""
-    given, example, (init, step), dt, steps = prepared
+    options, example, (init, step), dt, steps = prepared
     count = max(1, steps // CHUNKS)
     params = example.scene.params
-    start = state = in_precision(init(), data_type(given.precision))
+    start = state = in_precision(init(), data_type(options.precision))
 
     def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
         return state.x, state.v, info
@@ -240,4 +242,4 @@ def run_motion(prepared: Prepared) -> Motion:
             show(min(done, steps), f"t = {min(done, steps) * dt:.2f} s")
     x, v, info = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:steps], *seen)
     x, v = (np.concatenate([np.asarray(first)[None], rest]) for first, rest in ((start.x, x), (start.v, v)))
-    return Motion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent)
+    return SimulatedMotion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent)

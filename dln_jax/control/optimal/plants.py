@@ -17,8 +17,7 @@ from dln_jax.control.optimal.problem import ControlProblem, from_plant
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.nn.activations import softplus
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from dln_jax.types import JointKind, Scalar
 
 MARGIN = 1e-3

@@ -37,11 +37,10 @@ from jax.typing import DTypeLike
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.mechanics import discrete, jacobians
 from dln_jax.mechanics.discrete import ITERATIONS, Actuation
-from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
 from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
-from dln_jax.mechanics.loaded import LoadedSystem
-from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.mechanics.joint_friction import LoadedSystem
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, outside, predictive

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions
-from dln_jax.mechanics.trees.scanned import scanned_forces, scanned_regressor
+from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
 from dln_jax.types import JointKind, Vector
 
 OF_REVOLUTE = np.array([1, 2, 4, 5, 6, 8, 9])
@@ -81,7 +81,8 @@ class Projection(NamedTuple):
 def design(structure: Structure, frames: Frames, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
     """Phi of one state, unscaled."""
     d = q.shape[0]
-    regressor = scanned_regressor(structure.parents, structure.joints, structure.gravity, *frames, q, qd, qdd)
+    skeleton = Skeleton(structure.parents, structure.joints, structure.gravity, *frames)
+    regressor = scanned_regressor(skeleton, q, qd, qdd)
     columns = [regressor.reshape(d, 10 * d)[:, structure.inertial], jnp.diag(qdd)]
     if structure.friction:
         columns += [jnp.diag(qd), jnp.diag(jnp.tanh(qd / structure.velocity_scale)), jnp.eye(d, dtype=q.dtype)]
@@ -124,8 +125,8 @@ def project(
     inertias = inertias_of(structure, linear)
 
     def force(step: Array, *state: Vector) -> Vector:
-        moved = displaced(frames, step)
-        return scanned_forces(structure.parents, structure.joints, structure.gravity, *moved, inertias, *state) / unit
+        skeleton = Skeleton(structure.parents, structure.joints, structure.gravity, *displaced(frames, step))
+        return scanned_forces(skeleton, inertias, *state) / unit
 
     still = jnp.zeros((tau.shape[1], 6), tau.dtype)
     places = free_directions(structure.parents, structure.joints)

@@ -1,7 +1,6 @@
 """Friction of joints: laws, their Rayleigh functions, and load in transmissions."""
 
-from dln_jax.mechanics.friction.curves import unit_force
-from dln_jax.mechanics.friction.dissipation import joint_dissipation, joint_rates, require_shape
+from dln_jax.mechanics.friction.curves import joint_dissipation, joint_rates, require_shape, unit_force
 from dln_jax.mechanics.friction.laws import (
     LAWS,
     FrictionCoefficients,

@@ -65,38 +65,31 @@ class FrictionShape(NamedTuple):
     """s, 1/s or m/s; it may be negative."""
 
 
-COEFFICIENTS: Mapping[FrictionLaw, tuple[str, ...]] = {
-    "viscous": ("viscous",),
-    "coulomb": ("coulomb",),
-    "stribeck": ("stribeck",),
-    "offset": ("offset",),
-    "asymmetric": ("viscous_forward", "viscous_backward", "coulomb_forward", "coulomb_backward"),
-    "sigmoid": ("sigmoid",),
-    "load": (),
+PARAMETERS: Mapping[FrictionLaw, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "viscous": (("viscous",), ()),
+    "coulomb": (("coulomb",), ("velocity_scale",)),
+    "stribeck": (("stribeck",), ("velocity_scale", "stribeck_velocity")),
+    "offset": (("offset",), ()),
+    "asymmetric": (
+        ("viscous_forward", "viscous_backward", "coulomb_forward", "coulomb_backward"),
+        ("velocity_scale",),
+    ),
+    "sigmoid": (("sigmoid",), ("sigmoid_slope", "sigmoid_shift")),
+    "load": ((), ("velocity_scale",)),
 }
-"""Names in `FrictionCoefficients`, by law."""
-SHAPE: Mapping[FrictionLaw, tuple[str, ...]] = {
-    "viscous": (),
-    "coulomb": ("velocity_scale",),
-    "stribeck": ("velocity_scale", "stribeck_velocity"),
-    "offset": (),
-    "asymmetric": ("velocity_scale",),
-    "sigmoid": ("sigmoid_slope", "sigmoid_shift"),
-    "load": ("velocity_scale",),
-}
-"""Names in `FrictionShape`, by law."""
+"""Names in `FrictionCoefficients` and in `FrictionShape`, by law."""
 
 
 def coefficients_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
     """Names of the coefficients of some laws, in the order of `FrictionCoefficients`."""
-    named = {name for law in laws for name in COEFFICIENTS[law]}
-    return tuple(name for name in FrictionCoefficients._fields if name in named)
+    names = {name for law in laws for name in PARAMETERS[law][0]}
+    return tuple(name for name in FrictionCoefficients._fields if name in names)
 
 
 def shape_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
     """Names of the shape parameters of some laws, in the order of `FrictionShape`."""
-    named = {name for law in laws for name in SHAPE[law]}
-    return tuple(name for name in FrictionShape._fields if name in named)
+    names = {name for law in laws for name in PARAMETERS[law][1]}
+    return tuple(name for name in FrictionShape._fields if name in names)
 
 
 def require_laws(laws: Any, name: str) -> None:

@@ -3,8 +3,15 @@
 `tree_system(tree)` is a record for `mechanics.equations.dynamics`; `lagrangian(tree)` is its Lagrangian.
 """
 
-from dln_jax.mechanics.trees.description import Tree, dh_frames, make_tree, serial, with_payload
-from dln_jax.mechanics.trees.energies import kinetic_energy, lagrangian, potential_energy, tree_energies, tree_system
+from dln_jax.mechanics.trees.description import (
+    Tree,
+    dh_frames,
+    make_tree,
+    serial,
+    tree_from_json,
+    tree_to_json,
+    with_payload,
+)
 from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.mechanics.trees.inertia import (
     PARAMETERS,
@@ -13,8 +20,16 @@ from dln_jax.mechanics.trees.inertia import (
     moved,
     pseudo_inertia,
 )
-from dln_jax.mechanics.trees.recursions import composite_bodies, newton_euler, regressor
-from dln_jax.mechanics.trees.stored import tree_from_json, tree_to_json
+from dln_jax.mechanics.trees.recursions import (
+    composite_bodies,
+    kinetic_energy,
+    lagrangian,
+    newton_euler,
+    potential_energy,
+    regressor,
+    tree_energies,
+    tree_system,
+)
 
 __all__ = [
     "PARAMETERS",

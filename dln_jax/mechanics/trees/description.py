@@ -1,6 +1,7 @@
 """Description of a tree of rigid bodies: its structure, joint frames and axes, and inertias."""
 
-from collections.abc import Sequence
+import reprlib
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -92,7 +93,7 @@ def make_tree(
     if not (lengths > 0).all():
         raise InputError(f"joint {int(np.argmin(lengths))} has an axis of length zero; expected a direction")
     checked["axes"] = checked["axes"] / lengths[:, None]
-    kinds: list[JointKind] = ["revolute" if each == "revolute" else "prismatic" for each in joints]
+    kinds: list[JointKind] = ["revolute" if joint == "revolute" else "prismatic" for joint in joints]
     return Tree(tuple(map(int, parents)), tuple(kinds), names=tuple(names), **checked)
 
 
@@ -137,3 +138,26 @@ def with_payload(tree: Tree, link: int, inertia: Inertia, *, rotation: Any = Non
     if isinstance(tree.inertias, np.ndarray) and isinstance(there, np.ndarray):
         return tree._replace(inertias=tree.inertias + there * (np.arange(len(tree.parents)) == link)[:, None])
     return tree._replace(inertias=jnp.asarray(tree.inertias).at[link].add(there))
+
+
+def tree_to_json(tree: Tree) -> dict[str, Any]:
+    """Returns the tree's fields, with numbers as lists in double precision."""
+    fields = tree._asdict()
+    structure = {name: list(fields.pop(name)) for name in ("parents", "joints", "names")}
+    return {**structure, **{name: np.asarray(numbers, float).tolist() for name, numbers in fields.items()}}
+
+
+def tree_from_json(values: Any) -> Tree:
+    """Returns the tree of `tree_to_json`.
+
+    Raises:
+        InputError: fields that are missing or unknown, or that `make_tree` refuses.
+    """
+    if not isinstance(values, Mapping) or set(values) != set(Tree._fields):
+        raise InputError(f"tree: expected the fields {', '.join(Tree._fields)}, got {reprlib.repr(values)}")
+    try:
+        return make_tree(**values)
+    except InputError as error:
+        raise InputError(f"tree: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"tree: {reprlib.repr(str(error))}; expected numbers, and names of joints") from error

@@ -43,11 +43,11 @@ def aligned(tree: Tree) -> Tree:
         back = np.eye(3) if parent < 0 else turns[parent].T
         rotations.append(back @ rotation)
         positions.append(back @ position)
-    inertias = [moved(each, turn.T, np.zeros(3)) for each, turn in zip(tree.inertias, turns, strict=True)]
-    numpy = np if all(isinstance(each, np.ndarray) for each in (*rotations, *positions, *inertias)) else jnp
-    rounded = [numpy.stack(each) for each in (rotations, positions, inertias)]
+    inertias = [moved(theta, turn.T, np.zeros(3)) for theta, turn in zip(tree.inertias, turns, strict=True)]
+    numpy = np if all(isinstance(part, np.ndarray) for part in (*rotations, *positions, *inertias)) else jnp
+    rotations, positions, inertias = (numpy.stack(parts) for parts in (rotations, positions, inertias))
     axes = np.tile([0.0, 0.0, 1.0], (len(turns), 1))
-    return tree._replace(rotations=rounded[0], positions=rounded[1], inertias=rounded[2], axes=axes)
+    return tree._replace(rotations=rotations, positions=positions, inertias=inertias, axes=axes)
 
 
 def _onto(axis: np.ndarray) -> np.ndarray:
@@ -61,14 +61,14 @@ def _onto(axis: np.ndarray) -> np.ndarray:
 
 def placed(tree: Tree, q: Vector) -> list[Placed]:
     """Frames of the links of an aligned tree relative to their parent links."""
-    found = []
+    frames = []
     for link, kind in enumerate(tree.joints):
         rotation, position = tree.rotations[link], tree.positions[link]
         if kind == "revolute":
-            found.append(Placed(rotation, (jnp.cos(q[link]), jnp.sin(q[link])), position))
+            frames.append(Placed(rotation, (jnp.cos(q[link]), jnp.sin(q[link])), position))
         else:
-            found.append(Placed(rotation, None, position + rotation[:, 2] * q[link]))
-    return found
+            frames.append(Placed(rotation, None, position + rotation[:, 2] * q[link]))
+    return frames
 
 
 def outwards(frame: Placed, vector: Vector3) -> Vector3:

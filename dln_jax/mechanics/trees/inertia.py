@@ -70,5 +70,5 @@ def _joined(m: Any, h: Any, moments: Any) -> Any:
 
 def _alike(*arrays: Any) -> list[Any]:
     """Converts all to NumPy arrays, or all to JAX arrays if any is one."""
-    learned = any(isinstance(each, Array) for each in arrays)
-    return [jnp.asarray(each) if learned else np.asarray(each, float) for each in arrays]
+    learned = any(isinstance(array, Array) for array in arrays)
+    return [jnp.asarray(array) if learned else np.asarray(array, float) for array in arrays]

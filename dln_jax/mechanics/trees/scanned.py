@@ -3,11 +3,11 @@
 `recursions` unrolls the links, so that zeros of known frames cost nothing. Here no frame is known. In every link's
 frame the scan carries the link's motions for unit rates of the joints (the columns of its Jacobian), its own motion,
 and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008). The forces of the
-links are then independent. Joints are about z, for one state.
+links are then independent.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,26 +19,22 @@ from dln_jax.mechanics.trees.inertia import parts
 from dln_jax.types import JointKind, Vector
 
 
-def scanned_regressor(
-    parents: Sequence[int],
-    joints: Sequence[JointKind],
-    gravity: Any,
-    rotations: Any,
-    positions: Any,
-    q: Vector,
-    qd: Vector,
-    qdd: Vector,
-) -> Float[Array, "d d 10"]:
-    """d tau / d theta: forces of the joints for unit inertial parameters of the links, without armature.
+class Skeleton(NamedTuple):
+    """Links and joints of a tree, without inertias; a link's joint is about its z."""
 
-    Args:
-        parents: as of a `Tree`.
-        joints: kinds.
-        gravity: [3], m/s².
-        rotations: [d, 3, 3], of the links at q = 0 relative to their parent links.
-        positions: [d, 3], of the links relative to their parent links, m.
-        q: with `qd` and `qdd` the state.
-    """
+    parents: Sequence[int]
+    """As of a `Tree`."""
+    joints: Sequence[JointKind]
+    gravity: Any
+    """[3], m/s²."""
+    rotations: Any
+    """[d, 3, 3], of the links at q = 0 relative to their parent links."""
+    positions: Any
+    """[d, 3], of the links relative to their parent links, m."""
+
+
+def scanned_regressor(skeleton: Skeleton, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d d 10"]:
+    """d tau / d theta: forces of the joints for unit inertial parameters of the links, without armature."""
 
     def of_link(angular: Array, linear: Array) -> Array:
         w, dw, a = _motion(angular, linear)
@@ -48,22 +44,11 @@ def scanned_regressor(
         by_force, by_moment = linear[:, :-2].T @ force, angular[:, :-2].T @ moment
         return jnp.pad(by_force, ((0, 0), (0, 6))) + jnp.pad(by_moment, ((0, 0), (1, 0)))
 
-    found = jax.vmap(of_link)(*_spatial(parents, joints, gravity, rotations, positions, q, qd, qdd))
-    return jnp.swapaxes(found, 0, 1)
+    return jnp.swapaxes(jax.vmap(of_link)(*_spatial(skeleton, q, qd, qdd)), 0, 1)
 
 
-def scanned_forces(
-    parents: Sequence[int],
-    joints: Sequence[JointKind],
-    gravity: Any,
-    rotations: Any,
-    positions: Any,
-    inertias: Any,
-    q: Vector,
-    qd: Vector,
-    qdd: Vector,
-) -> Vector:
-    """tau [d] of links with inertial parameters `inertias`, as `newton_euler`, without armature; arguments as above."""
+def scanned_forces(skeleton: Skeleton, inertias: Any, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """tau [d] of links with inertial parameters `inertias` [d, 10], as `newton_euler`, without armature."""
 
     def of_link(angular: Array, linear: Array, theta: Array) -> Array:
         w, dw, a = _motion(angular, linear)
@@ -72,21 +57,14 @@ def scanned_forces(
         moment = jnp.cross(h, a) + moments @ dw + jnp.cross(w, moments @ w)
         return linear[:, :-2].T @ force + angular[:, :-2].T @ moment
 
-    spatial = _spatial(parents, joints, gravity, rotations, positions, q, qd, qdd)
-    return jnp.sum(jax.vmap(of_link)(*spatial, inertias), axis=0)
+    return jnp.sum(jax.vmap(of_link)(*_spatial(skeleton, q, qd, qdd), inertias), axis=0)
 
 
 def _spatial(
-    parents: Sequence[int],
-    joints: Sequence[JointKind],
-    gravity: Any,
-    rotations: Any,
-    positions: Any,
-    q: Vector,
-    qd: Vector,
-    qdd: Vector,
+    skeleton: Skeleton, q: Vector, qd: Vector, qdd: Vector
 ) -> tuple[Float[Array, "d 3 n"], Float[Array, "d 3 n"]]:
     """Angular and linear parts in the links' frames: d columns of the Jacobian, the velocity, the acceleration."""
+    parents, joints, gravity, rotations, positions = skeleton
     d = len(parents)
     turns = np.array([kind == "revolute" for kind in joints], float)
     c, s = jnp.where(turns > 0, jnp.cos(q), 1.0), jnp.where(turns > 0, jnp.sin(q), 0.0)
@@ -97,8 +75,8 @@ def _spatial(
     ground = jnp.zeros((2, 3, d + 2), q.dtype).at[1, :, -1].set(-jnp.asarray(gravity, q.dtype))
     serial = tuple(parents) == tuple(range(-1, d - 1))
 
-    def link(carried: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
-        index, parent, into, place, turns, rate, change = given
+    def link(carried: Array, inputs: tuple[Array, ...]) -> tuple[Array, Array]:
+        index, parent, into, place, turns, rate, change = inputs
         angular, linear = carried if serial else carried[parent]
         linear = into @ (linear - _hat(place) @ angular)
         angular = into @ angular
@@ -112,14 +90,14 @@ def _spatial(
         angular = angular.at[:, d + 1].add(turns * across)
         linear = linear.at[:, d + 1].add((1 - turns) * across)
         linear = linear.at[:2, d + 1].add(turns * rate * jnp.stack([v[1], -v[0]]))
-        found = jnp.stack([angular, linear])
-        return (found if serial else carried.at[index].set(found)), found
+        motion = jnp.stack([angular, linear])
+        return (motion if serial else carried.at[index].set(motion)), motion
 
     # Links look up their parent; the ground is stored last, where the index -1 points.
     start = ground if serial else jnp.concatenate([jnp.zeros((d, *ground.shape), q.dtype), ground[None]])
     links = (jnp.arange(d), jnp.asarray(parents), into, places, jnp.asarray(turns, q.dtype), qd, qdd)
-    _, found = lax.scan(link, start, links)
-    return found[:, 0], found[:, 1]
+    _, motions = lax.scan(link, start, links)
+    return motions[:, 0], motions[:, 1]
 
 
 def _motion(angular: Array, linear: Array) -> tuple[Array, Array, Array]:

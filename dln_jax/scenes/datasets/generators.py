@@ -1,22 +1,43 @@
 """Datasets sampled from scenes, with exact rates, torques and decomposition, in float64."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
+from dln_jax.files import cache_folder
 from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.mechanics.integrators import adaptive_rollout, rollout, second_order, symplectic_euler
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.letters import LETTERS, letter_path
+from dln_jax.scenes.pendulums import joint_angles, two_link_arm
 from dln_jax.scenes.scene import Scene, actuation_matrix, closed_form_forward_dynamics
-from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
 from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive, require_seed
+
+CHARACTERS_TEST = ("e", "q", "v")
+"""Test letters of the published protocol."""
+
+_VERSION = 1  # of the generators' output; a new version makes a new file instead of reading a stale one
+
+
+def default_data(scene: Scene) -> Trajectories:
+    """Letters for the two-link arm; random states, which exercise every term, for any other scene.
+
+    They are generated once, then read from the cache.
+    """
+    kind = "characters" if scene.name == "two-link-arm" else "uniform"
+    path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
+    if not path.exists():
+        data = characters() if kind == "characters" else uniform(scene)
+        schema.save(path, data, overwrite=True)  # safe if two processes generate at the same time: one rename wins
+    return schema.load(path)
 
 
 @in_float64
@@ -26,8 +47,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
     The outlines come from matplotlib's bundled font, smoothed. Angles, rates and torques are exact derivatives of the
     tip's path through the inverse kinematics and the closed-form equations of motion.
     """
-    require_positive(dt=dt)
-    _require_finite(dt=dt)
+    _require(dt=dt)
     paths = [letter_path(letter) for letter in letters]
     times = [np.arange(0.0, path.duration, dt) for path in paths]
 
@@ -48,10 +68,8 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
     # All letters use the longest duration and thus share a compilation; a path rests beyond its end.
     longest = max(map(len, times))
     motions = [states(path.position, dt * np.arange(longest)) for path in paths]
-    q, qd, qdd = (
-        np.concatenate([np.asarray(motion[k])[: len(t)] for motion, t in zip(motions, times, strict=True)])
-        for k in range(3)
-    )
+    cut = [[np.asarray(values)[: len(t)] for values in motion] for motion, t in zip(motions, times, strict=True)]
+    q, qd, qdd = map(np.concatenate, zip(*cut, strict=True))
     trajectory = np.repeat(np.arange(len(times)), [len(t) for t in times])
     return completed(two_link_arm(), np.concatenate(times), q, qd, qdd, trajectory, np.array(list(letters)))
 
@@ -72,16 +90,10 @@ def uniform(
     Bounds are in rad or m, 1/s, 1/s² and N m or N. Accelerations are drawn if the scene is fully actuated; otherwise
     controls are drawn and accelerations follow from them.
     """
-    bounds = {
-        "position_bound": position_bound,
-        "rate_bound": rate_bound,
-        "acceleration_bound": acceleration_bound,
-        "control_bound": control_bound,
-    }
-    require_positive(samples=samples, **bounds)
-    _require_room(samples, scene)
-    _require_finite(**bounds)
+    _require(samples=samples, position_bound=position_bound, rate_bound=rate_bound)
+    _require(acceleration_bound=acceleration_bound, control_bound=control_bound)
     require_seed(seed)
+    _require_room(samples, scene)
     d = scene.needs.degrees_of_freedom
     random = np.random.default_rng(seed)
     q, qd = (random.uniform(-bound, bound, (samples, d)) for bound in (position_bound, rate_bound))
@@ -114,8 +126,7 @@ def free_swing(
     Raises:
         InputError: the integration does not finish.
     """
-    require_positive(trajectories=trajectories, steps=steps, dt=dt, tolerance=tolerance)
-    _require_finite(dt=dt)
+    _require(trajectories=trajectories, steps=steps, dt=dt, tolerance=tolerance)
     require_seed(seed)
     _require_room(trajectories * steps, scene)
     if starts is None:
@@ -201,29 +212,15 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
     # Compiled separately, since fusing them would change the last digits of datasets.
     tau, parts = np.asarray(forces(closed_form.inverse_dynamics)), map(np.asarray, forces(closed_form.decompose))
     p, pd = map(np.asarray, _batched(momentum, scene)(q, qd, qdd))
-    inertial, coriolis, gravity = parts
-    return Trajectories(
-        t=t,
-        q=q,
-        qd=qd,
-        qdd=qdd,
-        tau=tau,
-        trajectory=trajectory,
-        label=label,
-        p=p,
-        pd=pd,
-        tau_inertial=inertial,
-        tau_coriolis=coriolis,
-        tau_gravity=gravity,
-        needs=scene.needs,
-    )
+    return Trajectories(t, q, qd, qdd, tau, trajectory, label, p, pd, *parts, needs=scene.needs)
 
 
-def _require_finite(**numbers: float) -> None:
+def _require(**numbers: float) -> None:
+    require_positive(**numbers)
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise InputError(f"{name} is {value}; expected a finite number")
 
 
-def _batched(function, scene: Scene):
+def _batched(function: Callable[..., Any], scene: Scene) -> Callable[..., Any]:
     return jax.jit(jax.vmap(lambda *state: function(scene, *state)))

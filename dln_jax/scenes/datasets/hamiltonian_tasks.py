@@ -39,12 +39,11 @@ import numpy as np
 
 from dln_jax.mechanics import hamiltonian
 from dln_jax.precision import in_float64
-from dln_jax.scenes.datasets.phase_samples import Task, make_task
-from dln_jax.scenes.double_pendulum import double_pendulum as double_pendulum_scene
-from dln_jax.scenes.n_body import n_body
-from dln_jax.scenes.oscillators import henon_heiles as henon_heiles_scene
-from dln_jax.scenes.oscillators import mass_spring
-from dln_jax.scenes.pendulum import pendulum as pendulum_scene
+from dln_jax.scenes.datasets.phase_samples import PhaseTask, make_task
+from dln_jax.scenes.particles import henon_heiles as henon_heiles_scene
+from dln_jax.scenes.particles import mass_spring, n_body
+from dln_jax.scenes.pendulums import double_pendulum as double_pendulum_scene
+from dln_jax.scenes.pendulums import pendulum as pendulum_scene
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import Hamiltonian, InputError, Potential, Scalar, Vector
 
@@ -52,7 +51,7 @@ from dln_jax.types import Hamiltonian, InputError, Potential, Scalar, Vector
 @in_float64
 def spring(
     seed: int = 0, *, trajectories: int = 50, friction: float = 0.0, noise: float = 0.1, tolerance: float = 1e-12
-) -> Task:
+) -> PhaseTask:
     """Mass on a spring, H = q² + p²: mass ½, stiffness 2; damped by `friction` (force over velocity)."""
     scene = mass_spring(mass=0.5, stiffness=2.0, friction=friction)
     return _oscillator(scene, _circle, _circle, 30, (0.1, 1.0), seed, trajectories, noise, tolerance)
@@ -61,14 +60,14 @@ def spring(
 @in_float64
 def pendulum(
     seed: int = 0, *, trajectories: int = 50, friction: float = 0.0, noise: float = 0.1, tolerance: float = 1e-12
-) -> Task:
+) -> PhaseTask:
     """Pendulum, H = 3 (1 - cos q) + p²: mass ½, length 1, acceleration 6; damped by `friction`."""
     scene = pendulum_scene(mass=0.5, length=1.0, acceleration=6.0, friction=friction)
     return _oscillator(scene, _swing, _circle, 45, (1.3, 2.3), seed, trajectories, noise, tolerance)
 
 
 @in_float64
-def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-12) -> Task:
+def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-12) -> PhaseTask:
     """Two bodies on almost circular orbits; q = (x1, y1, x2, y2), and p is the velocity."""
     random = np.random.RandomState(seed)
     starts = []
@@ -80,7 +79,7 @@ def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-1
 
 
 @in_float64
-def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e-12) -> Task:
+def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e-12) -> PhaseTask:
     """Three bodies that depart from a rotating triangle; q = (x1, y1, x2, y2, x3, y3), and p is the velocity."""
     random = np.random.RandomState(seed)
     third = 2 * np.pi / 3
@@ -102,7 +101,7 @@ damped_pendulum = functools.partial(pendulum, friction=0.1)
 
 
 @in_float64
-def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
+def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> PhaseTask:
     """A unit mass in the Hénon-Heiles potential, on orbits that stay in the well."""
     scene, H = _system(henon_heiles_scene)
     random = np.random.default_rng(seed)
@@ -115,14 +114,14 @@ def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1
 
 
 @in_float64
-def double_pendulum(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
+def double_pendulum(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> PhaseTask:
     """The double pendulum of 1 kg and 1 m, released from rest."""
     q = np.random.default_rng(seed).uniform(-1.2, 1.2, (trajectories, 2))
     starts = np.stack([q, np.zeros_like(q)], axis=1)
     return _without_noise(*_system(double_pendulum_scene), starts, np.linspace(0, 2.5, 50), tolerance)
 
 
-def _without_noise(scene: Scene, H: Hamiltonian, starts: np.ndarray, t: np.ndarray, tolerance: float) -> Task:
+def _without_noise(scene: Scene, H: Hamiltonian, starts: np.ndarray, t: np.ndarray, tolerance: float) -> PhaseTask:
     return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
 
 
@@ -170,7 +169,7 @@ def _oscillator(
     trajectories: int,
     noise: float,
     tolerance: float,
-) -> Task:
+) -> PhaseTask:
     if not noise >= 0:
         raise InputError(f"noise is {noise}; expected a standard deviation, zero for none")
     random = np.random.RandomState(seed)
@@ -186,7 +185,7 @@ def _oscillator(
     return make_task(scene, H, published_energy, starts, errors, t, slice(0, half), tolerance)
 
 
-Protocol = Callable[..., Task]
+Protocol = Callable[..., PhaseTask]
 """(seed, *, trajectories, tolerance, ...) -> data."""
 PROTOCOLS: dict[str, Protocol] = {
     "spring": spring,

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.generators import rollouts
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
@@ -58,7 +58,7 @@ def render(q: Scalar) -> Float[Array, "side side"]:
     return jnp.exp(-(square**2))
 
 
-class Frames(NamedTuple):
+class RodFrames(NamedTuple):
     """Motions of the rod, as states and as images."""
 
     t: Float[np.ndarray, " T"]
@@ -79,13 +79,13 @@ class Frames(NamedTuple):
 class FrameSplit(NamedTuple):
     """Three disjoint sets of trajectories: for training, for model selection and for the final test."""
 
-    train: Frames
-    validation: Frames
-    test: Frames
+    train: RodFrames
+    validation: RodFrames
+    test: RodFrames
 
 
 @in_float64
-def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int = FRAMES) -> Frames:
+def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int = FRAMES) -> RodFrames:
     """Generates the dataset; states are integrated adaptively to 1e-10 in float64.
 
     Raises:
@@ -99,7 +99,7 @@ def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int
     qd = random.uniform(-LARGEST_VELOCITY, LARGEST_VELOCITY, (trajectories, 1))
     t = FRAME_TIME * np.arange(frames)
     q, qd = (state[..., 0] for state in rollouts(rod(), q, qd, t))
-    return Frames(t, q, qd, images(q))
+    return RodFrames(t, q, qd, images(q))
 
 
 def images(q: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape pixels"]:
@@ -109,7 +109,7 @@ def images(q: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape pixels"]
     return np.asarray(drawn).reshape(*np.shape(q), PIXELS)
 
 
-def split(data: Frames, *, validation_share: float = 0.1, test_share: float = 0.2, seed: int = 0) -> FrameSplit:
+def split(data: RodFrames, *, validation_share: float = 0.1, test_share: float = 0.2, seed: int = 0) -> FrameSplit:
     """Splits trajectories by the seed, with at least one in each set.
 
     Raises:
@@ -128,7 +128,7 @@ def split(data: Frames, *, validation_share: float = 0.1, test_share: float = 0.
     return FrameSplit(*(choose(data, np.sort(part)) for part in parts))
 
 
-def choose(data: Frames, indices: np.ndarray) -> Frames:
+def choose(data: RodFrames, indices: np.ndarray) -> RodFrames:
     """Selects trajectories by index."""
     return data._replace(q=data.q[indices], qd=data.qd[indices], frames=data.frames[indices])
 

@@ -17,25 +17,25 @@ from dln_jax.scenes.scene import Scene
 from dln_jax.types import Dissipation, Hamiltonian, InputError, Vector, require_positive
 
 
-class Field(NamedTuple):
+class PhaseField(NamedTuple):
     """Time derivatives of states."""
 
     qd: Float[np.ndarray, "N d"]
     pd: Float[np.ndarray, "N d"]
 
 
-class Part(NamedTuple):
+class PhaseSamples(NamedTuple):
     """One side of the published split; all members have the same N samples."""
 
     data: Trajectories
     """As published: q and p with noise; qd, pd (and qdd) of the noiseless motion; tau = 0 exactly."""
     clean: Trajectories
     """The same samples without noise."""
-    field: Field
+    field: PhaseField
     """The exact (qd, pd) at the noisy q, p of `data`."""
 
 
-class Task(NamedTuple):
+class PhaseTask(NamedTuple):
     """A published dataset and the system it was made from."""
 
     scene: Scene
@@ -45,8 +45,8 @@ class Task(NamedTuple):
     """(q, p) -> the quantity published as the energy: q² + p² for the pendulum, else H."""
     t: np.ndarray
     """Times of every trajectory [T], s."""
-    train: Part
-    test: Part
+    train: PhaseSamples
+    test: PhaseSamples
 
 
 def make_task(
@@ -58,7 +58,7 @@ def make_task(
     t: np.ndarray,
     trained: slice,
     tolerance: float,
-) -> Task:
+) -> PhaseTask:
     """Makes a task from starts (q, p) [K, 2, d] at the times t [T], with noise on both [K, 2, T, d], or `None`.
 
     Raises:
@@ -72,30 +72,21 @@ def make_task(
     motion = reference_motion(H, starts[:, 0], starts[:, 1], t, dissipation=scene.dissipation, tolerance=tolerance)
     exact = functools.partial(_fields, H, scene.dissipation)
     q, p = (states.reshape(-1, d) for states in motion)
-    qd, pd = (np.asarray(rate) for rate in exact(q, p))
-    clean = Trajectories(
-        t=np.tile(t, len(starts)),
-        q=q,
-        qd=qd,
-        qdd=np.asarray(_accelerations(H, q, p, qd, pd)),
-        tau=np.zeros_like(q),
-        trajectory=np.repeat(order, len(t)),
-        label=np.array([f"{scene.name}-{index}" for index in order]),
-        p=p,
-        pd=pd,
-        needs=scene.needs,
-    )
-    if errors is None:
-        data, field = clean, Field(qd, pd)
-    else:
+    field = qd, pd = tuple(np.asarray(rate) for rate in exact(q, p))
+    qdd = np.asarray(_accelerations(H, q, p, qd, pd))
+    trajectory, label = np.repeat(order, len(t)), np.array([f"{scene.name}-{index}" for index in order])
+    times, tau = np.tile(t, len(starts)), np.zeros_like(q)
+    data = clean = Trajectories(times, q, qd, qdd, tau, trajectory, label, p, pd, needs=scene.needs)
+    if errors is not None:
         data = clean._replace(q=q + errors[:, 0].reshape(-1, d), p=p + errors[:, 1].reshape(-1, d))
-        field = Field(*(np.asarray(rate) for rate in exact(data.q, data.p)))
+        field = tuple(np.asarray(rate) for rate in exact(data.q, data.p))
 
-    def part(indices: np.ndarray) -> Part:
-        chosen = np.isin(clean.trajectory, indices)
-        return Part(select(data, indices), select(clean, indices), Field(field.qd[chosen], field.pd[chosen]))
+    def part(indices: np.ndarray) -> PhaseSamples:
+        chosen = np.isin(trajectory, indices)
+        rates = PhaseField(*(rate[chosen] for rate in field))
+        return PhaseSamples(select(data, indices), select(clean, indices), rates)
 
-    return Task(scene, H, published_energy, t, part(train), part(test))
+    return PhaseTask(scene, H, published_energy, t, part(train), part(test))
 
 
 _GROUP = 500

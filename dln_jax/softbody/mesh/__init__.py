@@ -1,6 +1,5 @@
 """Meshes of simplices: generation, validation and measurement."""
 
-from dln_jax.softbody.mesh.creatures import Creature, biped, body_length, crawler, quadruped
 from dln_jax.softbody.mesh.mesh import (
     Mesh,
     boundary,
@@ -12,7 +11,17 @@ from dln_jax.softbody.mesh.mesh import (
     vertices_where,
     volumes,
 )
-from dln_jax.softbody.mesh.shapes import beam, box, disc, lattice
+from dln_jax.softbody.mesh.shapes import (
+    Creature,
+    beam,
+    biped,
+    body_length,
+    box,
+    crawler,
+    disc,
+    lattice,
+    quadruped,
+)
 from dln_jax.softbody.mesh.simplices import simplex_volumes
 
 __all__ = [

@@ -41,7 +41,7 @@ def count_overlaps(mesh: Mesh) -> Callable[[Float[Array, "n dim"]], Int[Array, "
         places = jnp.nonzero(near, size=len(one), fill_value=0)[0]
 
         def look(state: tuple[Array, Array]) -> tuple[Array, Array]:
-            k, found = state
+            k, hits = state
             place = places[k]
             pair = pair_of[place]
 
@@ -50,8 +50,8 @@ def count_overlaps(mesh: Mesh) -> Callable[[Float[Array, "n dim"]], Int[Array, "
                 return jax.vmap(lambda a: jax.vmap(lambda b: simplices_overlap(a, b))(of_other))(of_one).any()
 
             # One overlapping pair of elements decides its pair of components.
-            hit = jax.lax.cond(found[pair], lambda _: jnp.asarray(True), meet, None)
-            return k + 1, found.at[pair].max(hit)
+            hit = jax.lax.cond(hits[pair], lambda _: jnp.asarray(True), meet, None)
+            return k + 1, hits.at[pair].max(hit)
 
         start = jnp.asarray(0), jnp.zeros(count, bool)
         return jax.lax.while_loop(lambda state: state[0] < near.sum(), look, start)[1].sum()

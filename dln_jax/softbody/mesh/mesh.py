@@ -14,9 +14,12 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dln_jax.softbody.mesh.simplices import facets, simplex_volumes
-from dln_jax.softbody.mesh.validity import as_elements, as_vertices, oriented, require_valid
+from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
 from dln_jax.types import InputError
+
+FLAT = 1e-12
+"""Largest `regularity` of a degenerate element, whose volume is rounding error."""
+WORDS = {2: ("triangle", "area"), 3: ("tetrahedron", "volume")}
 
 
 class Mesh(NamedTuple):
@@ -45,11 +48,14 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
             repeated, a duplicate or degenerate element, a vertex in no element. Or elements that share no vertex
             although some of their corners coincide: a mesh whose vertices were never merged.
     """
-    positions = as_vertices(vertices)
-    corners = as_elements(elements, positions.shape[1])
-    require_valid(positions, corners)
-    corners, turned = oriented(positions, corners)
-    return Mesh(positions, corners.astype(np.int32), turned)
+    positions = _as_vertices(vertices)
+    corners = _as_elements(elements, positions.shape[1])
+    _require_indices(positions, corners)
+    shape = regularity(positions, corners)
+    _require_volumes(positions, corners, shape)
+    inverted = shape < 0
+    turned = np.where(inverted[:, None], corners[:, [*range(corners.shape[1] - 2), -1, -2]], corners)
+    return Mesh(positions, turned.astype(np.int32), int(inverted.sum()))
 
 
 def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
@@ -148,3 +154,86 @@ def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, 
     counts = np.bincount(2 * group.reshape(-1) + swaps % 2, minlength=2 * len(first)).reshape(-1, 2)
     order = np.argsort(first)
     return every[first[order]], counts[order]
+
+
+def _as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
+    """Converts positions to float64 [n, 2] or [n, 3], all finite; raises `InputError` otherwise."""
+    array = _as_array("vertices", vertices)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"vertices has type {array.dtype}; expected real numbers: positions in m")
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise InputError(f"vertices has shape {list(array.shape)}; expected [n, 2] (plane) or [n, 3] (space)")
+    array = array.astype(np.float64)
+    if (bad := np.flatnonzero(~np.isfinite(array).all(axis=1))).size:
+        raise InputError(f"vertex {bad[0]} is at {array[bad[0]].tolist()}; expected finite numbers{_others(bad)}")
+    return array
+
+
+def _as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
+    """Converts corners to int64 [m, dim + 1]; raises `InputError` otherwise."""
+    array = _as_array("elements", elements)
+    kind = WORDS[dim][0]
+    if array.ndim != 2 or array.shape[1] != dim + 1 or not array.shape[0]:
+        raise InputError(
+            f"elements has shape {list(array.shape)}; expected [m, {dim + 1}] with m >= 1, "
+            f"the corners of each {kind}, as vertices has {dim} columns"
+        )
+    if array.dtype.kind not in "iu":
+        raise InputError(f"elements has type {array.dtype}; expected integers: the indices of vertices")
+    return array.astype(np.int64)
+
+
+def _require_volumes(vertices: np.ndarray, elements: np.ndarray, shape: np.ndarray) -> None:
+    """Refuses flat elements, which have no strain, and vertices without a mass or a second element."""
+    kind, measure = WORDS[vertices.shape[1]]
+    if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
+        raise InputError(
+            f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
+            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
+            f"leave it out, merge its corners or move one{_others(bad)}"
+        )
+    uses = np.bincount(elements.ravel(), minlength=len(vertices))
+    if (bad := np.flatnonzero(uses == 0)).size:
+        raise InputError(
+            f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
+        )
+    if uses.max() == 1 and (distinct := len(np.unique(vertices, axis=0))) < len(vertices):
+        raise InputError(
+            f"no two of the {len(elements)} elements share a vertex, so that each would move alone; "
+            f"the {len(vertices)} vertices have {distinct} distinct positions: merge those at the same position"
+        )
+
+
+def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
+    """Refuses corners out of range or repeated, and elements that would count twice."""
+    n = len(vertices)
+    if (bad := np.flatnonzero(((elements < 0) | (elements >= n)).any(axis=1))).size:
+        corners = elements[bad[0]]
+        wrong = corners[(corners < 0) | (corners >= n)][0]
+        raise InputError(
+            f"element {bad[0]} has corner {wrong}, but there are {n} vertices; expected 0 to {n - 1} "
+            f"(indices start at 0){_others(bad)}"
+        )
+    ordered = np.sort(elements, axis=1)
+    same = ordered[:, 1:] == ordered[:, :-1]
+    if (bad := np.flatnonzero(same.any(axis=1))).size:
+        twice = ordered[bad[0], 1:][same[bad[0]]][0]
+        raise InputError(
+            f"element {bad[0]} has corner {twice} twice: {elements[bad[0]].tolist()}; "
+            f"expected {elements.shape[1]} different vertices{_others(bad)}"
+        )
+    _, first, inverse = np.unique(ordered, axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.reshape(-1)]
+    if (bad := np.flatnonzero(original != np.arange(len(elements)))).size:
+        raise InputError(f"element {bad[0]} is a duplicate of element {original[bad[0]]}; remove one{_others(bad)}")
+
+
+def _as_array(name: str, value: ArrayLike) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{name} is not an array: its rows differ in length; expected rows of equal length") from error
+
+
+def _others(bad: np.ndarray) -> str:
+    return f" ({bad.size - 1} more like it)" if bad.size > 1 else ""

@@ -1,14 +1,21 @@
-"""Meshes of simple shapes: beam, box, disc, and any set of cells of a lattice."""
+"""Meshes of simple shapes: beam, box, disc, any set of cells of a lattice, and creatures with muscles along their skin.
+
+A creature stands on y = 0 and faces right. It is a drawing of square cells (`#`), with two triangles per cell, and
+pointed ends (`<`, `>`). All edges of the outline except those on the ground are muscles: both sides of the legs, to
+bend them, and the upper and lower side of the body. Sizes suit the material of the "creature" preset, whose energies
+count per triangle and not per area.
+"""
 
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from dln_jax.sizes import require_memory
-from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
+from dln_jax.softbody.mesh.mesh import Mesh, boundary, make_mesh
 from dln_jax.types import InputError, require_positive
 
 # Lattice cells are cut so that every diagonal joins two vertices with an even sum of coordinates: neighbours are mirror
@@ -26,6 +33,17 @@ PATTERNS = {
     ),
 }
 """Corners of the simplices in a cell at even coordinates; in one at odd coordinates x is mirrored."""
+POINT = 0.8
+"""Length of a pointed end, in cells."""
+
+
+class Creature(NamedTuple):
+    """A body and its muscles."""
+
+    name: str
+    mesh: Mesh
+    muscles: Int[np.ndarray, "k 2"]
+    """Vertices at the two ends of the muscles, from left to right."""
 
 
 def beam(length: float, height: float, cells_x: int, cells_y: int) -> Mesh:
@@ -75,6 +93,46 @@ def lattice(cells: ArrayLike) -> tuple[Int[np.ndarray, "n dim"], Int[np.ndarray,
     corners = lower[:, None, None] + np.where(odd[:, None, None, None], mirrored, pattern)
     positions, numbers = np.unique(corners.reshape(-1, lower.shape[1]), axis=0, return_inverse=True)
     return positions, numbers.reshape(-1, pattern.shape[1])
+
+
+def crawler() -> Creature:
+    """A long low body on four small feet, pointed in front and behind: 28 vertices, 24 muscles."""
+    return _drawn("crawler", 0.3, "<########>", " #.#..#.# ")
+
+
+def biped() -> Creature:
+    """A body on two legs: 32 vertices, 24 muscles."""
+    return _drawn("biped", 0.4, "####", "####", "####", "#..#", "#..#", "#..#")
+
+
+def quadruped() -> Creature:
+    """A body on two pairs of legs: 43 vertices, 32 muscles."""
+    return _drawn("quadruped", 0.4, "########", "########", "#.#..#.#", "#.#..#.#")
+
+
+def body_length(creature: Creature) -> float:
+    """Extent of the rest shape along x, in m."""
+    return float(np.ptp(creature.mesh.vertices[:, 0]))
+
+
+def _drawn(name: str, size: float, *rows: str) -> Creature:
+    """Returns the creature of a drawing whose cells have sides of `size` m."""
+    drawing = {(x, y): mark for y, row in enumerate(reversed(rows)) for x, mark in enumerate(row)}
+    positions, elements = lattice([cell for cell, mark in drawing.items() if mark == "#"])
+    number = {tuple(position): index for index, position in enumerate(positions.tolist())}
+    vertices, triangles = positions.tolist(), elements.tolist()
+    for (x, y), mark in drawing.items():
+        if mark == ">":
+            triangles.append([number[x, y], len(vertices), number[x, y + 1]])
+            vertices.append([x + POINT, y + 0.5])
+        if mark == "<":
+            triangles.append([number[x + 1, y], number[x + 1, y + 1], len(vertices)])
+            vertices.append([x + 1 - POINT, y + 0.5])
+    mesh = make_mesh(size * np.array(vertices, dtype=np.float64), triangles)
+    skin = boundary(mesh)
+    pairs = skin[(mesh.vertices[skin, 1] > 0).any(axis=1)]
+    x, y = mesh.vertices[pairs].mean(axis=1).T
+    return Creature(name, mesh, np.sort(pairs, axis=1)[np.lexsort((y, x))])
 
 
 def _grid(lengths: tuple[float, ...], cells: tuple[int, ...]) -> Mesh:

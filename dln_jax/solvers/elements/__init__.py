@@ -2,15 +2,9 @@
 
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, value
-from dln_jax.solvers.elements.linear_solvers import (
-    LinearSolver,
-    block_tridiagonal,
-    by_size,
-    by_stiffness,
-    dense,
-    matrix_free,
-)
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, block_tridiagonal, dense, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.selection import by_size, by_stiffness
 
 __all__ = [
     "ElementEnergy",

@@ -1,11 +1,10 @@
 """Solves symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
 
-There are three methods. The choice is made before tracing, by the estimated work for size, structure and stiffness:
+There are three methods, between which `selection` chooses:
 
-- dense Cholesky for small systems;
-- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for most systems;
-- matrix-free conjugate gradients with a block-Jacobi preconditioner on the element Hessians for wide bands: bodies in
-  space with more than some thousand unknowns.
+- dense Cholesky;
+- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks;
+- matrix-free conjugate gradients with a block-Jacobi preconditioner on the element Hessians.
 
 A matrix that is not positive definite gives a solution that is not finite, without shifts or clamping.
 """
@@ -23,38 +22,22 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from dln_jax.solvers.bands import places, solve_bands
 from dln_jax.solvers.elements.assembly import Pattern, assemble
-from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
-from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients, factorise_blocks, solve_blocks
+from dln_jax.solvers.elements.symmetric_systems import (
+    conjugate_gradients,
+    factorise_blocks,
+    places,
+    solve_bands,
+    solve_blocks,
+)
 from dln_jax.solvers.elimination import solve as eliminate
 from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 
-# With more unknowns the dense factorisation is slower than the block-tridiagonal one, measured on two cores.
-_DENSE_UNKNOWNS = 160
-# Of so many at once, bands up to here are factorised faster than each matrix by LAPACK; as measured with 56 to 120
+# Bands up to here, in batches of so many, are factorised faster than each matrix by LAPACK; as measured with 56 to 120
 # unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
 _LOWER_BANDS = 4
-# Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
-# rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
-# unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
-# unknowns takes 6e-10 s m s², within 1.7. A search to 1e-2 takes 1.6 to 5 N^(1/d) products at nu = 0.3 and 7 to 16 at
-# nu = 0.49 or E = 1e8, for N vertices in dimension d; and because it is inexact, a step takes 1.5 to 2 times the Newton
-# iterations. The products below stand for all of that. Whole steps in space by blocks, in units of those without a
-# matrix: 675 unknowns 0.69 (nu = 0.3) and 0.38 (0.49); 1,911: 1.19 and 0.50; 4,131 (6,994 tetrahedra): 1.88 and 0.74.
-_FACTORISATION_SECONDS = 1.3e-10
-_BLOCK_OVERHEAD = 150
-_PRODUCT_SECONDS = 6e-10
-_PRODUCTS = 15
-# An inexact search takes this many times the Newton iterations, also when its products are measured.
-_MORE_ITERATIONS = 1.75
-_LOWER_PRODUCTS = 20
-# Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
-_UPPER_ENTRIES = 3e7
-
-
 # Relative residuals of the conjugate gradients, and the products after which they give up.
 _SOLVE_RESIDUAL = 1e-10
 SEARCH_RESIDUAL = 1e-2
@@ -76,46 +59,6 @@ Columns = Float[Array, "n k"]
 LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 
-def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Chooses the method with the least work by size and structure, for unknown stiffness."""
-    return least_work(energies, at)(energies, at)
-
-
-def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, data: Sequence[Any]) -> LinearSolver:
-    """Chooses the method with the least work for the Hessian at x, with concrete data of the elements."""
-    measure = partial(search_takes_at_most, energies=energies, at=at, x=x, data=data, residual=SEARCH_RESIDUAL)
-    return least_work(energies, at, measure)(energies, at)
-
-
-def least_work(
-    energies: Sequence[ElementEnergy], at: Pattern, search_takes_at_most: Callable[[int], bool] | None = None
-) -> LinearSolverFactory:
-    """Returns `dense`, `block_tridiagonal` or `matrix_free`, by estimates of the work of factorisations and products.
-
-    `search_takes_at_most` returns whether a search direction takes at most this many products; it is called only if
-    size and structure do not settle the choice. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer
-    or nearly incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
-    `matrix_free`.
-    """
-    if at.unknowns <= _DENSE_UNKNOWNS:
-        return dense
-    size = _band(at, _ordering(at)) * at.width
-    stored = at.unknowns * size
-    if stored > _UPPER_ENTRIES:
-        return matrix_free
-    factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
-    product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
-    if search_takes_at_most is None:
-        # Vertices along an edge of the body; a product carries information across one of them.
-        across = at.blocks ** (1 / min(at.width, 3))
-        return block_tridiagonal if factorisation <= _PRODUCTS * across * product else matrix_free
-    affordable = int(factorisation / (_MORE_ITERATIONS * product))
-    # So few products gain little, and the measurement costs a compilation.
-    if affordable < _LOWER_PRODUCTS or not search_takes_at_most(affordable):
-        return block_tridiagonal
-    return matrix_free
-
-
 def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Factorises the whole matrix by Cholesky; under `vmap`, on a CPU, all narrow bands together."""
     table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
@@ -130,7 +73,7 @@ def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
         right = jnp.where(at.free, b, 0).reshape(-1, 1)
         return solve(factor, right).reshape(b.shape)
 
-    order = (_ordering(at)[:, None] * at.width + np.arange(at.width)).ravel()
+    order = (narrowest_order(at)[:, None] * at.width + np.arange(at.width)).ravel()
     place = np.argsort(order)
     band = int(np.abs(place[at.rows] - place[at.columns]).max(initial=0))
     if band > _WIDEST_BAND:
@@ -157,18 +100,18 @@ def _one_or_many(
         return x[np.argsort(order)].transpose(2, 0, 1)
 
     def many(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
-        of_each = jax.vmap(one)
+        one_by_one = jax.vmap(one)
         if len(values) < _LOWER_BANDS:
-            return of_each(values, b)
-        return lax.platform_dependent(values, b, cpu=by_bands, default=of_each)
+            return one_by_one(values, b)
+        return lax.platform_dependent(values, b, cpu=by_bands, default=one_by_one)
 
     return shared_or_batched(one, many)
 
 
 def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Factorises by blocks with Cholesky, the unknowns ordered so that only neighbouring blocks couple."""
-    order = _ordering(at)
-    size = _band(at, order)
+    order = narrowest_order(at)
+    size = width_of_band(at, order)
     count = -(-at.blocks // size)
     # Unknowns in their new order; the last block is padded with unknowns that couple to nothing.
     numbers = np.full(count * size * at.width, at.unknowns)
@@ -250,15 +193,15 @@ def _with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2
     return jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
 
 
-def _ordering(at: Pattern) -> Int[np.ndarray, " n"]:
+def narrowest_order(at: Pattern) -> Int[np.ndarray, " n"]:
     """Returns the reverse Cuthill-McKee order, or the present one if its band is narrower (meshes built by rows)."""
     rows, columns = at.rows // at.width, at.columns // at.width
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(at.blocks, at.blocks)).tocsr()
     ordering = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
-    return min(ordering, np.arange(at.blocks), key=lambda order: _band(at, order))
+    return min(ordering, np.arange(at.blocks), key=lambda order: width_of_band(at, order))
 
 
-def _band(at: Pattern, order: np.ndarray) -> int:
+def width_of_band(at: Pattern, order: np.ndarray) -> int:
     """Returns the largest distance in the order between two blocks that couple, at least 1."""
     place = np.argsort(order)
     return max(1, int(np.abs(place[at.rows // at.width] - place[at.columns // at.width]).max(initial=0)))

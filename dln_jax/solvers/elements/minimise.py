@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 from dln_jax.solvers.elements.assembly import Pattern, entries, gradient, pattern, value_and_gradient
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians, project
 from dln_jax.solvers.elements.line_search import Point, line_search
-from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFactory, by_size
-from dln_jax.solvers.newton import Info
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFactory
+from dln_jax.solvers.elements.selection import by_size
+from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
 
 # Gradients and energies below this many units of rounding are indistinguishable from zero.
@@ -61,7 +62,7 @@ def minimise(
     linear_solver: LinearSolverFactory = by_size,
     at: Pattern | None = None,
     definite: bool = False,
-) -> tuple[Blocks, Info]:
+) -> tuple[Blocks, SolverInfo]:
     """Returns the x [n, b] near x0 that minimises the sum of the energies, and the outcome of the search.
 
     Derivatives are those of the minimum, with respect to `data` and to the entries of x0 that are not free. Arrays that
@@ -74,10 +75,10 @@ def minimise(
         free: [n, b], which unknowns are solved for (default: all); the others keep their value in x0.
         scale: positive unit of the gradient's rows, [n] or a number; masses make the residual an acceleration.
         tolerance: largest |dE/dx| / scale that counts as a minimum; a gradient of rounding size always does.
-        iterations: Newton steps after which the search gives up, which `Info.converged` reports.
+        iterations: Newton steps after which the search gives up, which `SolverInfo.converged` reports.
         linear_solver: `by_size`, or `dense`, `block_tridiagonal`, `matrix_free` of `solvers.elements.linear_solvers`.
         at: the energies' pattern, if already computed.
-        definite: also report `Info.definite`, which costs another Hessian, factorisation and solve to full accuracy.
+        definite: also report `SolverInfo.definite`, at the cost of another Hessian, factorisation and accurate solve.
 
     Raises:
         InputError: indices, shapes or settings are invalid.
@@ -94,7 +95,7 @@ def minimise(
     scale = jnp.broadcast_to(jnp.asarray(scale, x0.dtype), x0.shape[:1])[:, None]
 
     @jax.custom_jvp
-    def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, Info]:
+    def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, SolverInfo]:
         x, info = _newton(total, x0, data, scale, tolerance, iterations)
         if not definite:
             return x, info
@@ -131,7 +132,7 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
 
     # Reverse mode saves only the arguments: recomputing takes less time than reading saved intermediates.
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def response(x: Blocks, leaves: list[Array], given_dots: list[Array], fixed_dot: Any) -> Blocks:
+    def response(x: Blocks, leaves: list[Array], varied_dots: list[Array], fixed_dot: Any) -> Blocks:
         data = structure.unflatten(leaves)
 
         def gradient_of(x: Blocks, variables: list[Array]) -> Blocks:
@@ -146,9 +147,9 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
 
         varied = [leaves[i] for i in varying]
         if moving:
-            _, right = jax.jvp(gradient_of, (x, varied), (fixed_dot, given_dots))
+            _, right = jax.jvp(gradient_of, (x, varied), (fixed_dot, varied_dots))
         else:
-            _, right = jax.jvp(lambda variables: gradient_of(x, variables), (varied,), (given_dots,))
+            _, right = jax.jvp(lambda variables: gradient_of(x, variables), (varied,), (varied_dots,))
         # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
         factor = _factor(total, *jax.lax.stop_gradient((x, data)))
         return jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
@@ -163,7 +164,9 @@ def _factor(total: _Sum, x: Blocks, data: Any) -> Any:
     return total.solver.factorise(hessians, entries(total.at, hessians))
 
 
-def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, iterations: int) -> tuple[Blocks, Info]:
+def _newton(
+    total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, iterations: int
+) -> tuple[Blocks, SolverInfo]:
     energies, at, _ = total
     rounding = _ROUNDING_UNITS * jnp.finfo(x0.dtype).eps
 
@@ -197,7 +200,7 @@ def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, 
     last = jax.lax.while_loop(running, iterate, start)
     x, energy, slope = last.point
     residual = jnp.max(jnp.abs(slope) / scale, initial=0)
-    return x, Info(residual, last.iterations, within(last) & jnp.isfinite(energy), None, last.unclear)
+    return x, SolverInfo(residual, last.iterations, within(last) & jnp.isfinite(energy), None, last.unclear)
 
 
 def _descent_direction(total: _Sum, hessians: Sequence[Array], values: Array, gradient: Blocks) -> Blocks:

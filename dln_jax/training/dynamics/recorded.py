@@ -15,10 +15,10 @@ from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, sp
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.kinematic_prior import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL
-from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST, default_data
+from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.registry import scene_named
 from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.training.dynamics.options import AUTO, ArmOptions, Options
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import entry_of

@@ -19,7 +19,7 @@ from dln_jax.data.splits import select
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
-from dln_jax.scenes.datasets.phase_samples import Part, reference_motion
+from dln_jax.scenes.datasets.phase_samples import PhaseSamples, reference_motion
 from dln_jax.training.hamiltonian.measurements import (
     MEASURED,
     NOTHING,
@@ -59,9 +59,9 @@ class Problem(NamedTuple):
     needs: Needs
     fitted: Trajectories
     """Training and validation data with q, p, qd, pd."""
-    train: Part | None
+    train: PhaseSamples | None
     """Training data with the exact field; `None` for measurements."""
-    test: Part | None
+    test: PhaseSamples | None
     truth: tuple[Motions, ...]
     """Motions to predict; the motions of an entry share their times."""
     energy: Hamiltonian | None

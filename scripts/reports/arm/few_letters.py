@@ -20,7 +20,7 @@ from dln_jax.mechanics import closed_form
 from dln_jax.metrics.errors import mean_square
 from dln_jax.metrics.report import Row
 from dln_jax.models.model import Parameters
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm.rivals import IDENTIFIED, Rival, rivals, size
 from scripts.reports.case import Case, Findings

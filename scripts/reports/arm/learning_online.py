@@ -36,7 +36,7 @@ from dln_jax.learning.online import empty_replay, learn_online
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.report import Row
 from dln_jax.models.model import Model, Parameters
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from scripts.reports.arm.motions import RATE, RECORDED, Motion, capacity, drawn_letters
 from scripts.reports.arm.rivals import Rival, rivals
 from scripts.reports.case import Case, Findings

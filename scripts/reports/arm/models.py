@@ -23,8 +23,8 @@ from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.models.model import Model
 from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import Hamiltonian
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for

@@ -14,7 +14,7 @@ from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.planar_chain import make_planar_chain
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from scripts.reports.arm.models import WIDTHS
 
 RATE, ACCELERATION, TORQUE = 0.5, 2.0, 2.0

@@ -16,9 +16,8 @@ from dln_jax.data.splits import Split, partition_labels, select, split
 from dln_jax.figures.benchmarks import error_against_time
 from dln_jax.metrics.report import UNITS, Row, markdown_table, unit_of
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST, default_data
-from dln_jax.scenes.datasets.generators import uniform_tests
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data, uniform_tests
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm.models import (
     TRIGONOMETRIC,

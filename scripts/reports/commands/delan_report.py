@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar
 from dln_jax.cli.arguments import Unstated, choice, names_in
 from dln_jax.cli.options import Drawn, Folder
 from dln_jax.data.splits import split
-from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST
+from dln_jax.scenes.datasets.generators import CHARACTERS_TEST
 from dln_jax.types import require_positive
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.arm import few_letters, learning_online, published_protocol

@@ -17,8 +17,8 @@ from dln_jax.cli.options import Folder
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data import schema
 from dln_jax.files import write_json
-from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.poles import cart_pole
 from scripts.reports.walks import Walk, walk_of
 
 BOUNDS = {"npz to torque error": (30, 60), "URDF and log to parameters": (40, None)}

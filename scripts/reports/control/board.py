@@ -15,8 +15,8 @@ from jax import Array
 
 from dln_jax.control import Controller, Hardware, Run, field_of, simulate
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
 
 RATE, SECONDS = 500.0, 10.0
 LIMIT = 6.0

@@ -9,8 +9,7 @@ import numpy as np
 from dln_jax.control import EnergyGains
 from dln_jax.metrics.report import Row
 from dln_jax.precision import in_float64
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from scripts.reports.case import Case, Findings
 from scripts.reports.control import energy_laws, laws_in_c, learned, mpc_report, robustness, traces, tracking
 from scripts.reports.control.board import Motor, criteria, plant, play

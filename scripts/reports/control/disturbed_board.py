@@ -26,7 +26,7 @@ from jaxtyping import Float
 from dln_jax.control import Controller, error, limited
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
-from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
+from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from scripts.reports.control.board import GOAL, LIMIT, RATE, SECONDS, Motor, plant
 
 VALUES, REPETITIONS, PUSHED = 21, 10, 50

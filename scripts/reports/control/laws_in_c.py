@@ -34,8 +34,8 @@ from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.report import Row, expect
-from dln_jax.scenes.chain import chain
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.pendulums import chain
+from dln_jax.scenes.poles import rotary_pendulum
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
 from scripts.reports.control.mpc_calls import STACK, first_state, one_call

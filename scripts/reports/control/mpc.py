@@ -17,7 +17,7 @@ from dln_jax.control.state_space import Field, field_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
-from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import Scene
 
 RATE, SECONDS, LIMIT, RAIL = 100.0, 6.0, 12.0, 0.5

@@ -8,8 +8,7 @@ import numpy as np
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.precision import in_float64
-from dln_jax.scenes.datasets.robot_arms import arm_torques
-from dln_jax.scenes.robot_arms import Arm
+from scripts.reports.robots.simulated_arms import Arm, arm_torques
 
 Arrays = dict[str, Any]
 TRAJECTORIES, SECONDS, RATE = 5, 8.0, 100.0

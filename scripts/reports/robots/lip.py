@@ -1,6 +1,6 @@
 """The LIP protocol: torques on unseen motions by a learned tree, a kernel and a tree of known kinematics.
 
-One motion of 50 s trains, motions of other seeds test (`datasets.robot_arms`); the torques of the tests are exact, so
+One motion of 50 s trains, motions of other seeds test (`simulated_arms`); the torques of the tests are exact, so
 that errors may fall below the noise of the training torques.
 """
 
@@ -16,17 +16,15 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
+from dln_jax.mechanics.closed_form import RecursiveSystem
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.metrics.report import Row
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.precision import in_float64
-from dln_jax.scenes.datasets.robot_arms import lip_trajectories
-from dln_jax.scenes.panda import panda
-from dln_jax.scenes.robot_arms import Arm, skew_arm, sliding_arm
 from dln_jax.types import FrictionLaw
 from dln_jax.zoo.catalogue import CATALOGUE
+from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm
 
 ARMS: dict[str, Callable[[], Arm]] = {
     **{f"panda-{d}": (lambda d=d: panda(d)) for d in range(3, 8)},

@@ -20,7 +20,7 @@ from dln_jax.models.lagrangian import make_delan
 from dln_jax.rollout import rollout
 from dln_jax.scale.mesh import program, replicate, spread
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.softbody.scene import State
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.creature import TIME_STEP

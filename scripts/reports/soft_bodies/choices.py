@@ -20,8 +20,8 @@ from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import pattern
-from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import ElementEnergy
+from dln_jax.solvers.elements.selection import least_work, search_takes_at_most
 from scripts.reports.case import Findings
 
 WAYS = {"blocks": linear_solvers.block_tridiagonal, "matrix-free": linear_solvers.matrix_free}
@@ -87,7 +87,7 @@ def _choice(scene: SoftScene, dt: float) -> linear_solvers.LinearSolverFactory:
     takes = functools.partial(
         search_takes_at_most, energies=energies, at=at, x=rest, data=data, residual=linear_solvers.SEARCH_RESIDUAL
     )
-    return linear_solvers.least_work(energies, at, takes)
+    return least_work(energies, at, takes)
 
 
 def _inertia(x: Any, weight: Any) -> Any:

@@ -21,7 +21,7 @@ from jaxtyping import Array
 from dln_jax.metrics.report import expect
 from dln_jax.rollout import rollout
 from dln_jax.softbody.examples import creature_scene
-from dln_jax.softbody.mesh import creatures
+from dln_jax.softbody.mesh import shapes
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, with_parameters
 from dln_jax.softbody.step import Step, make_step
@@ -129,7 +129,7 @@ def coulomb(quick: bool) -> Findings:
 
 def crawling_scene() -> tuple[SoftScene, int]:
     """The preset crawler and its number of muscles."""
-    body = creatures.crawler()
+    body = shapes.crawler()
     return creature_scene(body), len(body.muscles)
 
 

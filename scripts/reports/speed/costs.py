@@ -19,7 +19,7 @@ from dln_jax.mechanics.natural import NaturalSystem, lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.report import Row
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.scenes.chain import chain
+from dln_jax.scenes.pendulums import chain
 from dln_jax.types import Lagrangian
 from scripts.reports.case import Findings
 

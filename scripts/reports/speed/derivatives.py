@@ -68,7 +68,7 @@ def by_jvp_and_vjp(layers: tuple, q: Array, qd: Array, qdd: Array) -> Array:
         lambda q: cholesky_factor(network.value(factor, features(q), activation=tanh), d, shift=2.0, floor=0.1),
         lambda q: network.value(potential, features(q), activation=tanh)[0],
     )
-    return natural.inverse_dynamics(system, q, qd, qdd)
+    return natural.forces(system, q, qd, qdd)
 
 
 def by_one_pass(layers: tuple, q: Array, qd: Array, qdd: Array) -> Array:

@@ -23,7 +23,7 @@ from dln_jax.export.c.source import export_c
 from dln_jax.figures.benchmarks import call_times
 from dln_jax.metrics.report import Row, expect
 from dln_jax.precision import data_type
-from dln_jax.scenes.chain import chain
+from dln_jax.scenes.pendulums import chain
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings

@@ -17,9 +17,9 @@ from dln_jax.metrics.report import expect, largest
 from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.trigonometric import make_trigonometric
-from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulums import double_pendulum
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError, Needs
 from scripts.reports.case import Findings
 from scripts.reports.stability.random_models import untrained

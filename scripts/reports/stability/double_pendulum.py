@@ -23,7 +23,7 @@ from dln_jax.mechanics.integrators import gauss_legendre4, rk4, second_order
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.metrics.report import Row, expect, largest
 from dln_jax.rollout import rollout
-from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulums import double_pendulum
 from dln_jax.scenes.scene import Scene
 from scripts.reports.case import Findings
 

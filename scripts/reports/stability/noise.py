@@ -19,8 +19,7 @@ from dln_jax.metrics.report import expect
 from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import double_pendulum, two_link_arm
 from scripts.reports.case import Findings
 
 LEVELS = (1e-4, 1e-2, 1e-1)

@@ -21,7 +21,7 @@ from dln_jax.metrics.report import expect, largest
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.nn.activations import activation
-from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulums import double_pendulum
 from dln_jax.types import Needs
 from scripts.reports.case import Findings
 from scripts.reports.stability.random_models import random_parameters, random_states, untrained

@@ -30,7 +30,7 @@ from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.uncertainty import outside, predictive
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.generators import characters, uniform
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from scripts.reports.case import Case, Findings
 from scripts.reports.uncertainty.arms import UR10, VELOCITY_SCALE, arm, motions, plant
 

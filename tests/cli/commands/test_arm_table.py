@@ -8,8 +8,7 @@ from calls import command, refused
 
 from dln_jax.data import schema
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.zoo.catalogue import CATALOGUE
 from scripts.reports.arm import models as arm_models
 from scripts.reports.arm import table

@@ -16,7 +16,7 @@ from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.metrics.report import Row, markdown
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.scenes.chain import chain
+from dln_jax.scenes.pendulums import chain
 from dln_jax.training import low_latency_calls
 from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.types import Needs

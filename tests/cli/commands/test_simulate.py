@@ -18,12 +18,12 @@ from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.rollout import rollout
 from dln_jax.softbody.driven import drive, driven_step
 from dln_jax.softbody.examples import beam, creature, drop, slope, twist
-from dln_jax.softbody.mesh.creatures import body_length, crawler
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
+from dln_jax.softbody.mesh.shapes import body_length, crawler
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
 from dln_jax.softbody.verdict import Info
-from dln_jax.training.simulation_results import Motion, finite_moments, warn, with_slope
+from dln_jax.training.simulation_results import SimulatedMotion, finite_moments, warn, with_slope
 from dln_jax.types import InputError
 
 
@@ -150,7 +150,7 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     x = np.zeros((4, 3, 2))
     x[3, 0, 0] = np.nan
     info = Info(numbers, numbers, converged, energy_growth=-numbers, energy_at_hand=numbers, least_J=numbers)
-    motion = Motion(np.arange(4.0), x, np.zeros_like(x), info, 1.0, 1.0)
+    motion = SimulatedMotion(np.arange(4.0), x, np.zeros_like(x), info, 1.0, 1.0)
     assert finite_moments(motion) == 3
     warn(motion)
     said = capsys.readouterr().out
@@ -225,8 +225,8 @@ def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys)
         "invalid choice 'wood'": ("--material", "wood"),
         "invalid choice 'half'": ("--precision", "half"),
         "invalid choice 'leapfrog'": ("--integrator", "leapfrog"),
-        "--friction is no choice of the beam scene": ("--friction", "0.1"),
-        "--mesh is no choice of the creature scene": ("--scene", "creature", "--mesh", tmp_path / "absent.npz"),
+        "the beam scene has no --friction": ("--friction", "0.1"),
+        "the creature scene has no --mesh": ("--scene", "creature", "--mesh", tmp_path / "absent.npz"),
         "seed is -1": ("--seed", "-1"),
         "dimension is 4": ("--dimension", "4"),
         "number of cells along x is 0": ("--cells", "0"),
@@ -258,7 +258,7 @@ def test_the_script_refuses_wrong_meshes(tmp_path, capsys):
     path.write_text("no archive")
     assert "not a readable npz" in refused(capsys, simulate, "--mesh", path, "--out", tmp_path / "run")
     np.savez(path, **good)
-    assert "--cells is for the scene's own mesh" in refused(capsys, simulate, "--mesh", path, "--cells", "2")
+    assert "--cells sets the scene's own mesh" in refused(capsys, simulate, "--mesh", path, "--cells", "2")
     assert not (tmp_path / "run").exists()
 
 

@@ -18,9 +18,9 @@ from calls import command, refused
 from dln_jax.cli.commands import make_data, train_delan
 from dln_jax.data import schema
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.chain import chain
 from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.pendulums import chain
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[3]

@@ -21,7 +21,7 @@ from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.training import low_latency_calls
 from dln_jax.training.dynamics.methods import growth as dynamics_growth
 from dln_jax.zoo.descriptions import build, describe_for

@@ -13,7 +13,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.joint_friction import with_friction
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.zoo.run import load
 
 QUICK = ("--data", "swing.npz", "--no-figures", "--no-low-latency")

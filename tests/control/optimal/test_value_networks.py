@@ -18,7 +18,7 @@ from dln_jax.control.optimal.problem import (
 )
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.pendulums import pendulum
 from dln_jax.types import InputError
 
 HIGH = np.array([0.5, np.pi, 5.0, 20.0])

@@ -13,9 +13,9 @@ from dln_jax.data.checks.hypotheses import decisive
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError, Needs
 
 RATE, SAMPLES, RUNS = 100.0, 700, 4

@@ -10,9 +10,8 @@ import pytest
 
 from dln_jax.export.c.families import functions_of_run, functions_of_system
 from dln_jax.mechanics import integrators
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import Dynamics, PhaseRates
 from dln_jax.mechanics.equations import Canonical, dynamics, flow
-from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
 from dln_jax.scenes import cart_pole, chain, double_pendulum, n_body
 from dln_jax.types import InputError, Needs

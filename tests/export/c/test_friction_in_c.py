@@ -8,8 +8,7 @@ from dln_jax.export import functions_of_system
 from dln_jax.export.c import export_c, load_c
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.friction import LAWS, coefficients_of, joint_dissipation
-from dln_jax.mechanics.joint_friction import with_friction
-from dln_jax.mechanics.loaded import Load
+from dln_jax.mechanics.joint_friction import Load, with_friction
 
 LINK = trees.inertial_parameters(2.0, [0.05, 0.02, 0.1], np.diag([0.02, 0.03, 0.01]))
 ARM = trees.serial(*trees.dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0.1, 0, 0]]), [LINK] * 2, armature=[0.1, 0.05])

@@ -11,7 +11,7 @@ from dln_jax.export.c import jaxprs
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c, source_files
-from dln_jax.scenes.chain import chain
+from dln_jax.scenes.pendulums import chain
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"

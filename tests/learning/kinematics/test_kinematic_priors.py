@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dln_jax.learning.kinematics import frames_of_axes, kinematic_prior_from_json
-from dln_jax.scenes.panda import panda
 from dln_jax.types import InputError
+from scripts.reports.robots.simulated_arms import panda
 
 TREE = panda(3).tree
 BRANCHED = (-1, 0, 0)

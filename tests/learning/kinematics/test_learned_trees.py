@@ -10,9 +10,8 @@ from dln_jax.learning.kinematics.frames import Frames
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import make_tree
 from dln_jax.models.serial_tree import make_serial_tree
-from dln_jax.scenes.datasets.robot_arms import lip_trajectories
-from dln_jax.scenes.robot_arms import skew_arm, sliding_arm
 from dln_jax.types import InputError
+from scripts.reports.robots.simulated_arms import lip_trajectories, skew_arm, sliding_arm
 
 NOISE = 0.01
 

@@ -59,7 +59,7 @@ def test_coefficients_may_be_learned():
 
 
 @pytest.mark.parametrize(
-    "given, message",
+    "options, message",
     [
         ({"viscous": -0.1}, "viscous is -0.1; expected finite numbers, none of them negative"),
         ({"coulomb": [0.1, np.nan]}, "coulomb is"),
@@ -67,6 +67,6 @@ def test_coefficients_may_be_learned():
         ({"coulomb": 0.1, "velocity_scale": 0.0}, "velocity_scale is 0.0; expected a positive number"),
     ],
 )
-def test_what_is_no_friction_is_refused(given, message):
+def test_what_is_no_friction_is_refused(options, message):
     with pytest.raises(InputError, match=message):
-        joint_dissipation(**given)
+        joint_dissipation(**options)

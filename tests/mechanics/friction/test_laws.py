@@ -67,8 +67,8 @@ def test_the_function_is_the_integral_of_the_formula(name):
         middle, half = (knots[1:] + knots[:-1]) / 2, np.diff(knots) / 2
         values = FORMULAS[name](side * (middle[:, None] + half[:, None] * nodes))
         integral = side * np.cumsum(half * (values @ weights))
-        found = POTENTIALS[name](jnp.asarray(side * knots), SHAPE)
-        np.testing.assert_allclose(found, np.concatenate([[0.0], integral]), rtol=1e-10, atol=1e-14)
+        values = POTENTIALS[name](jnp.asarray(side * knots), SHAPE)
+        np.testing.assert_allclose(values, np.concatenate([[0.0], integral]), rtol=1e-10, atol=1e-14)
 
 
 @pytest.mark.parametrize("function", [unit_force, lambda name, u, shape: POTENTIALS[name](u, shape)])
@@ -89,7 +89,7 @@ def test_derivatives_by_rate_and_shape_are_differences(name, function):
 @pytest.mark.parametrize("name", FORMULAS)
 def test_single_precision_stays_single(name):
     u = jnp.asarray(RATES, jnp.float32)
-    shape = FrictionShape(*(jnp.full(len(RATES), each, jnp.float32) for each in SHAPE))
+    shape = FrictionShape(*(jnp.full(len(RATES), value, jnp.float32) for value in SHAPE))
     assert unit_force(name, u, shape).dtype == POTENTIALS[name](u, shape).dtype == jnp.float32
     np.testing.assert_allclose(unit_force(name, u, shape), FORMULAS[name](RATES), rtol=1e-5, atol=1e-5)
 
@@ -97,8 +97,10 @@ def test_single_precision_stays_single(name):
 def test_what_is_not_asked_for_is_not_computed():
     """Stribeck's integral takes an error function and 40 nodes, its force neither."""
     D = joint_dissipation(stribeck=0.2)
-    programs = [jax.jit(each).lower(jnp.zeros(2), jnp.zeros(2)).as_text() for each in (D, jax.grad(D, argnums=1))]
-    assert ["chlo.erf" in each or "2x40xf64" in each for each in programs] == [True, False]
+    programs = [
+        jax.jit(function).lower(jnp.zeros(2), jnp.zeros(2)).as_text() for function in (D, jax.grad(D, argnums=1))
+    ]
+    assert ["chlo.erf" in text or "2x40xf64" in text for text in programs] == [True, False]
 
 
 def test_equal_in_both_directions_is_viscous_and_coulomb():
@@ -110,7 +112,7 @@ def test_equal_in_both_directions_is_viscous_and_coulomb():
 
 def test_rates_of_joints_are_those_of_a_map():
     J = np.array([[1.0, 0.0], [-1.0, 1.0]])
-    D, mapped = (joint_dissipation([0.2, 0.1], [0.5, 0.3], joint_map=each) for each in (None, J))
+    D, mapped = (joint_dissipation([0.2, 0.1], [0.5, 0.3], joint_map=map_) for map_ in (None, J))
     qd = jnp.array([0.7, -0.4])
     np.testing.assert_allclose(mapped(qd, qd), D(qd, J @ qd))
     np.testing.assert_allclose(friction_force(mapped, qd, qd), J.T @ friction_force(D, qd, J @ qd))
@@ -132,13 +134,13 @@ def test_what_are_no_laws_is_refused(laws, message):
 
 
 @pytest.mark.parametrize(
-    "given, message",
+    "options, message",
     [
         ({"stribeck_velocity": [0.1, 0.0]}, r"stribeck_velocity is \[0.1, 0.0\]; expected a positive number"),
         ({"sigmoid_slope": np.inf}, "sigmoid_slope is inf"),
         ({"sigmoid_shift": np.nan}, "sigmoid_shift is nan; expected a finite number"),
     ],
 )
-def test_what_is_no_shape_is_refused(given, message):
+def test_what_is_no_shape_is_refused(options, message):
     with pytest.raises(InputError, match=message):
-        joint_dissipation(0.1, **given)
+        joint_dissipation(0.1, **options)

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics import jacobians
+from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.joint_friction import Load, carried, carrying, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.mechanics.loaded import Load, carried, carrying
-from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.scenes import two_link_arm
 
 ARM = two_link_arm()
@@ -68,8 +66,8 @@ def test_jacobians_are_differences(name):
     motion = dynamics(system)
     tau, h = jax.jit(motion.inverse_dynamics)(q, qd, qdd), 1e-6
     forward = jax.jit(motion.forward_dynamics)
-    found, by = jax.jit(functools.partial(jacobians.forward_dynamics_jacobians, system))(q, qd, tau)
-    np.testing.assert_allclose(found, qdd, rtol=1e-9)
+    qdd_again, by = jax.jit(functools.partial(jacobians.forward_dynamics_jacobians, system))(q, qd, tau)
+    np.testing.assert_allclose(qdd_again, qdd, rtol=1e-9)
     at = [q, qd, tau]
     for place in range(3):
         columns = []

@@ -9,7 +9,7 @@ import pytest
 
 from dln_jax.mechanics import jacobians
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.integrators import rk4, rollout, second_order
+from dln_jax.mechanics.integrators import looped_rk4, rollout, second_order
 from dln_jax.mechanics.trees import (
     Tree,
     dh_frames,
@@ -59,12 +59,11 @@ def random_tree(seed, d=3, *, branched=True, kinds=("revolute", "prismatic"), ax
 
 
 TREES = {
-    "branched": random_tree(0, d=4),
-    "about x": random_tree(1, axes=0),
-    "arm": random_tree(2, branched=False, kinds=("revolute",), axes=2),
-    "from prismatic joints": random_tree(3, branched=False, kinds=("prismatic", "revolute")),
-    "one joint": random_tree(4, d=1),
-    "weightless": random_tree(5, d=2)._replace(gravity=np.zeros(3)),
+    "branched": random_tree(7, d=3),
+    "about x": random_tree(4, d=2, axes=0),
+    "arm": random_tree(2, d=2, branched=False, kinds=("revolute",), axes=2),
+    "from prismatic joints": random_tree(0, d=2, branched=False, kinds=("prismatic", "revolute")),
+    "one weightless joint": random_tree(4, d=1)._replace(gravity=np.zeros(3)),
 }
 
 
@@ -82,8 +81,8 @@ def case(request):
     tree = TREES[request.param]
     state = tuple(np.random.default_rng(9).normal(size=(3, tree.degrees_of_freedom)))
     slow = dynamics(tree_energies(tree))
-    found = jax.jit(lambda q, qd, qdd: (slow.inverse_dynamics(q, qd, qdd), slow.mass_matrix(q), slow.energy(q, qd)))
-    return Case(tree, state, *map(np.asarray, found(*state)))
+    answers = jax.jit(lambda q, qd, qdd: (slow.inverse_dynamics(q, qd, qdd), slow.mass_matrix(q), slow.energy(q, qd)))
+    return Case(tree, state, *map(np.asarray, answers(*state)))
 
 
 def test_recursions_equal_derivatives_of_the_energies(case):
@@ -91,11 +90,11 @@ def test_recursions_equal_derivatives_of_the_energies(case):
     q, qd, qdd = case.state
 
     @jax.jit
-    def found(q, qd, qdd):
+    def answers(q, qd, qdd):
         tau = fast.inverse_dynamics(q, qd, qdd)
         return tau, fast.mass_matrix(q), fast.energy(q, qd), fast.forward_dynamics(q, qd, tau)
 
-    tau, mass, energy, acceleration = found(q, qd, qdd)
+    tau, mass, energy, acceleration = answers(q, qd, qdd)
     np.testing.assert_allclose(tau, case.tau, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(mass, case.mass_matrix, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(energy, case.energy, rtol=1e-12, atol=1e-12)
@@ -109,9 +108,8 @@ def test_forces_are_linear_in_the_parameters(case):
     np.testing.assert_allclose(phi @ theta, case.tau, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["arm", "from prismatic joints"])
-def test_jacobians_equal_those_of_the_generic_way(name):
-    tree = TREES[name]
+def test_jacobians_equal_those_of_the_generic_way():
+    tree = TREES["from prismatic joints"]
     state = np.random.default_rng(9).normal(size=(3, tree.degrees_of_freedom))
     ours = jax.jit(lambda *state: jacobians.inverse_dynamics_jacobians(tree_system(tree), *state))(*state)
     theirs = jax.jit(jax.jacfwd(lambda *state: newton_euler(tree, *state), argnums=(0, 1, 2)))(*state)
@@ -145,9 +143,9 @@ def test_potential_is_that_of_the_centres_of_mass(case):
 def test_energy_is_conserved():
     tree = TREES["arm"]
     motion = dynamics(tree_system(tree))
-    start = jnp.linspace(-0.5, 0.5, 3), jnp.linspace(1, -1, 3)
-    field = second_order(lambda t, q, qd: motion.forward_dynamics(q, qd, jnp.zeros(3)))
-    q, qd = jax.jit(lambda start: rollout(rk4(field), start, np.linspace(0, 0.2, 5), substeps=20))(start)
+    start = jnp.array([-0.5, 0.5]), jnp.array([1.0, -1.0])
+    field = second_order(lambda t, q, qd: motion.forward_dynamics(q, qd, jnp.zeros(2)))
+    q, qd = jax.jit(lambda start: rollout(looped_rk4(field), start, np.linspace(0, 0.2, 5), substeps=20))(start)
     energy, kinetic = jax.jit(jax.vmap(lambda q, qd: (motion.energy(q, qd), kinetic_energy(tree, q, qd))))(q, qd)
     scale = float(kinetic.max())
     assert np.abs(energy - energy[0]).max() < 1e-7 * scale
@@ -156,7 +154,7 @@ def test_energy_is_conserved():
 def test_hamiltons_equations_hold():
     tree = TREES["about x"]
     system, motion = tree_system(tree), dynamics(tree_system(tree))
-    q, qd = np.random.default_rng(3).normal(size=(2, 3))
+    q, qd = np.random.default_rng(3).normal(size=(2, 2))
     p = np.asarray(motion.mass_matrix(q)) @ qd
     rates = jax.jit(flow(system).rates)(q, p)
     np.testing.assert_allclose(rates[0], qd, rtol=1e-9, atol=1e-9)
@@ -164,7 +162,7 @@ def test_hamiltons_equations_hold():
 
 def test_a_planar_tree_is_the_textbook_chain():
     """Rods of length 1 and mass 1 that hang along -y and turn about z."""
-    d = 3
+    d = 2
     rod = inertial_parameters(1.0, [0, -0.5, 0], np.diag([1 / 12, 0, 1 / 12]))
     positions = [[0, 0, 0]] + [[0, -1.0, 0]] * (d - 1)
     tree = serial([np.eye(3)] * d, positions, [rod] * d, gravity=(0, -9.81, 0))
@@ -177,16 +175,16 @@ def test_a_planar_tree_is_the_textbook_chain():
 def test_a_payload_is_a_body_more():
     tree, random = TREES["arm"], np.random.default_rng(8)
     payload, turn, place = body(random), rotation(random), random.normal(size=3)
-    loaded = with_payload(tree, 2, payload, rotation=turn, position=place)
+    loaded = with_payload(tree, 1, payload, rotation=turn, position=place)
     fixed = make_tree(
-        (*tree.parents, 2), (*tree.joints, "revolute"), [*tree.rotations, turn], [*tree.positions, place],
+        (*tree.parents, 1), (*tree.joints, "revolute"), [*tree.rotations, turn], [*tree.positions, place],
         [*tree.axes, [0, 0, 1]], [*tree.inertias, payload], armature=[*tree.armature, 0], gravity=tree.gravity,
     )  # fmt: skip
-    q, qd, qdd = random.normal(size=(3, 3))
-    still = [np.append(each, 0.0) for each in (q, qd, qdd)]
-    expected = jax.jit(dynamics(tree_system(fixed)).inverse_dynamics)(*still)[:3]
-    found = jax.jit(dynamics(tree_system(loaded)).inverse_dynamics)(q, qd, qdd)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    q, qd, qdd = random.normal(size=(3, 2))
+    still = [np.append(vector, 0.0) for vector in (q, qd, qdd)]
+    expected = jax.jit(dynamics(tree_system(fixed)).inverse_dynamics)(*still)[:2]
+    tau = jax.jit(dynamics(tree_system(loaded)).inverse_dynamics)(q, qd, qdd)
+    np.testing.assert_allclose(tau, expected, rtol=1e-12)
 
 
 def test_bodies_that_exist_have_definite_pseudo_inertias():

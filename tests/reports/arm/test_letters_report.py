@@ -14,7 +14,7 @@ from dln_jax.learning.online import make_linear_refit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm import few_letters, learning_online
 from scripts.reports.arm.learning_online import CONDITIONS, Condition, closed_loop, write, written_by

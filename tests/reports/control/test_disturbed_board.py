@@ -7,7 +7,7 @@ import pytest
 
 from dln_jax.control import Controller, field_of, stateless
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.two_link_pendulum import Links
+from dln_jax.scenes.pendulums import Links
 from scripts.reports.control import board
 from scripts.reports.control.disturbed_board import (
     APART,

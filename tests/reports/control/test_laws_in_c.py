@@ -9,7 +9,7 @@ from dln_jax.control import mpc as predicting
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.poles import rotary_pendulum
 from scripts.reports.control import arm_loop, laws_in_c, mpc, tracking
 from scripts.reports.robots.arm import Motion
 

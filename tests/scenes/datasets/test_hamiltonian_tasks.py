@@ -14,8 +14,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.scenes.datasets.phase_samples import reference_motion
-from dln_jax.scenes.n_body import n_body
-from dln_jax.scenes.oscillators import henon_heiles, mass_spring
+from dln_jax.scenes.particles import henon_heiles, mass_spring, n_body
 from dln_jax.types import InputError
 
 SCENES = [
@@ -87,14 +86,18 @@ def test_absent_terms_are_absent():
 
 @pytest.mark.parametrize("name", ["spring", "pendulum"])
 def test_published_energies_are_those_of_the_scenes(name):
-    given = task(name)
+    dataset = task(name)
     q, p = np.random.default_rng(0).normal(size=(2, 20, 1))
 
     @jax.jit
     @jax.vmap
     def ask(q, p):
-        qd = p / given.scene.mass_matrix(q)[0]
-        return lagrangian.energy(given.scene.lagrangian, q, qd), given.hamiltonian(q, p), given.published_energy(q, p)
+        qd = p / dataset.scene.mass_matrix(q)[0]
+        return (
+            lagrangian.energy(dataset.scene.lagrangian, q, qd),
+            dataset.hamiltonian(q, p),
+            dataset.published_energy(q, p),
+        )
 
     circle = (q**2 + p**2)[:, 0]
     true = circle if name == "spring" else (3 * (1 - np.cos(q)) + p**2)[:, 0]
@@ -114,40 +117,42 @@ COUNTS = {
 @pytest.mark.parametrize("name", COUNTS)
 def test_counts_times_and_splits(name):
     published, samples, end, trained = COUNTS[name]
-    given = task(name)
+    dataset = task(name)
     assert inspect.signature(PROTOCOLS[name]).parameters["trajectories"].default == published
-    np.testing.assert_allclose(given.t, end * np.arange(samples) / (samples - 1), rtol=1e-14)
-    train, test = (np.unique(part.data.trajectory) for part in (given.train, given.test))
+    np.testing.assert_allclose(dataset.t, end * np.arange(samples) / (samples - 1), rtol=1e-14)
+    train, test = (np.unique(part.data.trajectory) for part in (dataset.train, dataset.test))
     # The oscillators are tested on the last trajectories, the bodies on the first.
     first, last = (train, test) if name in ("spring", "pendulum") else (test, train)
     assert len(train) == trained
     np.testing.assert_array_equal(np.concatenate([first, last]), np.arange(len(train) + len(test)))
-    for part in (given.train, given.test):
-        d = given.scene.needs.degrees_of_freedom
+    for part in (dataset.train, dataset.test):
+        d = dataset.scene.needs.degrees_of_freedom
         count = samples * len(np.unique(part.data.trajectory))
         for array in (part.data.q, part.data.p, part.clean.pd, part.clean.qdd, *part.field):
             assert array.shape == (count, d) and array.dtype == np.float64
-        np.testing.assert_array_equal(part.data.t.reshape(-1, samples), np.tile(given.t, (count // samples, 1)))
-        assert not part.data.tau.any() and part.data.needs == given.scene.needs
+        np.testing.assert_array_equal(part.data.t.reshape(-1, samples), np.tile(dataset.t, (count // samples, 1)))
+        assert not part.data.tau.any() and part.data.needs == dataset.scene.needs
 
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_energy_is_constant_along_the_reference(name):
-    given = task(name)
-    for part in (given.train, given.test):
-        energy = np.asarray(jax.jit(jax.vmap(given.hamiltonian))(part.clean.q, part.clean.p)).reshape(-1, len(given.t))
+    dataset = task(name)
+    for part in (dataset.train, dataset.test):
+        energy = np.asarray(jax.jit(jax.vmap(dataset.hamiltonian))(part.clean.q, part.clean.p)).reshape(
+            -1, len(dataset.t)
+        )
         assert np.abs(energy - energy[:, :1]).max() < 1e-9
         # Motions that stand still would pass.
-        assert (np.ptp(part.clean.q.reshape(len(energy), len(given.t), -1), axis=1) > 0.05).all()
+        assert (np.ptp(part.clean.q.reshape(len(energy), len(dataset.t), -1), axis=1) > 0.05).all()
 
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_derivatives_are_exact_at_the_noiseless_points(name):
     """By the scene's closed forms; `field` is the same at the noisy ones."""
-    given = task(name)
-    mass = np.diag(given.scene.mass_matrix(jnp.zeros(given.scene.needs.degrees_of_freedom)))
-    gravity = jax.jit(jax.vmap(given.scene.gravity))
-    for data, clean, field in (given.train, given.test):
+    dataset = task(name)
+    mass = np.diag(dataset.scene.mass_matrix(jnp.zeros(dataset.scene.needs.degrees_of_freedom)))
+    gravity = jax.jit(jax.vmap(dataset.scene.gravity))
+    for data, clean, field in (dataset.train, dataset.test):
         np.testing.assert_allclose(data.qd, clean.p / mass, rtol=1e-12)
         np.testing.assert_allclose(data.pd, -gravity(clean.q), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(data.qdd, data.pd / mass, rtol=1e-12)
@@ -158,10 +163,10 @@ def test_derivatives_are_exact_at_the_noiseless_points(name):
 
 @pytest.mark.parametrize(("name", "inner", "outer"), [("spring", 0.1, 1.0), ("pendulum", 1.3, 2.3)])
 def test_radii_and_noise_of_the_oscillators(name, inner, outer):
-    given = task(name)
+    dataset = task(name)
     radii, errors = [], []
-    for data, clean, _ in (given.train, given.test):
-        radii.append(np.hypot(clean.q, clean.p).reshape(-1, len(given.t))[:, 0])
+    for data, clean, _ in (dataset.train, dataset.test):
+        radii.append(np.hypot(clean.q, clean.p).reshape(-1, len(dataset.t))[:, 0])
         errors.append(np.concatenate([data.q - clean.q, data.p - clean.p], axis=1))
     radii, errors = np.concatenate(radii), np.concatenate(errors)
     assert (radii > inner).all() and (radii < outer).all() and np.ptp(radii) > 0.8 * (outer - inner)
@@ -193,9 +198,9 @@ def test_the_damped_spring_follows_its_closed_form():
 
 def starts(name):
     """Positions and velocities at t = 0, [K, bodies, 2]."""
-    given = task(name)
-    parts = [part.clean for part in (given.test, given.train)]
-    bodies = given.scene.needs.degrees_of_freedom // 2
+    dataset = task(name)
+    parts = [part.clean for part in (dataset.test, dataset.train)]
+    bodies = dataset.scene.needs.degrees_of_freedom // 2
     return (
         np.concatenate([getattr(part, key)[part.t == 0] for part in parts]).reshape(-1, bodies, 2) for key in ("q", "p")
     )

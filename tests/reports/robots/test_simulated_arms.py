@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics.trees import pseudo_inertia
-from dln_jax.scenes.datasets.robot_arms import arm_torques, lip_trajectories, sum_of_sines
-from dln_jax.scenes.panda import panda
-from dln_jax.scenes.robot_arms import skew_arm, sliding_arm
 from dln_jax.types import InputError
+from scripts.reports.robots.simulated_arms import (
+    arm_torques,
+    lip_trajectories,
+    panda,
+    skew_arm,
+    sliding_arm,
+    sum_of_sines,
+)
 
 ARMS = {"panda": panda, "panda-3": lambda: panda(3), "skew": skew_arm, "sliding": sliding_arm}
 

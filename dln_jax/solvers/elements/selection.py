@@ -1,0 +1,149 @@
+"""Chooses a linear solver before tracing, by the estimated work for size, structure and stiffness.
+
+- `dense` for small systems;
+- `block_tridiagonal` for most systems;
+- `matrix_free` for wide bands: bodies in space with more than some thousand unknowns.
+
+Stiffness, Poisson's ratio, time step and mesh together determine how many products conjugate gradients need for a
+search direction: it grows with the square root of the condition number of the Hessian. It can be measured only for
+concrete numbers.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.sparse import bsr_array, coo_array, csr_array, tril
+from scipy.sparse.linalg import cg
+
+from dln_jax.solvers.elements.assembly import Pattern, entries
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, lower_triangles
+from dln_jax.solvers.elements.linear_solvers import (
+    SEARCH_RESIDUAL,
+    LinearSolver,
+    LinearSolverFactory,
+    block_tridiagonal,
+    dense,
+    matrix_free,
+    narrowest_order,
+    width_of_band,
+)
+
+# With more unknowns the dense factorisation is slower than the block-tridiagonal one, measured on two cores.
+_DENSE_UNKNOWNS = 160
+# Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
+# rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
+# unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
+# unknowns takes 6e-10 s m s², within 1.7. A search to 1e-2 takes 1.6 to 5 N^(1/d) products at nu = 0.3 and 7 to 16 at
+# nu = 0.49 or E = 1e8, for N vertices in dimension d; and because it is inexact, a step takes 1.5 to 2 times the Newton
+# iterations. The products below stand for all of that. Whole steps in space by blocks, in units of those without a
+# matrix: 675 unknowns 0.69 (nu = 0.3) and 0.38 (0.49); 1,911: 1.19 and 0.50; 4,131 (6,994 tetrahedra): 1.88 and 0.74.
+_FACTORISATION_SECONDS = 1.3e-10
+_BLOCK_OVERHEAD = 150
+_PRODUCT_SECONDS = 6e-10
+_PRODUCTS = 15
+# An inexact search takes this many times the Newton iterations, also when its products are measured.
+_MORE_ITERATIONS = 1.75
+_LOWER_PRODUCTS = 20
+# Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
+_UPPER_ENTRIES = 3e7
+
+
+def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """Chooses the method with the least work by size and structure, for unknown stiffness."""
+    return least_work(energies, at)(energies, at)
+
+
+def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, data: Sequence[Any]) -> LinearSolver:
+    """Chooses the method with the least work for the Hessian at x, with concrete data of the elements."""
+    measure = partial(search_takes_at_most, energies=energies, at=at, x=x, data=data, residual=SEARCH_RESIDUAL)
+    return least_work(energies, at, measure)(energies, at)
+
+
+def least_work(
+    energies: Sequence[ElementEnergy], at: Pattern, search_takes_at_most: Callable[[int], bool] | None = None
+) -> LinearSolverFactory:
+    """Returns `dense`, `block_tridiagonal` or `matrix_free`, by estimates of the work of factorisations and products.
+
+    `search_takes_at_most` returns whether a search direction takes at most this many products; it is called only if
+    size and structure do not settle the choice. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer
+    or nearly incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
+    `matrix_free`.
+    """
+    if at.unknowns <= _DENSE_UNKNOWNS:
+        return dense
+    size = width_of_band(at, narrowest_order(at)) * at.width
+    stored = at.unknowns * size
+    if stored > _UPPER_ENTRIES:
+        return matrix_free
+    factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
+    product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
+    if search_takes_at_most is None:
+        # Vertices along an edge of the body; a product carries information across one of them.
+        across = at.blocks ** (1 / min(at.width, 3))
+        return block_tridiagonal if factorisation <= _PRODUCTS * across * product else matrix_free
+    affordable = int(factorisation / (_MORE_ITERATIONS * product))
+    # So few products gain little, and the measurement costs a compilation.
+    if affordable < _LOWER_PRODUCTS or not search_takes_at_most(affordable):
+        return block_tridiagonal
+    return matrix_free
+
+
+def search_takes_at_most(
+    products: int, energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any], *, residual: float
+) -> bool:
+    """Returns whether conjugate gradients with a block-Jacobi preconditioner need at most `products` products.
+
+    It solves with the Hessian at x for a uniform and a random right-hand side, and compiles one product of an element's
+    Hessian.
+
+    Args:
+        products: the limit, which also bounds the work.
+        energies, at: the sum of energies and its pattern.
+        x, data: concrete values.
+        residual: relative residual of the solution.
+    """
+    hessian, inverse = _hessian(energies, at, x, data)
+    unknowns = int(at.free.sum())
+    right = np.stack([np.ones(unknowns), np.random.default_rng(0).normal(size=unknowns)])
+    return all(_solved(hessian, inverse, b, products, residual) for b in right)
+
+
+def _solved(hessian: csr_array, inverse: csr_array, b: np.ndarray, products: int, residual: float) -> bool:
+    x, status = cg(hessian, b, rtol=residual, maxiter=products, M=inverse)
+    return status == 0 and bool(np.isfinite(x).all())
+
+
+def _hessian(
+    energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any]
+) -> tuple[csr_array, csr_array]:
+    """Returns the Hessian of the free unknowns, and the inverses of its diagonal blocks."""
+    with jax.ensure_compile_time_eval():
+        hessians = [
+            lower_triangles(jax.jit(jax.vmap(partial(_element_hessian, element)))(x[element.indices], of_elements))
+            for element, of_elements in zip(energies, data, strict=True)
+        ]
+        values = np.asarray(entries(at, hessians), float)
+    lower = csr_array(coo_array((values, (at.rows, at.columns)), shape=(at.unknowns, at.unknowns)))
+    (row, i), (column, j) = np.divmod(at.rows, at.width), np.divmod(at.columns, at.width)
+    near = row == column
+    blocks = np.eye(at.width) * ~at.free[:, :, None]
+    blocks[row[near], i[near], j[near]] = blocks[row[near], j[near], i[near]] = values[near]
+    places = np.arange(at.blocks + 1)
+    inverse = csr_array(bsr_array((np.linalg.pinv(blocks), places[:-1], places), shape=lower.shape))
+    free = np.flatnonzero(at.free)
+    return tuple(matrix[free][:, free] for matrix in (csr_array(lower + tril(lower, -1).T), inverse))
+
+
+def _element_hessian(element: ElementEnergy, x: Float[Array, "k b"], data: Any) -> Float[Array, "s s"]:
+    """Computes the Hessian by columns in a loop, which compiles several times faster than unrolled columns."""
+
+    def column(direction: Float[Array, " s"]) -> Float[Array, " s"]:
+        along = direction.reshape(x.shape)
+        return jax.jvp(lambda x: jax.grad(element.energy)(x, data), (x,), (along,))[1].reshape(-1)
+
+    return jax.lax.map(column, jnp.eye(x.size, dtype=x.dtype))
