@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import GAP, segments
+from dln_jax.data.splits import GAP, segments
 from dln_jax.types import InputError
 
 DEGREE = 4

@@ -102,7 +102,7 @@ MALFORMED = {
     "not a number": (HEADER + ROWS.replace("7", "nan"), "tau has 1 NaN or infinite value"),
     "infinite": (HEADER + ROWS.replace("7", "1e999"), "tau has 1 NaN or infinite value"),
     "no q": ("t [s],x [rad]\n0,1\n", "key 'q' is missing.*keys that are not read: x \\[rad\\]"),
-    "no t": ("q1 [rad]\n0\n1\n2\n", "key 't' is missing; add the time of each sample in seconds, or say --rate HZ"),
+    "no t": ("q1 [rad]\n0\n1\n2\n", "key 't' is missing; add the time of each sample in seconds, or give --rate HZ"),
     "twice": ("t [s],q1 [rad],q1 [rad]\n0,1,2\n", "two columns have the title 'q1 \\[rad\\]'"),
     "twice by other units": (
         "t [s],q1 [rad],q1 [deg]\n0,1,2\n",

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.segments import GAP
+from dln_jax.data.splits import GAP
 from dln_jax.types import InputError
 
 BRIDGED = 3.5

@@ -24,7 +24,7 @@ from dln_jax.data.encoders.filters import ORDER, derivatives, low_pass
 from dln_jax.data.encoders.noise import noise_of
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import segments
+from dln_jax.data.splits import segments
 from dln_jax.types import InputError, require_positive
 
 SHORTEST = 4.0

@@ -9,10 +9,9 @@ from dln_jax.cli.encoders import checked, fitted_torque, preparation, smoothed
 from dln_jax.cli.running import needs_from_option
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
-from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split
+from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split, with_joints
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.kinematic_prior import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL

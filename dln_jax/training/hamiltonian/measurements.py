@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.data import schema
+from dln_jax.data.arrays import spread
 from dln_jax.data.bodies import find_bodies
 from dln_jax.data.local_polynomials import DEGREE, smooth_locally
-from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories, column, time_derivative
-from dln_jax.data.segments import segments
-from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, select
+from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, segments, select
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places

@@ -20,10 +20,9 @@ from dln_jax.cli.encoders import Filtered, checked, fitted_torque, preparation, 
 from dln_jax.cli.options import Drawn, Folder
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
-from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select
+from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select, with_joints
 from dln_jax.identification.consistent import REGULARISATION
 from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.friction import LAWS, FrictionShape, require_laws, shape_of

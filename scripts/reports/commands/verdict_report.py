@@ -19,7 +19,7 @@ import numpy as np
 from dln_jax.cli.commands import train_delan
 from dln_jax.cli.options import Folder
 from dln_jax.cli.running import command_folder
-from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robot_files import mjcf
 from dln_jax.files import read_json
 from dln_jax.metrics.report import Row, expect
 from dln_jax.metrics.verdict import LEVELS, FitRefused

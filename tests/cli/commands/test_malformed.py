@@ -28,7 +28,7 @@ from dln_jax.cli.commands import (
     train_locomotion,
 )
 from dln_jax.cli.stored_arguments import checked_arguments, stored_arguments
-from dln_jax.data import archive, functions, meshes, schema
+from dln_jax.data import arrays, functions, meshes, schema
 from dln_jax.data.splits import split
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import write_json
@@ -226,7 +226,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     np.testing.assert_array_equal(data.tau, TRAJECTORIES["tau"])
     with pytest.raises(InputError, match=r"'x' is missing.*not read: t, q, .*readme.txt"):
         functions.load("data.npz")
-    monkeypatch.setattr(archive, "MOST_BYTES", 1000)
+    monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
     with pytest.raises(InputError, match="holds more than"):
         schema.load("data.npz")
 
