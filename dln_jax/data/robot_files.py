@@ -1,7 +1,7 @@
 """Writes robots: MJCF of any tree, and copies of URDF and MJCF files with identified inertias, armature and friction.
 
-In a copy, bodies fixed to a link move with it, and only their sum is known. It is written into the link that the joint moves, and
-the inertias of bodies fixed to that link are removed. Quantities that the format cannot store go into a comment.
+Bodies fixed to a link move with it, and only the sum of their inertias is known. A copy has this sum in the link that
+the joint moves, and no inertias in the bodies fixed to it. Quantities that the format cannot store go into a comment.
 """
 
 import copy
@@ -102,9 +102,7 @@ def write_robot(
         raise InputError(f"{original} has the joints {', '.join(names)}; the tree has {', '.join(tree.names)}")
     for name, theta in zip(names, np.asarray(tree.inertias, float), strict=True):
         if theta.any() and np.linalg.eigvalsh(pseudo_inertia(theta))[0] <= 0:
-            raise InputError(
-                f"the link behind joint '{name}' is not physically consistent; write consistent parameters"
-            )
+            raise InputError(f"the link behind joint '{name}' is not physically consistent; correct its inertia")
     remarks = (LUMPS, *remarks)
     if locked:
         where = ", ".join(f"{name} at {position!r}" for name, position in locked.items())

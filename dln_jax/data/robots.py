@@ -126,13 +126,14 @@ def _compiled(path: Path, root: ET.Element, locked: Collection[str]) -> tuple[An
     text = None
     if root.tag == "robot":
         require_joints(root, locked)
-        for joint, mimic in [(joint, mimic) for joint in root.iter("joint") for mimic in joint.findall("mimic")]:
-            if joint.get("name") not in locked:
-                raise InputError(
-                    f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move freely: "
-                    "lock it, and the joint that it follows"
-                )
-            joint.remove(mimic)
+        for joint in root.iter("joint"):
+            for mimic in joint.findall("mimic"):
+                if joint.get("name") not in locked:
+                    raise InputError(
+                        f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move "
+                        "freely: lock it, and the joint that it follows"
+                    )
+                joint.remove(mimic)
         text = ET.tostring(without_inertias(root), encoding="unicode")
     try:
         with quiet(mujoco):
