@@ -3,7 +3,7 @@
 import numpy as np
 
 from dln_jax.data.checks.findings import Finding, named
-from dln_jax.data.encoders.noise import step_of
+from dln_jax.data.encoders.sampling import step_of
 from dln_jax.data.schema import Trajectories
 
 TURNS = 4 * np.pi

@@ -13,8 +13,8 @@ from dln_jax.data.checks.repaired import any_energy
 from dln_jax.data.checks.times import check_times
 from dln_jax.data.checks.torques import check_degrees, check_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
-from dln_jax.data.encoders.noise import step_of
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
+from dln_jax.data.encoders.sampling import step_of
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories

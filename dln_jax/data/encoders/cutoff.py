@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.encoders.filters import ORDER, gain
-from dln_jax.data.encoders.noise import NORMAL
+from dln_jax.data.encoders.sampling import NORMAL, by_trajectory
 from dln_jax.types import InputError, require_positive
 
 SEGMENT = 8.0
@@ -97,7 +97,7 @@ def choose_cutoff(
     sizes = weight @ signal
     moves = (sizes > 0) & (q.std(axis=0) > MOVES * noise)
     if not moves.any():
-        raise InputError("no joint moves by more than its noise; a cut-off takes motions: give one, or look at q")
+        raise InputError("no joint moves by more than its noise, so no cut-off can be chosen; give one, or check q")
     error = np.empty(CANDIDATES)
     for place, cutoff in enumerate(tried):
         H = gain(f, float(cutoff), order)[:, None]
@@ -153,13 +153,13 @@ def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> F
     jitter of a fraction of a step, for example, is noise proportional to the velocity.
     """
     accelerations = f[:, None] ** 4 * _smoothed(spectrum)
-    found = np.zeros_like(spectrum)
+    rising = np.zeros_like(spectrum)
     for channel, power in enumerate(accelerations.T):
         peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
         lowest = peak + int(np.argmin(power[peak:]))
         if power[f > f[-1] / 2].min() > RISES * power[lowest]:
-            found[lowest:, channel] = spectrum[lowest:, channel]
-    return found
+            rising[lowest:, channel] = spectrum[lowest:, channel]
+    return rising
 
 
 def spectra(
@@ -172,9 +172,9 @@ def spectra(
     """
     from scipy.signal import welch
 
-    parts = [part for part in np.split(values, np.flatnonzero(np.diff(trajectory)) + 1) if len(part) >= 16]
+    parts = [part for part in by_trajectory(values, trajectory) if len(part) >= 16]
     if not parts:
-        raise InputError("no segment has 16 samples; a spectrum takes longer motions: record some, or give a cut-off")
+        raise InputError("no segment has the 16 samples of a spectrum; record longer motions, or give a cut-off")
     length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
     total, weight = 0.0, 0
     f = np.zeros(0)
@@ -202,7 +202,6 @@ def _smoothed(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
     logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
     summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(logarithm, axis=0)])
     place = np.arange(1, len(spectrum) + 1)
-    low = np.floor(place * 2 ** (-1 / 6)).astype(int) - 1
+    low = np.maximum(np.floor(place * 2 ** (-1 / 6)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(place * 2 ** (1 / 6)).astype(int), len(spectrum))
-    low = np.maximum(low, 0)
     return np.exp((summed[high] - summed[low]) / (high - low)[:, None])

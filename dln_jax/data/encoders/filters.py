@@ -19,6 +19,7 @@ tenth of the rate and to 1.3 % at a quarter, where central differences taken twi
 import numpy as np
 from jaxtyping import Float, Int
 
+from dln_jax.data.encoders.sampling import by_trajectory
 from dln_jax.types import InputError, require_positive
 
 ORDER = 4
@@ -63,10 +64,9 @@ def low_pass(
     from scipy.signal import butter, sosfiltfilt
 
     sections = butter(order, cutoff, fs=rate, output="sos")
-    ends = [] if trajectory is None else np.flatnonzero(np.diff(trajectory)) + 1
     extension = int(np.ceil(PERIODS * rate / cutoff))
     filtered = []
-    for part in np.split(values, ends):
+    for part in [values] if trajectory is None else by_trajectory(values, trajectory):
         slow = bent(part, int(np.ceil(END_PERIODS * rate / cutoff)))
         rest = sosfiltfilt(sections, part - slow, axis=0, padlen=min(extension, len(part) - 1))
         filtered.append(slow + rest)
@@ -82,25 +82,16 @@ def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"
     near = max(near, 2 * END_DEGREE)
     if len(values) < 2 * near:
         return np.zeros_like(values)
+    from numpy.polynomial.polynomial import polyfit
+    from scipy.interpolate import BPoly
+
     x = np.linspace(0.0, 1.0, len(values))  # along the segment
-    powers = range(6)
-    conditions, found = [], []
+    length, ends = x[near - 1], []
     for samples, end in ((slice(None, near), 0.0), (slice(-near, None), 1.0)):
         # Scale x by the length of the fit, which keeps the fit well conditioned.
-        length = x[near - 1]
-        local = np.vander((x[samples] - end) / length, END_DEGREE + 1, increasing=True)
-        coefficients = np.linalg.lstsq(local, values[samples], rcond=None)[0]
-        for order, factor in ((0, 1.0), (1, 1.0), (2, 2.0)):
-            slopes = np.array([_falling(power, order) * end ** max(power - order, 0) for power in powers])
-            conditions.append(slopes)
-            found.append(factor * coefficients[order] / length**order)
-    polynomial = np.linalg.solve(np.array(conditions), np.array(found))
-    return np.vander(x, 6, increasing=True) @ polynomial
-
-
-def _falling(power: int, order: int) -> float:
-    """Factor of the derivative of x^power: power (power - 1) ... with `order` factors, zero if power < order."""
-    return float(np.prod([power - k for k in range(order)])) if power >= order else 0.0
+        fit = polyfit((x[samples] - end) / length, values[samples], END_DEGREE)
+        ends.append([fit[0], fit[1] / length, 2 * fit[2] / length**2])
+    return BPoly.from_derivatives([0.0, 1.0], np.array(ends))(x)
 
 
 def derivatives(

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
-from dln_jax.data.encoders.noise import noise_of
+from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.robots import Robot
 from dln_jax.data.splits import every
 from dln_jax.files import write_json
