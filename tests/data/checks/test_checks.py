@@ -132,7 +132,7 @@ LOG_FAULTS = {
     "milliseconds": (lambda a: {**a, "t": 1000 * a["t"]}, "time-unit", (), "seconds"),
     "jitter": (jittered, "jitter", (), "vary by"),
     "gap": (with_gap, "gaps", (), "1 gap"),
-    "one run": (one_run, "split", (), "1 trajectories"),
+    "one run": (one_run, "split", (), "trajectories is 1"),
     "torque turned round": (lambda a: {**a, "tau": column(a["tau"], 1, np.negative)}, "torque-sign", (1,), "sign"),
     "torques late": (lambda a: {**a, "tau": late(a["tau"], 8)}, "delay", (), "late"),
     "torques cut off": (lambda a: {**a, "tau": np.clip(a["tau"], -6, 6)}, "saturation-tau", None, "cut off"),
@@ -233,7 +233,7 @@ def test_a_fault_against_the_robot_is_found(clean, name):
     assert found, f"{check} is not among {[finding.line for finding in findings]}"
     assert found[0].joints == joints and "\n" not in found[0].line
     if name == "upside down":
-        assert "-9." in found[0].said
+        assert "-9." in found[0].observation
     if name == "torques late":
         assert examined.on_tree.torques.log.delay == pytest.approx(2, abs=0.3)
 
@@ -285,7 +285,7 @@ def test_a_tilt_and_a_wrong_clock_are_found_with_the_robot(clean):
     tilted = arm(gravity=(9.81 * np.sin(0.3), 0.0, -9.81 * np.cos(0.3)))
     on_tree = examine(as_recording(schema.from_arrays(clean)), tilted, equations=300).on_tree
     assert [finding.check for finding in on_tree.findings] == ["gravity"]
-    assert "17 degrees" in on_tree.findings[0].said
+    assert "17 degrees" in on_tree.findings[0].observation
     slow = without(["qd"], {**clean, "t": 1.25 * clean["t"]})
     on_tree = examine(as_recording(schema.from_arrays(slow)), arm(), equations=300).on_tree
     assert [finding.check for finding in on_tree.findings] == ["clock"]
