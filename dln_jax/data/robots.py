@@ -48,14 +48,6 @@ class Robot(NamedTuple):
     """[d], 1/s or m/s, or one for all; stated in URDF only, since MJCF has no such limit."""
 
 
-class _Link(NamedTuple):
-    parent: int
-    kind: str
-    rotation: np.ndarray
-    position: np.ndarray
-    axis: np.ndarray
-
-
 def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = ()) -> Robot:
     """Reads a robot from a URDF or MJCF file.
 
@@ -179,7 +171,7 @@ def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping
     names = joint_names(model)
     _require_tree(mujoco, model, names, locked)
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
-    links: list[_Link] = []
+    links: list[tuple[int, str, np.ndarray, np.ndarray, np.ndarray]] = []  # parent, kind, rotation, position, axis
     inertias: list[np.ndarray] = []
     moving: list[int] = []
     # Frame of each body relative to the link it moves with; -1 is the ground.
@@ -195,7 +187,7 @@ def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping
                 R, p = _behind_locked(mujoco, kinds.get(kind), anchor, axis, locked[names[joint]], R, p)
                 continue
             moving.append(joint)
-            links.append(_Link(parent, kinds[kind], R, p + R @ anchor, axis))
+            links.append((parent, kinds[kind], R, p + R @ anchor, axis))
             inertias.append(np.zeros(10))
             parent = len(links) - 1
             R, p = np.eye(3), -anchor
@@ -205,13 +197,13 @@ def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping
             inertias[parent] = inertias[parent] + moved(theta, R, p)
     names = tuple(names[joint] for joint in moving)
     heavy = [theta[0] > 0 for theta in inertias]
+    parents, joints, rotations, positions, axes = zip(*links, strict=True)
     for link in reversed(range(len(links))):  # parents come before their children
-        if heavy[link] and links[link].parent >= 0:
-            heavy[links[link].parent] = True
+        if heavy[link] and parents[link] >= 0:
+            heavy[parents[link]] = True
     if not all(heavy):
         name = names[heavy.index(False)]
         raise InputError(f"joint '{name}' moves no mass; expected an <inertial> for the link behind it")
-    parents, joints, rotations, positions, axes = zip(*links, strict=True)
     dofs, infinite = model.jnt_dofadr[moving], np.array([-np.inf, np.inf])
     tree = make_tree(
         parents, joints, rotations, positions, axes, inertias,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dln_jax.data import checks, csv_tables, schema
-from dln_jax.data.motion_tables import write_motion
+from dln_jax.data.csv_tables import write_motion
 from dln_jax.types import InputError
 
 ROWS = "0,1,2,3,4\n0.1,5,6,7,8\n0.2,9,10,11,12\n"
@@ -57,7 +57,7 @@ def test_units_in_titles_are_converted_to_si(load, titles, factors):
 
 def test_units_that_no_title_states_are_asked_for(load):
     text = "t,q1,tau1\n0,90,1\n1,180,1\n2,180,1\n"
-    with pytest.raises(InputError, match=r"'t' has no unit; .* 't \[s\]', or say --units si"):
+    with pytest.raises(InputError, match=r"'t' has no unit; .* 't \[s\]', or give --units si"):
         load(text)
     assert load(text, units="si").q[0, 0] == 90
     data = load(text, units="degrees")

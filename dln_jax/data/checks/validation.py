@@ -1,4 +1,4 @@
-"""Reads a log tolerantly, runs all checks on it, and collects findings and intermediate results."""
+"""Reads a log tolerantly, runs all checks on it, and formats what they found as a page of text."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from dln_jax.data.checks.hypotheses import Torques, examine_torques
 from dln_jax.data.checks.torques import check_degrees, check_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
-from dln_jax.data.encoders.sampling import step_of
+from dln_jax.data.encoders.sampling import step_of, timing
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
@@ -29,6 +29,8 @@ FEWER, FEWER_EACH = 300, 100
 """Smaller numbers for `quick`: the minimum over all joints, and the number per joint."""
 BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
 """Without a robot, torques are not examined if one of these findings is present."""
+WIDTH = 10
+"""Characters per column of the report's table."""
 ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
 
 
@@ -191,3 +193,64 @@ def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:
         return []
     observation = f"accelerations by differences of this q have noise of {100 * share.max():.0f} % of their size"
     return [Finding("warning", "raw-differences", observation, ESTIMATED)]
+
+
+def report(examined: Examination, name: str) -> list[str]:
+    """Lines of text; findings come last, most severe first."""
+    data, smoothed = examined.recording.data, examined.smoothed
+    count = len(np.unique(data.trajectory))
+    lines = [f"{name}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} joints"]
+    if smoothed is not None:
+        steps = timing(data.t, data.trajectory)
+        lines.append(f"{steps.rate:.4g} Hz, steps vary by {steps.jitter:.1%}, {steps.gaps} gaps")
+        lines.append(
+            "the noise of q is too small for a filter"
+            if np.isinf(smoothed.cutoff)
+            else f"the best low-pass of q has a cut-off of about {smoothed.cutoff:.3g} Hz (--cutoff auto)"
+        )
+    lines += ["", *_table(examined), ""]
+    on_tree, torques = examined.on_tree, examined.torques
+    if on_tree is not None:
+        lines.append(
+            f"robot: the motions determine {on_tree.rank} of {on_tree.parameters} parameters, friction included (some "
+            f"are never determined alone); condition {on_tree.condition:.3g}"
+        )
+        lines.append("")
+    if torques is not None:
+        by = "parameters near the robot's" if on_tree is not None else "an energy of any arm and friction"
+        lines.append(
+            f"torques: {by} predict {torques.explained.mean():.1%} of the variance in left-out blocks; the likeliest "
+            f"delay is {torques.likely_delay:.2f} samples"
+        )
+    elif "tau" not in data.estimated:
+        lines.append("torques: signs, order of columns and delay cannot be checked in this log")
+    if not examined.findings:
+        lines.append("nothing was found")
+    return [*lines, *(finding.line for finding in examined.findings)]
+
+
+def _table(examined: Examination) -> list[str]:
+    data, smoothed, on_tree, torques = (
+        examined.recording.data, examined.smoothed, examined.on_tree, examined.torques
+    )  # fmt: skip
+    driven = "tau" not in data.estimated
+    columns = [("q from", "rad|m", data.q.min(axis=0)), ("to", "rad|m", data.q.max(axis=0))]
+    columns += [("step", "rad|m", examined.steps)]
+    if smoothed is not None:
+        columns += [("noise q", "rad|m", smoothed.noise_q)]
+        columns += [("max |qd|", "1/s", np.abs(smoothed.data.qd).max(axis=0))]
+    if driven:
+        columns += [("max |tau|", "N m|N", np.abs(data.tau).max(axis=0))]
+    if driven and smoothed is not None:
+        columns += [("noise tau", "N m|N", smoothed.noise_tau)]
+    if torques is not None:
+        columns += [("viscous", "N m s", torques.viscous), ("dry", "N m|N", torques.coulomb)]
+    if on_tree is not None and np.isfinite(on_tree.scale).any():
+        columns += [("tau/robot", "1", on_tree.scale)]
+    head = "joint" + "".join(f"{title:>{WIDTH}}" for title, _, _ in columns)
+    units = "     " + "".join(f"{unit:>{WIDTH}}" for _, unit, _ in columns)
+    rows = [
+        f"{joint + 1:5d}" + "".join(f"{values[joint]:{WIDTH}.3g}" for _, _, values in columns)
+        for joint in range(data.degrees_of_freedom)
+    ]
+    return [head, units, *rows]

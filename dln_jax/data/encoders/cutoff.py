@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.encoders.filters import ORDER, gain
+from dln_jax.data.encoders.filters import gain
 from dln_jax.data.encoders.sampling import NORMAL, by_trajectory
 from dln_jax.types import InputError, require_positive
 
@@ -68,12 +68,7 @@ class Choice(NamedTuple):
 
 
 def choose_cutoff(
-    q: Float[np.ndarray, "N d"],
-    trajectory: Int[np.ndarray, " N"],
-    *,
-    rate: float,
-    noise: Float[np.ndarray, " d"],
-    order: int = ORDER,
+    q: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"], *, rate: float, noise: Float[np.ndarray, " d"]
 ) -> Choice:
     """Finds the cut-off with the lowest expected error.
 
@@ -82,16 +77,17 @@ def choose_cutoff(
         trajectory: trajectory of every sample.
         rate: Hz.
         noise: standard deviation of the noise of every coordinate.
-        order: order of the filter.
 
     Raises:
         InputError: no segment has sixteen samples, or nothing moves by more than its noise.
     """
-    require_positive(rate=rate, order=order)
+    require_positive(rate=rate)
     f, spectrum = spectra(without_jumps(q, trajectory, noise), trajectory, rate=rate)
     white = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
     floor = np.maximum(white, _rising(f, spectrum))
-    signal = _motion(f, spectrum, floor)
+    # The motion's spectrum S ends at the frequency where the smoothed spectrum first falls to the floor.
+    hidden = np.cumsum(_smoothed(spectrum) < SEEN * floor, axis=0) > 0
+    signal = np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
     tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
     weight = (2 * np.pi * f) ** 4
     sizes = weight @ signal
@@ -100,7 +96,7 @@ def choose_cutoff(
         raise InputError("no joint moves by more than its noise, so no cut-off can be chosen; give one, or check q")
     error = np.empty(CANDIDATES)
     for place, cutoff in enumerate(tried):
-        H = gain(f, float(cutoff), order)[:, None]
+        H = gain(f, float(cutoff))[:, None]
         left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
         error[place] = np.mean(left[moves] / sizes[moves])
     best = int(np.argmin(error))
@@ -186,15 +182,6 @@ def spectra(
         total, weight = total + len(part) * power * (length / min(length, len(part) - 2)), weight + len(part)
     power = np.asarray(total)[1:] / weight
     return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4
-
-
-def _motion(
-    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, "F d"]
-) -> Float[np.ndarray, "F d"]:
-    """S of every joint: the spectrum above the floor, up to the frequency where it first falls to the floor."""
-    smooth = _smoothed(spectrum)
-    hidden = np.cumsum(smooth < SEEN * floor, axis=0) > 0
-    return np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
 
 
 def _smoothed(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:

@@ -31,9 +31,9 @@ END_PERIODS, END_DEGREE = 1.0, 5
 at an end are estimated."""
 
 
-def gain(f: Float[np.ndarray, " n"], cutoff: float, order: int = ORDER) -> Float[np.ndarray, " n"]:
+def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
     """H of both passes; 1 for an infinite cut-off."""
-    return 1 / (1 + (f / cutoff) ** (2 * order))
+    return 1 / (1 + (f / cutoff) ** (2 * ORDER))
 
 
 def low_pass(
@@ -41,7 +41,6 @@ def low_pass(
     *,
     rate: float,
     cutoff: float,
-    order: int = ORDER,
     trajectory: Int[np.ndarray, " N"] | None = None,
 ) -> Float[np.ndarray, "N k"]:
     """Low-pass filters values at equal steps, every trajectory separately.
@@ -50,20 +49,19 @@ def low_pass(
         values: columns of any quantity linear in the unknowns: torques, or columns of a regressor.
         rate: sampling rate, Hz.
         cutoff: Hz; infinite returns the values unchanged.
-        order: order of the Butterworth filter, which is applied twice.
         trajectory: trajectory of every sample (default: one).
 
     Raises:
-        InputError: the cut-off is not below half the rate, or the order is below 1.
+        InputError: the cut-off is not below half the rate.
     """
-    require_positive(rate=rate, cutoff=cutoff, order=order)
+    require_positive(rate=rate, cutoff=cutoff)
     if np.isinf(cutoff):
         return values
     if not cutoff < rate / 2:
         raise InputError(f"cutoff is {cutoff:g} Hz; expected less than {rate / 2:g} Hz, half the rate of the samples")
     from scipy.signal import butter, sosfiltfilt
 
-    sections = butter(order, cutoff, fs=rate, output="sos")
+    sections = butter(ORDER, cutoff, fs=rate, output="sos")
     extension = int(np.ceil(PERIODS * rate / cutoff))
     filtered = []
     for part in [values] if trajectory is None else by_trajectory(values, trajectory):

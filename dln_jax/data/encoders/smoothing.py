@@ -1,7 +1,7 @@
 """Converts q, t and tau of a log to trajectories with derivatives.
 
-1. Repeated rows are removed (see `repeats`). Long gaps cut a trajectory, short ones are bridged; samples at unequal
-   steps are interpolated to one rate.
+1. Repeated rows are removed (see `repeats`). Long gaps cut a trajectory into parts named LABEL/1, LABEL/2 and so on,
+   short ones are bridged; samples at unequal steps are interpolated to one rate.
 2. The noise of every channel is estimated. The noise and the spectra of q determine the cut-off, unless it is set.
 3. q is filtered without delay; qd and qdd are derivatives of the result. tau is filtered too if samples are dropped,
    which requires it, or on request.
@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from dln_jax.data.encoders import sampling
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
-from dln_jax.data.encoders.filters import ORDER, derivatives, low_pass
+from dln_jax.data.encoders.filters import derivatives, low_pass
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.schema import Trajectories
@@ -51,7 +51,6 @@ class Smoothed(NamedTuple):
     """Standard deviation of the noise of every torque of `data`, N m or N; zero without torques."""
     choice: Choice | None
     """Data behind the choice of the cut-off; `None` if the cut-off was set."""
-    order: int
     filtered_torque: bool
     decimate: int
     trim: float
@@ -70,31 +69,26 @@ def smooth(
     data: Trajectories,
     cutoff: float | None = None,
     *,
-    order: int = ORDER,
     rate: float | None = None,
     filter_torque: bool | None = None,
     decimate: int = 1,
     trim: float | None = None,
-    bridged: float = sampling.BRIDGED,
 ) -> Smoothed:
     """Estimates derivatives and smooths a log's q, t and tau for learning; existing rates are not used.
 
     Args:
         data: the log.
         cutoff: Hz, infinite for none (default: chosen from the data, see `cutoff`).
-        order: order of the Butterworth filter, which is applied twice.
         rate: rate of the equal steps, Hz (default: the median of the data).
         filter_torque: whether to filter tau as well (default: only if samples are dropped).
         decimate: keep every `decimate`-th sample.
         trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
-        bridged: gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory into parts
-            named LABEL/1, LABEL/2, ...
 
     Raises:
         InputError: settings out of range, a decimation to less than twice the cut-off, or no segment that is long
             enough.
     """
-    require_positive(order=order, decimate=decimate)
+    require_positive(decimate=decimate)
     if trim is not None and not trim >= 0:
         raise InputError(f"trim is {trim}; expected seconds >= 0")
     data, repeats = without_repeats(data)
@@ -103,13 +97,13 @@ def smooth(
         rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
     require_positive(rate=rate)
     d, values = data.degrees_of_freedom, np.hstack([data.q, data.tau])
-    pieces = segments(data.t, data.trajectory, gap=bridged)
+    pieces = segments(data.t, data.trajectory, gap=sampling.BRIDGED)
     even = [sampling.even(data.t[piece], values[piece], rate) for piece in pieces]
     values, part = np.concatenate([x for _, x in even]), np.repeat(np.arange(len(even)), [len(t) for t, _ in even])
     noise_q, noise_tau = (noise_of(channels, part) for channels in (values[:, :d], values[:, d:]))
     choice = None
     if cutoff is None:
-        choice = choose_cutoff(values[:, :d], part, rate=rate, noise=noise_q, order=order)
+        choice = choose_cutoff(values[:, :d], part, rate=rate, noise=noise_q)
         cutoff = choice.cutoff
     require_positive(cutoff=cutoff)
     if decimate > 1 and not cutoff < rate / decimate / 2:
@@ -127,7 +121,7 @@ def smooth(
             f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
-    filter_ = functools.partial(low_pass, rate=rate, cutoff=cutoff, order=order)
+    filter_ = functools.partial(low_pass, rate=rate, cutoff=cutoff)
     columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
     for index in kept:
         t, x = even[index]
@@ -143,7 +137,7 @@ def smooth(
     )
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
     return Smoothed(
-        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, order, filtered, decimate, trim,
+        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, filtered, decimate, trim,
         bridged=len(segments(data.t, data.trajectory)) - len(pieces), parts=len(kept),
         left_out=len(pieces) - len(kept), repeats=repeats,
     )  # fmt: skip
