@@ -117,23 +117,23 @@ def at_times_of(data: Trajectories, even: Smoothed, values: np.ndarray) -> np.nd
     return rows
 
 
-def _judged(key: str, formula: str, found: Match, rate: float, moves: np.ndarray) -> list[Finding]:
-    alike = (np.abs(found.correlation) > ALIKE) & moves
-    sizes = np.abs(found.factor)
+def _judged(key: str, formula: str, matched: Match, rate: float, moves: np.ndarray) -> list[Finding]:
+    alike = (np.abs(matched.correlation) > ALIKE) & moves
+    sizes = np.abs(matched.factor)
     degrees, radians, milli = (alike & (np.abs(sizes / unit - 1) < 0.05) for unit in (RADIAN, 1 / RADIAN, 1000.0))
-    opposite = alike & (found.factor < 0)
+    opposite = alike & (matched.factor < 0)
     other = alike & ~(degrees | radians | milli | opposite) & (np.abs(np.log(sizes + 1e-300)) > np.log(1.15))
-    late = alike & (np.abs(found.delay) > LATE) & (found.gained > 1.5)
-    worst = max(found.delay[late], key=abs, default=0.0)
+    late = alike & (np.abs(matched.delay) > LATE) & (matched.gained > 1.5)
+    worst = max(matched.delay[late], key=abs, default=0.0)
     delayed = f"up to {abs(worst) / rate * 1e3:.3g} ms {'late' if worst > 0 else 'early'}"
-    ratios = ", ".join(f"{factor:.3g}" for factor in found.factor[other])
+    ratios = ", ".join(f"{factor:.3g}" for factor in matched.factor[other])
     cases = (
         ("error", "unit", degrees, f"is 57.3 times {formula}", f"convert {key} from degrees to radians"),
         ("error", "unit", radians, f"is {formula} / 57.3", "convert q from degrees to radians"),
         ("error", "unit", milli, f"is 1000 times {formula}", "give t in seconds"),
         ("error", "sign", opposite, f"has the opposite sign of {formula}", f"change the sign of {key} or q"),
         ("error", "unit", other, f"is {ratios} times {formula}", f"check units and gear ratios, or {RATE_REMEDY}"),
-        ("error", "unlike", (np.abs(found.correlation) < UNLIKE) & moves, f"does not follow {formula}",
+        ("error", "unlike", (np.abs(matched.correlation) < UNLIKE) & moves, f"does not follow {formula}",
          f"check the order of the columns, or {RATE_REMEDY}"),
         ("warning", "delay", late, f"is {delayed} relative to q", RATE_REMEDY),
     )  # fmt: skip

@@ -18,29 +18,29 @@ FEWER = 300
 """Number of equations used to compare degrees with radians."""
 
 
-def check_torques(data: Trajectories, found: Torques, *, friction_stated: bool, with_robot: bool) -> list[Finding]:
+def check_torques(data: Trajectories, torques: Torques, *, friction_stated: bool, with_robot: bool) -> list[Finding]:
     """Turns the examination of torques into findings."""
-    log = found.log
+    log = torques.log
     findings = on_joints(
         "error", "tree-sign" if with_robot else "torque-sign", log.signs < 0,
-        f"the torque of {{}} has the wrong sign ({found.gain})", "change the sign of that tau or that q",
+        f"the torque of {{}} has the wrong sign ({torques.gain})", "change the sign of that tau or that q",
     )  # fmt: skip
     columns = ", ".join(str(source + 1) for source in log.order)
     findings += on_joints(
         "error", "order", np.array(log.order) != np.arange(len(log.order)),
-        f"the torques of {{}} are exchanged: columns {columns} of tau fit q ({found.gain})",
+        f"the torques of {{}} are exchanged: columns {columns} of tau fit q ({torques.gain})",
         "order the columns of tau as those of q",
     )  # fmt: skip
     if log.delay:
         step = 1e3 * float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0]))
         late = f"{abs(log.delay) * step:.3g} ms {'late' if log.delay > 0 else 'early'}"
-        observation = f"torques are {late} relative to positions ({found.gain})"
+        observation = f"torques are {late} relative to positions ({torques.gain})"
         remedy = "shift one of them in time, or correct the clock of the log"
         findings.append(Finding("warning", "delay", observation, remedy))
     elif not friction_stated and not findings:
         size = log.torques().std(axis=0)
-        sure = (found.explained > TRUSTED) & (found.coulomb > np.maximum(DRY * size, SURE * found.coulomb_error))
-        sizes = ", ".join(f"{dry:.2g}" for dry in found.coulomb[sure])
+        sure = (torques.explained > TRUSTED) & (torques.coulomb > np.maximum(DRY * size, SURE * torques.coulomb_error))
+        sizes = ", ".join(f"{dry:.2g}" for dry in torques.coulomb[sure])
         findings += on_joints(
             "note", "friction", sure, f"friction is seen at {{}} (dry: about {sizes})",
             'state it: --needs \'{"joints": [...], "joint_friction": ["viscous", "coulomb"]}\'',
@@ -71,5 +71,5 @@ def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) 
 
 
 def _unexplained(data: Trajectories, joints: tuple[str, ...]) -> float | None:
-    found = examine_torques(data, any_energy(joints), farthest=0, equations=FEWER, ambiguous=False, faults=False)
-    return None if found is None else float(found.explanation.unexplained.mean())
+    torques = examine_torques(data, any_energy(joints), farthest=0, equations=FEWER, ambiguous=False, faults=False)
+    return None if torques is None else float(torques.explanation.unexplained.mean())

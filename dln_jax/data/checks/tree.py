@@ -141,8 +141,8 @@ def _paced(log: Log, rows: np.ndarray, down: np.ndarray) -> list[Log]:
     return [] if abs(np.log(speed)) < PACE else [log._replace(speed=speed)]
 
 
-def _base_and_clock(found: Torques, down: np.ndarray) -> list[Finding]:
-    gravity, speed = found.log.gravity, found.log.speed
+def _base_and_clock(torques: Torques, down: np.ndarray) -> list[Finding]:
+    gravity, speed = torques.log.gravity, torques.log.speed
     if gravity is not None:
         estimate = "(" + ", ".join(f"{number:.1f}" for number in np.round(gravity, 1) + 0.0) + ")"
         observation = f"gravity is tilted by {_angle(gravity, down):.0f} degrees"
@@ -150,10 +150,12 @@ def _base_and_clock(found: Torques, down: np.ndarray) -> list[Finding]:
         if gravity @ down < 0 and _angle(gravity, -down) < 2 * TILTED:
             observation = "gravity points the other way"
             remedy = "reverse gravity in the description, or check how the arm is mounted and where joints have zero"
-        observation += f": the data imply {estimate} m/s² ({found.gain})"
+        observation += f": the data imply {estimate} m/s² ({torques.gain})"
         return [Finding("error", "gravity", observation, remedy)]
     if speed != 1.0:
-        observation = f"the robot's inertia implies motions about {speed:.2g} times as fast as t states ({found.gain})"
+        observation = (
+            f"the robot's inertia implies motions about {speed:.2g} times as fast as t states ({torques.gain})"
+        )
         remedy = "check whether t is in seconds, and the rate at which the log was taken"
         return [Finding("error", "clock", observation, remedy)]
     return []
