@@ -28,7 +28,7 @@ MOST_BYTES = 4 * 2**30
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 """Header readers for the format versions in which NumPy writes numbers and strings."""
 MOST_TIMES_TYPICAL = 1e20
-"""A number larger than the median by this factor is no measurement: float64 has 16 digits."""
+"""A number larger than the median by this factor cannot be a measurement: float64 has 16 digits."""
 MARKERS = "remove the samples if they mark missing values"
 
 
@@ -48,7 +48,7 @@ def load_file(
         table: reader for files whose name ends in .csv; returns the arrays by key and the columns it does not read.
 
     Raises:
-        InputError: the file is missing, is no npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
+        InputError: the file is missing, is not an npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
             `from_arrays` or `table` rejects its contents (the message then starts with the path).
     """
     path = Path(path)

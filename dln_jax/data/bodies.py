@@ -47,7 +47,7 @@ def arrangements(d: int) -> list[Bodies]:
 
 
 def find_bodies(forces: Float[np.ndarray, "N d"], *, order: Order | None = None) -> Bodies | None:
-    """The only arrangement in which the forces on the bodies balance, or `None` if there is none or more than one.
+    """The only arrangement in which the forces on the bodies balance, or `None` unless there is exactly one.
 
     With a known `order` only the dimension is determined, as the one that balances best.
     """

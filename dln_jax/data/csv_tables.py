@@ -218,7 +218,7 @@ def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.nda
     if table is None or (len(table) and table.shape[1] != len(titles)):
         raise InputError(_complaint(path, titles, read_places))
     if not len(table):
-        raise InputError("there are no samples below the header; add them")
+        raise InputError("the file has no samples below its header; add them")
     return table
 
 
@@ -234,7 +234,7 @@ def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
             if _number(cells[place]) is None:
                 shown = f"'{cells[place].strip():.40}'" if cells[place].strip() else "empty"
                 return f"line {line}: '{titles[place]:.60}' is {shown}; expected a number with a decimal point"
-    return "the rows below the header are no table of numbers; export the log again"
+    return "the rows below the header are not a table of numbers; export the log again"
 
 
 def _number(text: str) -> float | None:

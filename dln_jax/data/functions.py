@@ -56,7 +56,7 @@ def load(path: str | Path) -> FunctionSamples:
     """Reads and checks a file; never unpickles.
 
     Raises:
-        InputError: the file is missing, is no npz, holds pickled objects, or its arrays do not fit the table above.
+        InputError: the file is missing, is not an npz, holds pickled objects, or its arrays break the table above.
     """
     return load_file(path, from_arrays, KEYS)
 

@@ -25,7 +25,7 @@ def load(path: str | Path) -> StoredMesh:
     """Reads and checks a file; never unpickles.
 
     Raises:
-        InputError: the file is missing or no npz, its arrays are no mesh, or `held` is malformed.
+        InputError: the file is missing or not an npz, its arrays do not form a mesh, or `held` is malformed.
     """
     return load_file(path, from_arrays, KEYS)
 

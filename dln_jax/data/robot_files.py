@@ -94,7 +94,7 @@ def write_robot(
     """
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
-        raise InputError(f"{path} is the file that was read; give another name, so that it stays as it is")
+        raise InputError(f"{path} is the original file, which stays unchanged; give another name")
     root = parsed(original)
     _, model, locked = opened(original, copy.deepcopy(root), lock)
     names = [name for name in joint_names(model) if name not in locked]

@@ -75,7 +75,7 @@ def parsed(path: Path) -> ET.Element:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (ET.ParseError, LookupError, ValueError) as error:  # the last two for unknown encodings
-        raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
+        raise InputError(f"{path}: not XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
     return root

@@ -105,7 +105,7 @@ def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -
     for pattern, position in positions.items():
         matching = fnmatch.filter(names, pattern)
         if not matching:
-            raise InputError(f"there is no joint '{pattern}' to lock; it has {', '.join(names)}")
+            raise InputError(f"there is no joint '{pattern}' to lock; the joints are {', '.join(names)}")
         locked |= dict.fromkeys(matching, float(position))
     return locked
 
@@ -114,7 +114,7 @@ def _compiled(path: Path, root: ET.Element, locked: Collection[str]) -> tuple[An
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
-        raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
+        raise InputError(f"reading robots needs MuJoCo, which is not installed; {INSTALL}") from None
     text = None
     if root.tag == "robot":
         require_joints(root, locked)

@@ -73,7 +73,7 @@ def load(path: str | Path, *, rate: float | int | None = None, units: str | None
         units: units of CSV titles without one, "si" or "degrees".
 
     Raises:
-        InputError: the file is missing, is no npz, holds pickled objects, is malformed CSV, or breaks the schema.
+        InputError: the file is missing, is not an npz, holds pickled objects, is malformed CSV, or breaks the schema.
     """
     return load_arrays(path, from_arrays, rate=rate, units=units)
 
@@ -196,7 +196,7 @@ def _joint_names(stated: Any, d: int) -> np.ndarray:
 def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
     trajectory = numeric(arrays, "trajectory", (samples,), most=np.inf)
     if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0 or trajectory.max() > LARGEST_INDEX:
-        raise InputError("trajectory has entries that are no whole numbers >= 0; expected the index of each trajectory")
+        raise InputError("trajectory has entries that are not whole numbers >= 0; give the index of each trajectory")
     trajectory = trajectory.astype(np.int64)
     if "label" not in arrays:
         present, trajectory = np.unique(trajectory, return_inverse=True)

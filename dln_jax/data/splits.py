@@ -104,7 +104,7 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
         for first in range(0, len(segment) - 1, length - 1)
     ]
     if not pieces:
-        raise InputError("there are no two samples without a gap between them; record longer motions")
+        raise InputError("no two samples follow one another without a gap; record longer motions")
     indices = np.stack([np.pad(piece, (0, length - len(piece)), mode="edge") for piece in pieces])
     return indices, np.stack([np.arange(length) < len(piece) for piece in pieces]).astype(float)
 

@@ -55,7 +55,7 @@ def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] |
         return None
     try:
         rows = tuple(tuple(row) for row in stated) if isinstance(stated, list | tuple) else ()
-    except TypeError:  # an entry is no list
+    except TypeError:  # an entry is not a list
         rows = ()
     if len(rows) != joints or len({len(row) for row in rows}) != 1 or not rows[0]:
         raise _wrong(key, stated, f"[{joints}, u] with u >= 1, rows of one length, or null")

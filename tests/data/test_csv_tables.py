@@ -89,7 +89,7 @@ def test_times_come_from_a_rate_and_recordings_from_their_column(load):
 
 MALFORMED = {
     "empty": ("", "the file is empty"),
-    "no samples": (HEADER, "no samples below the header"),
+    "no samples": (HEADER, "no samples below its header"),
     "no header": (ROWS, "the first line holds numbers"),
     "ragged": (HEADER + ROWS + "0.3,1,2,3\n", "line 5 has 4 values, the header 5 titles"),
     "decimal comma": (HEADER + "0,1,1,2,5,3,4\n", "line 2 has 7 values, the header 5 titles; decimals take a point"),
@@ -117,7 +117,7 @@ MALFORMED = {
     "zero bytes": (HEADER.encode() + b"\x00\x00,1,2,3,4\n", "line"),
     "endless cell": (HEADER + f'"{"x" * 200_000}",1,2,3,4\n', "line 2 is not CSV"),
     "time that runs back": (HEADER + ROWS + "0.1,1,2,3,4\n", "t does not increase at sample 3.*column 'trajectory'"),
-    "half a trajectory": ("t [s],q1 [rad],trajectory\n0,1,0.5\n1,1,0.5\n", "no whole numbers"),
+    "half a trajectory": ("t [s],q1 [rad],trajectory\n0,1,0.5\n1,1,0.5\n", "not whole numbers"),
 }
 
 

@@ -80,7 +80,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
         findings += on_joints(
             "warning", "dead-torque", dead,
             f"the torque of {{}} is zero in all samples, although {'it moves' if dead.sum() == 1 else 'they move'}",
-            "log that torque; or state in needs, by actuation, that there is no motor",
+            "log that torque; or state in needs, by actuation, that the joint has no motor",
         )  # fmt: skip
         findings += on_joints(
             "warning", "constant-torque", constant, "the torque of {} is constant",

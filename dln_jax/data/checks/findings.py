@@ -34,7 +34,7 @@ class Finding(NamedTuple):
 def on_joints(
     severity: Severity, check: str, concerned: Bool[np.ndarray, " d"], observation: str, remedy: str
 ) -> list[Finding]:
-    """A finding about the joints in a mask, whose names replace {} in the observation; none if there are none."""
+    """A finding about the joints in a mask, whose names replace {} in the observation; empty without such joints."""
     joints = tuple(map(int, np.flatnonzero(concerned)))
     return [Finding(severity, check, observation.replace("{}", named(joints), 1), remedy, joints)] if joints else []
 

@@ -1,8 +1,8 @@
 """Tests hypotheses about faults in torques: a wrong sign, exchanged columns, a delay and others.
 
 A hypothesis is accepted if it predicts left-out blocks of time much better than the log as recorded, in nearly all
-blocks. Without a robot the prior of the torques is that of an arbitrary energy with friction (`energies`), valid for
-arms of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the
+blocks. Without a robot, the torques have the prior of an arbitrary energy with friction (`energies`), valid for arms
+of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the
 search is repeated.
 """
 
@@ -25,8 +25,8 @@ DECISIVE = 15.0
 MOST_BLOCKS = 0.8
 """Fraction of blocks that must agree."""
 BETTER = 0.8
-"""A sign or an order must lower the unexplained variance to this fraction: with a robot that of all joints, since its
-parameters couple them; without one that of the joints whose torques change."""
+"""A change of sign or order must lower the unexplained variance to this fraction of its value: with a robot the variance
+of all joints, since its parameters couple them; without one that of the joints whose torques change."""
 LESS_LATE = 0.95
 """The same for a delay."""
 LATE = 0.2
@@ -196,7 +196,7 @@ def _better(
 
 
 def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
-    """The few faults that are likelier than the log as it is, by fewer samples and rough weights."""
+    """The few faults that are likelier than the log as recorded, judged from fewer samples and rough weights."""
     if not trials:
         return []
     few = -(-len(log.rows) * len(log.order) // SCANNED)

@@ -266,7 +266,7 @@ def test_a_trajectory_may_have_any_number_and_is_named_by_it():
     assert data.label.tolist() == ["7", "20240131", "20240202"]
     np.testing.assert_array_equal(data.label[data.trajectory].astype(int), numbers)
     for wrong in (1e300, -1, 0.5):
-        with pytest.raises(InputError, match="no whole numbers >= 0"):
+        with pytest.raises(InputError, match="not whole numbers >= 0"):
             schema.from_arrays({**arrays, "trajectory": np.where(numbers == 7, wrong, numbers)})
     with pytest.raises(InputError, match="label names 1 trajectories"):
         schema.from_arrays({**arrays, "trajectory": numbers, "label": ["a"]})
