@@ -101,10 +101,10 @@ def checked(
     if getattr(options, "robot", None) is not None:
         more += f" --robot {getattr(options, 'robot')}"  # noqa: B009  only some commands have it
         more += f" --lock '{lock}'" if (lock := getattr(options, "lock", None)) else ""
-    errors = [f"{finding.said}; {finding.remedy}" for finding in findings if finding.severity == "error"]
+    errors = [f"{finding.observation}; {finding.remedy}" for finding in findings if finding.severity == "error"]
     if errors and not options.accept_log:
         raise InputError(f"{path}: {'; also '.join(errors)}; or go on with --accept-log ({more} says more)")
-    lines = [f"warning: {finding.said}; {finding.remedy}" for finding in findings if finding.severity == "error"]
+    lines = [f"warning: {finding.observation}; {finding.remedy}" for finding in findings if finding.severity == "error"]
     return [*lines, *(finding.line for finding in findings if finding.severity != "error"), f"{more} says more"]
 
 

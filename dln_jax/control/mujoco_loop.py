@@ -32,7 +32,7 @@ def simulate_in_mujoco(
     After a control that is not finite, or MuJoCo's warning of divergence, all is NaN.
 
     Args:
-        model: the text of an MJCF file, for example of a tree from `data.mjcf`, or a `mujoco.MjModel`.
+        model: the text of an MJCF file, for example of a tree from `data.robot_files.mjcf`, or a `mujoco.MjModel`.
         controller: called once per sample.
         x: initial (q, qd) [2 d], in MuJoCo's order of joints.
         seconds: duration of the run.

@@ -47,12 +47,12 @@ def arrangements(d: int) -> list[Bodies]:
 
 
 def find_bodies(forces: Float[np.ndarray, "N d"], *, order: Order | None = None) -> Bodies | None:
-    """The only arrangement in which the forces on the bodies balance, or `None` if there is none or more than one.
+    """The only arrangement in which the forces on the bodies balance, or `None` unless there is exactly one.
 
     With a known `order` only the dimension is determined, as the one that balances best.
     """
-    ways = [each for each in arrangements(forces.shape[1]) if order in (None, each.order)]
-    ranked = sorted((imbalance(forces, each), each) for each in ways)
+    ways = [bodies for bodies in arrangements(forces.shape[1]) if order in (None, bodies.order)]
+    ranked = sorted((imbalance(forces, bodies), bodies) for bodies in ways)
     if not ranked or order is not None:
         return ranked[0][1] if ranked else None
     (least, best), (next_least, _) = ranked[:2]

@@ -1,4 +1,4 @@
-"""Reads logs in CSV format: one row per sample and a header that names every column and its unit.
+"""Reads logs and writes motions in CSV format: one row per sample and a header that names every column and its unit.
 
     t [s],q1 [deg],q2 [deg],tau1 [N m],tau2 [N m]        or        t_s,q_elbow_rad,tau_elbow_Nm
 
@@ -17,13 +17,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from dln_jax.types import InputError
+from dln_jax.files import write_bytes
+from dln_jax.types import InputError, JointKind
 
 MOST_BYTES = 2**30
 """Largest file read; larger data are faster and smaller as npz."""
 STATED = {"si": {}, "degrees": {"q": "deg", "qd": "deg/s", "qdd": "deg/s2"}}
 """Units that a caller may state for titles without one: by key, SI for all others."""
+DECIMALS = 10
+"""Significant digits written, and decimals to which numbers are rounded."""
 TURN = math.pi / 180
 POSITIONS = {"rad": 1.0, "deg": TURN, "m": 1.0, "cm": 1e-2, "mm": 1e-3}
 FORCES = {"nm": 1.0, "n": 1.0, "mnm": 1e-3, "mn": 1e-3, "knm": 1e3, "kn": 1e3}
@@ -151,11 +155,11 @@ def _column(title: str) -> Column | None:
 
 def _spelled(unit: str) -> str:
     """Normalises a unit to its spelling in `UNITS`."""
-    found = re.sub(r"[\s/]+per[\s/]+", "/", unit.lower())
-    found = re.sub(r"[\s*·.^]", "", found)
+    unit = re.sub(r"[\s/]+per[\s/]+", "/", unit.lower())
+    unit = re.sub(r"[\s*·.^]", "", unit)
     for spelling, ours in _SPELLINGS.items():
-        found = found.replace(spelling, ours)
-    return found
+        unit = unit.replace(spelling, ours)
+    return unit
 
 
 def _factor(column: Column, stated: str | None) -> float:
@@ -167,7 +171,7 @@ def _factor(column: Column, stated: str | None) -> float:
         if stated is None:
             example = EXAMPLES.get(column.key, "q1 [rad] or q1 [deg]")
             raise InputError(
-                f"'{column.title:.60}' has no unit; write it into the header, as in '{example}', or say --units si "
+                f"'{column.title:.60}' has no unit; write it into the header, as in '{example}', or give --units si "
                 "(or degrees) for all titles without one"
             )
         return known[STATED[stated][column.key]] if column.key in STATED[stated] else 1.0
@@ -178,16 +182,16 @@ def _factor(column: Column, stated: str | None) -> float:
 
 def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
     """Column indices per key in the joint order of q: by number if all joints are numbers, else as in the file."""
-    found: dict[str, dict[str, int]] = {}
+    keys: dict[str, dict[str, int]] = {}
     for place, column in columns.items():
-        own = found.setdefault(column.key, {})
+        own = keys.setdefault(column.key, {})
         if column.joint in own:
             raise InputError(f"'{columns[own[column.joint]].title:.60}' and '{column.title:.60}' are the same column")
         own[column.joint] = place
-    joints = list(found.get("q", {}))
+    joints = list(keys.get("q", {}))
     if all(joint.isdecimal() for joint in joints):
         joints.sort(key=int)
-    for key, own in found.items():
+    for key, own in keys.items():
         if key in ("t", "trajectory") or not joints:
             continue
         for name, there, absent in ((key, own, joints), ("q", joints, own)):
@@ -195,18 +199,18 @@ def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
                 raise InputError(f"there is no column '{name}{missing[0]:.40}'; q and {key} must name the same joints")
     return {
         key: [own[joint] for joint in joints] if key not in ("t", "trajectory") and joints else list(own.values())
-        for key, own in found.items()
+        for key, own in keys.items()
     }
 
 
 def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.ndarray:
     """All rows below the header [N, columns], with zeros in ignored columns."""
-    unread = {place: _zero for place in range(len(titles)) if place not in read_places}
+    unread = set(range(len(titles))) - read_places
+    converters: dict[int | str, Callable] = {**dict.fromkeys(unread, lambda _: 0.0)}
     with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about files without samples
         lines = itertools.dropwhile(lambda line: not line.strip(), file)
         next(csv.reader(lines))
-        converters: dict[int | str, Callable] = {**unread}
         try:
             table = np.loadtxt(lines, delimiter=",", comments=None, quotechar='"', converters=converters, ndmin=2)
         except (ValueError, OverflowError):
@@ -214,7 +218,7 @@ def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.nda
     if table is None or (len(table) and table.shape[1] != len(titles)):
         raise InputError(_complaint(path, titles, read_places))
     if not len(table):
-        raise InputError("there are no samples below the header; add them")
+        raise InputError("the file has no samples below its header; add them")
     return table
 
 
@@ -230,7 +234,7 @@ def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
             if _number(cells[place]) is None:
                 shown = f"'{cells[place].strip():.40}'" if cells[place].strip() else "empty"
                 return f"line {line}: '{titles[place]:.60}' is {shown}; expected a number with a decimal point"
-    return "the rows below the header are no table of numbers; export the log again"
+    return "the rows below the header are not a table of numbers; export the log again"
 
 
 def _number(text: str) -> float | None:
@@ -240,5 +244,28 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _zero(text: str) -> float:
-    return 0.0
+def write_motion(
+    path: Path,
+    t: Float[np.ndarray, " N"],
+    q: Float[np.ndarray, "N d"],
+    qd: Float[np.ndarray, "N d"],
+    *,
+    names: tuple[str, ...],
+    joints: tuple[JointKind, ...],
+) -> None:
+    """Writes t, q and qd for a robot's controller; the header is like `t [s],q elbow [rad],..,qd elbow [rad/s]`.
+
+    Raises:
+        InputError: a name contains a comma, a quote or a line break, or the file cannot be written.
+    """
+    if broken := [name for name in names if set(name) & set(',"\r\n')]:
+        raise InputError(f"joint {broken[0]!r} cannot be a title in CSV; rename it without commas, quotes and lines")
+    units = ["rad" if kind == "revolute" else "m" for kind in joints]
+    titles = [
+        f"{key} {name} [{unit}{per}]"
+        for key, per in (("q", ""), ("qd", "/s"))
+        for name, unit in zip(names, units, strict=True)
+    ]
+    rows: Any = np.round(np.column_stack([t, q, qd]), DECIMALS) + 0.0  # no negative zero
+    lines = [",".join(["t [s]", *titles]), *(",".join(f"{number:.{DECIMALS}g}" for number in row) for row in rows)]
+    write_bytes(path, ("\n".join(lines) + "\n").encode())

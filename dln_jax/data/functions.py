@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.data import archive
-from dln_jax.data.archive import numeric
+from dln_jax.data.arrays import load_file, numeric
 from dln_jax.data.splits import held_out
 from dln_jax.types import InputError, require_positive
 
@@ -57,9 +56,9 @@ def load(path: str | Path) -> FunctionSamples:
     """Reads and checks a file; never unpickles.
 
     Raises:
-        InputError: the file is missing, is no npz, holds pickled objects, or its arrays do not fit the table above.
+        InputError: the file is missing, is not an npz, holds pickled objects, or its arrays break the table above.
     """
-    return archive.load(path, from_arrays, KEYS)
+    return load_file(path, from_arrays, KEYS)
 
 
 def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from dln_jax.data import archive
+from dln_jax.data.arrays import load_file
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.types import InputError
 
@@ -25,17 +25,17 @@ def load(path: str | Path) -> StoredMesh:
     """Reads and checks a file; never unpickles.
 
     Raises:
-        InputError: the file is missing or no npz, its arrays are no mesh, or `held` is malformed.
+        InputError: the file is missing or not an npz, its arrays do not form a mesh, or `held` is malformed.
     """
-    return archive.load(path, from_arrays, KEYS)
+    return load_file(path, from_arrays, KEYS)
 
 
 def from_arrays(arrays: dict[str, Any]) -> StoredMesh:
     """Checks the arrays of a mesh file; errors as `load`."""
     for name in ("vertices", "elements"):
         if name not in arrays:
-            found = ", ".join(arrays) or "nothing"
-            raise InputError(f"'{name}' is missing (found: {found}); expected `vertices` and `elements`")
+            keys = ", ".join(arrays) or "nothing"
+            raise InputError(f"'{name}' is missing (found: {keys}); expected `vertices` and `elements`")
     mesh, held = make_mesh(arrays["vertices"], arrays["elements"]), arrays.get("held")
     if held is None:
         return StoredMesh(mesh, None)

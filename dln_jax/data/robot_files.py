@@ -1,7 +1,7 @@
-"""Writes URDF and MJCF files with identified inertias, armature and friction in place of the original ones.
+"""Writes robots: MJCF of any tree, and copies of URDF and MJCF files with identified inertias, armature and friction.
 
-Bodies fixed to a link move with it, and only their sum is known. It is written into the link that the joint moves, and
-the inertias of bodies fixed to that link are removed. Quantities that the format cannot store go into a comment.
+Bodies fixed to a link move with it, and only the sum of their inertias is known. A copy has this sum in the link that
+the joint moves, and no inertias in the bodies fixed to it. Quantities that the format cannot store go into a comment.
 """
 
 import copy
@@ -12,15 +12,58 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robot_xml import parsed
-from dln_jax.data.robots import joint_names, opened
-from dln_jax.data.urdf import MOVING
+from dln_jax.data.robot_xml import MOVING, parsed
+from dln_jax.data.robots import Robot, joint_names, opened
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_positive
 
-LUMPS = "Inertias are of all that moves with a joint: in the link behind it, none in links that are fixed to that."
+LUMPS = "The inertia of all bodies that move with a joint is in the link behind it; links fixed to that link have none."
+
+
+def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
+    """MJCF text of a robot, with one body per link, one motor per joint and contacts disabled.
+
+    MuJoCo simulates it, and `read_robot` reads it back.
+
+    Args:
+        robot: robot to write; infinite limits are left out.
+        time_step: time step of the simulation, s.
+
+    Raises:
+        InputError: a link has no mass, which MuJoCo refuses, or the time step is not positive.
+    """
+    require_positive(time_step=time_step)
+    tree = robot.tree
+    names = tree.names or tuple(f"joint_{link}" for link in range(tree.degrees_of_freedom))
+    root = ET.Element("mujoco")
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    settings = {"gravity": _text(tree.gravity), "timestep": _text(time_step), "integrator": "implicitfast"}
+    ET.SubElement(ET.SubElement(root, "option", settings), "flag", contact="disable")
+    world, motors = ET.SubElement(root, "worldbody"), ET.SubElement(root, "actuator")
+    bodies: list[ET.Element] = []
+    for link, (name, parent) in enumerate(zip(names, tree.parents, strict=True)):
+        theta, turn = np.asarray(tree.inertias[link], float), np.asarray(tree.rotations[link])
+        if not theta[0] > 0:
+            raise InputError(
+                f"the link of joint '{name}' has a mass of {theta[0]:.3g} kg; expected a positive one in MJCF"
+            )
+        place = {"name": f"link_{name}", "pos": _text(tree.positions[link])}
+        if not np.array_equal(turn, np.eye(3)):
+            place["xyaxes"] = _text(turn[:, :2].T)  # the first two columns keep all digits
+        bodies.append(ET.SubElement(bodies[parent] if parent >= 0 else world, "body", place))
+        bodies[-1].append(_mjcf_inertial(theta))
+        numbers = {"armature": tree.armature, "damping": robot.damping, "frictionloss": robot.coulomb}
+        stated = {key: _text(values[link]) for key, values in numbers.items()}
+        for key, limits in (("range", robot.position_limits[link]), ("actuatorfrcrange", robot.force_limits[link])):
+            if np.isfinite(limits).all():
+                stated[key] = _text(limits)
+        kind = "hinge" if tree.joints[link] == "revolute" else "slide"
+        ET.SubElement(bodies[-1], "joint", {"name": name, "type": kind, "axis": _text(tree.axes[link]), **stated})
+        ET.SubElement(motors, "motor", name=f"motor_{name}", joint=name)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
 
 
 def write_robot(
@@ -51,29 +94,29 @@ def write_robot(
     """
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
-        raise InputError(f"{path} is the file that was read; give another name, so that it stays as it is")
+        raise InputError(f"{path} is the original file, which stays unchanged; give another name")
     root = parsed(original)
-    _, model, held = opened(original, copy.deepcopy(root), lock)
-    names = [name for name in joint_names(model) if name not in held]
+    _, model, locked = opened(original, copy.deepcopy(root), lock)
+    names = [name for name in joint_names(model) if name not in locked]
     if list(tree.names) != names:
         raise InputError(f"{original} has the joints {', '.join(names)}; the tree has {', '.join(tree.names)}")
     for name, theta in zip(names, np.asarray(tree.inertias, float), strict=True):
         if theta.any() and np.linalg.eigvalsh(pseudo_inertia(theta))[0] <= 0:
-            raise InputError(f"the link behind joint '{name}' is no body that exists; write consistent parameters")
+            raise InputError(f"the link behind joint '{name}' is not physically consistent; correct its inertia")
     remarks = (LUMPS, *remarks)
-    if held:
-        where = ", ".join(f"{name} at {position!r}" for name, position in held.items())
-        remarks = (*remarks, f"Held while this was identified, and counted to the link before (rad or m): {where}.")
+    if locked:
+        where = ", ".join(f"{name} at {position!r}" for name, position in locked.items())
+        remarks = (*remarks, f"Locked during identification, and part of the link before (rad or m): {where}.")
     friction = {"damping": damping, "coulomb": coulomb}
     if root.tag == "robot":
         if np.any(tree.armature):
-            numbers = ", ".join(f"{name} {value!r}" for name, value in zip(names, _floats(tree.armature), strict=True))
+            numbers = ", ".join(f"{name} {_text(value)}" for name, value in zip(names, tree.armature, strict=True))
             remarks = (*remarks, f"Armature, for which URDF has no place (kg m² or kg): {numbers}.")
-        _into_urdf(root, tree, held, **friction)
+        _into_urdf(root, tree, locked, **friction)
     else:
-        if held:
+        if locked:
             raise InputError(
-                f"{original}: joints of an MJCF file are held, whose bodies would have no mass; take them out of it"
+                f"{original}: bodies behind the locked joints of an MJCF file would have no mass; remove these joints"
             )
         _into_mjcf(original, root, model, tree, **friction)
     comment = ET.Comment("\n  " + "\n  ".join(line.replace("--", "- -") for line in remarks) + "\n")
@@ -82,31 +125,33 @@ def write_robot(
     write_bytes(path, ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
-def _into_urdf(root: ET.Element, tree: Tree, held: Collection[str], *, damping: Any, coulomb: Any) -> None:
+def _into_urdf(root: ET.Element, tree: Tree, locked: Collection[str], *, damping: Any, coulomb: Any) -> None:
     links = {link.get("name"): link for link in root.findall("link")}
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     fixed: dict[Any, list[Any]] = {}
     for joint in joints.values():
-        if joint.get("type") not in MOVING or joint.get("name") in held:
+        if joint.get("type") not in MOVING or joint.get("name") in locked:
             fixed.setdefault(_link(joint, "parent"), []).append(_link(joint, "child"))
     for k, name in enumerate(tree.names):
         joint = joints[name]
         child = _link(joint, "child")
-        for rigid in _below(fixed, child):
+        lump = [child]
+        for rigid in lump:  # the list grows by the links fixed to each
+            lump.extend(fixed.get(rigid, ()))
             for inertial in links[rigid].findall("inertial"):
                 links[rigid].remove(inertial)
         mass, centre, about = _about_centre(np.asarray(tree.inertias[k], float))
         inertial = ET.Element("inertial")
         ET.SubElement(inertial, "origin", xyz=_text(centre), rpy="0 0 0")
-        ET.SubElement(inertial, "mass", value=repr(mass))
+        ET.SubElement(inertial, "mass", value=_text(mass))
         places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-        ET.SubElement(inertial, "inertia", {key: repr(float(about[place])) for key, place in places.items()})
+        ET.SubElement(inertial, "inertia", {key: _text(about[place]) for key, place in places.items()})
         links[child].insert(0, inertial)
         for key, values in (("damping", damping), ("friction", coulomb)):
             if values is not None:
                 dynamics = joint.find("dynamics")
                 dynamics = ET.SubElement(joint, "dynamics") if dynamics is None else dynamics
-                dynamics.set(key, repr(_floats(values)[k]))
+                dynamics.set(key, _text(values[k]))
 
 
 def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damping: Any, coulomb: Any) -> None:
@@ -131,13 +176,11 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
             theta = np.asarray(tree.inertias[k], float)
             if theta.any():
                 # Move the parameters from the joint's anchor, the origin of the link's frame, to the body's frame.
-                mass, centre, about = _about_centre(np.asarray(moved(theta, np.eye(3), model.jnt_pos[k])))
-                entries = [about[place] for place in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-                inertial = ET.Element("inertial", pos=_text(centre), mass=repr(mass), fullinertia=_text(entries))
+                inertial = _mjcf_inertial(np.asarray(moved(theta, np.eye(3), model.jnt_pos[k])))
             named = (("armature", tree.armature), ("damping", damping), ("frictionloss", coulomb))
             for key, values in named:
                 if values is not None:
-                    joint.set(key, repr(_floats(values)[k]))
+                    joint.set(key, _text(values[k]))
             k += 1
         body.insert(0, inertial)
 
@@ -166,17 +209,15 @@ def _own(body: ET.Element, tag: str) -> Iterator[ET.Element]:
             yield from _own(child, tag)
 
 
-def _below(fixed: dict[Any, list[Any]], link: Any) -> list[Any]:
-    """A link and all links fixed to it."""
-    found = [link]
-    for each in found:
-        found.extend(fixed.get(each, ()))
-    return found
-
-
 def _link(joint: ET.Element, which: str) -> str | None:
     element = joint.find(which)
     return None if element is None else element.get("link")
+
+
+def _mjcf_inertial(theta: np.ndarray) -> ET.Element:
+    mass, centre, about = _about_centre(theta)
+    moments = _text(about[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+    return ET.Element("inertial", mass=_text(mass), pos=_text(centre), fullinertia=moments)
 
 
 def _about_centre(theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -186,9 +227,6 @@ def _about_centre(theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     return float(m), centre, moments - m * (centre @ centre * np.eye(3) - centre[:, None] * centre)
 
 
-def _floats(values: Any) -> list[float]:
-    return np.asarray(values, float).tolist()
-
-
 def _text(numbers: Any) -> str:
-    return " ".join(map(repr, _floats(numbers)))
+    """The shortest decimals that read back as the same numbers."""
+    return " ".join(map(repr, np.ravel(np.asarray(numbers, float)).tolist()))

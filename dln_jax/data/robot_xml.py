@@ -1,12 +1,19 @@
-"""Parses the XML of robot files; refuses other formats and files larger than any robot's."""
+"""Reads the XML of URDF and MJCF files: elements, the inertias of a URDF, and the limits of joints.
+
+Other formats, and files larger than any robot's, are refused. So are malformed limits: MuJoCo treats a range that is
+NaN, empty, swapped or half stated as no range, and a motion designed from such a file would drive the joint into its
+stop.
+"""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dln_jax.files import is_file
+from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
 
 LARGEST = 64 * 2**20
@@ -17,6 +24,14 @@ DEEPEST = 3 * MOST_JOINTS
 """Deepest nesting of elements: per joint, MJCF nests a body and perhaps a frame."""
 REPEATING = ("replicate", "composite", "flexcomp")
 """MJCF elements that stand for many."""
+MOVING = ("revolute", "continuous", "prismatic")
+"""URDF joint types that move."""
+NUMBERS = {"limit": ("lower", "upper", "effort", "velocity"), "dynamics": ("damping", "friction")}
+"""Numeric attributes of the child elements of a URDF joint."""
+MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+REMEDY = "correct the file, or lock the joint"
+RANGES = {"range": ("position", "limited"), "actuatorfrcrange": ("torque", "actuatorfrclimited")}
+"""Attributes of an MJCF joint that hold two numbers: what they limit, and the attributes that disable them."""
 
 
 class _Elements(ET.TreeBuilder):
@@ -30,21 +45,14 @@ class _Elements(ET.TreeBuilder):
             raise InputError(f"its elements are nested more than {DEEPEST} deep; expected the file of a robot")
         if self.count > MOST_ELEMENTS:
             raise InputError(f"it has more than {MOST_ELEMENTS:,} elements; expected the file of one robot")
-        if tag in REPEATING and _whole(attrs.get("count", "0")) > MOST_JOINTS:
+        # A composite has up to three counts; words are refused, too.
+        if tag in REPEATING and not all(_number(text) <= MOST_JOINTS for text in attrs.get("count", "0").split()):
             raise InputError(f"<{tag}> repeats {attrs['count']:.20} times; expected at most {MOST_JOINTS}")
         return super().start(tag, attrs)
 
     def end(self, tag: Any, /) -> ET.Element:
         self.depth -= 1
         return super().end(tag)
-
-
-def _whole(text: str) -> float:
-    """The largest number in an attribute; infinite if it is not numeric."""
-    try:
-        return max(map(float, text.split()), default=0.0)
-    except ValueError:
-        return np.inf
 
 
 def parsed(path: Path) -> ET.Element:
@@ -67,7 +75,147 @@ def parsed(path: Path) -> ET.Element:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (ET.ParseError, LookupError, ValueError) as error:  # the last two for unknown encodings
-        raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
+        raise InputError(f"{path}: not XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
     return root
+
+
+def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
+    """Inertial parameters [10] of every URDF link that states them, physically consistent or not, by name.
+
+    Raises:
+        InputError: an <inertial> is incomplete, not numeric or has a negative mass.
+    """
+    parameters = {}
+    for link in root.findall("link"):
+        inertial = link.find("inertial")
+        if inertial is not None:
+            name = link.get("name", "")
+            try:
+                parameters[name] = _parameters(inertial)
+            except (AttributeError, TypeError, ValueError):
+                raise InputError(
+                    f"link '{name}' has an <inertial> that is incomplete; expected a mass, not below zero, and six "
+                    "moments, all finite numbers"
+                ) from None
+    return parameters
+
+
+def _parameters(inertial: ET.Element) -> np.ndarray:
+    """Inertial parameters [10] in the frame of the link; raises `ValueError` and the like for a malformed element."""
+    from scipy.spatial.transform import Rotation
+
+    origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
+    m = float(mass.get("value"))  # type: ignore[union-attr, arg-type]
+    moments = np.array([[float(inertia.get(key)) for key in row] for row in MOMENTS])  # type: ignore[union-attr, arg-type]
+    stated = {} if origin is None else origin.attrib
+    xyz, rpy = (np.array(stated.get(key, "0 0 0").split(), float) for key in ("xyz", "rpy"))
+    if xyz.shape != (3,) or not (m >= 0 and np.isfinite([m, *moments.ravel(), *xyz, *rpy]).all()):
+        raise ValueError
+    turn = Rotation.from_euler("xyz", rpy).as_matrix()  # about the fixed axes x, y, z, in this order
+    return np.asarray(moved(inertial_parameters(m, np.zeros(3), moments), turn, xyz))
+
+
+def require_joints(root: ET.Element, locked: Collection[str]) -> None:
+    """Raises `InputError` for URDF joints that MuJoCo would misread, or for more than `MOST_JOINTS` that move."""
+    moving = [joint for joint in root.findall("joint") if joint.get("name", "") not in locked]
+    moving = [joint for joint in moving if joint.get("type") != "fixed"]
+    if len(moving) > MOST_JOINTS:
+        raise InputError(f"it has {len(moving)} joints that move; expected 1 to {MOST_JOINTS}")
+    names = [joint.get("name", "") for joint in root.findall("joint")]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise InputError(f"two joints are named '{twice[0]:.60}'; give each a name of its own")
+    for joint in moving:
+        if joint.get("type") not in MOVING:
+            raise InputError(
+                f"joint '{joint.get('name')}' is of type '{joint.get('type')}'; expected {', '.join(MOVING)} or fixed: "
+                "lock it if it does not move"
+            )
+        for tag, keys in NUMBERS.items():
+            element = joint.find(tag)
+            for key in keys if element is not None else ():
+                try:
+                    float(text := element.get(key, "0"))
+                except ValueError:
+                    raise InputError(
+                        f"joint '{joint.get('name')}': the {key} in <{tag}> is '{text:.40}'; expected a number"
+                    ) from None
+
+
+def without_inertias(root: ET.Element) -> ET.Element:
+    """Prepares a URDF for MuJoCo: no shapes, every link a body of its own, and unit inertias that MuJoCo accepts."""
+    for link in root.iter("link"):
+        for part in [*link.findall("visual"), *link.findall("collision"), *link.findall("inertial")]:
+            link.remove(part)
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "mass", value="1")
+        ET.SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    for settings in root.findall("mujoco"):
+        root.remove(settings)
+    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", fusestatic="false", balanceinertia="false")
+    return root
+
+
+def check_limits(path: Path, root: ET.Element, locked: Collection[str]) -> None:
+    """Raises `InputError` that names the first joint whose limits are not two finite numbers, lower < upper, or whose
+    velocity or effort in a URDF is negative or not a number. Locked joints are not checked."""
+    if root.tag == "robot":
+        for joint in root.findall("joint"):
+            limit, name = joint.find("limit"), joint.get("name", "")
+            if limit is None or name in locked or joint.get("type") not in MOVING:
+                continue
+            sides = [limit.get(side, "") for side in ("lower", "upper")]
+            if joint.get("type") != "continuous" and any(sides):
+                _require_range(name, "position", sides)
+            for kind in ("velocity", "effort"):
+                if not _number(limit.get(kind, "0")) >= 0:
+                    raise InputError(
+                        f"joint '{name}' has a limit of {kind} of '{limit.get(kind):.40}'; expected a number that is "
+                        f"not negative: {REMEDY}"
+                    )
+        return
+    for joint in (joint for part in _with_included(path, root) for joint in part.iter("joint")):
+        for attribute, (kind, switch) in RANGES.items():
+            stated = joint.get(attribute)
+            if stated is not None and joint.get(switch) != "false" and joint.get("name") not in locked:
+                _require_range(joint.get("name") or "of a default class", kind, stated.split())
+
+
+def velocity_limits(root: ET.Element) -> dict[str, float]:
+    """Velocity limits of a URDF by joint, rad/s or m/s, from <limit velocity="...">.
+
+    Joints without one are left out, as are limits of 0, which stand for an unknown limit in some files.
+    """
+    stated = {joint.get("name", ""): joint.find("limit") for joint in root.findall("joint")}
+    numbers = {name: _number(limit.get("velocity", "0")) for name, limit in stated.items() if limit is not None}
+    return {name: number for name, number in numbers.items() if number > 0}
+
+
+def _require_range(name: str, kind: str, stated: Sequence[str]) -> None:
+    numbers = np.array([_number(text) for text in stated])
+    if not (numbers.shape == (2,) and np.isfinite(numbers).all() and numbers[0] < numbers[1]):
+        shown = ", ".join(f"{text:.40}" if text else "nothing" for text in stated)
+        raise InputError(
+            f"joint '{name}' has limits of {kind} {shown}; expected two finite numbers, the lower first: {REMEDY}"
+        )
+
+
+def _number(text: str) -> float:
+    """The number; NaN for other text."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+def _with_included(path: Path, root: ET.Element) -> Iterator[ET.Element]:
+    """The root element and those of included files; unreadable ones are skipped, since MuJoCo reports them."""
+    yield root
+    for include in root.iter("include"):
+        file = path.parent / include.get("file", "")
+        if file.is_file() and file.resolve() != path.resolve():
+            try:
+                yield ET.parse(file).getroot()
+            except ET.ParseError:
+                continue

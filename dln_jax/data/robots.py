@@ -5,7 +5,6 @@ Visual and collision geometry is ignored, so meshes may be missing unless a body
 
 import contextlib
 import fnmatch
-import functools
 import importlib
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -15,9 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.joint_limits import check_limits, velocity_limits
-from dln_jax.data.robot_xml import MOST_JOINTS, parsed
-from dln_jax.data.urdf import link_inertias, require_joints, without_inertias
+from dln_jax.data.robot_xml import (
+    MOST_JOINTS,
+    check_limits,
+    link_inertias,
+    parsed,
+    require_joints,
+    velocity_limits,
+    without_inertias,
+)
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -43,14 +48,6 @@ class Robot(NamedTuple):
     """[d], 1/s or m/s, or one for all; stated in URDF only, since MJCF has no such limit."""
 
 
-class _Link(NamedTuple):
-    parent: int
-    kind: str
-    rotation: np.ndarray
-    position: np.ndarray
-    axis: np.ndarray
-
-
 def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = ()) -> Robot:
     """Reads a robot from a URDF or MJCF file.
 
@@ -58,7 +55,7 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
 
     Args:
         path: path of the file.
-        hold: joints to lock, such as those of a gripper: names (locked at zero), or positions by name, rad or m.
+        lock: joints to lock, such as those of a gripper: names (locked at zero), or positions by name, rad or m.
             "*finger*" matches all names that contain finger. Bodies behind a locked joint become fixed.
 
     Raises:
@@ -68,12 +65,13 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
     """
     path, root = Path(path), parsed(Path(path))
     try:
-        stated = link_inertias(root) if root.tag == "robot" else None
-        velocities = functools.partial(velocity_limits, root)
-        mujoco, model, held = opened(path, root, lock)
-        robot = _robot(mujoco, model, held, stated)
+        in_urdf = root.tag == "robot"
+        inertias, speeds = (link_inertias(root), velocity_limits(root)) if in_urdf else (None, {})
+        mujoco, model, locked = opened(path, root, lock)
+        robot = _robot(mujoco, model, locked, inertias)
         _require_numbers(robot)
-        return robot._replace(velocity_limits=velocities(robot.tree.names)) if root.tag == "robot" else robot
+        limits = np.array([speeds.get(name, np.inf) for name in robot.tree.names])
+        return robot._replace(velocity_limits=limits) if in_urdf else robot
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
 
@@ -87,12 +85,12 @@ def opened(
     """
     if root.tag == "mujoco":
         mujoco, model = _compiled(path, root, ())
-        held = _matching(lock, joint_names(model))
-        check_limits(path, root, held)
-        return mujoco, model, held
-    held = _matching(lock, [each.get("name", "") for each in root.findall("joint")])
-    check_limits(path, root, held)
-    return (*_compiled(path, root, held), held)
+        locked = _matching(lock, joint_names(model))
+        check_limits(path, root, locked)
+        return mujoco, model, locked
+    locked = _matching(lock, [joint.get("name", "") for joint in root.findall("joint")])
+    check_limits(path, root, locked)
+    return (*_compiled(path, root, locked), locked)
 
 
 def joint_names(model: Any) -> list[str]:
@@ -103,27 +101,36 @@ def joint_names(model: Any) -> list[str]:
 def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
     """Positions of the locked joints by full name."""
     positions = lock if isinstance(lock, Mapping) else dict.fromkeys(lock, 0.0)
-    found: dict[str, float] = {}
+    locked: dict[str, float] = {}
     for pattern, position in positions.items():
         matching = fnmatch.filter(names, pattern)
         if not matching:
-            raise InputError(f"there is no joint '{pattern}' to lock; it has {', '.join(names)}")
-        found |= dict.fromkeys(matching, float(position))
-    return found
+            raise InputError(f"there is no joint '{pattern}' to lock; the joints are {', '.join(names)}")
+        locked |= dict.fromkeys(matching, float(position))
+    return locked
 
 
-def _compiled(path: Path, root: ET.Element, held: Collection[str]) -> tuple[Any, Any]:
+def _compiled(path: Path, root: ET.Element, locked: Collection[str]) -> tuple[Any, Any]:
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
-        raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
+        raise InputError(f"reading robots needs MuJoCo, which is not installed; {INSTALL}") from None
+    text = None
     if root.tag == "robot":
-        require_joints(root, held, MOST_JOINTS)
+        require_joints(root, locked)
+        for joint in root.iter("joint"):
+            for mimic in joint.findall("mimic"):
+                if joint.get("name") not in locked:
+                    raise InputError(
+                        f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move "
+                        "freely: lock it, and the joint that it follows"
+                    )
+                joint.remove(mimic)
+        text = ET.tostring(without_inertias(root), encoding="unicode")
     try:
         with quiet(mujoco):
-            return mujoco, _model(mujoco, path, root, held)
-    except InputError:
-        raise
+            model = mujoco.MjModel
+            return mujoco, model.from_xml_path(str(path)) if text is None else model.from_xml_string(text)
     except (ValueError, RuntimeError, RecursionError, mujoco.FatalError, mujoco.UnexpectedError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: MuJoCo cannot compile it: {reason:.300}") from None
@@ -140,32 +147,18 @@ def quiet(mujoco: Any) -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _model(mujoco: Any, path: Path, root: ET.Element, held: Collection[str]) -> Any:
-    if root.tag == "mujoco":
-        return mujoco.MjModel.from_xml_path(str(path))
-    for joint in root.iter("joint"):
-        for mimic in joint.findall("mimic"):
-            if joint.get("name") not in held:
-                raise InputError(
-                    f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move freely: "
-                    "lock it, and the one that it follows"
-                )
-            joint.remove(mimic)
-    return mujoco.MjModel.from_xml_string(ET.tostring(without_inertias(root), encoding="unicode"))
-
-
-def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[str]) -> None:
+def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[str]) -> None:
     """Raises `InputError` unless every joint that is not locked moves freely about or along one axis."""
     others = {int(mujoco.mjtJoint.mjJNT_BALL): "a ball", int(mujoco.mjtJoint.mjJNT_FREE): "free"}
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
-        if kind in others and name not in held:
+        if kind in others and name not in locked:
             raise InputError(
-                f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: lock it, if so"
+                f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: lock it if it does not move"
             )
-    moving = {k for k, name in enumerate(names) if name not in held}
+    moving = {k for k, name in enumerate(names) if name not in locked}
     # Equality constraints and tendons between locked joints have no effect.
     joints, over = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtWrap.mjWRAP_JOINT)
-    tied = {int(k) for each in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid) for k in each}
+    tied = {int(k) for numbers in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid) for k in numbers}
     if set(map(int, model.eq_type)) - {joints} or set(map(int, model.wrap_type)) - {over} or tied & moving:
         raise InputError(
             "it has equality constraints or tendons, which close loops; expected a tree: lock the joints that they tie"
@@ -174,11 +167,11 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[st
         raise InputError(f"it has {len(moving)} joints; expected 1 to {MOST_JOINTS} that move")
 
 
-def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[str, np.ndarray] | None) -> Robot:
+def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping[str, np.ndarray] | None) -> Robot:
     names = joint_names(model)
-    _require_tree(mujoco, model, names, held)
+    _require_tree(mujoco, model, names, locked)
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
-    links: list[_Link] = []
+    links: list[tuple[int, str, np.ndarray, np.ndarray, np.ndarray]] = []  # parent, kind, rotation, position, axis
     inertias: list[np.ndarray] = []
     moving: list[int] = []
     # Frame of each body relative to the link it moves with; -1 is the ground.
@@ -189,13 +182,12 @@ def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[s
         R = R @ _matrix(mujoco, model.body_quat[body])
         for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             # The link's frame is at the joint's anchor, the body's frame behind it.
-            anchor = model.jnt_pos[joint]
-            axis = np.array(model.jnt_axis[joint])
-            if names[joint] in held:
-                R, p = _held(mujoco, kinds.get(int(model.jnt_type[joint])), anchor, axis, held[names[joint]], R, p)
+            anchor, axis, kind = model.jnt_pos[joint], np.array(model.jnt_axis[joint]), int(model.jnt_type[joint])
+            if names[joint] in locked:
+                R, p = _behind_locked(mujoco, kinds.get(kind), anchor, axis, locked[names[joint]], R, p)
                 continue
             moving.append(joint)
-            links.append(_Link(parent, kinds[int(model.jnt_type[joint])], R, p + R @ anchor, axis))
+            links.append((parent, kinds[kind], R, p + R @ anchor, axis))
             inertias.append(np.zeros(10))
             parent = len(links) - 1
             R, p = np.eye(3), -anchor
@@ -203,18 +195,22 @@ def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[s
         theta = _body(mujoco, model, body) if stated is None else stated.get(model.body(body).name, np.zeros(10))
         if parent >= 0 and theta.any():
             inertias[parent] = inertias[parent] + moved(theta, R, p)
-    names = [names[joint] for joint in moving]
-    for link, name in enumerate(names):
-        if not _moves_mass(links, inertias, link):
-            raise InputError(f"joint '{name}' moves no mass; expected an <inertial> for the link behind it")
+    names = tuple(names[joint] for joint in moving)
+    heavy = [theta[0] > 0 for theta in inertias]
     parents, joints, rotations, positions, axes = zip(*links, strict=True)
+    for link in reversed(range(len(links))):  # parents come before their children
+        if heavy[link] and parents[link] >= 0:
+            heavy[parents[link]] = True
+    if not all(heavy):
+        name = names[heavy.index(False)]
+        raise InputError(f"joint '{name}' moves no mass; expected an <inertial> for the link behind it")
+    dofs, infinite = model.jnt_dofadr[moving], np.array([-np.inf, np.inf])
     tree = make_tree(
         parents, joints, rotations, positions, axes, inertias,
-        armature=model.dof_armature[model.jnt_dofadr[moving]], gravity=np.asarray(model.opt.gravity), names=names,
+        armature=model.dof_armature[dofs], gravity=np.asarray(model.opt.gravity), names=names,
     )  # fmt: skip
-    inside, dofs = np.array([-np.inf, np.inf]), model.jnt_dofadr[moving]
-    ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], inside)
-    forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], inside)
+    ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], infinite)
+    forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], infinite)
     return Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
 
 
@@ -228,8 +224,8 @@ def _require_numbers(robot: Robot) -> None:
         right = (np.abs(numbers) <= LARGEST_NUMBER) & ((numbers >= 0) | (what not in losses))
         for joint in np.flatnonzero(~right.all(axis=1))[:1]:
             wanted = "zero or more" if what in losses else f"numbers up to {LARGEST_NUMBER:.0e}"
-            found = ", ".join(f"{each:.3g}" for each in numbers[joint])
-            raise InputError(f"the {what} of joint '{tree.names[joint]}' is {found}; expected {wanted}")
+            shown = ", ".join(f"{number:.3g}" for number in numbers[joint])
+            raise InputError(f"the {what} of joint '{tree.names[joint]}' is {shown}; expected {wanted}")
 
 
 def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:
@@ -239,7 +235,7 @@ def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:
     return np.asarray(inertial_parameters(model.body_mass[body], model.body_ipos[body], about))
 
 
-def _held(
+def _behind_locked(
     mujoco: Any, kind: str | None, anchor: np.ndarray, axis: np.ndarray, position: float, R: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frame of the body behind a locked joint, relative to the link it moves with."""
@@ -251,15 +247,6 @@ def _held(
     mujoco.mju_axisAngle2Quat(quaternion, axis, position)
     turn = _matrix(mujoco, quaternion)
     return R @ turn, p + R @ (anchor - turn @ anchor)
-
-
-def _moves_mass(links: list[_Link], inertias: list[np.ndarray], link: int) -> bool:
-    """Whether a link or one of its descendants has mass."""
-    behind = {link}
-    for other, each in enumerate(links):
-        if each.parent in behind:
-            behind.add(other)
-    return any(inertias[each][0] > 0 for each in behind)
 
 
 def _matrix(mujoco: Any, quaternion: np.ndarray) -> np.ndarray:

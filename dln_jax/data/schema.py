@@ -15,6 +15,7 @@ Samples of all trajectories are concatenated on axis 0.
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
 """
 
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -22,8 +23,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from dln_jax.data import archive, csv_tables
-from dln_jax.data.archive import numeric
+from dln_jax.data import csv_tables
+from dln_jax.data.arrays import load_file, numeric
 from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.files import is_file, writing
 from dln_jax.types import InputError, Needs, require_positive
@@ -31,7 +32,8 @@ from dln_jax.types import InputError, Needs, require_positive
 Data = TypeVar("Data")
 RATES = ("qd", "qdd")
 OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
-KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "joint_names", "needs")
+PER_JOINT = ("q", *RATES, *OPTIONAL)
+KEYS = ("t", *PER_JOINT, "trajectory", "label", "joint_names", "needs")
 LARGEST_INDEX = 2**53
 """Largest integer up to which float64 is exact."""
 
@@ -71,7 +73,7 @@ def load(path: str | Path, *, rate: float | int | None = None, units: str | None
         units: units of CSV titles without one, "si" or "degrees".
 
     Raises:
-        InputError: the file is missing, is no npz, holds pickled objects, is malformed CSV, or breaks the schema.
+        InputError: the file is missing, is not an npz, holds pickled objects, is malformed CSV, or breaks the schema.
     """
     return load_arrays(path, from_arrays, rate=rate, units=units)
 
@@ -82,12 +84,8 @@ def load_arrays(
     """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors as `load`."""
     if units is not None and Path(path).suffix.lower() != ".csv":
         raise InputError(f"{path!s:.200}: units are for CSV; the arrays of an npz file are in SI units")
-    return archive.load(
-        path,
-        lambda arrays: from_arrays(with_times(arrays, rate)),
-        KEYS,
-        table=lambda path: csv_tables.read(path, units=units),
-    )
+    table = functools.partial(csv_tables.read, units=units)
+    return load_file(path, lambda arrays: from_arrays(with_times(arrays, rate)), KEYS, table=table)
 
 
 def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
@@ -100,7 +98,7 @@ def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, An
         return arrays  # `from_arrays` refuses them
     samples = len(np.atleast_1d(np.asarray(arrays["q"])))
     if rate is None and "t" not in arrays:
-        raise InputError("key 't' is missing; add the time of each sample in seconds, or say --rate HZ")
+        raise InputError("key 't' is missing; add the time of each sample in seconds, or give --rate HZ")
     arrays = {"trajectory": np.zeros(samples, int), **arrays}
     if rate is None:
         return arrays
@@ -135,20 +133,12 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     trajectory, label = _trajectory_names(arrays, samples)
     _require_increasing_time(t, trajectory, label)
 
-    checked = {"q": q}
-    estimated = []
+    checked = {"q": q} | {key: numeric(arrays, key, q.shape) for key in (*RATES, *OPTIONAL) if key in arrays}
+    estimated = tuple(key for key in (*RATES, "tau") if key not in arrays)
     for key, source in zip(RATES, ("q", "qd"), strict=True):
-        if key in arrays:
-            checked[key] = numeric(arrays, key, q.shape)
-        else:
+        if key in estimated:
             checked[key] = time_derivative(t, checked[source], trajectory, name=key)
-            estimated.append(key)
-    for key in OPTIONAL:
-        if key in arrays:
-            checked[key] = numeric(arrays, key, q.shape)
-    if "tau" not in arrays:
-        checked["tau"] = np.zeros_like(q)
-        estimated.append("tau")
+    checked.setdefault("tau", np.zeros_like(q))
     needs = needs_from_text(str(arrays["needs"])) if "needs" in arrays else None
     if needs is not None and needs.degrees_of_freedom != q.shape[1]:
         raise InputError(
@@ -156,7 +146,7 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
         )
     names = _joint_names(arrays["joint_names"], q.shape[1]) if "joint_names" in arrays else None
     return Trajectories(
-        t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=tuple(estimated), **checked
+        t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=estimated, **checked
     )
 
 
@@ -174,7 +164,7 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
         raise InputError(f"{path} exists; choose another name or ask to overwrite it")
     if not isinstance(data, Trajectories):
         raise InputError(f"data is a {type(data).__name__}; expected Trajectories, such as `load_trajectories` gives")
-    arrays = {
+    arrays: dict[str, Any] = {
         key: value
         for key, value in data._asdict().items()
         if value is not None and key not in ("needs", "estimated", *data.estimated)
@@ -185,20 +175,19 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
         from_arrays(arrays)
     except InputError as error:
         raise InputError(f"{path} is not written: {error}") from None
-    whole: dict[str, Any] = {key: np.asarray(value) for key, value in arrays.items()}
     with writing(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, **whole)
+        np.savez_compressed(file, **arrays)
 
 
 def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
     """p and pd; raises `InputError` if the data have none."""
     if data.p is None or data.pd is None:
-        raise InputError("the data have no p and pd, which a field is fitted to; add them, or match trajectories")
+        raise InputError("the data have no p and pd, to which a field is fitted; add them, or fit trajectories instead")
     return data.p, data.pd
 
 
-def _joint_names(given: Any, d: int) -> np.ndarray:
-    names = np.asarray(given)
+def _joint_names(stated: Any, d: int) -> np.ndarray:
+    names = np.asarray(stated)
     if names.dtype.kind not in "US" or names.shape != (d,) or len(set(names.tolist())) < d:
         raise InputError(f"joint_names has type {names.dtype} and shape {names.shape}; expected {d} different strings")
     return names.astype(str)
@@ -207,7 +196,7 @@ def _joint_names(given: Any, d: int) -> np.ndarray:
 def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
     trajectory = numeric(arrays, "trajectory", (samples,), most=np.inf)
     if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0 or trajectory.max() > LARGEST_INDEX:
-        raise InputError("trajectory has entries that are no whole numbers >= 0; expected the index of each trajectory")
+        raise InputError("trajectory has entries that are not whole numbers >= 0; give the index of each trajectory")
     trajectory = trajectory.astype(np.int64)
     if "label" not in arrays:
         present, trajectory = np.unique(trajectory, return_inverse=True)
@@ -231,13 +220,10 @@ def _require_increasing_time(t: np.ndarray, trajectory: np.ndarray, label: np.nd
     starts = trajectory[np.flatnonzero(np.r_[True, ~same])]
     if len(set(starts)) < len(starts):
         raise InputError("trajectory returns to an earlier index; keep the samples of each trajectory together")
-    backward = same & (np.diff(t) <= 0)
-    if backward.any():
-        sample = int(np.flatnonzero(backward)[0]) + 1
-        name = label[trajectory[sample]]
+    for sample in 1 + np.flatnonzero(same & (np.diff(t) <= 0))[:1]:
         raise InputError(
-            f"t does not increase at sample {sample} of trajectory '{name}'; sort the samples by time, and number "
-            "recordings that follow one another in a column 'trajectory'"
+            f"t does not increase at sample {sample} of trajectory '{label[trajectory[sample]]}'; sort the samples by "
+            "time, and number recordings that follow one another in a column 'trajectory'"
         )
 
 

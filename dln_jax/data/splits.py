@@ -1,21 +1,26 @@
-"""Splits by trajectory, never by sample, since neighbouring samples of a trajectory are almost copies."""
+"""Parts of a dataset: splits, segments without a gap, windows, and columns in the order of a robot's joints.
+
+Splits are by trajectory, never by sample, since neighbouring samples of a trajectory are almost copies.
+"""
 
 import hashlib
+import reprlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from dln_jax.data.schema import Trajectories
+from dln_jax.data.schema import PER_JOINT, Trajectories
 from dln_jax.types import InputError, require_positive, require_seed
 
-PER_SAMPLE = ("t", "q", "qd", "qdd", "tau", "trajectory", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
-
-
+PER_SAMPLE = ("t", "trajectory", *PER_JOINT)
 LEAST_TRAJECTORIES = 3
 """Fewest trajectories for a split: one each for training, validation and test."""
 BLOCKS = 10
 """Number of time blocks per trajectory if there are too few trajectories."""
+GAP = 1.5
+"""A step longer than this multiple of its trajectory's median step is a gap."""
 
 
 class Split(NamedTuple):
@@ -28,7 +33,7 @@ class Split(NamedTuple):
 
 def select_samples(data: Trajectories, samples: np.ndarray | slice) -> Trajectories:
     """Selects samples by a mask, indices or a slice; labels stay unchanged."""
-    return data._replace(**{key: getattr(data, key)[samples] for key in PER_SAMPLE if getattr(data, key) is not None})
+    return data._replace(**{key: array[samples] for key in PER_SAMPLE if (array := getattr(data, key)) is not None})
 
 
 def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajectories:
@@ -39,6 +44,69 @@ def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajector
 def every(data: Trajectories, step: int) -> Trajectories:
     """Keeps every `step`-th sample."""
     return select_samples(data, slice(None, None, step))
+
+
+def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
+    """Reorders the columns of the data to these joints; data without joint names stay unchanged.
+
+    Raises:
+        InputError: the number of joints differs, or the names do.
+    """
+    d = data.degrees_of_freedom
+    if len(names) != d:
+        raise InputError(f"the data have {d} joints, the robot {len(names)}: {reprlib.repr(', '.join(names))}")
+    if data.joint_names is None:
+        return data
+    own = data.joint_names.tolist()
+    if missing := [name for name in names if name not in own]:
+        shown = ", ".join(own)
+        raise InputError(f"the robot's joint '{missing[0]}' is not among the data's ({shown:.300}); make names agree")
+    order = [own.index(name) for name in names]
+    columns = {key: array[:, order] for key in PER_JOINT if (array := getattr(data, key)) is not None}
+    needs = None if data.needs is None else data.needs._replace(joints=tuple(data.needs.joints[k] for k in order))
+    return data._replace(**columns, joint_names=data.joint_names[order], needs=needs)
+
+
+def segments(
+    t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
+) -> list[Int[np.ndarray, " n"]]:
+    """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
+
+    Raises:
+        InputError: `gap` is not above 1, or no trajectory has two samples.
+    """
+    if not gap > 1:
+        raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
+    if not (np.diff(trajectory) == 0).any():
+        raise InputError("no trajectory has two samples, so the data contain no motion; record longer trajectories")
+    pieces = []
+    for samples in np.split(np.arange(len(t)), np.flatnonzero(np.diff(trajectory)) + 1):
+        steps = np.diff(t[samples])
+        longest = gap * np.median(steps) if len(steps) else np.inf
+        pieces.extend(np.split(samples, np.flatnonzero(steps > longest) + 1))
+    return pieces
+
+
+def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tuple[np.ndarray, np.ndarray]:
+    """Sample indices [W, T] of consecutive windows, which share their end samples, and the weights of the samples.
+
+    Windows lie within segments. The remainder of a segment is a shorter window, padded with its last sample at weight
+    0.
+
+    Raises:
+        InputError: a length below 2, or no two samples without a gap between them.
+    """
+    if length < 2:
+        raise InputError(f"length is {length}; expected a window of at least 2 samples")
+    pieces = [
+        segment[first : first + length]
+        for segment in segments(data.t, data.trajectory, gap=gap)
+        for first in range(0, len(segment) - 1, length - 1)
+    ]
+    if not pieces:
+        raise InputError("no two samples follow one another without a gap; record longer motions")
+    indices = np.stack([np.pad(piece, (0, length - len(piece)), mode="edge") for piece in pieces])
+    return indices, np.stack([np.arange(length) < len(piece) for piece in pieces]).astype(float)
 
 
 def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
@@ -129,10 +197,9 @@ def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories,
     """
     require_seed(seed)
     present = np.unique(data.trajectory)
-    drawn = np.random.default_rng(seed).choice(
-        present, size=held_out(len(present), share, "trajectories"), replace=False
-    )
-    return select(data, np.setdiff1d(present, drawn)), select(data, drawn)
+    count = held_out(len(present), share, "trajectories")
+    held = np.random.default_rng(seed).choice(present, size=count, replace=False)
+    return select(data, np.setdiff1d(present, held)), select(data, held)
 
 
 def held_out(count: int, share: float, what: str) -> int:

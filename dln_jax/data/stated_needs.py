@@ -10,8 +10,6 @@ from dln_jax.files import matches
 from dln_jax.mechanics.friction import require_laws
 from dln_jax.types import InputError, JointKind, Needs
 
-JOINTS = get_args(JointKind)
-
 
 def needs_from_text(text: str) -> Needs:
     """`Needs` from JSON text; errors as `needs_from_json`, also for text that is not JSON."""
@@ -29,42 +27,42 @@ def needs_from_json(stated: Any) -> Needs:
     Raises:
         InputError: unknown or missing fields, or values of the wrong kind.
     """
-    advice = f"expected JSON with the fields {', '.join(Needs._fields)}"
     if not isinstance(stated, dict) or not set(stated) <= set(Needs._fields) or "joints" not in stated:
-        raise InputError(f"needs: {advice}, got {reprlib.repr(stated)}")
-    joints = stated["joints"]
-    if not isinstance(joints, list | tuple) or not joints or not all(each in JOINTS for each in joints):
-        raise InputError(f"needs: joints are {reprlib.repr(joints)}; expected a list of 'revolute' and 'prismatic'")
+        raise _wrong("JSON", stated, f"the fields {', '.join(Needs._fields)}")
+    values = {**Needs._field_defaults, **stated}
+    joints, laws, velocity = values["joints"], values["joint_friction"], values["velocity_scale"]
+    kinds = get_args(JointKind)
+    if not isinstance(joints, list | tuple) or not joints or not all(joint in kinds for joint in joints):
+        raise _wrong("joints", joints, "a list of 'revolute' and 'prismatic'")
     for key in ("gravity", "friction"):
-        if not isinstance(stated.get(key, False), bool):
-            raise InputError(f"needs: {key} is {reprlib.repr(stated[key])}; expected true or false")
-    actuation = _rows("actuation", stated.get("actuation"), len(joints))
-    joint_map = _rows("joint_map", stated.get("joint_map"), len(joints))
-    if joint_map is not None and (len(joint_map[0]) != len(joints) or np.linalg.matrix_rank(joint_map) < len(joints)):
-        square = f"[{len(joints)}, {len(joints)}] that can be inverted"
-        raise InputError(
-            f"needs: joint_map is {reprlib.repr(stated['joint_map'])}; expected a matrix {square}, or null"
-        )
-    laws = stated.get("joint_friction", [])
+        if not isinstance(values[key], bool):
+            raise _wrong(key, values[key], "true or false")
     if not isinstance(laws, list | tuple):
-        raise InputError(f"needs: joint_friction is {reprlib.repr(laws)}; expected a list of laws such as 'viscous'")
+        raise _wrong("joint_friction", laws, "a list of laws such as 'viscous'")
     require_laws(laws, "needs: joint_friction")
-    velocity = stated.get("velocity_scale", Needs._field_defaults["velocity_scale"])
     if not (matches(velocity, float) and velocity > 0):
-        raise InputError(f"needs: velocity_scale is {reprlib.repr(velocity)}; expected a positive number, rad/s or m/s")
-    friction = {"joint_friction": tuple(laws), "joint_map": joint_map, "velocity_scale": float(velocity)}
-    return Needs(**{**stated, "joints": tuple(joints), "actuation": actuation, **friction})
+        raise _wrong("velocity_scale", velocity, "a positive number, rad/s or m/s")
+    actuation, joint_map = (_rows(key, values[key], len(joints)) for key in ("actuation", "joint_map"))
+    if joint_map is not None and (len(joint_map[0]) != len(joints) or np.linalg.matrix_rank(joint_map) < len(joints)):
+        raise _wrong("joint_map", joint_map, f"an invertible matrix [{len(joints)}, {len(joints)}], or null")
+    read = {"joints": tuple(joints), "actuation": actuation, "joint_map": joint_map, "joint_friction": tuple(laws)}
+    return Needs(**{**values, **read, "velocity_scale": float(velocity)})
 
 
 def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] | None:
     """Reads a matrix with one row per joint."""
     if stated is None:
         return None
-    rows = stated if isinstance(stated, list | tuple) else ()
-    lengths = {len(row) if isinstance(row, list | tuple) else 0 for row in rows}
-    if len(rows) != joints or len(lengths) != 1 or not all(lengths):
-        shape = f"[{joints}, u] with u >= 1, rows of one length"
-        raise InputError(f"needs: {key} is {reprlib.repr(stated)}; expected {shape}, or null")
+    try:
+        rows = tuple(tuple(row) for row in stated) if isinstance(stated, list | tuple) else ()
+    except TypeError:  # an entry is not a list
+        rows = ()
+    if len(rows) != joints or len({len(row) for row in rows}) != 1 or not rows[0]:
+        raise _wrong(key, stated, f"[{joints}, u] with u >= 1, rows of one length, or null")
     if not all(matches(entry, float) for row in rows for entry in row):
-        raise InputError(f"needs: {key} is {reprlib.repr(stated)}; expected finite numbers")
-    return tuple(tuple(float(entry) for entry in row) for row in rows)
+        raise _wrong(key, stated, "finite numbers")
+    return tuple(tuple(map(float, row)) for row in rows)
+
+
+def _wrong(key: str, value: Any, expected: str) -> InputError:
+    return InputError(f"needs: {key} is {reprlib.repr(value)}; expected {expected}")

@@ -6,7 +6,8 @@ from matplotlib.figure import Figure
 
 from dln_jax.data.checks import Examination
 from dln_jax.data.checks.hypotheses import Torques
-from dln_jax.data.encoders import Smoothed
+from dln_jax.data.encoders import Choice, Smoothed
+from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 
 MOST_JOINTS = 9
@@ -21,92 +22,84 @@ def cutoff_figure(smoothed: Smoothed) -> Figure:
 
     `smoothed` comes from `data.encoders.smooth` with an automatic cut-off.
     """
+    if smoothed.choice is None:
+        raise ValueError("the cut-off was set, not chosen from the data")
     figure, axes = style.figure(2, 1, height=4.6, sharex=True, height_ratios=[1.4, 1.0])
-    _spectra(axes[0, 0], smoothed)
-    _expected(axes[1, 0], smoothed)
+    _spectra(axes[0, 0], smoothed.choice)
+    _expected(axes[1, 0], smoothed.choice)
     axes[0, 0].set_xlabel("")
     return figure
 
 
 def log_figure(examined: Examination) -> Figure:
     """One page: spectra and cut-off, time steps or delay, and friction against velocity for every joint."""
-    smoothed = examined.smoothed
-    seen = examined.on_tree.torques if examined.on_tree is not None else examined.regression
-    joints = 0 if seen is None else min(examined.recording.data.degrees_of_freedom, MOST_JOINTS)
+    data, smoothed, torques = examined.recording.data, examined.smoothed, examined.torques
+    joints = 0 if torques is None or smoothed is None else min(data.degrees_of_freedom, MOST_JOINTS)
     rows = 1 + -(-joints // COLUMNS)
     figure, axes = style.figure(rows, COLUMNS, height=2.3 * rows + 0.3)
     if smoothed is not None and smoothed.choice is not None:
-        _spectra(axes[0, 0], smoothed)
-        _expected(axes[0, 1], smoothed)
+        _spectra(axes[0, 0], smoothed.choice)
+        _expected(axes[0, 1], smoothed.choice)
     else:
         axes[0, 0].set_axis_off()
         axes[0, 1].set_axis_off()
-    if seen is not None and smoothed is not None:
-        _delays(axes[0, 2], seen, smoothed.rate)
-    else:
-        _steps(axes[0, 2], examined)
-    for place, axis in enumerate(axes[1:].flat):
-        if seen is None or smoothed is None or place >= joints:
-            axis.set_axis_off()
-            continue
-        qd = smoothed.data.qd[seen.rows, place]
-        shown = slice(None, None, -(-len(qd) // MOST_POINTS))
-        axis.plot(qd[shown], seen.rest[shown, place], ".", color="0.6", markersize=1.5)
-        speeds = np.linspace(qd.min(), qd.max(), 200)
-        dry = seen.coulomb[place] * np.tanh(speeds / seen.velocity_scale[place])
-        offset = float(np.mean(seen.rest[:, place]))
-        axis.plot(speeds, seen.viscous[place] * speeds + dry + offset, color=style.VERMILLION, linewidth=1.3)
-        style.title(axis, f"joint {place + 1}: {seen.explained[place]:.0%} explained")
-        axis.set_xlabel("velocity, 1/s")
-        if place % COLUMNS == 0:
+    for axis in axes[1:].flat[joints:]:
+        axis.set_axis_off()
+    if torques is None or smoothed is None:
+        _steps(axes[0, 2], data)
+        return figure
+    _delays(axes[0, 2], torques, smoothed.rate)
+    for joint, axis in enumerate(axes[1:].flat[:joints]):
+        _friction(axis, torques, smoothed.data.qd[torques.rows, joint], joint)
+        if joint % COLUMNS == 0:
             axis.set_ylabel("friction and error, N m")
     return figure
 
 
-def _spectra(axis: Axes, smoothed: Smoothed) -> None:
-    choice = smoothed.choice
-    if choice is None:
-        raise ValueError("the cut-off was given, not chosen")
+def _friction(axis: Axes, torques: Torques, qd: np.ndarray, joint: int) -> None:
+    shown = slice(None, None, -(-len(qd) // MOST_POINTS))
+    axis.plot(qd[shown], torques.rest[shown, joint], ".", color="0.6", markersize=1.5)
+    speeds = np.linspace(qd.min(), qd.max(), 200)
+    dry = torques.coulomb[joint] * np.tanh(speeds / torques.velocity_scale[joint])
+    offset = float(np.mean(torques.rest[:, joint]))
+    axis.plot(speeds, torques.viscous[joint] * speeds + dry + offset, color=style.VERMILLION, linewidth=1.3)
+    style.title(axis, f"joint {joint + 1}: {torques.explained[joint]:.0%} explained")
+    axis.set_xlabel("velocity, 1/s")
+
+
+def _spectra(axis: Axes, choice: Choice) -> None:
     for joint, shade in zip(range(choice.spectrum.shape[1]), [*style.CYCLE, *style.CYCLE], strict=False):
         axis.loglog(choice.f, choice.spectrum[:, joint], color=shade, linewidth=0.8, label=f"{joint + 1}")
         if choice.floor[joint] > 0:
             axis.axhline(choice.floor[joint], color=shade, linewidth=0.6, linestyle=":")
-    if np.isfinite(smoothed.cutoff):
-        axis.axvline(smoothed.cutoff, color=style.VERMILLION, linewidth=1.0)
+    if np.isfinite(choice.cutoff):
+        axis.axvline(choice.cutoff, color=style.VERMILLION, linewidth=1.0)
     axis.set_xlabel("frequency, Hz")
     axis.set_ylabel("spectrum of q, rad²/Hz")
     style.legend(axis, ncols=2, handlelength=0.8, columnspacing=0.8, loc="lower left", fontsize=6.5)
 
 
-def _expected(axis: Axes, smoothed: Smoothed) -> None:
-    choice = smoothed.choice
-    if choice is None:
-        raise ValueError("the cut-off was given, not chosen")
+def _expected(axis: Axes, choice: Choice) -> None:
     axis.loglog(choice.tried, np.sqrt(np.maximum(choice.error, 1e-16)), color="black", linewidth=1.2)
-    _mark(axis, smoothed.cutoff)
+    if np.isfinite(choice.cutoff):
+        axis.axvline(choice.cutoff, color=style.VERMILLION, linewidth=1.0)
+        axis.annotate(
+            f" {choice.cutoff:.3g} Hz", (choice.cutoff, 0.95), xycoords=("data", "axes fraction"),
+            color=style.VERMILLION, fontsize=style.SMALL, va="top",
+        )  # fmt: skip
     axis.set_xlabel("cut-off, Hz")
     axis.set_ylabel("expected error of qdd")
 
 
-def _mark(axis: Axes, cutoff: float) -> None:
-    if np.isfinite(cutoff):
-        axis.axvline(cutoff, color=style.VERMILLION, linewidth=1.0)
-        axis.annotate(
-            f" {cutoff:.3g} Hz", (cutoff, 0.95), xycoords=("data", "axes fraction"),
-            color=style.VERMILLION, fontsize=style.SMALL, va="top",
-        )  # fmt: skip
-
-
-def _delays(axis: Axes, seen: Torques, rate: float) -> None:
-    axis.plot(1e3 / rate * seen.tried, np.maximum(seen.loss, -1.0), color=style.BLUE, linewidth=1.2)
+def _delays(axis: Axes, torques: Torques, rate: float) -> None:
+    axis.plot(1e3 / rate * torques.tried, np.maximum(torques.loss, -1.0), color=style.BLUE, linewidth=1.2)
     axis.set_yscale("symlog", linthresh=10.0)
     axis.axvline(0.0, color="0.7", linewidth=0.8)
-    axis.set_xlabel("torques are late by, ms")
-    axis.set_ylabel("log likelihood ratio of none")
+    axis.set_xlabel("delay of the torques, ms")
+    axis.set_ylabel("log likelihood ratio, none / delay")
 
 
-def _steps(axis: Axes, examined: Examination) -> None:
-    data = examined.recording.data
+def _steps(axis: Axes, data: Trajectories) -> None:
     steps = np.diff(data.t)[np.diff(data.trajectory) == 0]
     axis.plot(1e3 * steps, ".", color=style.BLUE, markersize=1.5)
     axis.set_xlabel("sample")

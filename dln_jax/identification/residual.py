@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.data.magnitudes import on_device, spread
+from dln_jax.data.arrays import on_device, spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.learning.measured_motions import Gauge, check_gauge, gauge_error

@@ -20,8 +20,8 @@ from jax import Array
 from jax.sharding import Mesh
 from jaxtyping import Float
 
+from dln_jax.data.arrays import on_device
 from dln_jax.data.functions import FunctionSamples, SampleSplit
-from dln_jax.data.magnitudes import on_device
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser

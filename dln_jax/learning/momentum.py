@@ -16,10 +16,10 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from dln_jax.data.arrays import on_device
 from dln_jax.data.encoders import smooth
-from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import segments
+from dln_jax.data.splits import segments
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, momentum_and_rest, window_weights

@@ -23,9 +23,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.data.magnitudes import on_device
+from dln_jax.data.arrays import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import GAP, window_indices
+from dln_jax.data.splits import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.mechanics.dynamics import Flow, PlainFlow
 from dln_jax.mechanics.equations import flow

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.data.magnitudes import on_device
+from dln_jax.data.arrays import on_device
 from dln_jax.data.schema import Trajectories, momenta
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, mean_square, unmonitored
 from dln_jax.mechanics.equations import flow

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.data.arrays import spread
 from dln_jax.data.functions import FunctionSamples
-from dln_jax.data.magnitudes import spread
 from dln_jax.nn.differential_mlp import Layers
 
 

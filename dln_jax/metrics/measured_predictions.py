@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import GAP
+from dln_jax.data.splits import GAP
 from dln_jax.learning import motions, starts
 from dln_jax.learning.measured_motions import MeasuredWindows, motion
 from dln_jax.learning.starts import nearest

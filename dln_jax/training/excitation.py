@@ -10,7 +10,7 @@ from dln_jax.cli.arguments import numbers_of
 from dln_jax.cli.progress import progress
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data import schema
-from dln_jax.data.motion_tables import write_motion
+from dln_jax.data.csv_tables import write_motion
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.figures.excitation import excitation_figure
 from dln_jax.files import write_figure, write_json

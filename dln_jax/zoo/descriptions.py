@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import as_type

@@ -9,7 +9,7 @@ import pytest
 
 from dln_jax.control import Hardware, field_of, simulate, stateless
 from dln_jax.control.mujoco_loop import simulate_in_mujoco
-from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dln_jax.data import checks, csv_tables, schema
-from dln_jax.data.motion_tables import write_motion
+from dln_jax.data.csv_tables import write_motion
 from dln_jax.types import InputError
 
 ROWS = "0,1,2,3,4\n0.1,5,6,7,8\n0.2,9,10,11,12\n"
@@ -57,7 +57,7 @@ def test_units_in_titles_are_converted_to_si(load, titles, factors):
 
 def test_units_that_no_title_states_are_asked_for(load):
     text = "t,q1,tau1\n0,90,1\n1,180,1\n2,180,1\n"
-    with pytest.raises(InputError, match=r"'t' has no unit; .* 't \[s\]', or say --units si"):
+    with pytest.raises(InputError, match=r"'t' has no unit; .* 't \[s\]', or give --units si"):
         load(text)
     assert load(text, units="si").q[0, 0] == 90
     data = load(text, units="degrees")
@@ -89,7 +89,7 @@ def test_times_come_from_a_rate_and_recordings_from_their_column(load):
 
 MALFORMED = {
     "empty": ("", "the file is empty"),
-    "no samples": (HEADER, "no samples below the header"),
+    "no samples": (HEADER, "no samples below its header"),
     "no header": (ROWS, "the first line holds numbers"),
     "ragged": (HEADER + ROWS + "0.3,1,2,3\n", "line 5 has 4 values, the header 5 titles"),
     "decimal comma": (HEADER + "0,1,1,2,5,3,4\n", "line 2 has 7 values, the header 5 titles; decimals take a point"),
@@ -102,7 +102,7 @@ MALFORMED = {
     "not a number": (HEADER + ROWS.replace("7", "nan"), "tau has 1 NaN or infinite value"),
     "infinite": (HEADER + ROWS.replace("7", "1e999"), "tau has 1 NaN or infinite value"),
     "no q": ("t [s],x [rad]\n0,1\n", "key 'q' is missing.*keys that are not read: x \\[rad\\]"),
-    "no t": ("q1 [rad]\n0\n1\n2\n", "key 't' is missing; add the time of each sample in seconds, or say --rate HZ"),
+    "no t": ("q1 [rad]\n0\n1\n2\n", "key 't' is missing; add the time of each sample in seconds, or give --rate HZ"),
     "twice": ("t [s],q1 [rad],q1 [rad]\n0,1,2\n", "two columns have the title 'q1 \\[rad\\]'"),
     "twice by other units": (
         "t [s],q1 [rad],q1 [deg]\n0,1,2\n",
@@ -117,7 +117,7 @@ MALFORMED = {
     "zero bytes": (HEADER.encode() + b"\x00\x00,1,2,3,4\n", "line"),
     "endless cell": (HEADER + f'"{"x" * 200_000}",1,2,3,4\n', "line 2 is not CSV"),
     "time that runs back": (HEADER + ROWS + "0.1,1,2,3,4\n", "t does not increase at sample 3.*column 'trajectory'"),
-    "half a trajectory": ("t [s],q1 [rad],trajectory\n0,1,0.5\n1,1,0.5\n", "no whole numbers"),
+    "half a trajectory": ("t [s],q1 [rad],trajectory\n0,1,0.5\n1,1,0.5\n", "not whole numbers"),
 }
 
 

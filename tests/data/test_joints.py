@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from dln_jax.data.joints import with_joints
 from dln_jax.data.schema import from_arrays, load, save
-from dln_jax.data.splits import in_blocks
+from dln_jax.data.splits import in_blocks, with_joints
 from dln_jax.types import InputError
 
 ARRAYS = {

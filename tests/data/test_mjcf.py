@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system

@@ -81,9 +81,9 @@ def test_mistakes_are_one_line(original, tmp_path):
     hollow = tree.inertias.copy()
     hollow[-1, 4] = -1.0
     for change, path, message in (
-        ({}, original, "is the file that was read"),
+        ({}, original, "is the original file"),
         ({"names": tuple("abcdefg"[: len(tree.names)])}, tmp_path / "new", "the tree has a, b"),
-        ({"inertias": hollow}, tmp_path / "new", "no body that exists"),
+        ({"inertias": hollow}, tmp_path / "new", "is not physically consistent"),
     ):
         with pytest.raises(InputError, match=message) as caught:
             write_robot(path, original, tree._replace(**change))

@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from dln_jax.data import schema
-from dln_jax.data.local_polynomials import smooth_locally
+from dln_jax.data.encoders import smooth_locally
 from dln_jax.data.splits import select
 from dln_jax.learning import accelerations, measured_motions, rates
 from dln_jax.learning.engine.fit import fit

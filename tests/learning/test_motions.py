@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.data.segments import segments
+from dln_jax.data.splits import segments
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.motions import Weights, cut_windows, problem, take

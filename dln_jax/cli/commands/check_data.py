@@ -1,10 +1,10 @@
-"""Examine a log before it is learned from: what is wrong with it, and what to do about it.
+"""Validate a log before training: what is wrong with it, and what to do about it.
 
-Looks at rates, gaps and the order of times, units, signs, qd and qdd against q, delay between q and tau, saturation,
-steps of encoders, noise, unexcited joints and friction; with --robot also at gravity, gears, the order and limits of
-joints, and how well the motions determine the robot's parameters. Prints a report, and writes it as report.txt, the
-findings as findings.json, and a figure: spectra and cut-off, delay, and torque against velocity. The exit status is 1
-if an error was found, and 0 if there are only warnings and notes.
+Checks sampling times, units, signs, qd and qdd against q, the delay between q and tau, saturation, encoder steps,
+noise, joints that hardly move, and friction; with --robot also gravity, gears, the order and limits of joints, and how
+well the motions determine the robot's parameters. Prints a report and writes it as report.txt, the findings as
+findings.json, and a figure: spectra and cut-off, delay, and torque against velocity. The exit status is 1 if there are
+errors, and 0 if there are only warnings and notes.
 """
 
 from dataclasses import dataclass
@@ -24,31 +24,31 @@ from dln_jax.files import write_bytes, write_figure, write_json
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments(Folder, Drawn, Logged):
-    """The log to examine."""
+    """The log to validate."""
 
     data: Path
-    """Log as npz or CSV: t and q, and tau, qd, qdd and trajectory where there are any."""
+    """Log as npz or CSV: t and q, and optionally tau, qd, qdd and trajectory."""
     robot: Unstated[Path] = None
     """URDF or MJCF of the robot (needs MuJoCo)."""
     lock: Unstated[str] = None
-    """Joints of the robot that do not move, such as those of a gripper, comma separated; "*finger*" names all with
-    finger in their name (default: all joints move)."""
+    """Joints of the robot to lock, such as those of a gripper, separated by commas; "*finger*" stands for all names
+    that contain finger (default: none)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Examines the log, prints and writes the findings; exits with status 1 if there is an error among them."""
-    recording = read(given.data, rate=given.rate, units=given.units)
-    if given.robot is None:
-        refuse_given(given, ["lock"], "for joints of --robot")
-    robot = None if given.robot is None else read_robot(given.robot, lock=names_listed(given.lock))
+    recording = read(options.data, rate=options.rate, units=options.units)
+    if options.robot is None:
+        refuse_given(options, ["lock"], "for joints of --robot")
+    robot = None if options.robot is None else read_robot(options.robot, lock=names_listed(options.lock))
     examined = examine(recording, robot)
-    lines = report(examined, str(given.data))
-    with command_folder(given, "check_data") as folder:
+    lines = report(examined, str(options.data))
+    with command_folder(options, "check_data") as folder:
         print("\n".join(lines))
         write_bytes(folder / "report.txt", ("\n".join(lines) + "\n").encode())
-        write_json(folder / "findings.json", {"findings": [each._asdict() for each in examined.findings]})
+        write_json(folder / "findings.json", {"findings": [finding._asdict() for finding in examined.findings]})
         write_json(folder / "metrics.json", metrics(examined))
-        if given.figures:
+        if options.figures:
             write_figure(folder / "log.png", log_figure(examined))
         print(f"folder: {folder}")
     if any(finding.severity == "error" for finding in examined.findings):
@@ -57,15 +57,14 @@ def main(given: Arguments) -> None:
 
 def metrics(examined: Examination) -> dict[str, Any]:
     """Metrics of the examination, for metrics.json."""
-    counted = {f"{kind}s": sum(each.severity == kind for each in examined.findings) for kind in ("error", "warning")}
-    smoothed, regression, on_tree = examined.smoothed, examined.regression, examined.on_tree
-    numbers: dict[str, Any] = dict(counted)
+    severities = [finding.severity for finding in examined.findings]
+    numbers: dict[str, Any] = {f"{kind}s": severities.count(kind) for kind in ("error", "warning")}
+    smoothed, on_tree, torques = examined.smoothed, examined.on_tree, examined.torques
     if smoothed is not None:
         numbers |= {"rate_hz": smoothed.rate, "noise_q_max": float(np.max(smoothed.noise_q))}
         numbers |= {"cutoff_hz": smoothed.cutoff} if np.isfinite(smoothed.cutoff) else {}
     if on_tree is not None:
         numbers |= {"rank": on_tree.rank, "condition": on_tree.condition}
-    torques = on_tree.torques if on_tree is not None else regression
     if torques is not None:
         numbers |= {"delay_samples": torques.likely_delay, "unexplained": float(1 - torques.explained.mean())}
     return numbers

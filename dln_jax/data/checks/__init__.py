@@ -5,8 +5,6 @@ examination that `check_data` prints.
 """
 
 from dln_jax.data.checks.findings import Finding, by_severity
-from dln_jax.data.checks.recording import Recording, as_recording, read
-from dln_jax.data.checks.report import report
-from dln_jax.data.checks.validation import Examination, examine, quick
+from dln_jax.data.checks.validation import Examination, Recording, as_recording, examine, quick, read, report
 
 __all__ = ["Examination", "Finding", "Recording", "as_recording", "by_severity", "examine", "quick", "read", "report"]

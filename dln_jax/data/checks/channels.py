@@ -1,11 +1,18 @@
-"""Checks single channels: motionless joints, coarse steps, spikes and saturation."""
+"""Checks of the sampling times and of single channels: motionless joints, coarse steps, spikes and saturation."""
 
 import numpy as np
 
-from dln_jax.data.checks.findings import Finding, named
-from dln_jax.data.encoders.noise import step_of
+from dln_jax.data.checks.findings import Finding, on_joints
+from dln_jax.data.encoders.sampling import step_of, timing
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import LEAST_TRAJECTORIES
 
+JITTER = 0.05
+"""Largest standard deviation of the steps, relative to the step."""
+SLOWEST = 1.0
+"""Hz: at a lower rate t is hardly in seconds."""
+UNEQUAL = 0.2
+"""Largest relative difference between the rates of trajectories."""
 TURNS = 4 * np.pi
 """rad: two turns; larger angles of an arm are suspicious."""
 WEAK = 0.03
@@ -22,73 +29,82 @@ CLEAR = 3.0
 """A spike exceeds the range of its four neighbours by this factor."""
 ABRUPT = 0.5
 """A channel enters or leaves a clipping limit by more than this fraction of the typical step."""
+FILTER = "interpolate to equal steps with smooth() or --cutoff auto"
+
+
+def check_times(data: Trajectories) -> list[Finding]:
+    """Checks rate, jitter, gaps and the number of trajectories for a split."""
+    counts = np.unique(data.trajectory, return_counts=True)[1]
+    few = f"the number of trajectories is {len(counts)}; a split by trajectory needs {LEAST_TRAJECTORIES}"
+    split = Finding("warning", "split", few, "record more, or cut the log in time and number the parts")
+    findings = [split] if len(counts) < LEAST_TRAJECTORIES else []
+    if counts.max() < 2:
+        return findings
+    rate, jitter, gaps, longest, rates = timing(data.t, data.trajectory)
+    step = f"{1 / rate:.3g} s"
+    cases = (
+        (rate < SLOWEST, "error", "time-unit", f"samples are {step} apart",
+         "give t in seconds if it is in milliseconds or ticks"),
+        (gaps, "note", "gaps", f"t has {gaps} gap(s): the longest step is {longest:.3g} s, the typical one {step}",
+         "cut the log at gaps, as smooth() does; rates across them are guesses"),
+        (jitter > JITTER, "warning", "jitter", f"time steps vary by {jitter:.0%}", FILTER),
+        (np.ptp(rates) > UNEQUAL * rate, "note", "rates",
+         f"trajectories are sampled at {rates.min():.4g} to {rates.max():.4g} Hz", FILTER),
+    )  # fmt: skip
+    return findings + [Finding(*finding) for holds, *finding in cases if holds]
 
 
 def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding]:
     """Checks for still joints, constant torques, spikes, steps and flat tops; `rates` are qd of the filtered q."""
-    found = []
-    still = np.flatnonzero(np.ptp(data.q, axis=0) <= 1e-9 * max(1.0, np.abs(data.q).max()))
-    if len(still):
-        said = f"{named(still)} never move{'s' * (len(still) == 1)}"
-        remedy = "move it in some trajectories, or leave it out of q: its inertia and friction cannot be learned"
-        found.append(Finding("warning", "unexcited", said, remedy, tuple(map(int, still))))
-    if rates is not None:
-        speed = rates.std(axis=0)
-        weak = np.setdiff1d(np.flatnonzero(speed < WEAK * np.median(speed)), still)
-        if len(weak):
-            said = f"{named(weak)} move{'s' * (len(weak) == 1)} less than {WEAK:.0%} as fast as others"
-            remedy = "excite it more: what it does is hardly seen"
-            found.append(Finding("warning", "unexcited", said, remedy, tuple(map(int, weak))))
-    if "tau" not in data.estimated:
-        constant = np.flatnonzero(np.ptp(data.tau, axis=0) == 0)
-        found += _dead(data, still)
-        # A joint without a motor has zero torque; a passive system has only such joints.
-        constant = np.array([joint for joint in constant if data.tau[0, joint] != 0], int)
-        if len(constant):
-            said = f"the torque of {named(constant)} is constant"
-            remedy = "see that the right channel was logged"
-            found.append(Finding("warning", "constant-torque", said, remedy, tuple(map(int, constant))))
-        found += _saturated(data, "tau", "torque", "keep away from the motors' limits, or leave those samples out")
-    found += _spiky(data)
-    found += _saturated(data, "q", "position", "see whether it is at its stop or the log is clipped; leave that out")
+    still = np.ptp(data.q, axis=0) <= 1e-9 * max(1.0, np.abs(data.q).max())
+    speed = np.full(len(still), np.inf) if rates is None else rates.std(axis=0)
+    weak = (speed < WEAK * np.median(speed)) & ~still
     steps = step_of(data.q)
-    coarse = np.flatnonzero(steps > COARSE)
-    if len(coarse):
-        said = f"q of {named(coarse)} comes in steps of up to {steps.max():.2g}"
-        remedy = "filter before rates are derived: --cutoff auto, or smooth()"
-        found.append(Finding("note", "quantisation", said, remedy, tuple(map(int, coarse))))
-    return found
-
-
-def _dead(data: Trajectories, still: np.ndarray) -> list[Finding]:
-    """Reports torques that are always zero although the joint moves and no actuation matrix excludes a motor."""
-    needs = data.needs
-    driven = np.ones(data.degrees_of_freedom, bool)
-    if needs is not None and needs.actuation is not None:
-        driven = np.any(np.asarray(needs.actuation) != 0, axis=1)
-    dead = np.setdiff1d(np.flatnonzero(driven & ~data.tau.any(axis=0)), still)
-    if not len(dead):
-        return []
-    said = (
-        f"the torque of {named(dead)} is zero in all samples, although {'it moves' if len(dead) == 1 else 'they move'}"
+    findings = on_joints(
+        "warning", "unexcited", still, f"{{}} never {'moves' if still.sum() == 1 else 'move'}",
+        "move it in some trajectories, or leave it out of q: its inertia and friction cannot be learned",
+    )  # fmt: skip
+    findings += on_joints(
+        "warning", "unexcited", weak,
+        f"{{}} {'moves' if weak.sum() == 1 else 'move'} less than {WEAK:.0%} as fast as others",
+        "excite it more: the log hardly shows its dynamics",
+    )  # fmt: skip
+    if "tau" not in data.estimated:
+        # A joint without a motor has zero torque; a passive system has only such joints.
+        constant = (np.ptp(data.tau, axis=0) == 0) & (data.tau[0] != 0)
+        needs = data.needs
+        driven = np.ones(len(still), bool)
+        if needs is not None and needs.actuation is not None:
+            driven = np.any(np.asarray(needs.actuation) != 0, axis=1)
+        dead = driven & ~data.tau.any(axis=0) & ~still
+        findings += on_joints(
+            "warning", "dead-torque", dead,
+            f"the torque of {{}} is zero in all samples, although {'it moves' if dead.sum() == 1 else 'they move'}",
+            "log that torque; or state in needs, by actuation, that the joint has no motor",
+        )  # fmt: skip
+        findings += on_joints(
+            "warning", "constant-torque", constant, "the torque of {} is constant",
+            "check that the right channel was logged",
+        )  # fmt: skip
+        findings += _saturated(data, "tau", "torque", "avoid the limits of the motors, or leave those samples out")
+    findings += _spiky(data, "q", "position", "leave those samples out")
+    findings += _spiky(data, "tau", "torque", "leave those samples out, or let identify weigh them by --robust")
+    findings += _saturated(
+        data, "q", "position", "check whether it is at its stop or the log is clipped; leave those samples out"
     )
-    remedy = "log that torque; or state in needs, by actuation, that there is no motor"
-    return [Finding("warning", "dead-torque", said, remedy, tuple(map(int, dead)))]
+    findings += on_joints(
+        "note", "quantisation", steps > COARSE, f"q of {{}} comes in steps of up to {steps.max():.2g}",
+        "filter before rates are derived: --cutoff auto, or smooth()",
+    )  # fmt: skip
+    return findings
 
 
-def _spiky(data: Trajectories) -> list[Finding]:
+def _spiky(data: Trajectories, key: str, word: str, remedy: str) -> list[Finding]:
     """Reports single samples far from both neighbours, which agree with each other."""
-    found = []
-    for key, word in (("q", "position"), ("tau", "torque")):
-        if key in data.estimated:
-            continue
-        counts = spikes(getattr(data, key), data.trajectory).sum(axis=0)
-        joints = np.flatnonzero(counts)
-        if len(joints):
-            said = f"the {word} of {named(joints)} has {int(counts.sum())} spike(s)"
-            remedy = "leave those samples out" + (", or let identify weigh them by --robust" if key == "tau" else "")
-            found.append(Finding("warning", "spikes", said, remedy, tuple(map(int, joints))))
-    return found
+    if key in data.estimated:
+        return []
+    counts = spikes(getattr(data, key), data.trajectory).sum(axis=0)
+    return on_joints("warning", "spikes", counts > 0, f"the {word} of {{}} has {int(counts.sum())} spike(s)", remedy)
 
 
 def spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
@@ -97,27 +113,22 @@ def spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
     A sample is compared with the median of the two neighbours on either side. Upper quartiles of that error and of the
     neighbours' range over all samples give the usual change.
     """
-    found = np.zeros(values.shape, bool)
+    mask = np.zeros(values.shape, bool)
     inside = np.flatnonzero(trajectory[4:] == trajectory[:-4]) + 2
     if len(inside) < 50:
-        return found
-    near = values[inside - 1], values[inside + 1]
-    wide = values[inside - 2], values[inside + 2]
-    middle = np.median([*near, *wide], axis=0)
-    spread = np.max([*near, *wide], axis=0) - np.min([*near, *wide], axis=0)
-    error = np.abs(values[inside] - middle)
+        return mask
+    neighbours = [values[inside + k] for k in (-1, 1, -2, 2)]
+    spread = np.ptp(neighbours, axis=0)
+    error = np.abs(values[inside] - np.median(neighbours, axis=0))
     usual = np.quantile(error, 0.75, axis=0) + np.quantile(spread, 0.75, axis=0)
-    found[inside] = (error > SPIKE * usual) & (error > CLEAR * spread) & (error > 0)
-    return found
+    mask[inside] = (error > SPIKE * usual) & (error > CLEAR * spread) & (error > 0)
+    return mask
 
 
 def _saturated(data: Trajectories, key: str, word: str, remedy: str) -> list[Finding]:
-    shares = [flat_share(channel, data.trajectory) for channel in getattr(data, key).T]
-    joints = [joint for joint, share in enumerate(shares) if share > SHARE]
-    if not joints:
-        return []
-    said = f"the {word} of {named(joints)} is cut off flat in up to {max(shares):.1%} of the samples"
-    return [Finding("warning", f"saturation-{key}", said, remedy, tuple(joints))]
+    shares = np.array([flat_share(channel, data.trajectory) for channel in getattr(data, key).T])
+    observation = f"the {word} of {{}} is cut off flat in up to {shares.max():.1%} of the samples"
+    return on_joints("warning", f"saturation-{key}", shares > SHARE, observation, remedy)
 
 
 def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
@@ -138,9 +149,7 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
         at = np.abs(channel - extreme) <= 1e-9 * size
         edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0]))
         for first, last in edges.reshape(-1, 2):
-            if last - first < RUN:
-                continue
             beside = [place for place in (first - 1, last - 1) if 0 <= place < len(moves) and same[place]]
-            if any(moves[place] > ABRUPT * typical for place in beside):
+            if last - first >= RUN and any(moves[place] > ABRUPT * typical for place in beside):
                 count += last - first
     return count / len(channel)

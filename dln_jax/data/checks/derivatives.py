@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from dln_jax.data.checks.delays import away_from_ends, vertex
-from dln_jax.data.checks.findings import Finding, named
-from dln_jax.data.encoders.smoothing import Smoothed
+from dln_jax.data.checks.findings import Finding, on_joints
+from dln_jax.data.encoders.smoothing import PART, Smoothed
 from dln_jax.data.schema import Trajectories
 
 RADIAN = 180 / np.pi
@@ -20,59 +20,78 @@ LATE = 0.5
 """Smallest delay reported, in samples."""
 FARTHEST = 0.25
 """s: largest delay tested."""
+TINY = np.finfo(float).tiny
 RATE_REMEDY = "leave qd and qdd out of the file, and let --cutoff auto derive them from q"
 
 
 class Match(NamedTuple):
-    """Least-squares match of two signals, measured(t) = factor * derived(t - delay)."""
+    """Least-squares match of two signals in every channel, measured(t) = factor * derived(t - delay)."""
 
-    factor: float
-    delay: float
+    factor: Float[np.ndarray, " d"]
+    delay: Float[np.ndarray, " d"]
     """Delay of the measured signal in samples."""
-    correlation: float
-    gained: float
+    correlation: Float[np.ndarray, " d"]
+    gained: Float[np.ndarray, " d"]
     """Squared error at no delay over that at `delay`."""
 
 
-def match(measured: np.ndarray, derived: np.ndarray, part: np.ndarray, farthest: int) -> Match:
-    """Factor and delay that minimise the squared error between a measured and a derived signal."""
-    shifts = np.arange(-farthest, farthest + 1)
+def match(
+    measured: Float[np.ndarray, "N d"], derived: Float[np.ndarray, "N d"], part: Int[np.ndarray, " N"], farthest: int
+) -> Match:
+    """Factor and delay that minimise the squared error between measured and derived signals."""
+    shifts, columns = np.arange(-farthest, farthest + 1), np.arange(measured.shape[1])
     inside = away_from_ends(part, farthest)
-    if len(inside) < 16 or not derived[inside].any():
-        return Match(1.0, 0.0, 0.0, 1.0)
+    if len(inside) < 16:
+        return Match(np.ones(len(columns)), *np.zeros((2, len(columns))), np.ones(len(columns)))
     x = derived[inside]
-    products = np.array([[measured[inside + s] @ x, measured[inside + s] @ measured[inside + s]] for s in shifts])
-    errors = products[:, 1] - products[:, 0] ** 2 / (x @ x)
-    relative = errors / np.maximum(products[:, 1], np.finfo(float).tiny)
-    best = int(np.argmin(relative))
-    place = float(shifts[best]) + vertex(relative, best)
-    correlation = np.sqrt(max(0.0, 1 - relative[best])) * np.sign(products[best, 0])
-    now = relative[farthest]
-    least = max(float(relative[best]), float(np.finfo(float).eps))
-    return Match(float(products[best, 0] / (x @ x)), place, float(correlation), float(now / least))
+    along = np.array([np.sum(measured[inside + shift] * x, axis=0) for shift in shifts])
+    sizes = np.array([np.sum(measured[inside + shift] ** 2, axis=0) for shift in shifts])
+    size = np.maximum(np.sum(x**2, axis=0), TINY)
+    relative = (sizes - along**2 / size) / np.maximum(sizes, TINY)
+    best = np.argmin(relative, axis=0)
+    lowest, along = relative[best, columns], along[best, columns]
+    offset = np.array([vertex(errors, place) for errors, place in zip(relative.T, best, strict=True)])
+    return Match(
+        factor=along / size,
+        delay=shifts[best] + offset,
+        correlation=np.sqrt(np.maximum(0.0, 1 - lowest)) * np.sign(along),
+        gained=relative[farthest] / np.maximum(lowest, np.finfo(float).eps),
+    )
+
+
+def vertex(values: np.ndarray, lowest: int | np.integer) -> float:
+    """Offset of the minimum of the parabola through the lowest value and its neighbours, in steps."""
+    if not 0 < lowest < len(values) - 1:
+        return 0.0
+    before, here, after = values[lowest - 1 : lowest + 2]
+    curvature = before - 2 * here + after
+    return float(0.5 * (before - after) / curvature) if curvature > 0 else 0.0
+
+
+def away_from_ends(part: Int[np.ndarray, " N"], farthest: int) -> Int[np.ndarray, " n"]:
+    """Indices of samples with `farthest` neighbours of the same part on either side."""
+    places = np.arange(farthest, len(part) - farthest)
+    return places[(part[places - farthest] == part[places]) & (part[places + farthest] == part[places])]
 
 
 def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
     """Checks that qd is the rate of q, and qdd that of qd, if the file has them; `even` is smooth(data, trim=0)."""
-    found = []
-    for key, derived, of in (("qd", even.data.qd, "dq/dt"), ("qdd", even.data.qdd, "d²q/dt²")):
+    findings = []
+    moves = data.q.std(axis=0) > 0
+    derived = {"qd": (even.data.qd, "dq/dt"), "qdd": (even.data.qdd, "d²q/dt²")}
+    for key, other in (("qd", "qdd"), ("qdd", "qd")):
         if key in data.estimated:
             continue
+        own, formula = derived[key]
         measured = at_times_of(data, even, getattr(data, key))
-        farthest = max(2, min(round(FARTHEST * even.rate), 40, len(measured) // 8))
-        matches = [
-            match(measured[:, joint], derived[:, joint], even.data.trajectory, farthest)
-            for joint in range(data.degrees_of_freedom)
-        ]
-        moves = data.q.std(axis=0) > 0
-        other = "qdd" if key == "qd" else "qd"
-        exchanged = _closer(measured, derived, getattr(even.data, other), even.data.trajectory) & moves
-        if exchanged[moves].all() and moves.any():
-            said = f"{key} is {'d²q/dt²' if key == 'qd' else 'dq/dt'}, not {of}"
-            found.append(Finding("error", f"{key}-exchanged", said, "exchange qd and qdd, or " + RATE_REMEDY))
+        if moves.any() and _closer(measured, own, derived[other][0], even.data.trajectory)[moves].all():
+            observation = f"{key} is {derived[other][1]}, not {formula}"
+            findings.append(Finding("error", f"{key}-exchanged", observation, f"exchange qd and qdd, or {RATE_REMEDY}"))
             continue
-        found += _judged(key, of, matches, even.rate, moves)
-    return found
+        farthest = max(2, min(round(FARTHEST * even.rate), 40, len(measured) // 8))
+        matched = match(measured, own, even.data.trajectory, farthest)
+        findings += _judged(key, formula, matched, even.rate, moves)
+    return findings
 
 
 def _closer(measured: np.ndarray, own: np.ndarray, other: np.ndarray, part: np.ndarray) -> np.ndarray:
@@ -81,8 +100,7 @@ def _closer(measured: np.ndarray, own: np.ndarray, other: np.ndarray, part: np.n
 
     def left(reference: np.ndarray) -> np.ndarray:
         x, y = reference[inside], measured[inside]
-        tiny = np.finfo(float).tiny
-        return 1 - np.sum(x * y, axis=0) ** 2 / np.maximum(np.sum(x**2, axis=0) * np.sum(y**2, axis=0), tiny)
+        return 1 - np.sum(x * y, axis=0) ** 2 / np.maximum(np.sum(x**2, axis=0) * np.sum(y**2, axis=0), TINY)
 
     return (left(other) < 1 - ALIKE**2) & (left(other) < EXCHANGED * left(own))
 
@@ -90,46 +108,37 @@ def _closer(measured: np.ndarray, own: np.ndarray, other: np.ndarray, part: np.n
 def at_times_of(data: Trajectories, even: Smoothed, values: np.ndarray) -> np.ndarray:
     """Columns of a log at the times of its smoothed samples, by linear interpolation."""
     rows = np.empty((len(even.data.t), values.shape[1]))
-    names = [str(label).rpartition("/")[0] or str(label) for label in even.data.label]
-    known = [str(label) for label in data.label]
+    sources = {str(label): index for index, label in enumerate(data.label)}
     for index, label in enumerate(map(str, even.data.label)):
-        source = known.index(label) if label in known else known.index(names[index])
+        source = sources.get(label, sources.get(label.rpartition(PART)[0]))
         here, there = even.data.trajectory == index, data.trajectory == source
         for column in range(values.shape[1]):
             rows[here, column] = np.interp(even.data.t[here], data.t[there], values[there, column])
     return rows
 
 
-def _judged(key: str, of: str, matches: list[Match], rate: float, moves: np.ndarray) -> list[Finding]:
-    found, factors = [], np.array([each.factor for each in matches])
-    alike = np.array([abs(each.correlation) > ALIKE for each in matches]) & moves
-    unlike = np.array([abs(each.correlation) < UNLIKE for each in matches]) & moves
-
-    def where(chosen: np.ndarray) -> tuple[str, tuple[int, ...]]:
-        joints = np.flatnonzero(chosen)
-        return named(joints), tuple(map(int, joints))
-
-    def add(severity, check: str, chosen: np.ndarray, said: str, remedy: str) -> None:
-        if chosen.any():
-            names, joints = where(chosen)
-            found.append(Finding(severity, check, f"{key} of {names} {said}", remedy, joints))
-
-    degrees = alike & (np.abs(np.abs(factors) / RADIAN - 1) < 0.05)
-    radians = alike & (np.abs(np.abs(factors) * RADIAN - 1) < 0.05)
-    milli = alike & (np.abs(np.abs(factors) / 1000 - 1) < 0.05)
-    add("error", f"{key}-unit", degrees, f"is 57.3 times {of}", f"convert {key} from degrees to radians")
-    add("error", f"{key}-unit", radians, f"is {of} / 57.3", "convert q from degrees to radians")
-    add("error", f"{key}-unit", milli, f"is 1000 times {of}", "give t in seconds")
-    opposite = alike & (factors < 0)
-    add("error", f"{key}-sign", opposite, f"has the opposite sign of {of}", f"turn {key} or q round")
-    other = alike & ~(degrees | radians | milli | opposite) & (np.abs(np.log(np.abs(factors) + 1e-300)) > np.log(1.15))
-    if other.any():
-        ratios = ", ".join(f"{factor:.3g}" for factor in factors[other])
-        add("error", f"{key}-unit", other, f"is {ratios} times {of}", "see units and gear ratios, or " + RATE_REMEDY)
-    add("error", f"{key}-unlike", unlike, f"does not follow {of}", "see the order of the columns, or " + RATE_REMEDY)
-    late = alike & np.array([abs(each.delay) > LATE and each.gained > 1.5 for each in matches])
-    if late.any():
-        worst = max((each.delay for each, is_late in zip(matches, late, strict=True) if is_late), key=abs)
-        word = "late" if worst > 0 else "early"
-        add("warning", f"{key}-delay", late, f"is up to {abs(worst) / rate * 1e3:.3g} ms {word} after q", RATE_REMEDY)
-    return found
+def _judged(key: str, formula: str, matched: Match, rate: float, moves: np.ndarray) -> list[Finding]:
+    alike = (np.abs(matched.correlation) > ALIKE) & moves
+    sizes = np.abs(matched.factor)
+    degrees, radians, milli = (alike & (np.abs(sizes / unit - 1) < 0.05) for unit in (RADIAN, 1 / RADIAN, 1000.0))
+    opposite = alike & (matched.factor < 0)
+    other = alike & ~(degrees | radians | milli | opposite) & (np.abs(np.log(sizes + 1e-300)) > np.log(1.15))
+    late = alike & (np.abs(matched.delay) > LATE) & (matched.gained > 1.5)
+    worst = max(matched.delay[late], key=abs, default=0.0)
+    delayed = f"up to {abs(worst) / rate * 1e3:.3g} ms {'late' if worst > 0 else 'early'}"
+    ratios = ", ".join(f"{factor:.3g}" for factor in matched.factor[other])
+    cases = (
+        ("error", "unit", degrees, f"is 57.3 times {formula}", f"convert {key} from degrees to radians"),
+        ("error", "unit", radians, f"is {formula} / 57.3", "convert q from degrees to radians"),
+        ("error", "unit", milli, f"is 1000 times {formula}", "give t in seconds"),
+        ("error", "sign", opposite, f"has the opposite sign of {formula}", f"change the sign of {key} or q"),
+        ("error", "unit", other, f"is {ratios} times {formula}", f"check units and gear ratios, or {RATE_REMEDY}"),
+        ("error", "unlike", (np.abs(matched.correlation) < UNLIKE) & moves, f"does not follow {formula}",
+         f"check the order of the columns, or {RATE_REMEDY}"),
+        ("warning", "delay", late, f"is {delayed} relative to q", RATE_REMEDY),
+    )  # fmt: skip
+    return [
+        finding
+        for severity, kind, joints, observation, remedy in cases
+        for finding in on_joints(severity, f"{key}-{kind}", joints, f"{key} of {{}} {observation}", remedy)
+    ]

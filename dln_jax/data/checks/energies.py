@@ -12,11 +12,13 @@ own, so few samples suffice for chains, and the general energies remain for all 
 friction: viscous, dry on two scales, and an offset.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+from dln_jax.data.checks.evidence import Prior
 
 STRONGEST = 0.5
 """Dependence of the energies on the angle of the joint with the largest inertia; 1 is a pure cosine."""
@@ -30,6 +32,11 @@ LENGTH = 2.0
 """Length scale of the energies for a prismatic joint, in multiples of its range."""
 SCALES = (0.02, 0.3)
 """Velocity scales of dry friction, relative to the typical velocity of the joint."""
+
+
+States = tuple[np.ndarray, np.ndarray, np.ndarray]
+Build = Callable[[States, np.ndarray, np.ndarray | None], Prior]
+"""(q, qd, qdd [n, d]), torques [n, d], gravity [3] (`None` for the stated one) -> prior of those torques."""
 
 
 class Parts(NamedTuple):
@@ -49,6 +56,23 @@ class _Kernel(NamedTuple):
     """e_i = k_i'' / k_i - h_i²."""
 
 
+def any_energy(joints: tuple[str, ...]) -> Build:
+    """Prior without a robot: torques of an arbitrary kinetic and potential energy, and friction."""
+
+    def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
+        del gravity  # any
+        parts = [part for pair in covariances(states, states, joints, sizes_of(states[2], tau)) for part in pair]
+        return Prior(np.zeros(tau.size), parts, friction(states[1]))
+
+    return build
+
+
+def sizes_of(qdd: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """Magnitudes of the joints' inertias [d] as the ratio of torques to accelerations."""
+    ratios = tau.std(axis=0) / np.maximum(qdd.std(axis=0), 1e-12)
+    return np.maximum(ratios, 1e-3 * max(float(ratios.max()), 1e-300))
+
+
 def covariances(
     states: Sequence[np.ndarray], others: Sequence[np.ndarray], joints: Sequence[str], sizes: np.ndarray
 ) -> list[Parts]:
@@ -64,13 +88,13 @@ def covariances(
     ranges = np.maximum(np.ptp(states[0], axis=0), 1e-9)
     strength = np.clip(STRONGEST * relative, WEAKEST, STRONGEST)
     place = np.arange(len(sizes))
-    found = [_covariance(states, others, joints, ranges, (strength, strength), sizes)]
+    pairs = [_covariance(states, others, joints, ranges, (strength, strength), sizes)]
     for body in np.unique(np.linspace(0, place[-1], min(len(place), MOST_BODIES)).round()):
         below = place <= body
         turned = np.where(below, OF_BODY, 0.0)
         moved = np.where(place > 0, turned, 0.0)
-        found.append(_covariance(states, others, joints, ranges, (moved, turned), below * sizes.mean()))
-    return found
+        pairs.append(_covariance(states, others, joints, ranges, (moved, turned), below * sizes.mean()))
+    return pairs
 
 
 def _covariance(
@@ -110,10 +134,10 @@ def _kernel(
 
 def _hessian(kernel: _Kernel) -> np.ndarray:
     """h_i h_j + [i = j] e_i [n, m, d, d]: minus the mixed second derivatives, divided by the value."""
-    found = kernel.slope[..., :, None] * kernel.slope[..., None, :]
+    hessian = kernel.slope[..., :, None] * kernel.slope[..., None, :]
     diagonal = np.arange(kernel.slope.shape[2])
-    found[..., diagonal, diagonal] += kernel.bend
-    return found
+    hessian[..., diagonal, diagonal] += kernel.bend
+    return hessian
 
 
 def _kinetic(kernel: _Kernel, rates: Sequence[np.ndarray], others: Sequence[np.ndarray], W: np.ndarray) -> np.ndarray:
@@ -122,7 +146,7 @@ def _kinetic(kernel: _Kernel, rates: Sequence[np.ndarray], others: Sequence[np.n
     h, e = kernel.slope, kernel.bend
     s, sa, sb, sab = ((left * W) @ right.T for left, right in ((u, v), (a, v), (u, b), (a, b)))
     uh, vh = np.einsum("ni,nmi->nm", u, h), np.einsum("mi,nmi->nm", v, h)
-    U, V, A, B = (W * each for each in (u, v, a, b))
+    U, V, A, B = (W * rate for rate in (u, v, a, b))
     eye = np.diag(W)
 
     # All divided by the kernel's value: D k = uh, D' k = -vh, k_i = h_i, k_j' = -h_j, with D = u . d/dq.
@@ -142,17 +166,19 @@ def _kinetic(kernel: _Kernel, rates: Sequence[np.ndarray], others: Sequence[np.n
     momentum_b = 2 * (outer(U, B) + scaled(sb, eye))  # B of it
     force = 2 * (outer(A, V) + scaled(sa, eye))
     force_b = 2 * (outer(A, B) + scaled(sab, eye))
-    found = scaled(both, momentum) + scaled(uh, momentum_b)
-    found -= (2 * s[..., None] * V[None])[..., :, None] * d_other[..., None, :]
-    found += scaled(-vh, force) + force_b
-    found -= (2 * sa[..., None] * V[None])[..., :, None] * (-h)[..., None, :]
-    found -= other_d[..., :, None] * (2 * s[..., None] * U[:, None])[..., None, :]
-    found -= h[..., :, None] * (2 * sb[..., None] * U[:, None])[..., None, :]
-    found += mixed * (s**2)[..., None, None]
-    return kernel.value[..., None, None] * found
+    total = scaled(both, momentum) + scaled(uh, momentum_b)
+    total -= (2 * s[..., None] * V[None])[..., :, None] * d_other[..., None, :]
+    total += scaled(-vh, force) + force_b
+    total -= (2 * sa[..., None] * V[None])[..., :, None] * (-h)[..., None, :]
+    total -= other_d[..., :, None] * (2 * s[..., None] * U[:, None])[..., None, :]
+    total -= h[..., :, None] * (2 * sb[..., None] * U[:, None])[..., None, :]
+    total += mixed * (s**2)[..., None, None]
+    return kernel.value[..., None, None] * total
 
 
-def friction_columns(qd: Float[np.ndarray, "n d"], typical: Float[np.ndarray, " d"]) -> Float[np.ndarray, "n d 4"]:
-    """Friction columns of every joint, dimensionless: viscous, dry on two scales, and an offset."""
-    ratio = qd / typical
-    return np.stack([ratio, *(np.tanh(ratio / scale) for scale in SCALES), np.ones_like(qd)], axis=2)
+def friction(qd: Float[np.ndarray, "n d"]) -> list[np.ndarray]:
+    """Friction columns [n d, 4] of every joint, dimensionless: viscous, dry on two scales, and an offset."""
+    n, d = qd.shape
+    ratio = qd / np.maximum(qd.std(axis=0), 1e-12)
+    own = np.stack([ratio, *(np.tanh(ratio / scale) for scale in SCALES), np.ones_like(qd)], axis=2)
+    return [(own * (np.arange(d) == joint)[:, None]).reshape(n * d, -1) for joint in range(d)]

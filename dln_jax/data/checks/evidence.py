@@ -5,9 +5,8 @@ maximise the likelihood (minorisation-maximisation: Zhou et al., arXiv 1509.0742
 probability of every block of time conditional on all others, so a fault counts only if it shows in most of the log.
 """
 
-import importlib
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -55,7 +54,6 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
     pull = inverse @ y
     densities, unexplained = [], []
     for block in blocks_of(n, d):
-        block = block.ravel()
         own = inverse[np.ix_(block, block)]
         error = np.linalg.solve(own, pull[block])
         densities.append(0.5 * np.linalg.slogdet(own)[1] - 0.5 * error @ own @ error)
@@ -81,7 +79,7 @@ def _likeliest(prior: Prior, y: np.ndarray, noise: np.ndarray, d: int, iteration
         for columns in prior.columns:
             slopes.append((np.sum((columns.T @ pull) ** 2), np.vdot(columns, inverse @ columns)))
         own = (pull**2 * noise).reshape(-1, d), (np.diag(inverse) * noise).reshape(-1, d)
-        slopes += zip(*(each.sum(axis=0) for each in own), strict=True)
+        slopes += zip(*(values.sum(axis=0) for values in own), strict=True)
         weights = weights * np.array([np.sqrt(fit / max(size, 1e-300)) for fit, size in slopes])
         weights[-d:] = np.maximum(weights[-d:], 1e-7)
     return weights
@@ -100,19 +98,18 @@ def _covariance(prior: Prior, weights: np.ndarray, noise: np.ndarray, d: int) ->
 
 def blocks_of(n: int, d: int) -> list[np.ndarray]:
     """Indices of the equations of every block of samples."""
-    return np.array_split(np.arange(n * d).reshape(n, d), min(BLOCKS, n))
+    return [block.ravel() for block in np.array_split(np.arange(n * d).reshape(n, d), min(BLOCKS, n))]
 
 
-def screened(found: Explanation, prior: Prior, trials: Sequence[Float[np.ndarray, "n d"]]) -> Float[np.ndarray, "B H"]:
+def screened(now: Explanation, prior: Prior, trials: Sequence[Float[np.ndarray, "n d"]]) -> Float[np.ndarray, "B H"]:
     """Log density of every block for other torques at the same weights, relative to the first of them."""
-    n, d = trials[0].shape
     Y = np.stack([trial.ravel() for trial in trials], axis=1) - prior.mean[:, None]
-    pull = found.inverse @ Y
-    losses = []
-    for block in blocks_of(n, d):
-        own = pull[block.ravel()]
-        losses.append(-0.5 * np.sum(own * np.linalg.solve(found.inverse[np.ix_(block.ravel(), block.ravel())], own), 0))
-    return np.array(losses) - np.array(losses)[:, :1]
+    pull = now.inverse @ Y
+    densities = []
+    for block in blocks_of(*trials[0].shape):
+        own = pull[block]
+        densities.append(-0.5 * np.sum(own * np.linalg.solve(now.inverse[np.ix_(block, block)], own), axis=0))
+    return np.array(densities) - np.array(densities)[:, :1]
 
 
 def _start(prior: Prior, size: float, noise: np.ndarray) -> np.ndarray:
@@ -122,9 +119,10 @@ def _start(prior: Prior, size: float, noise: np.ndarray) -> np.ndarray:
 
 
 def _inverse(K: np.ndarray) -> np.ndarray:
-    lapack: Any = importlib.import_module("scipy.linalg.lapack")
-    factor, _ = lapack.dpotrf(K, lower=True)
-    inverse, failed = lapack.dpotri(factor, lower=True)
+    from scipy.linalg.lapack import dpotrf, dpotri  # pyright: ignore[reportAttributeAccessIssue]
+
+    factor, _ = dpotrf(K, lower=True)
+    inverse, failed = dpotri(factor, lower=True)
     if failed:
         raise np.linalg.LinAlgError("the covariance of the torques is not positive definite")
     lower = np.tril(inverse)

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -18,8 +18,8 @@ class Finding(NamedTuple):
     severity: Severity
     check: str
     """Stable lower-case name of the check."""
-    said: str
-    """Observation, with numbers."""
+    observation: str
+    """What was observed, with numbers."""
     remedy: str
     """Recommended action."""
     joints: tuple[int, ...] = ()
@@ -28,12 +28,20 @@ class Finding(NamedTuple):
     @property
     def line(self) -> str:
         """The finding as one line of text."""
-        return f"{self.severity}: {self.said}; {self.remedy}"
+        return f"{self.severity}: {self.observation}; {self.remedy}"
+
+
+def on_joints(
+    severity: Severity, check: str, concerned: Bool[np.ndarray, " d"], observation: str, remedy: str
+) -> list[Finding]:
+    """A finding about the joints in a mask, whose names replace {} in the observation; empty without such joints."""
+    joints = tuple(map(int, np.flatnonzero(concerned)))
+    return [Finding(severity, check, observation.replace("{}", named(joints), 1), remedy, joints)] if joints else []
 
 
 def by_severity(findings: Iterable[Finding]) -> list[Finding]:
     """Sorts findings by severity."""
-    return sorted(findings, key=lambda each: SEVERITIES.index(each.severity))
+    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
 def named(joints: Sequence[int] | Int[np.ndarray, " j"]) -> str:

@@ -8,13 +8,13 @@ import jax
 import numpy as np
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data.checks.findings import Finding, named
+from dln_jax.data.checks.findings import Finding, on_joints
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.trees import Tree, regressor
 from dln_jax.types import JointKind
 
-OUTSIDE = 0.05
+TOLERANCE = 0.05
 """rad or m: tolerance beyond a limit."""
 EXPLAINED = 0.02
 """Unexplained fraction of the torques' variance below which their order counts as correct."""
@@ -37,7 +37,7 @@ def regressor_of(tree: Tree) -> Callable[..., np.ndarray]:
     def phi(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, gravity: np.ndarray) -> np.ndarray:
         # Padding limits the number of shapes, and thus of compiled programs.
         missing = -len(q) % PADDED
-        states = [np.concatenate([each, np.repeat(each[-1:], missing, axis=0)]) for each in (q, qd, qdd)]
+        states = [np.pad(values, ((0, missing), (0, 0)), mode="edge") for values in (q, qd, qdd)]
         with jax.enable_x64(True):
             return np.asarray(program(*frames, np.asarray(gravity, float), *states))[: len(q)]
 
@@ -62,23 +62,21 @@ def named_order(robot: Robot, names: tuple[str, ...]) -> list[Finding]:
     stated = robot.tree.names
     if not names or not stated or names == stated:
         return []
+    observation = f"the data's joints are {', '.join(names):.200}, the robot's {', '.join(stated):.200}"
     if set(names) == set(stated):
-        said = f"the data's joints are {', '.join(names)}, the robot's {', '.join(stated)}"
-        return [Finding("error", "order", said, "order the columns as the robot does")]
-    said = f"the data name joints {', '.join(names)[:80]}, the robot {', '.join(stated)[:80]}"
-    return [Finding("note", "order", said, "see that the columns are in the robot's order")]
+        return [Finding("error", "order", observation, "order the columns as the robot does")]
+    return [Finding("note", "order", observation, "check that the columns are in the robot's order")]
 
 
 def limits(data: Trajectories, robot: Robot) -> list[Finding]:
     """Checks that positions are within the robot's limits."""
-    low, high = robot.position_limits.T
-    outside = np.mean((data.q < low - OUTSIDE) | (data.q > high + OUTSIDE), axis=0)
-    joints = np.flatnonzero(outside > 1e-3)
-    if not len(joints):
-        return []
-    said = f"q of {named(joints)} is outside the robot's limits in up to {outside.max():.0%} of the samples"
-    remedy = "see units, zeros and signs of q, and the order of the joints"
-    return [Finding("warning", "limits", said, remedy, tuple(map(int, joints)))]
+    lower, upper = robot.position_limits.T
+    beyond = np.mean((data.q < lower - TOLERANCE) | (data.q > upper + TOLERANCE), axis=0)
+    return on_joints(
+        "warning", "limits", beyond > 1e-3,
+        f"q of {{}} is outside the robot's limits in up to {beyond.max():.0%} of the samples",
+        "check units, zeros and signs of q, and the order of the joints",
+    )  # fmt: skip
 
 
 def better_order(
@@ -86,11 +84,11 @@ def better_order(
     theta: np.ndarray,
     gravity: np.ndarray,
     samples: tuple[np.ndarray, ...],
-    friction: list[np.ndarray],
+    friction: np.ndarray,
 ) -> list[Finding]:
     """Searches for a joint order that explains the torques much better: two joints exchanged, all reversed or rotated.
 
-    `samples` are q, qd, qdd and tau [n, d], `friction` the friction columns [n, 3] of every joint.
+    `samples` are q, qd, qdd and tau [n, d], `friction` the friction columns [d, n, 3].
     """
     q, qd, qdd, tau = samples
     d = q.shape[1]
@@ -116,5 +114,6 @@ def better_order(
     best = int(np.argmin(shares))
     if shares[best] > BETTER * now:
         return []
-    said = f"torques fit far better with the columns in the order {', '.join(str(j + 1) for j in trials[best])}"
-    return [Finding("error", "order", said, "order the columns as the robot does")]
+    order = ", ".join(str(joint + 1) for joint in trials[best])
+    observation = f"torques fit far better with the columns in the order {order}"
+    return [Finding("error", "order", observation, "order the columns as the robot does")]

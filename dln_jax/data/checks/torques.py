@@ -3,9 +3,9 @@
 import numpy as np
 
 from dln_jax.data.checks.channels import TURNS
-from dln_jax.data.checks.findings import Finding, named
+from dln_jax.data.checks.energies import any_energy
+from dln_jax.data.checks.findings import Finding, on_joints
 from dln_jax.data.checks.hypotheses import Torques, examine_torques
-from dln_jax.data.checks.repaired import any_energy
 from dln_jax.data.schema import Trajectories
 
 TRUSTED = 0.8
@@ -18,41 +18,34 @@ FEWER = 300
 """Number of equations used to compare degrees with radians."""
 
 
-def check_torques(data: Trajectories, found: Torques, *, friction_stated: bool, by: str = "") -> list[Finding]:
-    """Turns the examination of torques into findings; `by` is non-empty if a robot's file was used."""
-    log, findings = found.log, []
-    before, after = (each.unexplained.mean() for each in (found.explanation, found.repaired))
-    gain = f"unexplained in blocks left out: {before:.2%} now, {after:.2%} then"
-    wrong = np.flatnonzero(log.signs < 0)
-    if len(wrong):
-        check = "tree-sign" if by else "torque-sign"
-        said = f"the torque of {named(wrong)} has the wrong sign ({gain})"
-        findings.append(Finding("error", check, said, "turn that tau or that q round", tuple(map(int, wrong))))
-    if log.order != tuple(range(len(log.order))):
-        moved = tuple(joint for joint, source in enumerate(log.order) if joint != source)
-        order = ", ".join(str(source + 1) for source in log.order)
-        said = f"the torques of {named(moved)} are exchanged: columns {order} of tau fit q ({gain})"
-        findings.append(Finding("error", "order", said, "order the columns of tau as those of q", moved))
+def check_torques(data: Trajectories, torques: Torques, *, friction_stated: bool, with_robot: bool) -> list[Finding]:
+    """Turns the examination of torques into findings."""
+    log = torques.log
+    findings = on_joints(
+        "error", "tree-sign" if with_robot else "torque-sign", log.signs < 0,
+        f"the torque of {{}} has the wrong sign ({torques.gain})", "change the sign of that tau or that q",
+    )  # fmt: skip
+    columns = ", ".join(str(source + 1) for source in log.order)
+    findings += on_joints(
+        "error", "order", np.array(log.order) != np.arange(len(log.order)),
+        f"the torques of {{}} are exchanged: columns {columns} of tau fit q ({torques.gain})",
+        "order the columns of tau as those of q",
+    )  # fmt: skip
     if log.delay:
         step = 1e3 * float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0]))
-        word = "late" if log.delay > 0 else "early"
-        said = f"torques are {abs(log.delay) * step:.3g} ms {word} against positions ({gain})"
-        findings.append(Finding("warning", "delay", said, "shift one of them in time, or repair the clock of the log"))
+        late = f"{abs(log.delay) * step:.3g} ms {'late' if log.delay > 0 else 'early'}"
+        observation = f"torques are {late} relative to positions ({torques.gain})"
+        remedy = "shift one of them in time, or correct the clock of the log"
+        findings.append(Finding("warning", "delay", observation, remedy))
     elif not friction_stated and not findings:
-        findings += _friction(found)
+        size = log.torques().std(axis=0)
+        sure = (torques.explained > TRUSTED) & (torques.coulomb > np.maximum(DRY * size, SURE * torques.coulomb_error))
+        sizes = ", ".join(f"{dry:.2g}" for dry in torques.coulomb[sure])
+        findings += on_joints(
+            "note", "friction", sure, f"friction is seen at {{}} (dry: about {sizes})",
+            'state it: --needs \'{"joints": [...], "joint_friction": ["viscous", "coulomb"]}\'',
+        )  # fmt: skip
     return findings
-
-
-def _friction(found: Torques) -> list[Finding]:
-    size = found.log.torques().std(axis=0)
-    sure = (found.explained > TRUSTED) & (found.coulomb > DRY * size) & (found.coulomb > SURE * found.coulomb_error)
-    rubbing = np.flatnonzero(sure)
-    if not len(rubbing):
-        return []
-    sizes = ", ".join(f"{found.coulomb[joint]:.2g}" for joint in rubbing)
-    said = f"friction is seen at {named(rubbing)} (dry: about {sizes})"
-    remedy = 'state it: --needs \'{"joints": [...], "joint_friction": ["viscous", "coulomb"]}\''
-    return [Finding("note", "friction", said, remedy, tuple(map(int, rubbing)))]
 
 
 def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) -> list[Finding]:
@@ -61,20 +54,22 @@ def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) 
     large = np.array([kind == "revolute" for kind in joints]) & (largest > TURNS)
     if not large.any():
         return []
-    where = np.flatnonzero(large)
     factor = np.where(large, np.pi / 180, 1.0)
     converted = data._replace(q=data.q * factor, qd=data.qd * factor, qdd=data.qdd * factor)
-    now, then = (_unexplained(each, joints) if driven else None for each in (data, converted))
+    now, then = (_unexplained(log, joints) if driven else None for log in (data, converted))
     better = now is not None and then is not None and then < 0.7 * now
-    if not better and largest.max() < 10 * TURNS:
-        said = f"q of {named(where)} goes to {largest.max():.3g} rad, which is {largest.max() / 2 / np.pi:.1f} turns"
-        remedy = "nothing if it turns on and on; else convert from degrees, or from the motor's angle by the gear ratio"
-        return [Finding("note", "q-unit", said, remedy, tuple(map(int, where)))]
-    said = f"q of {named(where)} goes to {largest.max():.3g}, far beyond two turns"
-    remedy = "convert to radians if these are degrees, or divide by the gear ratio if they are the motor's"
-    return [Finding("error", "q-unit", said, remedy, tuple(map(int, where)))]
+    if better or largest.max() >= 10 * TURNS:
+        return on_joints(
+            "error", "q-unit", large, f"q of {{}} goes to {largest.max():.3g}, far beyond two turns",
+            "convert to radians if these are degrees, or divide by the gear ratio if they are the motor's",
+        )  # fmt: skip
+    return on_joints(
+        "note", "q-unit", large,
+        f"q of {{}} goes to {largest.max():.3g} rad, which is {largest.max() / 2 / np.pi:.1f} turns",
+        "ignore this if the joint turns without limit; else convert from degrees, or divide by the gear ratio",
+    )  # fmt: skip
 
 
 def _unexplained(data: Trajectories, joints: tuple[str, ...]) -> float | None:
-    found = examine_torques(data, any_energy(joints), farthest=0, equations=FEWER, ambiguous=False, faults=False)
-    return None if found is None else float(found.explanation.unexplained.mean())
+    torques = examine_torques(data, any_energy(joints), farthest=0, equations=FEWER, ambiguous=False, faults=False)
+    return None if torques is None else float(torques.explanation.unexplained.mean())

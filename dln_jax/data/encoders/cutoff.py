@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.encoders.filters import ORDER, gain
-from dln_jax.data.encoders.noise import NORMAL
+from dln_jax.data.encoders.filters import gain
+from dln_jax.data.encoders.sampling import NORMAL, by_trajectory
 from dln_jax.types import InputError, require_positive
 
 SEGMENT = 8.0
@@ -68,12 +68,7 @@ class Choice(NamedTuple):
 
 
 def choose_cutoff(
-    q: Float[np.ndarray, "N d"],
-    trajectory: Int[np.ndarray, " N"],
-    *,
-    rate: float,
-    noise: Float[np.ndarray, " d"],
-    order: int = ORDER,
+    q: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"], *, rate: float, noise: Float[np.ndarray, " d"]
 ) -> Choice:
     """Finds the cut-off with the lowest expected error.
 
@@ -82,25 +77,26 @@ def choose_cutoff(
         trajectory: trajectory of every sample.
         rate: Hz.
         noise: standard deviation of the noise of every coordinate.
-        order: order of the filter.
 
     Raises:
         InputError: no segment has sixteen samples, or nothing moves by more than its noise.
     """
-    require_positive(rate=rate, order=order)
+    require_positive(rate=rate)
     f, spectrum = spectra(without_jumps(q, trajectory, noise), trajectory, rate=rate)
     white = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
     floor = np.maximum(white, _rising(f, spectrum))
-    signal = _motion(f, spectrum, floor)
+    # The motion's spectrum S ends at the frequency where the smoothed spectrum first falls to the floor.
+    hidden = np.cumsum(_smoothed(spectrum) < SEEN * floor, axis=0) > 0
+    signal = np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
     tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
     weight = (2 * np.pi * f) ** 4
     sizes = weight @ signal
     moves = (sizes > 0) & (q.std(axis=0) > MOVES * noise)
     if not moves.any():
-        raise InputError("no joint moves by more than its noise; a cut-off takes motions: give one, or look at q")
+        raise InputError("no joint moves by more than its noise, so no cut-off can be chosen; give one, or check q")
     error = np.empty(CANDIDATES)
     for place, cutoff in enumerate(tried):
-        H = gain(f, float(cutoff), order)[:, None]
+        H = gain(f, float(cutoff))[:, None]
         left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
         error[place] = np.mean(left[moves] / sizes[moves])
     best = int(np.argmin(error))
@@ -153,13 +149,13 @@ def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> F
     jitter of a fraction of a step, for example, is noise proportional to the velocity.
     """
     accelerations = f[:, None] ** 4 * _smoothed(spectrum)
-    found = np.zeros_like(spectrum)
+    rising = np.zeros_like(spectrum)
     for channel, power in enumerate(accelerations.T):
         peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
         lowest = peak + int(np.argmin(power[peak:]))
         if power[f > f[-1] / 2].min() > RISES * power[lowest]:
-            found[lowest:, channel] = spectrum[lowest:, channel]
-    return found
+            rising[lowest:, channel] = spectrum[lowest:, channel]
+    return rising
 
 
 def spectra(
@@ -172,9 +168,9 @@ def spectra(
     """
     from scipy.signal import welch
 
-    parts = [part for part in np.split(values, np.flatnonzero(np.diff(trajectory)) + 1) if len(part) >= 16]
+    parts = [part for part in by_trajectory(values, trajectory) if len(part) >= 16]
     if not parts:
-        raise InputError("no segment has 16 samples; a spectrum takes longer motions: record some, or give a cut-off")
+        raise InputError("no segment has the 16 samples of a spectrum; record longer motions, or give a cut-off")
     length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
     total, weight = 0.0, 0
     f = np.zeros(0)
@@ -188,21 +184,11 @@ def spectra(
     return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4
 
 
-def _motion(
-    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, "F d"]
-) -> Float[np.ndarray, "F d"]:
-    """S of every joint: the spectrum above the floor, up to the frequency where it first falls to the floor."""
-    smooth = _smoothed(spectrum)
-    hidden = np.cumsum(smooth < SEEN * floor, axis=0) > 0
-    return np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
-
-
 def _smoothed(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
     """Geometric mean over a sixth of an octave on either side, so that a gap between lines does not end a motion."""
     logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
     summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(logarithm, axis=0)])
     place = np.arange(1, len(spectrum) + 1)
-    low = np.floor(place * 2 ** (-1 / 6)).astype(int) - 1
+    low = np.maximum(np.floor(place * 2 ** (-1 / 6)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(place * 2 ** (1 / 6)).astype(int), len(spectrum))
-    low = np.maximum(low, 0)
     return np.exp((summed[high] - summed[low]) / (high - low)[:, None])

@@ -19,6 +19,7 @@ tenth of the rate and to 1.3 % at a quarter, where central differences taken twi
 import numpy as np
 from jaxtyping import Float, Int
 
+from dln_jax.data.encoders.sampling import by_trajectory
 from dln_jax.types import InputError, require_positive
 
 ORDER = 4
@@ -30,9 +31,9 @@ END_PERIODS, END_DEGREE = 1.0, 5
 at an end are estimated."""
 
 
-def gain(f: Float[np.ndarray, " n"], cutoff: float, order: int = ORDER) -> Float[np.ndarray, " n"]:
+def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
     """H of both passes; 1 for an infinite cut-off."""
-    return 1 / (1 + (f / cutoff) ** (2 * order))
+    return 1 / (1 + (f / cutoff) ** (2 * ORDER))
 
 
 def low_pass(
@@ -40,7 +41,6 @@ def low_pass(
     *,
     rate: float,
     cutoff: float,
-    order: int = ORDER,
     trajectory: Int[np.ndarray, " N"] | None = None,
 ) -> Float[np.ndarray, "N k"]:
     """Low-pass filters values at equal steps, every trajectory separately.
@@ -49,24 +49,22 @@ def low_pass(
         values: columns of any quantity linear in the unknowns: torques, or columns of a regressor.
         rate: sampling rate, Hz.
         cutoff: Hz; infinite returns the values unchanged.
-        order: order of the Butterworth filter, which is applied twice.
         trajectory: trajectory of every sample (default: one).
 
     Raises:
-        InputError: the cut-off is not below half the rate, or the order is below 1.
+        InputError: the cut-off is not below half the rate.
     """
-    require_positive(rate=rate, cutoff=cutoff, order=order)
+    require_positive(rate=rate, cutoff=cutoff)
     if np.isinf(cutoff):
         return values
     if not cutoff < rate / 2:
         raise InputError(f"cutoff is {cutoff:g} Hz; expected less than {rate / 2:g} Hz, half the rate of the samples")
     from scipy.signal import butter, sosfiltfilt
 
-    sections = butter(order, cutoff, fs=rate, output="sos")
-    ends = [] if trajectory is None else np.flatnonzero(np.diff(trajectory)) + 1
+    sections = butter(ORDER, cutoff, fs=rate, output="sos")
     extension = int(np.ceil(PERIODS * rate / cutoff))
     filtered = []
-    for part in np.split(values, ends):
+    for part in [values] if trajectory is None else by_trajectory(values, trajectory):
         slow = bent(part, int(np.ceil(END_PERIODS * rate / cutoff)))
         rest = sosfiltfilt(sections, part - slow, axis=0, padlen=min(extension, len(part) - 1))
         filtered.append(slow + rest)
@@ -82,25 +80,16 @@ def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"
     near = max(near, 2 * END_DEGREE)
     if len(values) < 2 * near:
         return np.zeros_like(values)
+    from numpy.polynomial.polynomial import polyfit
+    from scipy.interpolate import BPoly
+
     x = np.linspace(0.0, 1.0, len(values))  # along the segment
-    powers = range(6)
-    conditions, found = [], []
+    length, ends = x[near - 1], []
     for samples, end in ((slice(None, near), 0.0), (slice(-near, None), 1.0)):
         # Scale x by the length of the fit, which keeps the fit well conditioned.
-        length = x[near - 1]
-        local = np.vander((x[samples] - end) / length, END_DEGREE + 1, increasing=True)
-        coefficients = np.linalg.lstsq(local, values[samples], rcond=None)[0]
-        for order, factor in ((0, 1.0), (1, 1.0), (2, 2.0)):
-            slopes = np.array([_falling(power, order) * end ** max(power - order, 0) for power in powers])
-            conditions.append(slopes)
-            found.append(factor * coefficients[order] / length**order)
-    polynomial = np.linalg.solve(np.array(conditions), np.array(found))
-    return np.vander(x, 6, increasing=True) @ polynomial
-
-
-def _falling(power: int, order: int) -> float:
-    """Factor of the derivative of x^power: power (power - 1) ... with `order` factors, zero if power < order."""
-    return float(np.prod([power - k for k in range(order)])) if power >= order else 0.0
+        fit = polyfit((x[samples] - end) / length, values[samples], END_DEGREE)
+        ends.append([fit[0], fit[1] / length, 2 * fit[2] / length**2])
+    return BPoly.from_derivatives([0.0, 1.0], np.array(ends))(x)
 
 
 def derivatives(

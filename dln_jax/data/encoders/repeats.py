@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.data.encoders.noise import noise_of, step_of
+from dln_jax.data.encoders.sampling import noise_of, step_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select_samples
 
@@ -79,7 +79,7 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
 
 def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, float]:
     """Mask of the rows that repeat the one before, and the size of the step after a repeat in usual steps."""
-    found = np.zeros(len(values), bool)
+    repeating = np.zeros(len(values), bool)
     changes = np.diff(values, axis=0)
     inside = np.diff(trajectory) == 0
     same = (changes == 0).all(axis=1) & inside
@@ -87,7 +87,7 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
     others = changes[inside & ~same] == 0
     by_chance = float(np.prod(others.mean(axis=0))) * len(changes) if len(others) else np.inf
     if same.sum() <= CHANCE * by_chance:
-        return found, np.inf
+        return repeating, np.inf
     levels, noise = step_of(values), noise_of(values, trajectory)
     moves = np.flatnonzero(~same)
     along, usual_squared = 0.0, 0.0
@@ -106,11 +106,11 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
         noisy = (levels == 0) & (noise > 0.1 * np.abs(usual)) & (noise < np.inf)
         if not (moving | noisy).any():
             continue
-        found[first + 1 : last + 1] = True
+        repeating[first + 1 : last + 1] = True
         around = changes[max(first - NEAR, 0) : first], changes[last + 1 : last + 1 + NEAR]
         typical = np.mean(np.concatenate(around), axis=0)
         along, usual_squared = along + float(ending @ typical), usual_squared + float(typical @ typical)
-    return found, along / usual_squared if usual_squared > 0 else np.inf
+    return repeating, along / usual_squared if usual_squared > 0 else np.inf
 
 
 def _interpolated(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong: np.ndarray) -> np.ndarray:
@@ -120,8 +120,8 @@ def _interpolated(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wro
     from scipy.interpolate import make_interp_spline
 
     values = values.copy()
-    for each in np.unique(trajectory[wrong]):
-        here = np.flatnonzero(trajectory == each)
+    for index in np.unique(trajectory[wrong]):
+        here = np.flatnonzero(trajectory == index)
         good, bad = here[~wrong[here]], here[wrong[here]]
         values[bad] = make_interp_spline(t[good], values[good], k=min(3, len(good) - 1), axis=0)(t[bad])
     return values
@@ -130,8 +130,8 @@ def _interpolated(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wro
 def _source_times(t: np.ndarray, trajectory: np.ndarray, repeated: np.ndarray) -> np.ndarray:
     """Times of the rows on the source's clock: a repeat takes no time, and each trajectory keeps its duration."""
     t = t.copy()
-    for each in np.unique(trajectory[repeated]):
-        here = np.flatnonzero(trajectory == each)
+    for index in np.unique(trajectory[repeated]):
+        here = np.flatnonzero(trajectory == index)
         steps = np.where(repeated[here], 0.0, np.r_[0.0, np.diff(t[here])])
         last = here[~repeated[here]][-1]
         t[here] = t[here[0]] + np.cumsum(steps) * (t[last] - t[here[0]]) / steps.sum()

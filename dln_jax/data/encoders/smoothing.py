@@ -1,7 +1,7 @@
 """Converts q, t and tau of a log to trajectories with derivatives.
 
-1. Repeated rows are removed (see `repeats`). Long gaps cut a trajectory, short ones are bridged; samples at unequal
-   steps are interpolated to one rate.
+1. Repeated rows are removed (see `repeats`). Long gaps cut a trajectory into parts named LABEL/1, LABEL/2 and so on,
+   short ones are bridged; samples at unequal steps are interpolated to one rate.
 2. The noise of every channel is estimated. The noise and the spectra of q determine the cut-off, unless it is set.
 3. q is filtered without delay; qd and qdd are derivatives of the result. tau is filtered too if samples are dropped,
    which requires it, or on request.
@@ -12,6 +12,7 @@ friction belong to no state, see `filters`. On a simulated seven-axis arm filter
 (`scripts.reports.encoder_data`).
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,11 +21,11 @@ from jaxtyping import Float
 
 from dln_jax.data.encoders import sampling
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
-from dln_jax.data.encoders.filters import ORDER, derivatives, low_pass
-from dln_jax.data.encoders.noise import noise_of
+from dln_jax.data.encoders.filters import derivatives, low_pass
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
+from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import segments
+from dln_jax.data.splits import segments
 from dln_jax.types import InputError, require_positive
 
 SHORTEST = 4.0
@@ -50,7 +51,6 @@ class Smoothed(NamedTuple):
     """Standard deviation of the noise of every torque of `data`, N m or N; zero without torques."""
     choice: Choice | None
     """Data behind the choice of the cut-off; `None` if the cut-off was set."""
-    order: int
     filtered_torque: bool
     decimate: int
     trim: float
@@ -69,31 +69,26 @@ def smooth(
     data: Trajectories,
     cutoff: float | None = None,
     *,
-    order: int = ORDER,
     rate: float | None = None,
     filter_torque: bool | None = None,
     decimate: int = 1,
     trim: float | None = None,
-    bridged: float = sampling.BRIDGED,
 ) -> Smoothed:
     """Estimates derivatives and smooths a log's q, t and tau for learning; existing rates are not used.
 
     Args:
         data: the log.
         cutoff: Hz, infinite for none (default: chosen from the data, see `cutoff`).
-        order: order of the Butterworth filter, which is applied twice.
         rate: rate of the equal steps, Hz (default: the median of the data).
         filter_torque: whether to filter tau as well (default: only if samples are dropped).
         decimate: keep every `decimate`-th sample.
         trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
-        bridged: gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory into parts
-            named LABEL/1, LABEL/2, ...
 
     Raises:
         InputError: settings out of range, a decimation to less than twice the cut-off, or no segment that is long
             enough.
     """
-    require_positive(order=order, decimate=decimate)
+    require_positive(decimate=decimate)
     if trim is not None and not trim >= 0:
         raise InputError(f"trim is {trim}; expected seconds >= 0")
     data, repeats = without_repeats(data)
@@ -101,95 +96,65 @@ def smooth(
         # Rounding removes the rounding errors of time differences.
         rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
     require_positive(rate=rate)
-    pieces = segments(data.t, data.trajectory, gap=bridged)
-    gaps = len(segments(data.t, data.trajectory)) - len(pieces)
-    uniform = _Uniform.of(data, pieces, rate)
-    noise_q, noise_tau = (noise_of(values, uniform.part) for values in (uniform.q, uniform.tau))
+    d, values = data.degrees_of_freedom, np.hstack([data.q, data.tau])
+    pieces = segments(data.t, data.trajectory, gap=sampling.BRIDGED)
+    even = [sampling.even(data.t[piece], values[piece], rate) for piece in pieces]
+    values, part = np.concatenate([x for _, x in even]), np.repeat(np.arange(len(even)), [len(t) for t, _ in even])
+    noise_q, noise_tau = (noise_of(channels, part) for channels in (values[:, :d], values[:, d:]))
     choice = None
     if cutoff is None:
-        choice = choose_cutoff(uniform.q, uniform.part, rate=rate, noise=noise_q, order=order)
+        choice = choose_cutoff(values[:, :d], part, rate=rate, noise=noise_q)
         cutoff = choice.cutoff
     require_positive(cutoff=cutoff)
-    slowest = rate / decimate / 2
-    if decimate > 1 and not cutoff < slowest:
+    if decimate > 1 and not cutoff < rate / decimate / 2:
         raise InputError(
             f"decimate is {decimate}, which leaves {rate / decimate:g} Hz; expected more than twice the cut-off of "
             f"{cutoff:g} Hz: keep more samples, or lower the cut-off"
         )
     filtered = decimate > 1 if filter_torque is None else filter_torque
     trim = (0.0 if np.isinf(cutoff) else TRIMMED / cutoff) if trim is None else trim
-    shortest = max(6, round(SHORTEST * rate / cutoff) + 1, 2 * round(trim * rate) + 2 * decimate)
-    kept = [index for index in range(len(pieces)) if np.sum(uniform.part == index) >= shortest]
+    ends = round(trim * rate)
+    shortest = max(6, round(SHORTEST * rate / cutoff) + 1, 2 * ends + 2 * decimate)
+    kept = [index for index, (t, _) in enumerate(even) if len(t) >= shortest]
     if not kept:
         raise InputError(
             f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
-    smoothed = _filtered(data, pieces, uniform, kept, rate, cutoff, order, filtered, trim, decimate)
+    filter_ = functools.partial(low_pass, rate=rate, cutoff=cutoff)
+    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
+    for index in kept:
+        t, x = even[index]
+        q, tau = filter_(x[:, :d]), filter_(x[:, d:]) if filtered else x[:, d:]
+        for key, array in zip(columns, (t, q, *derivatives(q, rate=rate), tau), strict=True):
+            columns[key].append(array[ends : len(t) - ends : decimate])
+    smoothed = data._replace(
+        **{key: np.concatenate(parts) for key, parts in columns.items()},
+        trajectory=np.repeat(np.arange(len(kept)), [len(t) for t in columns["t"]]),
+        label=_labels(data, [int(data.trajectory[pieces[index][0]]) for index in kept]),
+        **dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")),
+        estimated=tuple(key for key in data.estimated if key == "tau"),
+    )
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
     return Smoothed(
-        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, order, filtered, decimate, trim,
-        bridged=gaps, parts=len(kept), left_out=len(pieces) - len(kept), repeats=repeats,
+        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, filtered, decimate, trim,
+        bridged=len(segments(data.t, data.trajectory)) - len(pieces), parts=len(kept),
+        left_out=len(pieces) - len(kept), repeats=repeats,
     )  # fmt: skip
+
+
+def _labels(data: Trajectories, sources: list[int]) -> np.ndarray:
+    """Labels of parts by the trajectories that they come from; parts of one trajectory are numbered from 1."""
+    counts = [sources[: place + 1].count(source) for place, source in enumerate(sources)]
+    return np.array(
+        [
+            str(data.label[source]) + (f"{PART}{count}" if sources.count(source) > 1 else "")
+            for source, count in zip(sources, counts, strict=True)
+        ]
+    )
 
 
 def labels_of_parts(data: Trajectories, labels: Sequence[str]) -> list[str]:
     """Labels after smoothing: the label of a trajectory that was cut becomes those of its parts; others stay."""
-    found: list[str] = []
-    for label in labels:
-        parts = [each for each in data.label if each.rpartition(PART)[0] == label]
-        found.extend([label] if label in data.label or not parts else parts)
-    return found
-
-
-class _Uniform(NamedTuple):
-    """Segments at equal steps, concatenated."""
-
-    t: np.ndarray
-    q: np.ndarray
-    tau: np.ndarray
-    part: np.ndarray
-
-    @classmethod
-    def of(cls, data: Trajectories, pieces: list[np.ndarray], rate: float) -> "_Uniform":
-        values, d = np.hstack([data.q, data.tau]), data.degrees_of_freedom
-        resampled = [sampling.even(data.t[piece], values[piece], rate) for piece in pieces]
-        joined = np.concatenate([each for _, each in resampled])
-        part = np.repeat(np.arange(len(pieces)), [len(t) for t, _ in resampled])
-        return cls(np.concatenate([t for t, _ in resampled]), joined[:, :d], joined[:, d:], part)
-
-
-def _filtered(
-    data: Trajectories,
-    pieces: list[np.ndarray],
-    uniform: _Uniform,
-    kept: list[int],
-    rate: float,
-    cutoff: float,
-    order: int,
-    filtered: bool,
-    trim: float,
-    decimate: int,
-) -> Trajectories:
-    """Filters, differentiates, trims and decimates the kept segments, which become trajectories."""
-    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
-    of = [int(data.trajectory[pieces[index][0]]) for index in kept]
-    for index in kept:
-        here = uniform.part == index
-        q = low_pass(uniform.q[here], rate=rate, cutoff=cutoff, order=order)
-        tau = low_pass(uniform.tau[here], rate=rate, cutoff=cutoff, order=order) if filtered else uniform.tau[here]
-        ends = round(trim * rate)
-        inside = slice(ends, len(q) - ends, decimate)
-        for key, array in zip(columns, (uniform.t[here], q, *derivatives(q, rate=rate), tau), strict=True):
-            columns[key].append(array[inside])
-    label = [
-        str(data.label[each]) + (f"{PART}{of[: place + 1].count(each)}" if of.count(each) > 1 else "")
-        for place, each in enumerate(of)
-    ]
-    joined = {key: np.concatenate(parts) for key, parts in columns.items()}
-    trajectory = np.repeat(np.arange(len(kept)), [len(part) for part in columns["t"]])
-    return data._replace(
-        **joined, trajectory=trajectory, label=np.array(label), p=None, pd=None,
-        tau_inertial=None, tau_coriolis=None, tau_gravity=None,
-        estimated=tuple(key for key in data.estimated if key == "tau"),
-    )  # fmt: skip
+    parts = {label: [part for part in data.label if part.rpartition(PART)[0] == label] for label in labels}
+    return [part for label in labels for part in ([label] if label in data.label else parts[label] or [label])]

@@ -8,10 +8,9 @@ from dln_jax.cli.arguments import names_listed, refuse_given, require_positive_i
 from dln_jax.cli.encoders import checked, fitted_torque, needs_from_option, preparation, smoothed
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
-from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split
+from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split, with_joints
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.kinematic_prior import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL

@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.data import schema
+from dln_jax.data.arrays import spread
 from dln_jax.data.bodies import find_bodies
-from dln_jax.data.local_polynomials import DEGREE, smooth_locally
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
 from dln_jax.data.schema import Trajectories, column, time_derivative
-from dln_jax.data.segments import segments
-from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, select
+from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, segments, select
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
@@ -155,10 +154,10 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
         more = f", or {2 * d} of q and then p" if own else ""
         raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates{more}")
     parts = segments(data.t, data.trajectory)
-    if max(map(len, parts)) < DEGREE + 2:
+    if max(map(len, parts)) < SHORTEST:
         if noise is None:
             return None
-        raise InputError(f"--noise is for motions, but no segment without a gap has {DEGREE + 2} samples; leave it out")
+        raise InputError(f"--noise is for motions, but no segment without a gap has {SHORTEST} samples; leave it out")
     order = np.random.default_rng(0).permutation(len(parts))
     count = int(np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED)) + 1
     surveyed = samples_of(data, np.concatenate([parts[index] for index in sorted(order[:count])]))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.arrays import spread
 from dln_jax.data.schema import column
 from dln_jax.figures import animations
 from dln_jax.figures.style import TRUTH

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.learning import accelerations, measured_motions, motions, rates
 from dln_jax.learning.engine import problem as engine

@@ -10,10 +10,9 @@ from dln_jax.cli.arguments import names_in, names_listed, numbers_of, require_po
 from dln_jax.cli.encoders import checked, fitted_torque, preparation, smoothed
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
-from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select
+from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select, with_joints
 from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.friction import FrictionShape, require_laws, shape_of
 from dln_jax.mechanics.trees import tree_to_json

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import INSTALL, Robot
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial

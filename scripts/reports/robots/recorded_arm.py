@@ -15,10 +15,9 @@ import numpy as np
 
 from dln_jax.data import schema
 from dln_jax.data.encoders import smooth
-from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import in_blocks, select
+from dln_jax.data.splits import in_blocks, select, with_joints
 from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.friction import FrictionFit, fit_friction
 from dln_jax.learning.kinematics import fit_tree

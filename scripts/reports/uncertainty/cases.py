@@ -11,9 +11,8 @@ import numpy as np
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import smooth
-from dln_jax.data.joints import with_joints
 from dln_jax.data.schema import Trajectories, load
-from dln_jax.data.splits import in_blocks, partition_labels, select
+from dln_jax.data.splits import in_blocks, partition_labels, select, with_joints
 from dln_jax.data.splits import split as split_by_labels
 from dln_jax.learning import dynamics as problems
 from dln_jax.learning.engine.fit import fit

@@ -9,7 +9,7 @@ from calls import command, refused
 
 from dln_jax.cli.commands import excite
 from dln_jax.data import schema
-from dln_jax.data.motion_tables import write_motion
+from dln_jax.data.csv_tables import write_motion
 from dln_jax.data.robots import read_robot
 from dln_jax.identification.excitation.limits import limits_of_robot
 from dln_jax.types import InputError

@@ -177,7 +177,7 @@ def test_mistakes_are_one_line(workplace, capsys):
         ("arm.urdf", "other.npz", (), "joint 'shoulder' is not among the data's (elbow, wrist)"),
         ("arm.urdf", "three.npz", (), "the data have 3 joints, the robot 2"),
         ("arm.urdf", "silent.npz", (), "have no tau"),
-        ("broken.urdf", "log.npz", (), "no XML"),
+        ("broken.urdf", "log.npz", (), "not XML"),
         ("arm.urdf", "log.npz", ("--noise", "1"), "expected 2 positive numbers"),
         ("arm.urdf", "log.npz", ("--test", "0"), "one only"),
         ("arm.urdf", "log.npz", ("--regularisation", "0"), "regularisation is 0.0"),

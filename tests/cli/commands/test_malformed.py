@@ -30,7 +30,7 @@ from dln_jax.cli.commands import (
     train_locomotion,
 )
 from dln_jax.cli.stored_arguments import checked_arguments, stored_arguments
-from dln_jax.data import archive, functions, meshes, schema
+from dln_jax.data import arrays, functions, meshes, schema
 from dln_jax.data.splits import split
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import write_json
@@ -228,7 +228,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     np.testing.assert_array_equal(data.tau, TRAJECTORIES["tau"])
     with pytest.raises(InputError, match=r"'x' is missing.*not read: t, q, .*readme.txt"):
         functions.load("data.npz")
-    monkeypatch.setattr(archive, "MOST_BYTES", 1000)
+    monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
     with pytest.raises(InputError, match="holds more than"):
         schema.load("data.npz")
 
@@ -268,7 +268,7 @@ def test_a_trajectory_may_have_any_number_and_is_named_by_it():
     assert data.label.tolist() == ["7", "20240131", "20240202"]
     np.testing.assert_array_equal(data.label[data.trajectory].astype(int), numbers)
     for wrong in (1e300, -1, 0.5):
-        with pytest.raises(InputError, match="no whole numbers >= 0"):
+        with pytest.raises(InputError, match="not whole numbers >= 0"):
             schema.from_arrays({**arrays, "trajectory": np.where(numbers == 7, wrong, numbers)})
     with pytest.raises(InputError, match="label names 1 trajectories"):
         schema.from_arrays({**arrays, "trajectory": numbers, "label": ["a"]})

@@ -11,7 +11,7 @@ from calls import command, refused
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
-from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation

@@ -208,7 +208,6 @@ REFUSED = [
     ({"decimate": 0}, "decimate is 0"),
     ({"cutoff": 0.1}, "longer motions"),
     ({"trim": -0.1}, "trim is -0.1"),
-    ({"bridged": 0.5}, "gap is 0.5"),
 ]
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dln_jax.cli.arguments import class_with, require_positive_if_given
-from dln_jax.data.encoders.noise import noise_of
+from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.robots import Robot
 from dln_jax.data.splits import every
 from dln_jax.files import write_json

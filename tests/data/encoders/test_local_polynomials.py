@@ -1,10 +1,10 @@
-"""Rates of noisy motions: better than differences, noise found, gaps respected."""
+"""Rates of noisy, unevenly sampled motions: better than differences, noise found, gaps respected."""
 
 import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.data.local_polynomials import smooth_locally
+from dln_jax.data.encoders import smooth_locally
 from dln_jax.types import InputError
 
 NOISE = np.array([1e-3, 1e-2])
@@ -23,26 +23,19 @@ def test_noise_is_found_and_rates_are_better_than_differences():
     data, q, qd = motion()
     smooth = smooth_locally(data)
     np.testing.assert_allclose(smooth.noise, NOISE, rtol=0.15)
-    assert len(smooth.rows) == len(data.t) and smooth.points[0] > smooth.points[1]
+    assert len(smooth.rows) == len(data.t)
     assert (np.std(smooth.data.q - q, axis=0) < 0.6 * NOISE).all()
     assert (np.std(smooth.data.qd - qd, axis=0) < 0.1 * np.std(data.qd - qd, axis=0)).all()
 
 
-def test_polynomials_are_exact():
-    t = np.sort(np.random.default_rng(0).uniform(0, 2, 40))
+def test_polynomials_are_exact_and_short_segments_are_left_out():
+    t = 0.05 * (np.arange(45) + 0.4 * np.random.default_rng(0).uniform(size=45))
+    t[40:] += 1.0
     q = np.polynomial.Polynomial([0.3, -1, 2, 0.5, -0.7])
-    smooth = smooth_locally(schema.from_arrays({"t": t, "q": q(t)[:, None], "trajectory": np.zeros(40)}), gap=100.0)
-    np.testing.assert_allclose(smooth.data.qdd[:, 0], q.deriv(2)(t), atol=1e-6)
-    np.testing.assert_allclose(smooth.data.qd[:, 0], q.deriv()(t), atol=1e-8)
-
-
-def test_mistakes_are_named():
-    data = motion()[0]
-    refused = [
-        (lambda: smooth_locally(data, degree=1), "degree is 1"),
-        (lambda: smooth_locally(data, points=5), "points is 5"),
-        (lambda: smooth_locally(data, points=500), "has 500 samples"),
-    ]
-    for call, message in refused:
-        with pytest.raises(InputError, match=message):
-            call()
+    smooth = smooth_locally(schema.from_arrays({"t": t, "q": q(t)[:, None], "trajectory": np.zeros(45)}))
+    np.testing.assert_array_equal(smooth.rows, np.arange(40))
+    np.testing.assert_allclose(smooth.data.qdd[:, 0], q.deriv(2)(t[:40]), atol=1e-6)
+    np.testing.assert_allclose(smooth.data.qd[:, 0], q.deriv()(t[:40]), atol=1e-8)
+    few = schema.from_arrays({"t": t[40:], "q": q(t[40:])[:, None], "trajectory": np.zeros(5)})
+    with pytest.raises(InputError, match="no segment without a gap has 6 samples"):
+        smooth_locally(few)

@@ -1,7 +1,8 @@
-"""Reads npz archives of plain numbers and strings without unpickling; every error names its key.
+"""Reads npz archives of plain numbers and strings without unpickling, and checks the magnitudes of their numbers.
 
 Only the arrays requested are read. Each must match the sizes stated in the archive and in its header, and together they
-may hold at most `MOST_BYTES`.
+may hold at most `MOST_BYTES`. Markers of missing values, such as 1e308, and unsuitable units are refused: scales and
+losses would be infinite or zero although every single number is finite.
 """
 
 import math
@@ -11,7 +12,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
 from dln_jax.files import is_file
 from dln_jax.sizes import LARGEST, SMALLEST
@@ -23,9 +27,12 @@ MOST_BYTES = 4 * 2**30
 """Limit on all arrays of one file, since a small archive may expand a thousandfold."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 """Header readers for the format versions in which NumPy writes numbers and strings."""
+MOST_TIMES_TYPICAL = 1e20
+"""A number larger than the median by this factor cannot be a measurement: float64 has 16 digits."""
+MARKERS = "remove the samples if they mark missing values"
 
 
-def load(
+def load_file(
     path: str | Path,
     from_arrays: Callable[[dict[str, Any]], Data],
     keys: Sequence[str],
@@ -41,7 +48,7 @@ def load(
         table: reader for files whose name ends in .csv; returns the arrays by key and the columns it does not read.
 
     Raises:
-        InputError: the file is missing, is no npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
+        InputError: the file is missing, is not an npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
             `from_arrays` or `table` rejects its contents (the message then starts with the path).
     """
     path = Path(path)
@@ -53,8 +60,8 @@ def load(
         arrays, unread = table(path) if table and path.suffix.lower() == ".csv" else _read(path, keys)
         return from_arrays(arrays)
     except InputError as error:
-        beside = f" (keys that are not read: {', '.join(unread)[:200]})" if unread else ""
-        raise InputError(f"{path}: {error}{beside}") from None
+        names = f" (keys that are not read: {', '.join(unread)[:200]})" if unread else ""
+        raise InputError(f"{path}: {error}{names}") from None
 
 
 def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -135,7 +142,42 @@ def numeric(
     if largest != 0 and not SMALLEST <= largest <= most:
         squares = "overflow" if largest > most else "vanish"
         raise InputError(
-            f"{key} has numbers of up to {largest:.1e}, whose squares {squares}; remove the samples if they mark "
-            "missing values, else give it in SI units"
+            f"{key} has numbers of up to {largest:.1e}, whose squares {squares}; {MARKERS}, else give it in SI units"
         )
     return array
+
+
+def on_device(name: str, array: np.ndarray, dtype: Any) -> Array:
+    """Converts an array of samples to a dtype on the device.
+
+    Raises:
+        InputError: the sum of its squares overflows in that dtype.
+    """
+    _require_squares(name, array, dtype)
+    return jnp.asarray(array, dtype)
+
+
+def spread(name: str, array: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
+    """Standard deviation of each column, in float64.
+
+    Raises:
+        InputError: squares overflow, nonzero numbers are so small that all squares vanish, or some exceed the median by
+            `MOST_TIMES_TYPICAL`.
+    """
+    _require_squares(name, array, np.float64)
+    sizes = np.abs(array[array != 0])
+    largest = float(sizes.max(initial=0.0))
+    if sizes.size and largest > MOST_TIMES_TYPICAL * (typical := float(np.median(sizes))):
+        raise InputError(f"{name} has numbers of up to {largest:.1e} where half are below {typical:.1e}; {MARKERS}")
+    if 0 < largest < np.sqrt(np.finfo(np.float64).tiny):
+        raise InputError(f"{name} has numbers of at most {largest:.1e}, whose squares vanish; give it in smaller units")
+    return array.std(axis=0)
+
+
+def _require_squares(name: str, array: np.ndarray, dtype: Any) -> None:
+    largest = float(np.abs(array).max(initial=0.0))
+    if not largest < np.sqrt(float(np.finfo(dtype).max) / max(array.size, 1)):
+        raise InputError(
+            f"{name} has numbers of up to {largest:.1e}, whose squares overflow in {np.dtype(dtype).name}; {MARKERS}, "
+            "else give it in larger units"
+        )
