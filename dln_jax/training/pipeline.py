@@ -74,8 +74,10 @@ class Kind(NamedTuple):
     """(case, options, run folder, devices) -> the fit; may store checkpoints."""
     judge: Callable[[Any, Fitted, Any, Path], Judged]
     """(case, fit, options, run folder) -> errors, costs and verdict of the stored model."""
-    save: Callable[[Path, Fitted], None] = lambda folder, fitted: save(folder, fitted.description, fitted.parameters)
-    """(run folder, fit) -> nothing; stores the model."""
+    save: Callable[[Path, Fitted, Any], None] = lambda folder, fitted, _: save(
+        folder, fitted.description, fitted.parameters
+    )
+    """(run folder, fit, case) -> nothing; stores the model."""
 
 
 def train(kind: Kind, options: Any, command: str) -> None:
@@ -91,9 +93,9 @@ def train(kind: Kind, options: Any, command: str) -> None:
         for text in kind.announce(case):
             print(text)
         fitted = kind.fit(case, options, folder, mesh)
-        kind.save(folder, fitted)
+        kind.save(folder, fitted, case)
         judged = kind.judge(case, fitted, options, folder)
-        if options.figures:
+        if getattr(options, "figures", False):
             for name, draw in judged.figures.items():
                 draw(folder / name)
         metrics = {**judged.metrics, **judged.measured()}

@@ -8,6 +8,7 @@ import pytest
 from calls import command, refused
 
 from dln_jax.cli.commands import train_value
+from dln_jax.training.value_training import over_seeds
 from dln_jax.training.values import Trained, load_value
 
 TINY = ("--method", "residual", "--width", "3", "--depth", "1", "--iterations", "1", "--starts", "3")
@@ -26,17 +27,17 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, "--stored", tmp_path / "run", "--starts", "3", "--out", tmp_path / "again")
     again = json.loads((tmp_path / "again" / "metrics.json").read_text())
     assert again["down_return_mean"] == pytest.approx(numbers["down_return_mean"])
-    assert json.loads((tmp_path / "again" / "config.json").read_text())["plant"] == "pendulum"
+    assert json.loads((tmp_path / "again" / "config.json").read_text())["chosen"]["plant"] == "pendulum"
     for option, value in (("--plant", "cart-pole"), ("--goal", "0.1"), ("--seed", "3"), ("--method", "fitted")):
-        said = refused(capsys, train_value, "--stored", tmp_path / "run", option, value, "--out", tmp_path / "other")
-        assert f"{option} does not go with --stored" in said
+        line = refused(capsys, train_value, "--stored", tmp_path / "run", option, value, "--out", tmp_path / "other")
+        assert f"{option} is an option of a training, without --stored" in line
         assert not (tmp_path / "other").exists()
     assert "already contains a run" in refused(capsys, train_value, *TINY, "--out", tmp_path / "run")
 
 
 def test_the_numbers_of_several_seeds():
-    found = train_value.over_seeds([Trained(None, validation, 2.0 * validation) for validation in (3.0, 1.0, 2.0)])
-    assert found == {"validation_median": 2.0, "validation_worst": 3.0, "train_seconds_median": 4.0}
+    numbers = over_seeds([Trained(None, validation, 2.0 * validation) for validation in (3.0, 1.0, 2.0)])
+    assert numbers == {"validation_median": 2.0, "validation_worst": 3.0, "train_seconds_median": 4.0}
 
 
 MISTAKES = [
