@@ -54,10 +54,10 @@ def main() -> None:
 def report_names() -> list[str]:
     """Sorted names of the reports of this checkout; empty for an installed package."""
     try:
-        found = importlib.util.find_spec(REPORTS)
+        package = importlib.util.find_spec(REPORTS)
     except ModuleNotFoundError:
-        found = None
-    places = [] if found is None else found.submodule_search_locations or []
+        package = None
+    places = [] if package is None else package.submodule_search_locations or []
     return sorted(file.stem for place in places for file in Path(place).glob("[a-z]*.py"))
 
 

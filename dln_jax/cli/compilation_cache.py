@@ -28,7 +28,7 @@ class Compilation(NamedTuple):
 
     seconds: float
     """Compilation time, including programs that came from the cache."""
-    found: int
+    cached: int
     """Number of programs that came from the cache."""
 
 
@@ -63,26 +63,26 @@ def keep(wanted: bool) -> str:
 def compilation() -> Compilation:
     """Totals since the first call of this function; subtract two readings to measure an interval."""
     counts = _counts()
-    return Compilation(counts["seconds"], int(counts["found"]))
+    return Compilation(counts["seconds"], int(counts["cached"]))
 
 
 def summary(since: Compilation, unkept: str = "") -> str:
     """Summary of the compilation since a reading, in one line; empty if it was short and used no cached program."""
     now = compilation()
-    seconds, found = now.seconds - since.seconds, now.found - since.found
-    if seconds < 0.5 and not found:
+    seconds, cached = now.seconds - since.seconds, now.cached - since.cached
+    if seconds < 0.5 and not cached:
         return ""
-    many = {0: "no program", 1: "one program"}.get(found, f"{found} programs")
+    many = {0: "no program", 1: "one program"}.get(cached, f"{cached} programs")
     why = f" (none is kept: {unkept})" if unkept else ""
     return f"compilation took {seconds:.1f} s; {many} came from the cache{why}"
 
 
 @functools.cache
 def _counts() -> dict[str, float]:
-    counts = {"seconds": 0.0, "found": 0}
+    counts = {"seconds": 0.0, "cached": 0}
 
     def count(event: str, **_: str | int) -> None:
-        counts["found"] += event == "/jax/compilation_cache/cache_hits"
+        counts["cached"] += event == "/jax/compilation_cache/cache_hits"
 
     def add(event: str, duration_secs: float, **_: str | int) -> None:
         counts["seconds"] += duration_secs if event == "/jax/core/compile/backend_compile_duration" else 0.0

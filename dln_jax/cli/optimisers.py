@@ -29,4 +29,4 @@ def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
 def name_of(optimiser: Optimiser | type[Optimiser]) -> str:
     """The name of an optimiser in command lines."""
     kind = optimiser if isinstance(optimiser, type) else type(optimiser)
-    return next(name for name, each in NAMES.items() if each is kind)
+    return next(name for name, optimiser_kind in NAMES.items() if optimiser_kind is kind)

@@ -121,7 +121,7 @@ def as_one_line(prog: str, options: Any) -> Iterator[None]:
 
 def _refusal(message: str) -> SystemExit:
     """Prints an error as one line, and returns the exit for a user's mistake (status 2)."""
-    shown = "".join(each if each.isprintable() else repr(each)[1:-1] for each in message)
+    shown = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in message)
     if len(shown) > 2 * MOST_CHARACTERS:
         shown = f"{shown[:MOST_CHARACTERS]} ... {shown[-MOST_CHARACTERS:]}"
     _say(f"error: {shown}")

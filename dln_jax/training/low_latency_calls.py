@@ -40,14 +40,14 @@ class Arguments:
     """Calls that are timed."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Times the calls and prints JSON."""
     enable_low_latency()
     states = np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False)
-    system = load(given.run).flow if given.function == "rates" else load(given.run).dynamics
-    function = low_latency(getattr(system, given.function), *states[0])
-    found = one_step(function, [tuple(map(jnp.asarray, state)) for state in states], calls=given.calls)
-    print(json.dumps({key: getattr(found, key) for key in ("p50_us", "p99_us")}))
+    system = load(options.run).flow if options.function == "rates" else load(options.run).dynamics
+    function = low_latency(getattr(system, options.function), *states[0])
+    latency = one_step(function, [tuple(map(jnp.asarray, state)) for state in states], calls=options.calls)
+    print(json.dumps({key: getattr(latency, key) for key in ("p50_us", "p99_us")}))
 
 
 def low_latency_metrics(
@@ -76,8 +76,8 @@ def low_latency_metrics(
         )
         if done.returncode:
             raise ValueError(f"exit status {done.returncode}: {last_line(done.stderr)}")
-        found = json.loads(last_line(done.stdout))
-        return {f"one_step_low_latency_{key}": float(found[key]) for key in ("p50_us", "p99_us")}
+        answer = json.loads(last_line(done.stdout))
+        return {f"one_step_low_latency_{key}": float(answer[key]) for key in ("p50_us", "p99_us")}
     except (OSError, subprocess.TimeoutExpired, ValueError, KeyError, TypeError) as error:
         why = f"no answer in {LIMIT:.0f} s" if isinstance(error, subprocess.TimeoutExpired) else str(error)
         say(f"single calls were not timed in low-latency mode ({why})")

@@ -36,7 +36,7 @@ def print_numbers(
 ) -> None:
     """Prints a table of quantities, their values and units."""
     justify = {"quantity": "left", "joint": "left", "unit": "left"}
-    table = Table(*(Column(each, justify=justify.get(each, "right")) for each in columns), title=title)  # type: ignore
+    table = Table(*(Column(column, justify=justify.get(column, "right")) for column in columns), title=title)  # type: ignore
     for row in rows:
         table.add_row(*row)
     Console(highlight=False, soft_wrap=True).print(table)

@@ -140,10 +140,12 @@ def by_iteration(
     """Fits value functions by fitted value iteration, one per seed; devices share the states."""
     done, total = itertools.count(1), len(seeds) * numbers.iterations
 
-    def told(at: Progress) -> None:
+    def report_progress(at: Progress) -> None:
         report(next(done), total, f"cost and misfit {at.validation:.4g}")
 
-    fits = fit_values(plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, report=told)
+    fits = fit_values(
+        plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, report=report_progress
+    )
     return [
         Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
         for fit in fits
@@ -163,21 +165,21 @@ def by_equation(
     Devices of a mesh share the samples.
     """
     network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
-    each = len(discounts) - 1 + ROUNDS
+    stages = len(discounts) - 1 + ROUNDS
     trained: list[Trained] = []
     for place, seed in enumerate(seeds):
         of_parameters, of_samples = jax.random.split(jax.random.key(seed))
-        done, began = itertools.count(1 + place * each), time.perf_counter()
+        done, began = itertools.count(1 + place * stages), time.perf_counter()
 
-        def told(stage: Stage, done: Iterator[int] = done) -> None:
+        def report_progress(stage: Stage, done: Iterator[int] = done) -> None:
             text = f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}"
-            report(next(done), len(seeds) * each, text)
+            report(next(done), len(seeds) * stages, text)
 
-        found = fit_residual(
+        solution = fit_residual(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
-            discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=told,
+            discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=report_progress,
         )  # fmt: skip
-        trained.append(Trained(found.parameters, found.validation, time.perf_counter() - began))
+        trained.append(Trained(solution.parameters, solution.validation, time.perf_counter() - began))
     return trained
 
 
@@ -185,14 +187,14 @@ def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) ->
     """Returns of a law in the published evaluation, from both kinds of starts; a failed start counts as NaN."""
     numbers: dict[str, float] = {}
     for where in ("down", "uniform"):
-        found = evaluate(plant, law, starts(plant, where, count, seed))
+        evaluation = evaluate(plant, law, starts(plant, where, count, seed))
         numbers |= {
-            f"{where}_return_mean": float(np.mean(found.returns)),
-            f"{where}_return_median": float(np.median(found.returns)),
-            f"{where}_return_worst": float(np.min(found.returns)),
-            f"{where}_up_share": float(np.mean(np.isfinite(found.settled))),
-            f"{where}_settled_median_seconds": float(np.median(found.settled)),
-            f"{where}_control_most": found.most,
+            f"{where}_return_mean": float(np.mean(evaluation.returns)),
+            f"{where}_return_median": float(np.median(evaluation.returns)),
+            f"{where}_return_worst": float(np.min(evaluation.returns)),
+            f"{where}_up_share": float(np.mean(np.isfinite(evaluation.settled))),
+            f"{where}_settled_median_seconds": float(np.median(evaluation.settled)),
+            f"{where}_control_most": evaluation.most,
         }
     return numbers
 

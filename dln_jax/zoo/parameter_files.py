@@ -74,14 +74,14 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
 
 def require_fitting(tree: Any, like: Any) -> None:
     """Raises `InputError` unless a tree has real arrays with the names, shapes and dtypes of another."""
-    given, expected = _flatten(tree), _flatten(like)
-    if different := sorted(set(given) ^ set(expected)):
-        state = "unknown" if different[0] in given else "missing"
+    own, expected = _flatten(tree), _flatten(like)
+    if different := sorted(set(own) ^ set(expected)):
+        state = "unknown" if different[0] in own else "missing"
         raise InputError(f"the parameters are those of another model: '{different[0]:.80}' is {state}")
     for key, array in expected.items():
-        if not isinstance(given[key], np.ndarray | jax.Array | np.generic) or given[key].dtype.kind not in "fiu":
-            raise InputError(f"parameter '{key}' is {reprlib.repr(given[key])}; expected an array of real numbers")
-        shape, dtype = np.shape(given[key]), given[key].dtype
+        if not isinstance(own[key], np.ndarray | jax.Array | np.generic) or own[key].dtype.kind not in "fiu":
+            raise InputError(f"parameter '{key}' is {reprlib.repr(own[key])}; expected an array of real numbers")
+        shape, dtype = np.shape(own[key]), own[key].dtype
         if shape != array.shape or dtype != array.dtype:
             raise InputError(f"parameter '{key}' is {dtype} {shape}; expected {array.dtype} {array.shape}")
 

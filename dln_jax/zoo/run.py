@@ -120,13 +120,13 @@ class Run:
 
     def _refusal(self, asked: str) -> InputError:
         if isinstance(self.model, FunctionModel):
-            given = ".derivatives"
+            offered = ".derivatives"
         elif isinstance(self.model, ImageModel):
-            given = ".images"
+            offered = ".images"
         else:
             plain = {PhaseRates: ".flow", InverseForward: ".dynamics"}
-            given = plain.get(type(self.energies), ".dynamics or .flow")
-        return InputError(f"a {self.description['name']} has no {asked}; ask for {given}")
+            offered = plain.get(type(self.energies), ".dynamics or .flow")
+        return InputError(f"a {self.description['name']} has no {asked}; ask for {offered}")
 
 
 def save_model(

@@ -52,7 +52,7 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False, resumabl
 def holds_only(folder: Path, *names: str) -> bool:
     """Whether a folder has only files with these names, and partial files left by a killed process."""
     every = folder.iterdir()
-    return all(each.name in names or (each.name.endswith(PARTIAL) and not each.is_dir()) for each in every)
+    return all(path.name in names or (path.name.endswith(PARTIAL) and not path.is_dir()) for path in every)
 
 
 @contextmanager
@@ -106,7 +106,7 @@ def _create(folder: Path) -> list[Path]:
     try:
         if folder.is_dir():
             return []
-        missing = [each for each in (folder, *folder.parents) if not each.exists()]
+        missing = [parent for parent in (folder, *folder.parents) if not parent.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         return missing
     except OSError as error:
@@ -130,5 +130,5 @@ def _withdraw(folder: Path, created: list[Path]) -> None:
     with suppress(OSError):
         (folder / CONFIG).unlink(missing_ok=True)
         (folder / LOCK).unlink(missing_ok=True)
-        for each in created:
-            each.rmdir()
+        for path in created:
+            path.rmdir()

@@ -165,8 +165,8 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
     sizes = {key: np.where(size > 0, size, 1.0) for key, size in sizes.items()}
 
     def of(key: str, least: float) -> np.ndarray:
-        found = smooth_locally(surveyed._replace(q=column(surveyed, key))).noise
-        return np.maximum(found, least * sizes[key])
+        noise = smooth_locally(surveyed._replace(q=column(surveyed, key))).noise
+        return np.maximum(noise, least * sizes[key])
 
     of_q = of("q", FREE_OF_NOISE) if noise is None else np.broadcast_to(noise[:d], d)
     if noise is not None and len(noise) == 2 * d:
@@ -219,9 +219,9 @@ def samples_of(data: Trajectories, chosen: slice | np.ndarray) -> Trajectories:
 def pieces(data: Trajectories, length: int) -> Trajectories:
     """Segments cut to the length of two windows, as trajectories of their own, so that some can be held out."""
     parts = [
-        each[at : at + 2 * length]
-        for each in segments(data.t, data.trajectory)
-        for at in range(0, len(each), 2 * length)
+        rows[at : at + 2 * length]
+        for rows in segments(data.t, data.trajectory)
+        for at in range(0, len(rows), 2 * length)
     ]
     index = np.arange(len(parts))
     return data._replace(trajectory=np.repeat(index, [len(part) for part in parts]), label=index.astype(str))

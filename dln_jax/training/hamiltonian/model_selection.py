@@ -110,13 +110,13 @@ def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
         return {} if order is None else {"order": order}
     if set(problem.needs.joints) != {"prismatic"} or not arrangements(problem.needs.degrees_of_freedom):
         return {}  # the model itself refuses them
-    found = find_bodies(forces_of(problem.fitted), order=order)
-    if found is None:
+    bodies = find_bodies(forces_of(problem.fitted), order=order)
+    if bodies is None:
         raise InputError(
             f"the forces along {problem.needs.degrees_of_freedom} coordinates do not show which of them belong to one "
             "body; state --order bodies (x1, y1, x2, y2) or --order axes (x1, x2, y1, y2), or take another model"
         )
-    return found._asdict()
+    return bodies._asdict()
 
 
 def polynomial_degree(problem: Problem) -> int:
@@ -164,21 +164,21 @@ def choose_model(
         return description, errors
 
     if len(every) == 1:
-        found = described(every[0])
+        description = described(every[0])
         if rates_are_biased(problem):
             say(
                 f"auto: {every[0].words}; the states are noisy, so that errors of rates cannot rank models: "
                 f"try --model {POLYNOMIAL} as well"
             )
-        return found
+        return description
     target = EXACT * mean_square_rates(problem, described(every[-1]), parts[1])
 
     def in_time() -> Iterator[Candidate]:
-        for at, each in enumerate(every):
+        for at, candidate in enumerate(every):
             if at and time.perf_counter() - began >= seconds:
                 say(f"auto: out of time, not tried: {'; '.join(other.words for other in every[at:])}")
                 return
-            yield each
+            yield candidate
 
     return grow(in_time(), attempt, target=target)[0].outcome
 
@@ -207,10 +207,10 @@ def candidates(problem: Problem, networks: bool) -> list[Candidate]:
         # Assumed friction has one coefficient per coordinate.
         friction = {"friction_width": 0} if problem.assumed else {}
         return [Candidate("separable-hnn" if d == 1 else "structured-hnn", needs, friction)]
-    found = [Candidate(name, needs) for name in ("separable-hnn", "structured-hnn")]
+    structured = [Candidate(name, needs) for name in ("separable-hnn", "structured-hnn")]
     if networks or d > MOST_POLYNOMIAL or (needs.friction and not problem.assumed):
-        return found
-    return [*(Candidate(POLYNOMIAL, free, {"degree": degree}) for degree in TRIED_DEGREES), *found]
+        return structured
+    return [*(Candidate(POLYNOMIAL, free, {"degree": degree}) for degree in TRIED_DEGREES), *structured]
 
 
 def validation_errors(
@@ -220,12 +220,12 @@ def validation_errors(
     if description["name"] == POLYNOMIAL:
         return match_linear(build(description), parts[0], validation=parts[1])[1]
     task = first_problem(problem, description, parts, 0)
-    found = fit(task, GaussNewton(steps=TRIAL_STEPS), must_start=False)
+    training = fit(task, GaussNewton(steps=TRIAL_STEPS), must_start=False)
     residual = task.residual
     assert residual is not None
     keys = accelerations.KEYS if in_velocities(problem, description) else ("q", "p", "qd", "pd")
     arrays = tuple(column(parts[1], key) for key in keys)
-    left = jax.jit(jax.vmap(lambda *sample: residual(found.parameters, *sample)))(*arrays)
+    left = jax.jit(jax.vmap(lambda *sample: residual(training.parameters, *sample)))(*arrays)
     errors = np.sum(np.asarray(left) ** 2, axis=1)
     if not in_velocities(problem, description):
         return errors

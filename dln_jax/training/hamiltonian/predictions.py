@@ -54,10 +54,10 @@ def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
     """Predicts the problem's motions from their first states; p is the velocity for models with their own momenta."""
     model, parameters = build(trained.description), trained.result.parameters
     if in_velocities(problem, trained.description):
-        given = padded([on_grid(true.t, true.q[0], true.p[0]) for true in problem.truth])
+        windows = padded([on_grid(true.t, true.q[0], true.p[0]) for true in problem.truth])
         fitted = min(WINDOW[MEASURED], *(len(true.t) - 1 for true in problem.truth))
-        moved = predict_measured(model, parameters, given, fitted=fitted, substeps=SUBSTEPS)
-        kept = [np.flatnonzero(weight) for weight in given.weight]
+        moved = predict_measured(model, parameters, windows, fitted=fitted, substeps=SUBSTEPS)
+        kept = [np.flatnonzero(weight) for weight in windows.weight]
         pairs = zip(problem.truth, moved.q, moved.qd, kept, strict=True)
         return [Motions(true.t, q[None, rows], qd[None, rows]) for true, q, qd, rows in pairs]
     # All times are padded to one length, so that one program predicts all motions.
@@ -95,10 +95,10 @@ def velocity_field(
 
 def figure_of(problem: Problem, seen: Mapping[str, Seen]) -> Figure:
     """The figure of a task: the first motion by every model, and its energy or, if unknown, the first coordinate."""
-    motions = {TRUTH: problem.truth[0], **{name: each.motions for name, each in seen.items()}}
-    fields = {name: each.rates for name, each in seen.items()}
+    motions = {TRUTH: problem.truth[0], **{name: model.motions for name, model in seen.items()}}
+    fields = {name: model.rates for name, model in seen.items()}
     H = problem.energy
-    heights = {name: each.q[:, :, 0] if H is None else energies(H, each) for name, each in motions.items()}
+    heights = {name: motion.q[:, :, 0] if H is None else energies(H, motion) for name, motion in motions.items()}
     quantity = "q1" if H is None else "true energy"
     return motion_figure(motions, heights, fields=fields, quantity=quantity, units=units_of(problem))
 

@@ -51,7 +51,7 @@ def judged(
     scales = case.description.get("velocity_scale") if {"coulomb", "stribeck"} & set(case.laws) else None
     fitted = np.array(scales) if isinstance(scales, list) else None
     every += [friction_verdict(case.names, test.qd, test.tau, friction, fitted)]
-    bodies = [predict(without_joints(each), test.q, test.qd, test.qdd).torque for each in (mine, case.known)]
+    bodies = [predict(without_joints(theta), test.q, test.qd, test.qdd).torque for theta in (mine, case.known)]
     every += [weight_verdict(*bodies)]
     verdict = worst(*every)
     share = spikes(case.sets.train.tau).mean(axis=0)
@@ -110,7 +110,7 @@ def friction_verdict(
 
 def without_joints(parameters: RigidTreeParameters) -> RigidTreeParameters:
     """Parameters of the bodies alone, without armature and friction."""
-    return RigidTreeParameters(*(each if k == 0 or each is None else 0 * each for k, each in enumerate(parameters)))
+    return RigidTreeParameters(*(leaf if k == 0 or leaf is None else 0 * leaf for k, leaf in enumerate(parameters)))
 
 
 def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"]) -> Verdict:

@@ -75,15 +75,15 @@ def grow_to_target(
             break
     if ended:
         print(ended)
-    fastest = min(enough, key=lambda each: each[0].one_step_us, default=None)
-    chosen = fastest or min(tried, key=lambda each: each[0].validation_error)
+    fastest = min(enough, key=lambda trial: trial[0].one_step_us, default=None)
+    chosen = fastest or min(tried, key=lambda trial: trial[0].validation_error)
     write_json(folder / "candidates.json", {"candidates": [candidate._asdict() for candidate, *_ in tried]})
     columns = ("network", "parameters", "validation error", "training, s", "one step, µs", "")
     table = Table(*columns, title=f"grown until the validation error is {target:g}")
-    for each, *_ in tried:
-        numbers = f"{each.parameters:,}", f"{each.validation_error:.2e}", f"{each.train_seconds:.1f}"
-        verdict = "kept" if each == chosen[0] else "met" if each.validation_error <= target else ""
-        table.add_row(each.name, *numbers, f"{each.one_step_us:.1f}", verdict)
+    for candidate, *_ in tried:
+        numbers = f"{candidate.parameters:,}", f"{candidate.validation_error:.2e}", f"{candidate.train_seconds:.1f}"
+        verdict = "kept" if candidate == chosen[0] else "met" if candidate.validation_error <= target else ""
+        table.add_row(candidate.name, *numbers, f"{candidate.one_step_us:.1f}", verdict)
     Console(highlight=False, soft_wrap=True).print(table)
     if fastest is None:
         print(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
