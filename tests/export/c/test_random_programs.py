@@ -50,14 +50,14 @@ def compared(seeds, folder):
     """Fails unless all of these programs that C has agree with JAX; how many it does not have."""
     every = {f"program_{seed}": random_programs.program(seed) for seed in seeds}
     states = {
-        name: random_programs.states(seed, each[1], STATES)
-        for seed, (name, each) in zip(seeds, every.items(), strict=True)
+        name: random_programs.states(seed, program[1], STATES)
+        for seed, (name, program) in zip(seeds, every.items(), strict=True)
     }
     programs = every
     try:
         got = in_sanitized_c(programs, states, folder)
     except InputError:
-        programs = {name: each for name, each in every.items() if not refused(each)}
+        programs = {name: program for name, program in every.items() if not refused(program)}
         assert programs.keys() != every.keys()
         got = in_sanitized_c(programs, states, folder)
     for name, (function, _) in programs.items():
