@@ -162,7 +162,7 @@ def test_a_swing_up_is_solved_by_an_sqp(hessian, library):
     assert float(solution["f"]) == pytest.approx(148.466897, rel=1e-6)
     states, torques = np.split(np.array(solution["x"]).ravel(), [2 * (steps + 1)])
     states, in_jax = states.reshape(-1, 2), FUNCTIONS["step"][0]
-    after = jax.jit(jax.vmap(lambda x, u: in_jax(x, u, dt)["x_next"]))(states[:-1], torques[:, None])
+    after = jax.jit(jax.vmap(lambda x, u: in_jax(x, u, jnp.array(dt))["x_next"]))(states[:-1], torques[:, None])
     assert np.abs(after - states[1:]).max() < 1e-9
 
 
