@@ -339,7 +339,7 @@ def test_mistakes_are_named():
         ),
         "which float32 cannot hold": lambda: functions_of_run(large, precision="f32"),
         "precision is 'f16'": lambda: functions_of_run(run, precision="f16"),
-        "of one's own is exported in f64": lambda: functions_of_run(own, precision="f32"),
+        "a user-defined model is exported in f64": lambda: functions_of_run(own, precision="f32"),
         "iterations is 0": lambda: functions_of_system(run.energies, 2, dtype=float, iterations=0),
     }
     for message, call in cases.items():
