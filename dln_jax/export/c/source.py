@@ -72,7 +72,7 @@ def export_c(
         casadi: also write NAME_casadi.c, the functions with exact derivatives for CasADi's `external`; a collection
             names the functions to include.
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
-            NAME_casadi.c functions that CasADi cannot take; the files list what is missing.
+            NAME_casadi.c functions that CasADi cannot take; the files list the missing functions.
         stack: bytes of stack that a function may use; a plan over many steps may need more than the default.
         overwrite: replace existing files.
 

@@ -1,4 +1,4 @@
-"""Texts of the files of an export: header and preamble, a demo program, what CasADi calls, and a CMake file."""
+"""Texts of the files of an export: header, preamble, demo program, CasADi interface and CMake file."""
 
 from collections.abc import Mapping, Sequence
 from math import prod
@@ -21,7 +21,7 @@ _PREAMBLE = """\
 #include "$name.h"
 
 #if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || defined _M_FP_FAST || __FINITE_MATH_ONLY__ + 0
-#error "NaN, infinities and rounding are relied on: leave out -ffast-math and what it stands for"
+#error "NaN, infinities and rounding are relied on: do not use -ffast-math or any of its options"
 #endif
 
 typedef $real real;
@@ -145,7 +145,7 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
     real = PRECISIONS[precision][1]
     kinds = {**KINDS, "real": real}
     text = comment(
-        f"{name}_demo.c: prints what the functions of {name}.h give at one state.",
+        f"{name}_demo.c: prints the results of the functions of {name}.h at one state.",
         f"cc -std=c99 -O3 -march=native {name}.c {name}_demo.c -lm -o {name}_demo\n"
         f"./{name}_demo 1000000    also times a million calls of each",
     ) + _START.format(name=name, real=real)
