@@ -57,7 +57,7 @@ class Source:
         return PRECISIONS[self.precision][2]
 
     def copy(self) -> "Source":
-        """Returns a copy with containers of its own, to discard if a function is refused."""
+        """Returns a copy that shares no containers, to discard if a function is refused."""
         return Source(**{attribute.name: copy(getattr(self, attribute.name)) for attribute in fields(self)})
 
     def table(self, numbers: np.ndarray, dtype: str) -> str:
@@ -217,6 +217,6 @@ class Body:
 
 
 def _step(positions: np.ndarray, axis: int) -> int | None:
-    """Returns the common step of all positions along an axis, or None if there is none."""
+    """Returns the common step of all positions along an axis, or None if the steps differ."""
     steps = np.diff(positions, axis=axis)
     return None if steps.size and np.ptp(steps) else int(steps.flat[0]) if steps.size else 0

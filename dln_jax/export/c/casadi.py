@@ -35,56 +35,8 @@ from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
 from dln_jax.export.c.jaxprs import traced
 from dln_jax.export.c.lowering import program_of
 from dln_jax.export.c.plan import plan_of
+from dln_jax.export.c.templates import CASADI_DECLARATIONS, CASADI_FUNCTION
 from dln_jax.types import InputError
-
-_DECLARATIONS = """
-typedef double casadi_real;
-typedef long long int casadi_int;
-
-#ifdef __cplusplus
-#define EXPORTED extern "C"
-#else
-#define EXPORTED
-#endif
-/* What CasADi asks about a function, which has no state that would need counting, and no workspace but the stack. */
-#define DESCRIBED(f, inputs, outputs) \\
-    EXPORTED void f##_incref(void) {} \\
-    EXPORTED void f##_decref(void) {} \\
-    EXPORTED casadi_int f##_n_in(void) { return inputs; } \\
-    EXPORTED casadi_int f##_n_out(void) { return outputs; } \\
-    EXPORTED const char *f##_name_in(casadi_int i) { return f##_names[i]; } \\
-    EXPORTED const char *f##_name_out(casadi_int i) { return f##_names[inputs + i]; } \\
-    EXPORTED const casadi_int *f##_sparsity_in(casadi_int i) { return f##_sparsities[i]; } \\
-    EXPORTED const casadi_int *f##_sparsity_out(casadi_int i) { return f##_sparsities[inputs + i]; } \\
-    EXPORTED int f(const casadi_real **arg, casadi_real **res, casadi_int *integers, casadi_real *reals, int memory)
-"""
-_TEXT = """
-/* {operations} floating-point operations, {bytes} bytes of stack */
-static const char *const {symbol}_names[] = {{{names}}};
-static const casadi_int {symbol}_sparsities[][{length}] = {{{sparsities}}};
-DESCRIBED({symbol}, {inputs}, {outputs})
-{{
-{lines}
-}}
-"""
-ABOUT = """{name}_casadi.c: functions of {name}.h with exact derivatives, for CasADi 3.6 and later.
-{written_by}
-
-cmake -B build && cmake --build build, then in Python, with the name of one of the functions for F:
-F = casadi.external("casadi_{name}_F", "build/lib{name}.so")
-
-acados loads the same library; its folder is model_external_shared_lib_dir, and its name, {name},
-model_external_shared_lib_name among the solver's options."""
-BUILD = """
-# The library that CasADi and acados load
-add_library({name}_casadi SHARED {name}.c {name}_casadi.c)
-set_target_properties({name}_casadi PROPERTIES OUTPUT_NAME {name} ARCHIVE_OUTPUT_NAME {name}_casadi
-  C_STANDARD 99 C_EXTENSIONS OFF WINDOWS_EXPORT_ALL_SYMBOLS ON)
-if(UNIX)
-  target_link_libraries({name}_casadi PRIVATE m)
-endif()
-"""
-
 
 Function = Callable[[Array], Array]
 
@@ -135,7 +87,7 @@ def external_functions(
             left_out.append(str(error))
             continue
         source, text = kept, text + written
-    return source, f"{_DECLARATIONS}\nstatic const casadi_real zeros[{largest}] = {{0}};\n{text}", left_out
+    return source, f"{CASADI_DECLARATIONS}\nstatic const casadi_real zeros[{largest}] = {{0}};\n{text}", left_out
 
 
 def _flat(
@@ -261,7 +213,7 @@ def _function(
             continue
         if body.bytes <= stack:
             blocks = [*inputs, *outputs]
-            return body.source, _TEXT.format(
+            return body.source, CASADI_FUNCTION.format(
                 symbol=symbol,
                 names=", ".join(f'"{block.name}"' for block in blocks),
                 length=3 + max(0 if block.dense else block.columns for block in blocks),

@@ -1,7 +1,7 @@
 """Elementary functions in exported C: plain C99 without branches or tables, which compilers vectorise.
 
 Each is right to two units in the last place over its range, with the usual values at zeros, infinities and NaN; only
-`exp` rounds to zero what is below the smallest normal number. The ideas are standard (Cody and Waite, Software Manual
+`exp` rounds results below the smallest normal number to zero. The ideas are standard (Cody and Waite, Software Manual
 for the Elementary Functions, 1980; Muller, Elementary Functions, 2016):
 
     exp, expm1  x = n ln 2 + r, a polynomial in r, 2ⁿ by its bits
@@ -58,9 +58,9 @@ _HALF_PI = {
 _EXP_RANGE = {"f64": (-708.3964185322641, 709.782712893384), "f32": (-87.33654, 88.72283)}
 
 BOUNDS: Mapping[str, Mapping[str, float]] = {name: {"f64": 2e5, "f32": 1e4} for name in ("sin", "cos")}
-"""|x| beyond which <math.h> must be called instead, for want of digits of pi; functions not named have no bound."""
+"""Largest |x| for which the digits of pi suffice; beyond it C calls <math.h>. Other functions have no bound."""
 
-# A choice is made by bits: gcc moves what only one side of ?: needs into a branch, and then cannot vectorise.
+# A choice is made by bits: gcc moves code that only one side of ?: needs into a branch, and then cannot vectorise.
 _COMMON = """
 /* Elementary functions: the bits of a number and back, and condition ? x : y without a branch */
 typedef $word elementary_word;
@@ -190,24 +190,24 @@ return copysign${{f}}(result, x);
 }
 _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="        ", break_on_hyphens=False)
 VECTORISED: tuple[str, ...] = tuple(_BODIES)
-"""Names of the functions."""
+"""Names of the functions, which vectorise."""
 
 
 def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] = ()) -> str:
-    """C text of `elementary_NAME(x)` for the names, `elementary_NAME_each(n, x, y)` for arrays, and what they need.
+    """Returns the C of `elementary_NAME(x)` for names, of `elementary_NAME_each(n, x, y)` for arrays, and of helpers.
 
-    The name `choice` stands for the choice between two numbers alone, which the others need too, `rounded` for
-    rounding to fewer bits, and `ordered` for comparisons in the total order.
+    The name `choice` stands for the choice between two numbers, which the others need too, `rounded` for rounding to
+    fewer bits, and `ordered` for comparisons in the total order.
 
-    Before it, the source has <float.h>, <math.h>, <stdint.h>, the type `real`, and `MULTIPLY_ADD(a, b, c)`, which is
-    a b + c, fused or not. Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own
-    because gcc vectorises the loop around a call only where it inlines the call, and it inlines some sixty a source.
+    The source must first include <float.h>, <math.h> and <stdint.h> and define the type `real` and
+    `MULTIPLY_ADD(a, b, c)`, which is a b + c, fused or not. Arrays have separate functions because gcc vectorises the
+    loop around a call only if it inlines the call, and it inlines about sixty calls in a source.
     """
     arrays = set(arrays)
     needed = set(names) | arrays
     chosen = needed & set(VECTORISED)
     if not chosen and not needed & {"choice", "rounded", "ordered"}:
-        return ""  # clang warns of what is not used
+        return ""  # clang warns of unused functions
     facts = _values(precision)
     # By method 1 float is computed in double, which is wrong for the functions of float alone.
     text = [fill(_EVALUATION, precision, or_double=" && FLT_EVAL_METHOD != 1" * (precision == "f64"))] * bool(chosen)

@@ -20,7 +20,7 @@ _CHOICES = {
 }
 """C without a branch, for loops, since a branch would prevent vectorisation."""
 _BOXES = 6
-"""Largest number of boxes that become loops of their own; more are read through tables of positions."""
+"""Largest number of boxes that become separate loops; more boxes are read through tables of positions."""
 
 
 def unrolled(body: Body, node: Node) -> None:

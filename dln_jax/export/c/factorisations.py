@@ -14,7 +14,7 @@ FUNCTIONS = {
     /* Lower triangular l with l l^T = a [n, n]; all NaN where a is not positive definite */
     static void cholesky(int n, const real *a, real *l)
     {
-        int definite = 1; /* a NaN reaches what depends on it */
+        int definite = 1; /* a NaN reaches all elements that depend on it */
         for (int i = 0; i < n; ++i)
             for (int j = 0; j < n; ++j) {
                 real rest = a[i * n + j];
@@ -182,7 +182,7 @@ FUNCTIONS = {
     }
     """,
 }
-"""C functions by the name of their node; a source contains those that it calls."""
+"""C functions by the name of their node; a source contains the functions that it calls."""
 
 
 def definitions(names: Collection[str], suffix: str) -> str:

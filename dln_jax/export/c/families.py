@@ -138,7 +138,7 @@ def _of_run(run: Run, precision: str, iterations: int) -> Functions:
     description, model, dtype = run.description, run.model, data_type(precision)
     if precision != description["precision"]:
         if description["name"] not in CATALOGUE:
-            raise InputError(f"a model of one's own is exported in {description['precision']}, that of its training")
+            raise InputError(f"a user-defined model is exported in {description['precision']}, that of its training")
         model = build({**description, "precision": precision})
     parameters = jax.tree.map(functools.partial(_converted, dtype), run.parameters)
     if isinstance(model, FunctionModel):
@@ -170,22 +170,18 @@ def _converted(dtype: Any, leaf: Array) -> Array:
 def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tuple[int, ...]) -> Functions:
     """Pairs functions with examples: vectors of this size, except the arguments with other shapes."""
     shapes["dt"] = ()
-    return {
-        name: (
-            function,
-            tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(function).parameters),
-        )
-        for name, function in functions.items()
-    }
+
+    def examples(function: Function) -> tuple[np.ndarray, ...]:
+        return tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(function).parameters)
+
+    return {name: (function, examples(function)) for name, function in functions.items()}
 
 
 def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) -> Named:
     motion = dynamics(system, degrees_of_freedom=d)
     forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
-    inverse_jacobians, coriolis_jacobians = (
-        functools.partial(jacobian, system)
-        for jacobian in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
-    )
+    inverse_jacobians = functools.partial(jacobians.inverse_dynamics_jacobians, system)
+    coriolis_jacobians = functools.partial(jacobians.coriolis_jacobians, system)
     link = _link(system)
     natural = isinstance(link, Natural)
 

@@ -60,7 +60,7 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
 
 
 def array_of(leaf: Any) -> Any:
-    """Returns a leaf as an array, if it is none."""
+    """Returns an array, or a number as an array."""
     return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
 
 

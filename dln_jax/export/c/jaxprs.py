@@ -24,7 +24,7 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
     try:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
     except OverflowError as error:
-        raise InputError(f"a whole number is out of range ({error}); C has those of 64 bits") from error
+        raise InputError(f"a whole number is out of range ({error}); C has integers of up to 64 bits") from error
     if closed.effects:
         raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
     return closed, shapes

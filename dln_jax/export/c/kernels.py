@@ -1,4 +1,4 @@
-"""C of reductions, scattered updates and sorts; factorisations have a module of their own."""
+"""C of reductions, scattered updates and sorts; `factorisations` has the functions on matrices."""
 
 from collections.abc import Collection, Sequence
 from string import Template

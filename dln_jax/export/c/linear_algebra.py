@@ -1,4 +1,4 @@
-"""Rules for factorisations and triangular solves, which C computes in functions of its own."""
+"""Rules for factorisations and triangular solves, which separate C functions compute."""
 
 from collections.abc import Sequence
 from math import prod
@@ -22,7 +22,7 @@ def _applied(
     program: Program, op: str, *arrays: Node, shapes: Sequence[Sequence[int]], ranks: Sequence[int] = (2, 2),
     kind: str = "real", attribute: Any = None,
 ) -> list[Node]:  # fmt: skip
-    """Returns the results of an operation on every item of a batch; those of one item lie end to end in one array."""
+    """Returns the results of an operation on every item of a batch; the results of one item lie end to end."""
     batch, sizes = arrays[0].shape[: len(arrays[0].shape) - ranks[0]], [prod(shape) for shape in shapes]
     items = zip(*(_items(program, array, rank) for array, rank in zip(arrays, ranks, strict=False)), strict=True)
     nodes = [program.make(op, (sum(sizes),), kind, item, attribute) for item in items]

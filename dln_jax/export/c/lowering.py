@@ -21,8 +21,8 @@ _CALLS = {
     "custom_vmap_call": "call",
 }  # fmt: skip
 _REFUSED = {
-    "random": "random numbers; draw them outside and pass them as arguments",
-    "threefry": "random numbers; draw them outside and pass them as arguments",
+    "random": "random numbers; draw them beforehand and pass them as arguments",
+    "threefry": "random numbers; draw them beforehand and pass them as arguments",
     "callback": "a callback into Python, which C cannot call",
     "debug_print": "printing, a side effect",
 }

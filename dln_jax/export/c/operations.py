@@ -144,7 +144,7 @@ _ON_BOOL = {"add": "or", "mul": "and", "max": "or", "min": "and", "ne": "xor"}
 
 
 def on_kind(op: str, kind: str) -> str:
-    """Returns the name of an operation for numbers of a kind: integers and booleans have operations of their own."""
+    """Returns the name of an operation for numbers of a kind: some differ for integers and booleans."""
     if kind == "bool":
         return _ON_BOOL.get(op, op)
     return f"integer_{op}" if kind != "real" and f"integer_{op}" in OPERATIONS else op

@@ -37,10 +37,10 @@ class Plan(NamedTuple):
     """Elements that something reads, of every node."""
     levels: dict[Node, int]
     """Length of the longest chain of products before a node."""
-    reads: dict[Node, set[Node]]
-    """Arrays of its region that a step reads; a loop reads the arrays that its body reads."""
+    reads: dict[Node | None, set[Node]]
+    """Arrays of its region that a step reads; a loop reads the arrays that its body reads, and None the results."""
     readers: dict[Node, set[Node | None]]
-    """Steps that read an array; None stands for the results."""
+    """Steps that read an array."""
 
 
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
@@ -64,29 +64,28 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     arrays = {node for node in arrays if node.op not in ("input", "const")}
     root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), unrolled)
     arrays -= {node for node, into in root.items() if into is not node}
-    levels, needed = _levels(program, nodes), _needed(program, nodes, unrolled, arrays, results)
+    levels, needed = _levels(nodes), _needed(program, nodes, unrolled, arrays, results)
     order: dict[Region, list[Node]] = {}
-    for node in sorted(
-        nodes, key=lambda candidate: (levels[candidate], not _is_product(candidate, unrolled), candidate.number)
-    ):
+    in_order = sorted(nodes, key=lambda node: (levels[node], node in unrolled or node.op != "dot_general", node.number))
+    for node in in_order:
         ends = root.get(node, node)
         if needed[ends].any() and (node in unrolled or ends is node):
             order.setdefault(node.region, []).append(node)
-    reads = _reads(program, nodes, arrays, root)
+    reads = _reads(program, nodes, arrays, root, results)
     steps: dict[Node, set[Node | None]] = {}
-    of_results = {source for node in results for source in sources(node, arrays)}
-    every: list[tuple[Node | None, set[Node]]] = [*reads.items(), (None, of_results)]
-    for step, read in every:
+    for step, read in reads.items():
         for source in read:
             steps.setdefault(source, set()).add(step)
     return Plan(order, unrolled, arrays, root, needed, levels, reads, steps)
 
 
-def inner(program: Program, node: Node) -> list[Loop]:
-    """Returns the bodies of a loop or branch."""
-    if node.op == "branch":
-        return [program.loops[number] for number in node.attribute]
-    return [program.loops[node.attribute]] if node.op in ("while", "repeat") else []
+def _numbers(node: Node) -> list[int]:
+    """Returns the numbers of the bodies of a loop or branch."""
+    return [int(number) for number in np.ravel(node.attribute)] if node.op in ("while", "repeat", "branch") else []
+
+
+def _bodies(program: Program, node: Node) -> list[Loop]:
+    return [program.loops[number] for number in _numbers(node)]
 
 
 def is_direct(node: Node) -> bool:
@@ -117,7 +116,7 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
         if node not in reached:
             reached.add(node)
             waiting += node.args
-            for loop in inner(program, node):
+            for loop in _bodies(program, node):
                 waiting += [*loop.carries, *loop.conditions, *loop.results]
     nodes = sorted(reached, key=lambda node: node.number)
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
@@ -127,7 +126,7 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
             readers[arg].append(node)
         if node.op in PLAIN_MEMORY or (node.op in VECTORISED and not _is_unrolled(node)):
             contiguous |= set(node.args[:1] if node.op == "take" else node.args)
-        for loop in inner(program, node):
+        for loop in _bodies(program, node):
             whole |= {*loop.results, *loop.conditions, *node.args}
     return nodes, readers, whole, contiguous
 
@@ -154,10 +153,6 @@ def _is_scalar(node: Node) -> bool:
     return node.size == 1 and node.op not in ("dot_general", *_FACTORED) and node.op[:4] != "put_"
 
 
-def _is_product(node: Node, unrolled: set[Node]) -> bool:
-    return node.op == "dot_general" and node not in unrolled
-
-
 def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
     """Returns the last node of the loop that an elementwise node is fused into."""
     root: dict[Node, Node] = {}
@@ -171,37 +166,35 @@ def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
     return root
 
 
-def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
+def _levels(nodes: list[Node]) -> dict[Node, int]:
     levels: dict[Node, int] = {}
     highest: dict[int, int] = {}
     for node in nodes:
-        level = max((levels[arg] for arg in node.args), default=0)
-        for number in (node.attribute if node.op == "branch" else (node.attribute,)) if inner(program, node) else ():
-            level = max(level, highest.get(number, 0))
-        levels[node] = level + (node.op == "dot_general")
+        before = [*(levels[arg] for arg in node.args), *(highest.get(number, 0) for number in _numbers(node))]
+        levels[node] = max(before, default=0) + (node.op == "dot_general")
         for number in node.region:
             highest[number] = max(highest.get(number, 0), levels[node])
     return levels
 
 
-def sources(node: Node, arrays: set[Node]) -> set[Node]:
+def _sources(node: Node, arrays: set[Node]) -> set[Node]:
     """Returns the arrays that a reading of a node reads."""
     if node.op == "gather" and node not in arrays:
-        return {source for arg in node.args for source in sources(arg, arrays)}
+        return {source for arg in node.args for source in _sources(arg, arrays)}
     return {node} & arrays
 
 
-def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
-    reads: dict[Node, set[Node]] = {}
-    loops = {number: node for node in nodes if inner(program, node) for number in np.ravel(node.attribute)}
+def _reads(program: Program, nodes, arrays, root, results) -> dict[Node | None, set[Node]]:
+    reads: dict[Node | None, set[Node]] = {None: {source for node in results for source in _sources(node, arrays)}}
+    loops = {number: node for node in nodes for number in _numbers(node)}
     for node in nodes:
         if node.op == "gather" and node not in arrays:
             continue
         read = [*node.args]
-        for loop in inner(program, node):
+        for loop in _bodies(program, node):
             read += [*loop.results, *loop.conditions]
         for argument in read:
-            for source in sources(argument, arrays):
+            for source in _sources(argument, arrays):
                 # A reading in a nested loop counts as a reading by that loop.
                 depth = len(source.region)
                 step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
@@ -221,7 +214,7 @@ def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np
             continue
         if node in arrays:
             mask[:] = True
-        for loop in inner(program, node):
+        for loop in _bodies(program, node):
             for k, result in enumerate(loop.results):
                 if k < len(loop.carries) or k in projected.get(node, ()):
                     needed[result][:] = True

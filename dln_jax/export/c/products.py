@@ -18,7 +18,7 @@ _LANES = {"f64": 4, "f32": 8}
 _TILE = 64
 """Columns whose sums are kept at once; gcc allocates registers better for wide blocks."""
 _ROWS = 16
-"""Largest number of rows that get sums of their own; a product with more is a loop over rows."""
+"""Largest number of rows with separate sums; a product with more rows is a loop over rows."""
 
 
 def chain(pairs: list[tuple[str, str]], dtype: str) -> str:

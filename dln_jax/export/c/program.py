@@ -218,7 +218,7 @@ class Program:
         return None
 
     def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
-        """Returns the operation applied before a common broadcast of its arguments, or None if there is none."""
+        """Returns the operation applied before a common broadcast of its arguments, or None if they share none."""
         repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
         others = [arg for arg in args if arg.size == 1 or is_uniform(arg)]
         if not shape or any(arg.op == "const" for arg in repeated) or len(repeated) + len(others) < len(args):

@@ -28,8 +28,8 @@ def export_run(
     Args:
         run: folder of the run.
         directory: folder of the export.
-        functions: names from `families.functions_of_run`; default: all but those that are too large for C, and for
-            CasADi all that are not derivatives.
+        functions: names from `families.functions_of_run`; default: all functions that are not too large for C, and
+            for CasADi all functions that are not derivatives.
         name: name of the export.
         precision: f32 or f64; default: the precision of the training.
         iterations: Newton steps of the implicit midpoint rule.

@@ -14,10 +14,7 @@ import jax
 import numpy as np
 
 from dln_jax.export.c import casadi as external
-from dln_jax.export.c import factorisations, kernels, operations
 from dln_jax.export.c.body import Source
-from dln_jax.export.c.demo import cmake, demo
-from dln_jax.export.c.elementary import definitions
 from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import (
     FORMAT,
@@ -30,7 +27,8 @@ from dln_jax.export.c.interface import (
 )
 from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.text import PRECISIONS, check_name, comment, fill, kind_of, table
+from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
+from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
 from dln_jax.export.exports import described, write_exports
 from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
@@ -47,60 +45,6 @@ LINES = 4000
 
 class TooLargeError(InputError):
     """A function needs more stack, or more lines, than generated C suits."""
-
-
-_PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
-Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
-written. What is not finite in a state is not hidden."""
-_NEEDED = """C99; needs <math.h>, <float.h> and <stdint.h>, and nothing else. Fastest with -O3 for the processor at hand
-(gcc: -march=native); does not compile with -ffast-math, which gives wrong numbers."""
-_PREAMBLE = """\
-#include <float.h>
-#include <math.h>
-#include <stdint.h>
-
-#include "$name.h"
-
-#if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || defined _M_FP_FAST || __FINITE_MATH_ONLY__ + 0
-#error "NaN, infinities and rounding are relied on: leave out -ffast-math and what it stands for"
-#endif
-
-typedef $real real;
-
-/* Passes of gcc that take as long as all others here, and find nothing */
-#if defined(__GNUC__) && !defined(__clang__)
-#pragma GCC optimize("no-gcse", "no-gcse-after-reload")
-#endif
-
-/* Of two operations or of one, whichever the processor has */
-#ifdef FP_FAST_FMA$upper
-#define MULTIPLY_ADD(a, b, c) fma${f}(a, b, c)
-#else
-#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))
-#endif
-#ifdef __cplusplus
-#define RESTRICT
-#else
-#define RESTRICT restrict
-#endif
-
-"""
-_HEADER = """\
-#ifndef $guard
-#define $guard
-
-#include <stdint.h>
-
-#ifdef __cplusplus
-extern "C" {
-#endif
-$declared
-#ifdef __cplusplus
-}
-#endif
-
-#endif
-"""
 
 
 def export_c(
@@ -128,7 +72,7 @@ def export_c(
         casadi: also write NAME_casadi.c, the functions with exact derivatives for CasADi's `external`; a collection
             names the functions to include.
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
-            NAME_casadi.c functions that CasADi cannot take; the files list what is missing.
+            NAME_casadi.c functions that CasADi cannot take; the files list the missing functions.
         stack: bytes of stack that a function may use; a plan over many steps may need more than the default.
         overwrite: replace existing files.
 
@@ -168,8 +112,8 @@ def source_files(
         written_by = f"Written by dln-jax {version}, C format {FORMAT}."
         parts = dict.fromkeys(part.text for part in source.parts.values())
         files = {
-            f"{name}.h": _header(name, written_by, signatures, precision, left_out),
-            f"{name}.c": comment(f"{name}.c", written_by, _NEEDED) + "".join([_preamble(source, name), *parts, *texts]),
+            f"{name}.h": header(name, written_by, signatures, precision, left_out),
+            f"{name}.c": comment(f"{name}.c", written_by, NEEDED) + "".join([preamble(source, name), *parts, *texts]),
             f"{name}_demo.c": demo(name, signatures, precision),
             "CMakeLists.txt": cmake(name),
         }
@@ -180,9 +124,9 @@ def source_files(
             source, text, left_out = external.external_functions(
                 name, chosen, libm=libm, stack=stack, leave_out=leave_out_large
             )
-            about = _about(external.ABOUT.format(name=name, written_by=written_by), left_out=left_out)
-            files[f"{name}_casadi.c"] = about + _preamble(source, name) + text
-            files["CMakeLists.txt"] += external.BUILD.format(name=name)
+            title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
+            files[f"{name}_casadi.c"] = title + preamble(source, name) + text
+            files["CMakeLists.txt"] += CASADI_BUILD.format(name=name)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
@@ -258,36 +202,3 @@ def _function(
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
     return signature._replace(stack_bytes=body.bytes, operations=body.operations), text, total
-
-
-def _preamble(source: Source, name: str) -> str:
-    """Returns the part of a source before its functions."""
-    precision = source.precision
-    tables = "".join(f"{table(*named, precision)}\n" for named in source.tables.values())
-    return "".join((
-        fill(_PREAMBLE, precision, name=name, upper=source.suffix.upper()),
-        tables.removesuffix("\n"),
-        definitions(source.functions, precision, arrays=source.arrays),
-        operations.definitions(source.integers, precision),
-        kernels.orderings(source.orders),
-        factorisations.definitions(source.kernels, source.suffix),
-    ))  # fmt: skip
-
-
-def _header(
-    name: str, written_by: str, signatures: Mapping[str, Signature], precision: str, left_out: Sequence[str]
-) -> str:
-    declared = ""
-    for key, signature in signatures.items():
-        shapes = "".join(f"{leaf.name} {list(leaf.shape)}, " for leaf in signature.results if leaf.shape)
-        facts = f"{signature.operations} floating-point operations, {signature.stack_bytes} bytes of stack"
-        prototype = declaration(name, key, signature, PRECISIONS[precision][1])
-        declared += f"\n/* {f'{shapes[:-2]}; ' if shapes else ''}{facts} */\n{prototype};\n"
-    about = _about(f"{name}.h", written_by, _PROMISES, left_out=left_out)
-    return about + fill(_HEADER, precision, guard=f"{name.upper()}_H", declared=declared)
-
-
-def _about(*paragraphs: str, left_out: Sequence[str]) -> str:
-    """Returns a comment that also lists the functions left out, and why."""
-    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
-    return comment(*paragraphs, *[absent] * bool(absent))

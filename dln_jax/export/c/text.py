@@ -70,7 +70,7 @@ _RESERVED = frozenset(
 def kind_of(dtype: Any) -> str:
     """Returns the kind of a JAX dtype, and raises InputError if C has none."""
     if str(dtype) not in _KINDS:
-        hint = "random numbers are drawn outside" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
+        hint = "draw random numbers beforehand" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
         raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")
     return _KINDS[str(dtype)]
 

@@ -42,7 +42,7 @@ def in_c(
         call = getattr(loaded, name)
         rows = [call(*jax.tree.leaves(at_precision(state, precision))) for state in states[name]]
         rows = [row if isinstance(row, tuple) else (row,) for row in rows]
-        results[name] = [np.stack([np.asarray(each) for each in column]) for column in zip(*rows, strict=True)]
+        results[name] = [np.stack([np.asarray(result) for result in column]) for column in zip(*rows, strict=True)]
     return results
 
 
@@ -53,5 +53,7 @@ def in_jax(functions: Functions, states: Mapping[str, list[Any]], *, precision="
         for name in functions
     }
     with jax.enable_x64(precision == "f64"):  # as they are exported
-        every = jax.jit(lambda given: {name: jax.vmap(functions[name][0])(*given[name]) for name in functions})(stacked)
-    return {name: [np.asarray(leaf) for leaf in jax.tree.leaves(each)] for name, each in every.items()}
+        every = jax.jit(lambda states: {name: jax.vmap(functions[name][0])(*states[name]) for name in functions})(
+            stacked
+        )
+    return {name: [np.asarray(leaf) for leaf in jax.tree.leaves(tree)] for name, tree in every.items()}

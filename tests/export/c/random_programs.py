@@ -16,23 +16,8 @@ from jax.extend.core import primitives as of_jax
 REAL, WHOLE = (jnp.float64,), (jnp.int32, jnp.int64, jnp.uint32, jnp.uint64)
 TYPES = (*REAL * 3, *WHOLE[:2] * 2, *WHOLE[2:], jnp.bool_)
 SHAPES = (
-    (),
-    (1,),
-    (2,),
-    (3,),
-    (5,),
-    (8,),
-    (9,),
-    (17,),
-    (40,),
-    (65,),
-    (2, 2),
-    (3, 4),
-    (4, 4),
-    (7, 3),
-    (2, 3, 4),
-    (9, 8),
-)
+    (), (1,), (2,), (3,), (5,), (8,), (9,), (17,), (40,), (65,), (2, 2), (3, 4), (4, 4), (7, 3), (2, 3, 4), (9, 8),
+)  # fmt: skip
 LARGEST = 300
 """Elements of an array."""
 Arrays = list[Any]
@@ -60,7 +45,8 @@ def program(seed: int) -> tuple[Callable[..., Any], tuple[np.ndarray, ...]]:
 def states(seed: int, examples: tuple[np.ndarray, ...], count: int) -> list[tuple[np.ndarray, ...]]:
     """The examples, and others of the same shapes and types."""
     random = np.random.default_rng([seed, 2])
-    return [examples, *(tuple(_of(random, each.shape, each.dtype) for each in examples) for _ in range(count - 1))]
+    others = (tuple(_of(random, array.shape, array.dtype) for array in examples) for _ in range(count - 1))
+    return [examples, *others]
 
 
 def _drawn(random: np.random.Generator) -> np.ndarray:
@@ -83,24 +69,24 @@ def _computed(random: np.random.Generator, known: Arrays, *, steps: int, depth: 
     """What is known, and what so many steps add."""
     for _ in range(steps):
         step = STEPS[random.choice(len(STEPS), p=WEIGHTS)]
-        found = step(random, known, depth)
-        known = [*known, *(each for each in found if each.size <= LARGEST)]
+        results = step(random, known, depth)
+        known = [*known, *(result for result in results if result.size <= LARGEST)]
     return known
 
 
 def _chosen(random: np.random.Generator, known: Arrays, kinds: str = "fiub", rank: int = 0) -> Any:
     """One of the arrays of a kind and least rank, late ones more often; a constant where there is none."""
-    fitting = [each for each in known if jnp.dtype(each.dtype).kind in kinds and each.ndim >= rank]
+    fitting = [array for array in known if jnp.dtype(array.dtype).kind in kinds and array.ndim >= rank]
     if not fitting or random.random() < 0.05:
-        shape = [each for each in SHAPES if len(each) >= rank]
-        dtype = next(each for each in random.permutation(np.array(TYPES, object)) if jnp.dtype(each).kind in kinds)
-        return jnp.asarray(_of(random, shape[random.integers(len(shape))], dtype))
+        shapes = [shape for shape in SHAPES if len(shape) >= rank]
+        dtype = next(dtype for dtype in random.permutation(np.array(TYPES, object)) if jnp.dtype(dtype).kind in kinds)
+        return jnp.asarray(_of(random, shapes[random.integers(len(shapes))], dtype))
     return fitting[max(random.integers(len(fitting)), random.integers(len(fitting)))]
 
 
 def _partner(random: np.random.Generator, known: Arrays, x: Any) -> Any:
     """Another of the type, of a shape that broadcasts with it."""
-    fitting = [each for each in known if each.dtype == x.dtype and _broadcast(each, x) and each is not x]
+    fitting = [array for array in known if array.dtype == x.dtype and _broadcast(array, x) and array is not x]
     if fitting and random.random() < 0.7:
         return fitting[random.integers(len(fitting))]
     shape = x.shape if random.random() < 0.5 else ()
@@ -231,7 +217,7 @@ def _reduced(random, known, depth):
 def _product(random, known, depth):
     a = _chosen(random, known, rank=1)
     b = _of(random, (a.shape[-1], *((), (3,), (9,))[random.integers(3)]), a.dtype)
-    same = [each for each in known if each.dtype == a.dtype and each.ndim and each.shape[0] == a.shape[-1]]
+    same = [array for array in known if array.dtype == a.dtype and array.ndim and array.shape[0] == a.shape[-1]]
     b = same[random.integers(len(same))] if same and random.random() < 0.6 else jnp.asarray(b)
     if random.random() < 0.3:
         b = jnp.tensordot(a, a[..., :1], 0).reshape(a.size, -1)[: a.shape[-1]] if a.ndim == 1 else b
@@ -298,8 +284,8 @@ def _scanned(random, known, depth):
 
     def turn(carry, row):
         inside = np.random.default_rng(seed)
-        found = _computed(inside, [carry, row], steps=2, depth=depth - 1)
-        return _alike(found[-1], carry), found[-2]
+        results = _computed(inside, [carry, row], steps=2, depth=depth - 1)
+        return _alike(results[-1], carry), results[-2]
 
     last, every = lax.scan(turn, start, rows, reverse=bool(random.integers(2)))
     return [last, every]
@@ -347,8 +333,8 @@ def _looped(random, known, depth):
     seed = int(random.integers(1 << 30))
 
     def body(k, carry):
-        found = _computed(np.random.default_rng(seed), [carry, k], steps=2, depth=depth - 1)
-        return _alike(found[-1], carry)
+        results = _computed(np.random.default_rng(seed), [carry, k], steps=2, depth=depth - 1)
+        return _alike(results[-1], carry)
 
     if random.random() < 0.5:
         return [lax.fori_loop(0, int(random.integers(1, 5)), body, start)]
@@ -366,12 +352,12 @@ def _nested(random, known, depth):
 
     def made(constant):
         def function(x, y):
-            found = _computed(np.random.default_rng(seed), [x, y * constant], steps=3, depth=depth - 1)
-            return found[-1], _tame(y + constant)
+            results = _computed(np.random.default_rng(seed), [x, y * constant], steps=3, depth=depth - 1)
+            return results[-1], _tame(y + constant)
 
         return jax.jit(function)
 
-    functions = [made(each) for each in constants]
+    functions = [made(constant) for constant in constants]
     return [*functions[0](x, y), *functions[1](x, y), functions[0](x, y + 1)[1]]
 
 

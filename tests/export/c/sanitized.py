@@ -29,13 +29,13 @@ def in_sanitized_c(functions: Functions, states: Mapping[str, list[Any]], folder
     program = folder / "run"
     (folder / "run.c").write_text(_main(signatures, {name: len(states[name]) for name in functions}))
     compile_c([*FLAGS, str(folder / "model.c"), str(folder / "run.c"), "-lm", "-o", str(program)])
-    given = b"".join(
+    data = b"".join(
         np.ascontiguousarray(array, _type(leaf.kind)).tobytes()
         for name, signature in signatures.items()
         for state in states[name]
         for leaf, array in zip(signature.arguments, state, strict=True)
     )
-    ran = subprocess.run([program], input=given, capture_output=True, timeout=300)
+    ran = subprocess.run([program], input=data, capture_output=True, timeout=300)
     assert ran.returncode == 0, ran.stderr.decode()[-3000:]
     return _read(ran.stdout, signatures, states)
 
@@ -45,28 +45,28 @@ def _main(signatures: Mapping[str, Signature], counts: Mapping[str, int]) -> str
     text = '#include <stdio.h>\n\n#include "model.h"\n\n'
     text += "static void take(void *to, size_t size, size_t count)\n{\n"
     text += '    if (fread(to, size, count, stdin) != count) perror("arguments");\n}\n\nint main(void)\n{\n'
-    for name, each in signatures.items():
+    for name, signature in signatures.items():
         text += f"    for (int k = 0; k < {counts[name]}; ++k) {{\n"
-        for place, leaf in enumerate([*each.arguments, *each.results]):
+        for place, leaf in enumerate([*signature.arguments, *signature.results]):
             kind = "double" if leaf.kind == "real" else KINDS[leaf.kind]
             text += f"        {kind} x{place}[{max(int(np.prod(leaf.shape)), 1)}];\n"
         passed = []
-        for place, leaf in enumerate(each.arguments):
+        for place, leaf in enumerate(signature.arguments):
             text += f"        take(x{place}, sizeof *x{place}, {int(np.prod(leaf.shape))});\n"
             passed.append(f"x{place}" if leaf.shape else f"*x{place}")
-        results = [f"x{len(each.arguments) + place}" for place in range(len(each.results))]
-        call = f"model_{name}({', '.join([*passed, *([] if each.returns else results)])})"
-        text += f"        *{results[0]} = {call};\n" if each.returns else f"        {call};\n"
-        for result, leaf in zip(results, each.results, strict=True):
+        results = [f"x{len(signature.arguments) + place}" for place in range(len(signature.results))]
+        call = f"model_{name}({', '.join([*passed, *([] if signature.returns else results)])})"
+        text += f"        *{results[0]} = {call};\n" if signature.returns else f"        {call};\n"
+        for result, leaf in zip(results, signature.results, strict=True):
             text += f"        fwrite({result}, sizeof *{result}, {int(np.prod(leaf.shape))}, stdout);\n"
         text += "    }\n"
     return text + "    return 0;\n}\n"
 
 
 def _read(data: bytes, signatures: Mapping[str, Signature], states: Mapping[str, list[Any]]) -> Any:
-    start, found = 0, {}
+    start, every = 0, {}
     for name, signature in signatures.items():
-        found[name] = []
+        every[name] = []
         for _ in states[name]:
             results = []
             for leaf in signature.results:
@@ -74,9 +74,9 @@ def _read(data: bytes, signatures: Mapping[str, Signature], states: Mapping[str,
                 size = int(np.prod(leaf.shape)) * dtype.itemsize
                 results.append(np.frombuffer(data[start : start + size], dtype).reshape(leaf.shape))
                 start += size
-            found[name].append(results)
+            every[name].append(results)
     assert start == len(data)
-    return found
+    return every
 
 
 def _type(kind: str) -> Any:

@@ -43,7 +43,7 @@ def number(k):
 def loaded(request, tmp_path_factory):
     folder, real = tmp_path_factory.mktemp("binding"), np.float64 if request.param == "f64" else np.float32
     examples = (np.zeros((2, 3), real), real(0))
-    functions: dict[str, Any] = {each.__name__: (each, examples) for each in (matrix, several)}
+    functions: dict[str, Any] = {function.__name__: (function, examples) for function in (matrix, several)}
     functions["number"] = (number, examples[1:])
     if request.param == "f64":
         functions["count"] = (count, (np.bool_(True), np.int32(0), np.int64(0)))
@@ -66,8 +66,8 @@ def test_any_real_numbers_of_the_shape_are_taken(loaded, order, dtype, k):
 
 def test_results_are_new_arrays_and_numbers(loaded):
     functions, real = loaded
-    given = MATRIX.astype(real)
-    first, second = functions.several(given, 1.0), functions.several(given, 2.0)
+    array = MATRIX.astype(real)
+    first, second = functions.several(array, 1.0), functions.several(array, 2.0)
     np.testing.assert_array_equal(first.y, MATRIX + 1)
     np.testing.assert_array_equal(second.y, MATRIX + 2)
     assert first.total == second.total == 15 and first.y.flags.writeable
@@ -99,7 +99,7 @@ def test_nothing_is_held_on_to(loaded):
 
 def test_threads_may_call_at_once(loaded):
     functions, real = loaded
-    inputs = [np.full((2, 3), each, real) for each in range(200)]
+    inputs = [np.full((2, 3), number, real) for number in range(200)]
     with ThreadPoolExecutor(4) as pool:
         results = list(pool.map(lambda a: functions.matrix(a, 1.0), inputs))
     for a, result in zip(inputs, results, strict=True):
@@ -109,10 +109,10 @@ def test_threads_may_call_at_once(loaded):
 @pytest.mark.parametrize(
     "args, kwargs, message",
     [
-        ((MATRIX,), {}, "matrix takes a, k; got 1 of them$"),
-        ((MATRIX, 1.0, 2.0), {}, "matrix takes a, k; got 3 of them and others"),
-        ((MATRIX, 1.0), {"k": 1.0}, "matrix takes a, k; got 3 of them"),
-        ((MATRIX,), {"j": 1.0}, "matrix takes a, k; got 2 of them and others"),
+        ((MATRIX,), {}, "matrix takes a, k; missing a required argument: 'k'$"),
+        ((MATRIX, 1.0, 2.0), {}, "matrix takes a, k; too many positional arguments$"),
+        ((MATRIX, 1.0), {"k": 1.0}, "matrix takes a, k; multiple values for argument 'k'$"),
+        ((MATRIX,), {"k": 1.0, "j": 1.0}, "matrix takes a, k; got an unexpected keyword argument 'j'$"),
         ((MATRIX.T, 1.0), {}, r"a has shape \(3, 2\); expected \(2, 3\)"),
         ((MATRIX, [1.0]), {}, r"k has shape \(1,\)"),
         ((MATRIX, "1"), {}, "k has type <U1; expected real numbers"),

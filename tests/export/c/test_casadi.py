@@ -38,8 +38,8 @@ def root(x):
 
 
 FUNCTIONS = {
-    "forward_dynamics": (dynamics(two_link_arm().energies).forward_dynamics, ARM),
-    "step": functions_of_system(pendulum().energies, 1, dtype=np.float64)["step_rk4"],
+    "forward_dynamics": (dynamics(two_link_arm().closed_form).forward_dynamics, ARM),
+    "step": functions_of_system(pendulum().closed_form, 1, dtype=np.float64)["step_rk4"],
     "products": (products, [np.ones((3, 2)), np.ones(2), np.float64(1)]),
     "root": (root, [np.ones(3)]),
 }
@@ -57,12 +57,12 @@ def library(tmp_path_factory):
 def of_a_vector(name):
     """The function of one vector, all arguments column-major and end to end, and the shapes of these."""
     function, examples = FUNCTIONS[name]
-    shapes = [np.shape(each) for each in examples]
+    shapes = [np.shape(example) for example in examples]
     cuts = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
 
     def flat(x):
-        given = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
-        return jnp.concatenate([jnp.ravel(each.T) for each in jax.tree.leaves(function(*given))])
+        arguments = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
+        return jnp.concatenate([jnp.ravel(result.T) for result in jax.tree.leaves(function(*arguments))])
 
     return flat, [(*shape, 1, 1)[:2] for shape in shapes]
 
@@ -81,18 +81,22 @@ def test_values_and_derivatives_equal_jax(name, library):
     result = columns(function(*symbols))
     random = np.random.default_rng(0)
     x, weights, seed = (random.normal(size=n) for n in (columns(symbols).numel(), result.numel(), result.numel()))
-    given = columns(symbols)
-    hessian, gradient = casadi.hessian(casadi.dot(result, weights), given)
-    backward = casadi.jtimes(result, given, seed, True)
-    along = casadi.jtimes(result, given, x)
+    variables = columns(symbols)
+    hessian, gradient = casadi.hessian(casadi.dot(result, weights), variables)
+    backward = casadi.jtimes(result, variables, seed, True)
+    along = casadi.jtimes(result, variables, x)
     every = casadi.Function(
-        "every", symbols, [result, casadi.jacobian(result, given), gradient, hessian, backward, along]
+        "every", symbols, [result, casadi.jacobian(result, variables), gradient, hessian, backward, along]
     )
     parts = np.split(x, np.cumsum([n * m for n, m in shapes])[:-1])
     got = every(*(part.reshape(shape, order="F") for part, shape in zip(parts, shapes, strict=True)))
-    slopes = jax.jit(jax.jacfwd(flat))(x)
-    curvature = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: flat(x) @ weights)))(x)
-    expected = flat(x), slopes, weights @ slopes, curvature, seed @ slopes, slopes @ x
+
+    @jax.jit
+    def derivatives(x):
+        return flat(x), jax.jacfwd(flat)(x), jax.jacfwd(jax.jacfwd(lambda x: flat(x) @ weights))(x)
+
+    value, slopes, curvature = derivatives(x)
+    expected = value, slopes, weights @ slopes, curvature, seed @ slopes, slopes @ x
     assert np.abs(curvature).max() > 0
     for ours, wanted in zip(got, expected, strict=True):
         scale = max(1.0, np.abs(wanted).max())
@@ -130,7 +134,7 @@ def test_null_pointers_are_zeros_and_what_nobody_wants(library):
     A, written = np.arange(6.0), [np.full(36, np.nan) for _ in range(6)]
     arg = (Block * 5)(A.ctypes.data_as(Block))  # the others are null, and so is scale
     wanted = 5  # dy/dscale = A b, of which b is zero
-    res = (Block * 6)(*(each.ctypes.data_as(Block) if k == wanted else None for k, each in enumerate(written)))
+    res = (Block * 6)(*(array.ctypes.data_as(Block) if k == wanted else None for k, array in enumerate(written)))
     assert call(arg, res, None, None, 0) == 0
     assert np.array_equal(written[wanted][:3], np.zeros(3)) and np.isnan(written[wanted][3:]).all()
     assert np.isnan(written[:wanted]).all()
@@ -158,7 +162,7 @@ def test_a_swing_up_is_solved_by_an_sqp(hessian, library):
     assert float(solution["f"]) == pytest.approx(148.466897, rel=1e-6)
     states, torques = np.split(np.array(solution["x"]).ravel(), [2 * (steps + 1)])
     states, in_jax = states.reshape(-1, 2), FUNCTIONS["step"][0]
-    after = jax.vmap(lambda x, u: in_jax(x, u, jnp.array(dt))["x_next"])(states[:-1], torques[:, None])
+    after = jax.jit(jax.vmap(lambda x, u: in_jax(x, u, jnp.array(dt))["x_next"]))(states[:-1], torques[:, None])
     assert np.abs(after - states[1:]).max() < 1e-9
 
 
@@ -210,6 +214,6 @@ def test_what_casadi_cannot_take_is_left_out_where_it_may_be(tmp_path):
         folder = tmp_path / str(chosen)
         export_c(functions, folder, casadi=chosen, leave_out_large=True)
         text = (folder / "model_casadi.c").read_text()
-        assert [each for each in "fghi" if f"DESCRIBED(casadi_model_{each}," not in text] == list(missing)
+        assert [letter for letter in "fghi" if f"DESCRIBED(casadi_model_{letter}," not in text] == list(missing)
         assert " * Left out: casadi_model_g: x is real of shape [2, 2, 2]; CasADi takes real" in text
         assert "model_g(" in (folder / "model.h").read_text()

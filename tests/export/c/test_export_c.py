@@ -34,8 +34,8 @@ def step(x, u):
 def solved(q, i):
     m = jnp.outer(q, q) + 3 * jnp.eye(3, dtype=q.dtype)
     turned = lax.scan(lambda c, y: (jnp.cos(c) + y, c), q, jnp.stack([q, q]))[1]
-    found = lax.while_loop(lambda s: s[1] < 4, lambda s: (jnp.linalg.solve(m, s[0]), s[1] + 1), (q, 0))[0]
-    return found, turned.at[i].add(2.0), lax.cond(q[0] > 0, jnp.tanh, jnp.exp, jnp.linalg.cholesky(m))
+    solution = lax.while_loop(lambda s: s[1] < 4, lambda s: (jnp.linalg.solve(m, s[0]), s[1] + 1), (q, 0))[0]
+    return solution, turned.at[i].add(2.0), lax.cond(q[0] > 0, jnp.tanh, jnp.exp, jnp.linalg.cholesky(m))
 
 
 FUNCTIONS = {
@@ -57,8 +57,8 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
     assert re.findall(r"#include (\S+)", source) == ["<float.h>", "<math.h>", "<stdint.h>", '"arm.h"']
     assert not re.search(r"\b(malloc|static (?!const|inline|void)|double)\b", source)
     stated = json.loads(once["arm.json"])["functions"]
-    for each in stated.values():
-        assert f"{each['operations']} floating-point operations, {each['stack_bytes']} bytes of stack" in header
+    for facts in stated.values():
+        assert f"{facts['operations']} floating-point operations, {facts['stack_bytes']} bytes of stack" in header
 
 
 @pytest.mark.parametrize("m, n", [(3, 4), (40, 70), (64, 64)])
@@ -88,9 +88,9 @@ def test_what_is_called_counts_with_what_calls_it():
     callers = {"once": large, "of_larger": lambda x: 2 * larger(x), "of_both": lambda x: larger(larger(x)) + large(x)}
     files = source_files({name: (lambda x, call=call: call(x), (x,)) for name, call in callers.items()}, name="model")
     stated = json.loads(files["model.json"])["functions"]
-    for each, calls in zip(stated.values(), (1, 2, 5), strict=True):  # large(x) is computed once
-        assert each["stack_bytes"] > alone["stack_bytes"]
-        assert calls <= each["operations"] / alone["operations"] < calls + 0.01
+    for facts, calls in zip(stated.values(), (1, 2, 5), strict=True):  # large(x) is computed once
+        assert facts["stack_bytes"] > alone["stack_bytes"]
+        assert calls <= facts["operations"] / alone["operations"] < calls + 0.01
     assert files["model.c"].count(b"static void part_") == 2
 
 
@@ -127,7 +127,7 @@ def test_results_may_overlap_arguments(tmp_path):
     compile_c(["-O1", "-fPIC", "-shared", str(tmp_path / "model.c"), "-lm", "-o", str(built)])
     x, u = np.array([0.1, 0.2, -0.3, 0.4]), np.array([0.5])
     expected = x[::-1] + u * np.sin(x)
-    pointers = [ctypes.c_void_p(each.ctypes.data) for each in (x, u, x)]
+    pointers = [ctypes.c_void_p(array.ctypes.data) for array in (x, u, x)]
     ctypes.CDLL(str(built)).model_step(*pointers)
     np.testing.assert_allclose(x, expected, rtol=1e-14)
 
@@ -204,7 +204,7 @@ def test_a_kill_leaves_an_old_export_or_a_new_one_or_a_refusal(tmp_path, monkeyp
 
     def written(files):
         ours = {name: {key: data for key, data in files.items() if key.startswith(name)} for name in "ab"}
-        return {**files, **{f"{name}.json": described({"age": 1}, each) for name, each in ours.items()}}
+        return {**files, **{f"{name}.json": described({"age": 1}, own) for name, own in ours.items()}}
 
     write_exports(tmp_path, written(old), overwrite=False)
     replace, count = Path.replace, iter(range(7))
@@ -349,7 +349,7 @@ def test_library_functions_bear_extended_precision(tmp_path):
 
 def test_integers_have_the_types_of_stdint(tmp_path):
     types = (np.int32, np.int64, np.uint32, np.uint64)
-    export_c({"f": (lambda *each: each[0][0] + 1, tuple(np.zeros(2, kind) for kind in types))}, tmp_path)
+    export_c({"f": (lambda *arrays: arrays[0][0] + 1, tuple(np.zeros(2, kind) for kind in types))}, tmp_path)
     header = (tmp_path / "model.h").read_text()
     assert "#include <stdint.h>" in header
     for kind in types:

@@ -28,7 +28,7 @@ MATRICES = {
     "nearly diagonal": np.diag(np.arange(N)) + 1e-13 * RANDOM.normal(size=(N, N)),
     "exchange": np.eye(N)[::-1],
 }
-SYMMETRIC = {name: np.tril(each) + np.tril(each, -1).T for name, each in MATRICES.items()}
+SYMMETRIC = {name: np.tril(matrix) + np.tril(matrix, -1).T for name, matrix in MATRICES.items()}
 EPS = np.finfo(float).eps
 
 
@@ -40,17 +40,17 @@ def eigh(a):
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     functions = {"eigh": (eigh, (np.eye(N),)), "qr": (jnp.linalg.qr, (np.eye(N),))}
-    holes = [np.where(np.arange(N * N).reshape(N, N) == 30, each, np.eye(N)) for each in (np.nan, np.inf)]
+    holes = [np.where(np.arange(N * N).reshape(N, N) == 30, value, np.eye(N)) for value in (np.nan, np.inf)]
     states = {
-        "eigh": [(each,) for each in (*SYMMETRIC.values(), *(np.maximum(each, each.T) for each in holes))],
-        "qr": [(each,) for each in (*MATRICES.values(), *holes)],
+        "eigh": [(matrix,) for matrix in (*SYMMETRIC.values(), *(np.maximum(matrix, matrix.T) for matrix in holes))],
+        "qr": [(matrix,) for matrix in (*MATRICES.values(), *holes)],
     }
     return in_c(functions, states, tmp_path_factory.mktemp("c"))
 
 
 @pytest.mark.parametrize("place, name", list(enumerate(MATRICES)))
 def test_eigenvectors_are_orthonormal_and_have_their_values(place, name, results):
-    values, vectors = (each[place] for each in results["eigh"])
+    values, vectors = (result[place] for result in results["eigh"])
     size = max(np.abs(SYMMETRIC[name]).max(), np.finfo(float).tiny)
     a = SYMMETRIC[name] / size
     assert (np.diff(values) >= 0).all()
@@ -61,7 +61,7 @@ def test_eigenvectors_are_orthonormal_and_have_their_values(place, name, results
 
 @pytest.mark.parametrize("place, name", list(enumerate(MATRICES)))
 def test_qr_is_orthonormal_times_upper_triangular(place, name, results):
-    q, r = (each[place] for each in results["qr"])
+    q, r = (result[place] for result in results["qr"])
     size = max(np.abs(MATRICES[name]).max(), np.finfo(float).tiny)
     assert (np.tril(r, -1) == 0).all()
     assert np.abs(q.T @ q - np.eye(N)).max() < 20 * N * EPS
@@ -69,7 +69,7 @@ def test_qr_is_orthonormal_times_upper_triangular(place, name, results):
 
 
 def test_numbers_that_are_not_finite_are_not_hidden(results):
-    values, vectors = (each[len(MATRICES) :] for each in results["eigh"])
+    values, vectors = (result[len(MATRICES) :] for result in results["eigh"])
     assert np.isnan(values).all() and np.isnan(vectors).all()
-    q, r = (each[len(MATRICES) :] for each in results["qr"])
-    assert all(np.isnan(each).any() for each in (*q, *r))
+    q, r = (result[len(MATRICES) :] for result in results["qr"])
+    assert all(np.isnan(result).any() for result in (*q, *r))

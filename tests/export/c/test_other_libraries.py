@@ -56,7 +56,7 @@ def check_agreement(function, folder):
 
 def test_newton_of_optimistix(tmp_path):
     roots = check_agreement(root, tmp_path)
-    left = jax.vmap(implicit)(roots, np.stack([each for (each,) in STATES]))
+    left = jax.vmap(implicit)(roots, np.stack([state for (state,) in STATES]))
     assert np.abs(left).max() < 1e-12
 
 
@@ -108,14 +108,14 @@ EQUINOX = {
 
 
 def test_primitives_of_equinox(tmp_path):
-    functions = {f"case_{place}": (each, STATES[0]) for place, each in enumerate(EQUINOX.values())}
+    functions = {f"case_{place}": (function, STATES[0]) for place, function in enumerate(EQUINOX.values())}
     states = dict.fromkeys(functions, STATES)
     got = in_c(functions, states, tmp_path)
     for name, case in zip(functions, EQUINOX, strict=True):
         # Not mapped: what is noinline, or asks about a whole batch, is not the same inside of vmap.
         jitted = jax.jit(functions[name][0])
-        each = [jax.tree.leaves(jitted(*state)) for state in STATES]
-        for ours, theirs in zip(got[name], map(np.stack, zip(*each, strict=True)), strict=True):
+        rows = [jax.tree.leaves(jitted(*state)) for state in STATES]
+        for ours, theirs in zip(got[name], map(np.stack, zip(*rows, strict=True)), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=1e-13, err_msg=case)
 
 

@@ -104,9 +104,9 @@ def test_names_that_c_or_its_libraries_have_are_refused(name, tmp_path):
     ):
         if options.get("functions", {}).get("run") and not name[:1].isalpha():
             continue  # a result is named `result` then
-        given = {"functions": {"run": (jnp.sin, (X,))}, **options}
+        keywords = {"functions": {"run": (jnp.sin, (X,))}, **options}
         with pytest.raises(InputError, match="expected a C name") as caught:
-            export_c(given.pop("functions"), tmp_path / "c", **given)
+            export_c(keywords.pop("functions"), tmp_path / "c", **keywords)
         assert "\n" not in str(caught.value) and not (tmp_path / "c").exists()
 
 

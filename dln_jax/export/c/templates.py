@@ -1,0 +1,229 @@
+"""Texts of the files of an export: header, preamble, demo program, CasADi interface and CMake file."""
+
+from collections.abc import Mapping, Sequence
+from math import prod
+
+from dln_jax.export.c import elementary, factorisations, kernels, operations
+from dln_jax.export.c.body import Source
+from dln_jax.export.c.interface import KINDS, Signature, declaration
+from dln_jax.export.c.text import PRECISIONS, comment, fill, table
+
+_PROMISES = """Functions of one state. Their workspace is on the stack, so they may run in several threads.
+Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
+written. NaN and infinities in a state propagate to the results."""
+NEEDED = """C99; needs <math.h>, <float.h> and <stdint.h>, and nothing else. Fastest with -O3 for the processor at hand
+(gcc: -march=native); does not compile with -ffast-math, which gives wrong numbers."""
+_PREAMBLE = """\
+#include <float.h>
+#include <math.h>
+#include <stdint.h>
+
+#include "$name.h"
+
+#if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || defined _M_FP_FAST || __FINITE_MATH_ONLY__ + 0
+#error "NaN, infinities and rounding are relied on: do not use -ffast-math or any of its options"
+#endif
+
+typedef $real real;
+
+/* These passes of gcc take as long as all others together and find nothing here */
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("no-gcse", "no-gcse-after-reload")
+#endif
+
+/* a b + c, rounded once if the processor has such an operation */
+#ifdef FP_FAST_FMA$upper
+#define MULTIPLY_ADD(a, b, c) fma${f}(a, b, c)
+#else
+#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))
+#endif
+#ifdef __cplusplus
+#define RESTRICT
+#else
+#define RESTRICT restrict
+#endif
+
+"""
+_HEADER = """\
+#ifndef $guard
+#define $guard
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+$declared
+#ifdef __cplusplus
+}
+#endif
+
+#endif
+"""
+CASADI_DECLARATIONS = """
+typedef double casadi_real;
+typedef long long int casadi_int;
+
+#ifdef __cplusplus
+#define EXPORTED extern "C"
+#else
+#define EXPORTED
+#endif
+/* CasADi's queries about a function. The function has no state that needs reference counts, and its workspace is on
+   the stack. */
+#define DESCRIBED(f, inputs, outputs) \\
+    EXPORTED void f##_incref(void) {} \\
+    EXPORTED void f##_decref(void) {} \\
+    EXPORTED casadi_int f##_n_in(void) { return inputs; } \\
+    EXPORTED casadi_int f##_n_out(void) { return outputs; } \\
+    EXPORTED const char *f##_name_in(casadi_int i) { return f##_names[i]; } \\
+    EXPORTED const char *f##_name_out(casadi_int i) { return f##_names[inputs + i]; } \\
+    EXPORTED const casadi_int *f##_sparsity_in(casadi_int i) { return f##_sparsities[i]; } \\
+    EXPORTED const casadi_int *f##_sparsity_out(casadi_int i) { return f##_sparsities[inputs + i]; } \\
+    EXPORTED int f(const casadi_real **arg, casadi_real **res, casadi_int *integers, casadi_real *reals, int memory)
+"""
+CASADI_FUNCTION = """
+/* {operations} floating-point operations, {bytes} bytes of stack */
+static const char *const {symbol}_names[] = {{{names}}};
+static const casadi_int {symbol}_sparsities[][{length}] = {{{sparsities}}};
+DESCRIBED({symbol}, {inputs}, {outputs})
+{{
+{lines}
+}}
+"""
+CASADI_ABOUT = """{name}_casadi.c: functions of {name}.h with exact derivatives, for CasADi 3.6 and later.
+{written_by}
+
+cmake -B build && cmake --build build, then in Python, with the name of one of the functions for F:
+F = casadi.external("casadi_{name}_F", "build/lib{name}.so")
+
+acados loads the same library; its folder is model_external_shared_lib_dir, and its name, {name},
+model_external_shared_lib_name among the solver's options."""
+CASADI_BUILD = """
+# The library that CasADi and acados load
+add_library({name}_casadi SHARED {name}.c {name}_casadi.c)
+set_target_properties({name}_casadi PROPERTIES OUTPUT_NAME {name} ARCHIVE_OUTPUT_NAME {name}_casadi
+  C_STANDARD 99 C_EXTENSIONS OFF WINDOWS_EXPORT_ALL_SYMBOLS ON)
+if(UNIX)
+  target_link_libraries({name}_casadi PRIVATE m)
+endif()
+"""
+_START = """#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+
+#include "{name}.h"
+
+/* Uniform in [-1, 1), the same on every machine */
+static unsigned long seed_ = 1;
+
+static {real} uniform_(void)
+{{
+    seed_ = (1103515245UL * seed_ + 12345UL) & 0x7fffffffUL;
+    return ({real})seed_ / ({real})0x40000000UL - 1;
+}}
+
+int main(int arguments_, char **argument_)
+{{
+    const long calls_ = arguments_ > 1 ? atol(argument_[1]) : 0;
+"""
+_TIMED = """        if (calls_ > 0) {{
+            const clock_t start_ = clock();
+            for (long k_ = 0; k_ < calls_; ++k_) {{ {moved}{call}; }}
+            const double seconds_ = (double)(clock() - start_) / CLOCKS_PER_SEC;
+            const double each_ = seconds_ / (double)calls_;
+            printf("{function}: %.0f calls/s, %.3f us each\\n", 1 / each_, 1e6 * each_);
+        }}
+"""
+
+
+def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
+    """Returns NAME_demo.c, which prints every function at one state and, with an argument N, times N calls.
+
+    Real arguments are random, but a time step `dt` is a millisecond.
+    """
+    real = PRECISIONS[precision][1]
+    kinds = {**KINDS, "real": real}
+    text = comment(
+        f"{name}_demo.c: prints the results of the functions of {name}.h at one state.",
+        f"cc -std=c99 -O3 -march=native {name}.c {name}_demo.c -lm -o {name}_demo\n"
+        f"./{name}_demo 1000000    also times a million calls of each",
+    ) + _START.format(name=name, real=real)
+    for key, function in functions.items():
+        leaves = [*function.arguments, *function.results]
+        names = [leaf.name if leaf.shape else f"{leaf.name}[0]" for leaf in leaves]
+        call = f"{name}_{key}({', '.join(names[: len(names) - function.returns])})"
+        call = f"{names[-1]} = {call}" if function.returns else call
+        lines = [f"static {kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];" for leaf in leaves]
+        for leaf in function.arguments:
+            value = "uniform_()" if leaf.kind == "real" else "0"
+            value = f"({real})1e-3" if leaf.name == "dt" else value  # discrete-time steps have this argument
+            lines.append(f"for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {leaf.name}[i_] = {value};")
+        lines.append(f"{call};")
+        for leaf in function.results:
+            printed = f'printf(" %.9g", (double){leaf.name}[i_]);'
+            lines += [f'printf("{key} {leaf.name}:");', f"for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {printed}"]
+            lines.append('printf("\\n");')
+        # The state changes between calls, so that the compiler cannot remove any.
+        first = next((leaf.name for leaf in function.arguments if leaf.kind == "real"), None)
+        moved = f"{first}[0] += ({real})1e-6; " if first else ""
+        text += "    {\n" + "".join(f"        {line}\n" for line in lines)
+        text += _TIMED.format(moved=moved, call=call, function=f"{name}_{key}") + "    }\n"
+    return text + "    return 0;\n}\n"
+
+
+def cmake(name: str) -> str:
+    """Returns CMakeLists.txt, which builds the model as a library, and the demo."""
+    return f"""# Builds the model as a library and its demo: cmake -B build && cmake --build build
+cmake_minimum_required(VERSION 3.10)
+project({name} C)
+
+if(NOT CMAKE_BUILD_TYPE)
+  set(CMAKE_BUILD_TYPE Release)
+endif()
+
+add_library({name} {name}.c)
+target_include_directories({name} PUBLIC ${{CMAKE_CURRENT_SOURCE_DIR}})
+set_target_properties({name} PROPERTIES C_STANDARD 99 C_EXTENSIONS OFF POSITION_INDEPENDENT_CODE ON)
+if(UNIX)
+  target_link_libraries({name} PUBLIC m)
+endif()
+
+add_executable({name}_demo {name}_demo.c)
+set_target_properties({name}_demo PROPERTIES C_STANDARD 99 C_EXTENSIONS OFF)
+target_link_libraries({name}_demo PRIVATE {name})
+"""
+
+
+def preamble(source: Source, name: str) -> str:
+    """Returns the part of a source before its functions."""
+    precision = source.precision
+    tables = "".join(f"{table(*named, precision)}\n" for named in source.tables.values())
+    return "".join((
+        fill(_PREAMBLE, precision, name=name, upper=source.suffix.upper()),
+        tables.removesuffix("\n"),
+        elementary.definitions(source.functions, precision, arrays=source.arrays),
+        operations.definitions(source.integers, precision),
+        kernels.orderings(source.orders),
+        factorisations.definitions(source.kernels, source.suffix),
+    ))  # fmt: skip
+
+
+def header(
+    name: str, written_by: str, signatures: Mapping[str, Signature], precision: str, left_out: Sequence[str]
+) -> str:
+    """Returns the header: the prototype of every function, the shapes of its results and its cost."""
+    declared = ""
+    for key, signature in signatures.items():
+        shapes = "".join(f"{leaf.name} {list(leaf.shape)}, " for leaf in signature.results if leaf.shape)
+        facts = f"{signature.operations} floating-point operations, {signature.stack_bytes} bytes of stack"
+        prototype = declaration(name, key, signature, PRECISIONS[precision][1])
+        declared += f"\n/* {f'{shapes[:-2]}; ' if shapes else ''}{facts} */\n{prototype};\n"
+    text = about(f"{name}.h", written_by, _PROMISES, left_out=left_out)
+    return text + fill(_HEADER, precision, guard=f"{name.upper()}_H", declared=declared)
+
+
+def about(*paragraphs: str, left_out: Sequence[str]) -> str:
+    """Returns a comment that also lists the functions left out, and why."""
+    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
+    return comment(*paragraphs, *[absent] * bool(absent))
