@@ -5,7 +5,7 @@ A step for controllers is x_next = F(x, u, dt), with A = dF/dx and B = dF/du:
     x = (q, qd) [2 d],   qdd = forward_dynamics(q, qd, tau),   tau = actuation u, held over the step
     x = (q, p) [2 d] in a phase space, without u
 
-A step takes a fixed number of operations: its implicit midpoint rule takes a fixed number of Newton steps, while that
+It takes a fixed number of operations: its implicit midpoint rule takes a fixed number of Newton steps, while that
 of `mechanics.integrators` iterates until it has converged. Derivatives are exact (for the implicit step by the implicit
 function theorem at the last iterate) and share the Jacobians of `mechanics.jacobians`.
 """
@@ -31,10 +31,10 @@ ITERATIONS = 3
 """Newton steps of the implicit midpoint rule."""
 Step = Callable[[Any, Any, Any], Any]
 """(x, u, dt) -> x_next."""
-Torque = Literal["held", "interpolated"]
-"""Torque between its samples."""
 PhaseStep = Callable[[Any, Any, Any], Any]
 """(q, p, dt) -> (q, p) after the step."""
+Torque = Literal["held", "interpolated"]
+"""A recorded torque between its samples."""
 Actuation = Sequence[Sequence[float]] | Float[np.ndarray, "d u"] | None
 """Actuation matrix of `types.Needs`; with `None`, u is tau."""
 

@@ -16,11 +16,11 @@ from jax import Array
 
 from dln_jax.mechanics import closed_form, natural
 from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
-from dln_jax.mechanics.dynamics import friction_of
+from dln_jax.mechanics.dynamics import friction_of, minus_potential
 from dln_jax.mechanics.joint_friction import LoadedSystem, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.types import CholeskyFactor, Dissipation, Potential
+from dln_jax.types import CholeskyFactor, Dissipation, Potential, Scalar, Vector
 
 
 class Residual(NamedTuple):
@@ -48,12 +48,12 @@ def with_residual(system: Any, residual: Residual) -> RecursiveSystem | Lagrangi
         link = with_residual(system.link, residual._replace(dissipation=None))
         return with_friction(system._replace(link=link), D)
     if isinstance(system, LagrangianSystem):
-        L = system.lagrangian
-        if factor is not None:
-            L = _sum(L, natural.lagrangian(NaturalSystem(factor)))
-        if V is not None:
-            L = _sum(L, lambda q, qd: -V(q))
-        return with_friction(system._replace(lagrangian=L), D)
+
+        def lagrangian(q: Vector, qd: Vector) -> Scalar:
+            L = minus_potential(system.lagrangian(q, qd), V, q)
+            return L if factor is None else L + 0.5 * jnp.sum((factor(q).T @ qd) ** 2)
+
+        return with_friction(system._replace(lagrangian=lagrangian), D)
     system = _recursive(system)
     if V is not None:
         forces = _sum(system.forces, lambda q, qd, qdd: jax.grad(V)(q))

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 
-class Solution(NamedTuple):
+class LeastSquaresSolution(NamedTuple):
     """The unknowns, and how well the equations determine them."""
 
     x: np.ndarray
@@ -39,7 +39,7 @@ def solve(
     ridge: float = 0.0,
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
-) -> Solution:
+) -> LeastSquaresSolution:
     """Returns the x that minimises |A x - b|² + ridge |D x|²; of several, the one with the smallest |D x|.
 
     Args:
@@ -73,7 +73,7 @@ def solve(
         scaled, rhs = triangle[:, :-1], triangle[:, -1]
     left, sizes, right = truncated_svd(scaled, rank_tolerance)
     x = right.T @ (sizes / (sizes**2 + ridge) * (left.T @ rhs)) / scale
-    return Solution(
+    return LeastSquaresSolution(
         x=x,
         rank=len(sizes),
         condition=float(sizes[0] / sizes[-1]) if len(sizes) else np.inf,
@@ -87,7 +87,7 @@ def solve_chunks(
     ridge: float = 0.0,
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
-) -> Solution:
+) -> LeastSquaresSolution:
     """Solves equations (A, b) that come in chunks of rows, holding one chunk at a time; arguments as for `solve`.
 
     The chunks are folded into one triangle, [triangle; A b] = Q R, which has the same solutions and residual.

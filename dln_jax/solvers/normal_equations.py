@@ -50,7 +50,7 @@ class NormalEquations(NamedTuple):
     """J as [k, blocks, P, rows of a block], or None if it is not kept."""
 
 
-class Factor(NamedTuple):
+class ScaledFactor(NamedTuple):
     """Cholesky factor of a positive definite matrix A, scaled to unit diagonal: A = S⁻¹ L Lᵀ S⁻¹."""
 
     lower: Array
@@ -220,7 +220,7 @@ def pull_back(
     return total(product, mesh)
 
 
-def factorise(matrix: Float[Array, "P P"]) -> tuple[Factor, Array]:
+def factorise(matrix: Float[Array, "P P"]) -> tuple[ScaledFactor, Array]:
     """Returns a factor of a symmetric matrix (lower triangle), and whether the fallback was needed.
 
     Scaled to unit diagonal, a matrix whose Cholesky factor exists and has all L_ii² > P eps is solved as it is. Else
@@ -238,10 +238,10 @@ def factorise(matrix: Float[Array, "P P"]) -> tuple[Factor, Array]:
         roots = jnp.sqrt(jnp.maximum(values, smallest * values[-1]))
         return jnp.linalg.qr(roots[:, None] * vectors.T, mode="r").T
 
-    return Factor(lax.cond(well_conditioned, lambda: lower, by_eigenvalues), scaling), ~well_conditioned
+    return ScaledFactor(lax.cond(well_conditioned, lambda: lower, by_eigenvalues), scaling), ~well_conditioned
 
 
-def solve(factor: Factor, b: Float[Array, "P"]) -> Float[Array, "P"]:
+def solve(factor: ScaledFactor, b: Float[Array, "P"]) -> Float[Array, "P"]:
     """Returns x [P] with A x = b."""
     forward = solve_triangular(factor.lower, factor.scaling * b, lower=True)
     return factor.scaling * solve_triangular(factor.lower, forward, lower=True, trans="T")

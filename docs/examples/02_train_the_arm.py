@@ -15,8 +15,8 @@ from dln_jax import GaussNewton, dynamics, fit, make_delan
 from dln_jax.data.splits import split
 from dln_jax.learning.dynamics import problem
 from dln_jax.nn.activations import tanh
+from dln_jax.scenes import two_link_arm
 from dln_jax.scenes.datasets.generators import default_data
-from dln_jax.scenes.pendulums import two_link_arm
 
 jax.config.update("jax_enable_x64", True)
 

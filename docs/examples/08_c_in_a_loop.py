@@ -18,8 +18,8 @@ import numpy as np
 from dln_jax import dynamics, export_c, load_c
 from dln_jax.learning.linear import fit_linear
 from dln_jax.models.trigonometric import make_trigonometric
+from dln_jax.scenes import two_link_arm
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulums import two_link_arm
 
 jax.config.update("jax_enable_x64", True)
 

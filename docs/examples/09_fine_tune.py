@@ -18,8 +18,8 @@ import optax
 import dln_jax
 from dln_jax import dynamics
 from dln_jax.cli.commands import train_delan
+from dln_jax.scenes import two_link_arm
 from dln_jax.scenes.datasets.generators import default_data
-from dln_jax.scenes.pendulums import two_link_arm
 
 jax.config.update("jax_enable_x64", True)
 

@@ -113,12 +113,14 @@ class Case(NamedTuple):
 
 def cases():
     densities = [stable_neo_hookean, neo_hookean, st_venant_kirchhoff, corotated]
-    for dimension, mesh in MESHES.items():
-        for density, numpy_density in zip(densities, [stable, logarithmic, green, linear_in_stretch], strict=True):
-            term = elastic(mesh, density, youngs_modulus=np.array([900.0, 1400.0]), poisson_ratio=0.35)
-            yield Case(density.__name__, dimension, term, elastic_reference(numpy_density, mesh.elements))
-        term = springs(PAIRS, stiffness=20.0, rest_length=lengths(mesh.vertices))
-        yield Case("stiff-springs", dimension, term, spring_reference)
+    for density, numpy_density in zip(densities, [stable, logarithmic, green, linear_in_stretch], strict=True):
+        for dimension, mesh in MESHES.items():
+            # In the plane, the sum of singular values has a formula of its own; the others read invariants alone.
+            if dimension == 3 or density in (stable_neo_hookean, corotated):
+                term = elastic(mesh, density, youngs_modulus=np.array([900.0, 1400.0]), poisson_ratio=0.35)
+                yield Case(density.__name__, dimension, term, elastic_reference(numpy_density, mesh.elements))
+    term = springs(PAIRS, stiffness=20.0, rest_length=lengths(MESHES[3].vertices))
+    yield Case("stiff-springs", 3, term, spring_reference)
     term = springs(PAIRS, stiffness=np.array([20.0, 30.0, 50.0]), softening=0.3)
     yield Case("springs", 2, term, softened_spring_reference)
     yield Case("muscles", 3, muscles(PAIRS, stiffness=90.0), muscle_reference, np.array([0.3, 1.0, 0.7]))
@@ -126,7 +128,7 @@ def cases():
 
 def has_parameter_derivatives(case: Case) -> bool:
     """The preparation is the same for all solids: one in space is enough."""
-    return case.dimension == 2 or case.name in ("stable_neo_hookean", "muscles")
+    return case.dimension == 2 or case.name in ("stable_neo_hookean", "stiff-springs", "muscles")
 
 
 class Answers(NamedTuple):

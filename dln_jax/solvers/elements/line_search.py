@@ -14,7 +14,7 @@ _DECREASE = 1e-4
 _HALVINGS = 40
 
 
-class Point(NamedTuple):
+class Evaluated(NamedTuple):
     """A point with its energy and gradient."""
 
     x: Blocks
@@ -23,19 +23,19 @@ class Point(NamedTuple):
 
 
 class _LineSearchTrial(NamedTuple):
-    point: Point
+    point: Evaluated
     length: Float[Array, ""]
     accepted: Bool[Array, ""]
 
 
 def line_search(
     evaluate: Callable[[Blocks], tuple[Float[Array, ""], Blocks]],
-    start: Point,
+    start: Evaluated,
     direction: Blocks,
     slope: Float[Array, ""],
     unclear: Float[Array, ""],
     scale: Float[Array, "n 1"],
-) -> tuple[Point, Bool[Array, ""]]:
+) -> tuple[Evaluated, Bool[Array, ""]]:
     """Takes the first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient if rounding hides that.
 
     Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
@@ -63,7 +63,7 @@ def line_search(
         lower = change <= _DECREASE * trial.length * slope
         flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
         accepted = (lower | flatter) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
-        return _LineSearchTrial(Point(x, energy, gradient), trial.length / 2, accepted)
+        return _LineSearchTrial(Evaluated(x, energy, gradient), trial.length / 2, accepted)
 
     one = jnp.ones((), start.x.dtype)
     smallest = 2.0**-_HALVINGS
@@ -73,4 +73,4 @@ def line_search(
         _LineSearchTrial(start, one, jnp.asarray(False)),
     )
     kept = [jnp.where(last.accepted, new, old) for new, old in zip(last.point, start, strict=True)]
-    return Point(*kept), last.accepted
+    return Evaluated(*kept), last.accepted

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elements.assembly import Pattern, entries, gradient, pattern, value_and_gradient
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians, project
-from dln_jax.solvers.elements.line_search import Point, line_search
+from dln_jax.solvers.elements.line_search import Evaluated, line_search
 from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFactory
 from dln_jax.solvers.elements.selection import by_size
 from dln_jax.solvers.newton import SolverInfo
@@ -43,7 +43,7 @@ class _Sum(NamedTuple):
 
 
 class _MinimumIterate(NamedTuple):
-    point: Point
+    point: Evaluated
     floor: Blocks
     unclear: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -193,7 +193,7 @@ def _newton(
         point, accepted = line_search(evaluate, state.point, direction, slope, unclear, scale)
         return _MinimumIterate(point, floor, unclear, state.iterations + 1, ~accepted)
 
-    first = Point(x0, *evaluate(x0))
+    first = Evaluated(x0, *evaluate(x0))
     start = _MinimumIterate(
         first, jnp.zeros_like(x0), rounding * jnp.abs(first.energy), jnp.asarray(0), jnp.asarray(False)
     )
