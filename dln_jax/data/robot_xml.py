@@ -134,9 +134,10 @@ def require_joints(root: ET.Element, locked: Collection[str]) -> None:
             )
         for tag, keys in NUMBERS.items():
             element = joint.find(tag)
-            for key in keys if element is not None else ():
+            for key in keys:
+                text = "0" if element is None else element.get(key, "0")
                 try:
-                    float(text := element.get(key, "0"))
+                    float(text)
                 except ValueError:
                     raise InputError(
                         f"joint '{joint.get('name')}': the {key} in <{tag}> is '{text:.40}'; expected a number"

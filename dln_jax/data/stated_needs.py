@@ -53,10 +53,9 @@ def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] |
     """Reads a matrix with one row per joint."""
     if stated is None:
         return None
-    try:
-        rows = tuple(tuple(row) for row in stated) if isinstance(stated, list | tuple) else ()
-    except TypeError:  # an entry is not a list
-        rows = ()
+    rows: list[tuple[Any, ...]] = []
+    if isinstance(stated, list | tuple) and all(isinstance(row, list | tuple) for row in stated):
+        rows = [tuple(row) for row in stated]
     if len(rows) != joints or len({len(row) for row in rows}) != 1 or not rows[0]:
         raise _wrong(key, stated, f"[{joints}, u] with u >= 1, rows of one length, or null")
     if not all(matches(entry, float) for row in rows for entry in row):

@@ -25,8 +25,8 @@ DECISIVE = 15.0
 MOST_BLOCKS = 0.8
 """Fraction of blocks that must agree."""
 BETTER = 0.8
-"""A change of sign or order must lower the unexplained variance to this fraction: with a robot that of all joints, since
-its parameters couple them, without one that of the joints whose torques change."""
+"""A change of sign or order must lower the unexplained variance to this fraction. With a robot the variance is that of
+all joints, since its parameters couple them; without one it is that of the joints whose torques change."""
 LESS_LATE = 0.95
 """The same for a delay."""
 LATE = 0.2
