@@ -6,7 +6,7 @@ the joint moves, and no inertias in the bodies fixed to it. Quantities that the 
 
 import copy
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -164,11 +164,22 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
         # These settings would alter the inertias written below.
         for name in ("inertiafromgeom", "settotalmass", "boundmass", "boundinertia", "balanceinertia"):
             compiler.attrib.pop(name, None)
-    k = 0
-    for body, moves in _bodies(root):
-        joints = list(_own(body, "joint"))
-        if not (joints or moves):
+    outer = {child: element for element in root.iter() for child in element}
+
+    def body_of(element: ET.Element) -> ET.Element:
+        """The body around an element, which may be in frames."""
+        while (element := outer[element]).tag == "frame":
+            pass
+        return element
+
+    worlds, joints_of, moving, k = root.findall("worldbody"), {}, set(), 0
+    for joint in (joint for world in worlds for joint in world.iter("joint")):
+        joints_of.setdefault(body_of(joint), []).append(joint)
+    for body in [body for world in worlds for body in world.iter("body")]:  # in MuJoCo's order
+        joints = joints_of.get(body, [])
+        if not (joints or body_of(body) in moving):
             continue
+        moving.add(body)
         for inertial in body.findall("inertial"):
             body.remove(inertial)
         inertial = ET.Element("inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")
@@ -183,30 +194,6 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
                     joint.set(key, _text(values[k]))
             k += 1
         body.insert(0, inertial)
-
-
-def _bodies(root: ET.Element) -> Iterator[tuple[ET.Element, bool]]:
-    """Bodies in MuJoCo's order, and whether a joint moves the parent of each."""
-
-    def below(element: ET.Element, moves: bool) -> Iterator[tuple[ET.Element, bool]]:
-        for child in element:
-            if child.tag == "body":
-                yield child, moves
-                yield from below(child, moves or any(True for _ in _own(child, "joint")))
-            elif child.tag == "frame":
-                yield from below(child, moves)
-
-    for world in root.findall("worldbody"):
-        yield from below(world, False)
-
-
-def _own(body: ET.Element, tag: str) -> Iterator[ET.Element]:
-    """Child elements of a body, including those in its frames."""
-    for child in body:
-        if child.tag == tag:
-            yield child
-        elif child.tag == "frame":
-            yield from _own(child, tag)
 
 
 def _link(joint: ET.Element, which: str) -> str | None:

@@ -26,7 +26,7 @@ REPEATING = ("replicate", "composite", "flexcomp")
 """MJCF elements that stand for many."""
 MOVING = ("revolute", "continuous", "prismatic")
 """URDF joint types that move."""
-NUMBERS = {"limit": ("lower", "upper", "effort", "velocity"), "dynamics": ("damping", "friction")}
+NUMBERS = {"limit": ("lower", "upper"), "dynamics": ("damping", "friction")}
 """Numeric attributes of the child elements of a URDF joint."""
 MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
 REMEDY = "correct the file, or lock the joint"
@@ -117,32 +117,6 @@ def _parameters(inertial: ET.Element) -> np.ndarray:
     return np.asarray(moved(inertial_parameters(m, np.zeros(3), moments), turn, xyz))
 
 
-def require_joints(root: ET.Element, locked: Collection[str]) -> None:
-    """Raises `InputError` for URDF joints that MuJoCo would misread, or for more than `MOST_JOINTS` that move."""
-    moving = [joint for joint in root.findall("joint") if joint.get("name", "") not in locked]
-    moving = [joint for joint in moving if joint.get("type") != "fixed"]
-    if len(moving) > MOST_JOINTS:
-        raise InputError(f"it has {len(moving)} joints that move; expected 1 to {MOST_JOINTS}")
-    names = [joint.get("name", "") for joint in root.findall("joint")]
-    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
-        raise InputError(f"two joints are named '{twice[0]:.60}'; give each a name of its own")
-    for joint in moving:
-        if joint.get("type") not in MOVING:
-            raise InputError(
-                f"joint '{joint.get('name')}' is of type '{joint.get('type')}'; expected {', '.join(MOVING)} or fixed: "
-                "lock it if it does not move"
-            )
-        for tag, keys in NUMBERS.items():
-            element = joint.find(tag)
-            for key in keys if element is not None else ():
-                try:
-                    float(text := element.get(key, "0"))
-                except ValueError:
-                    raise InputError(
-                        f"joint '{joint.get('name')}': the {key} in <{tag}> is '{text:.40}'; expected a number"
-                    ) from None
-
-
 def without_inertias(root: ET.Element) -> ET.Element:
     """Prepares a URDF for MuJoCo: no shapes, every link a body of its own, and unit inertias that MuJoCo accepts."""
     for link in root.iter("link"):
@@ -157,29 +131,46 @@ def without_inertias(root: ET.Element) -> ET.Element:
     return root
 
 
-def check_limits(path: Path, root: ET.Element, locked: Collection[str]) -> None:
-    """Raises `InputError` that names the first joint whose limits are not two finite numbers, lower < upper, or whose
-    velocity or effort in a URDF is negative or not a number. Locked joints are not checked."""
-    if root.tag == "robot":
-        for joint in root.findall("joint"):
-            limit, name = joint.find("limit"), joint.get("name", "")
-            if limit is None or name in locked or joint.get("type") not in MOVING:
-                continue
-            sides = [limit.get(side, "") for side in ("lower", "upper")]
-            if joint.get("type") != "continuous" and any(sides):
-                _require_range(name, "position", sides)
-            for kind in ("velocity", "effort"):
-                if not _number(limit.get(kind, "0")) >= 0:
-                    raise InputError(
-                        f"joint '{name}' has a limit of {kind} of '{limit.get(kind):.40}'; expected a number that is "
-                        f"not negative: {REMEDY}"
-                    )
+def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
+    """Raises `InputError` for joints that MuJoCo would misread; locked joints are not checked.
+
+    Limits must be two finite numbers, lower < upper. In a URDF, velocities and efforts must not be negative, names must
+    differ, joints must be of a known type, and at most `MOST_JOINTS` may move.
+    """
+    if root.tag == "mujoco":
+        for joint in (joint for part in _with_included(path, root) for joint in part.iter("joint")):
+            for attribute, (kind, switch) in RANGES.items():
+                stated = joint.get(attribute)
+                if stated is not None and joint.get(switch) != "false" and joint.get("name") not in locked:
+                    _require_range(joint.get("name") or "of a default class", kind, stated.split())
         return
-    for joint in (joint for part in _with_included(path, root) for joint in part.iter("joint")):
-        for attribute, (kind, switch) in RANGES.items():
-            stated = joint.get(attribute)
-            if stated is not None and joint.get(switch) != "false" and joint.get("name") not in locked:
-                _require_range(joint.get("name") or "of a default class", kind, stated.split())
+    names = [joint.get("name", "") for joint in root.findall("joint")]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise InputError(f"two joints are named '{twice[0]:.60}'; rename one")
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint") if joint.get("type") != "fixed"}
+    moving = {name: joint for name, joint in joints.items() if name not in locked}
+    if len(moving) > MOST_JOINTS:
+        raise InputError(f"it has {len(moving)} joints that move; expected 1 to {MOST_JOINTS}")
+    for name, joint in moving.items():
+        kind = joint.get("type")
+        if kind not in MOVING:
+            raise InputError(
+                f"joint '{name}' is of type '{kind}'; expected {', '.join(MOVING)} or fixed: lock it if it is still"
+            )
+        limit, dynamics = ({} if part is None else part.attrib for part in map(joint.find, ("limit", "dynamics")))
+        sides = [limit.get(side, "") for side in ("lower", "upper")]
+        if kind != "continuous" and any(sides):
+            _require_range(name, "position", sides)
+        for key in ("velocity", "effort"):
+            if not _number(limit.get(key, "0")) >= 0:
+                raise InputError(
+                    f"joint '{name}' has a limit of {key} of '{limit.get(key):.40}'; expected a number that is not "
+                    f"negative: {REMEDY}"
+                )
+        for tag, stated in (("limit", limit), ("dynamics", dynamics)):
+            for key in NUMBERS[tag]:
+                if np.isnan(_number(text := stated.get(key, "0"))):
+                    raise InputError(f"joint '{name}': the {key} in <{tag}> is '{text:.40}'; expected a number")
 
 
 def velocity_limits(root: ET.Element) -> dict[str, float]:

@@ -14,15 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.robot_xml import (
-    MOST_JOINTS,
-    check_limits,
-    link_inertias,
-    parsed,
-    require_joints,
-    velocity_limits,
-    without_inertias,
-)
+from dln_jax.data.robot_xml import MOST_JOINTS, check_joints, link_inertias, parsed, velocity_limits, without_inertias
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -86,10 +78,10 @@ def opened(
     if root.tag == "mujoco":
         mujoco, model = _compiled(path, root, ())
         locked = _matching(lock, joint_names(model))
-        check_limits(path, root, locked)
+        check_joints(path, root, locked)
         return mujoco, model, locked
     locked = _matching(lock, [joint.get("name", "") for joint in root.findall("joint")])
-    check_limits(path, root, locked)
+    check_joints(path, root, locked)
     return (*_compiled(path, root, locked), locked)
 
 
@@ -117,7 +109,6 @@ def _compiled(path: Path, root: ET.Element, locked: Collection[str]) -> tuple[An
         raise InputError(f"reading robots needs MuJoCo, which is not installed; {INSTALL}") from None
     text = None
     if root.tag == "robot":
-        require_joints(root, locked)
         for joint in root.iter("joint"):
             for mimic in joint.findall("mimic"):
                 if joint.get("name") not in locked:
@@ -192,7 +183,12 @@ def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping
             parent = len(links) - 1
             R, p = np.eye(3), -anchor
         carried.append((parent, R, p))
-        theta = _body(mujoco, model, body) if stated is None else stated.get(model.body(body).name, np.zeros(10))
+        if stated is None:
+            turn = _matrix(mujoco, model.body_iquat[body])
+            about = turn @ np.diag(model.body_inertia[body]) @ turn.T
+            theta = np.asarray(inertial_parameters(model.body_mass[body], model.body_ipos[body], about))
+        else:
+            theta = stated.get(model.body(body).name, np.zeros(10))
         if parent >= 0 and theta.any():
             inertias[parent] = inertias[parent] + moved(theta, R, p)
     names = tuple(names[joint] for joint in moving)
@@ -226,13 +222,6 @@ def _require_numbers(robot: Robot) -> None:
             wanted = "zero or more" if what in losses else f"numbers up to {LARGEST_NUMBER:.0e}"
             shown = ", ".join(f"{number:.3g}" for number in numbers[joint])
             raise InputError(f"the {what} of joint '{tree.names[joint]}' is {shown}; expected {wanted}")
-
-
-def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:
-    """Inertial parameters of one of MuJoCo's bodies in the frame of the body."""
-    turn = _matrix(mujoco, model.body_iquat[body])
-    about = turn @ np.diag(model.body_inertia[body]) @ turn.T
-    return np.asarray(inertial_parameters(model.body_mass[body], model.body_ipos[body], about))
 
 
 def _behind_locked(

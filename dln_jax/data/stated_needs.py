@@ -2,13 +2,13 @@
 
 import json
 import reprlib
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from dln_jax.files import matches
 from dln_jax.mechanics.friction import require_laws
-from dln_jax.types import InputError, JointKind, Needs
+from dln_jax.types import InputError, Needs
 
 
 def needs_from_text(text: str) -> Needs:
@@ -29,34 +29,28 @@ def needs_from_json(stated: Any) -> Needs:
     """
     if not isinstance(stated, dict) or not set(stated) <= set(Needs._fields) or "joints" not in stated:
         raise _wrong("JSON", stated, f"the fields {', '.join(Needs._fields)}")
-    values = {**Needs._field_defaults, **stated}
-    joints, laws, velocity = values["joints"], values["joint_friction"], values["velocity_scale"]
-    kinds = get_args(JointKind)
-    if not isinstance(joints, list | tuple) or not joints or not all(joint in kinds for joint in joints):
-        raise _wrong("joints", joints, "a list of 'revolute' and 'prismatic'")
-    for key in ("gravity", "friction"):
-        if not isinstance(values[key], bool):
-            raise _wrong(key, values[key], "true or false")
-    if not isinstance(laws, list | tuple):
-        raise _wrong("joint_friction", laws, "a list of laws such as 'viscous'")
-    require_laws(laws, "needs: joint_friction")
+    if isinstance(laws := stated.get("joint_friction", ()), list | tuple):
+        require_laws(laws, "needs: joint_friction")
+    try:
+        needs = Needs(**{**stated, "actuation": None, "joint_map": None})
+    except InputError as error:
+        raise InputError(f"needs: {error}") from None
+    d, velocity = needs.degrees_of_freedom, needs.velocity_scale
     if not (matches(velocity, float) and velocity > 0):
         raise _wrong("velocity_scale", velocity, "a positive number, rad/s or m/s")
-    actuation, joint_map = (_rows(key, values[key], len(joints)) for key in ("actuation", "joint_map"))
-    if joint_map is not None and (len(joint_map[0]) != len(joints) or np.linalg.matrix_rank(joint_map) < len(joints)):
-        raise _wrong("joint_map", joint_map, f"an invertible matrix [{len(joints)}, {len(joints)}], or null")
-    read = {"joints": tuple(joints), "actuation": actuation, "joint_map": joint_map, "joint_friction": tuple(laws)}
-    return Needs(**{**values, **read, "velocity_scale": float(velocity)})
+    actuation, joint_map = (_rows(key, stated.get(key), d) for key in ("actuation", "joint_map"))
+    if joint_map is not None and (len(joint_map[0]) != d or np.linalg.matrix_rank(joint_map) < d):
+        raise _wrong("joint_map", joint_map, f"an invertible matrix [{d}, {d}], or null")
+    return needs._replace(actuation=actuation, joint_map=joint_map, velocity_scale=float(velocity))
 
 
 def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] | None:
     """Reads a matrix with one row per joint."""
     if stated is None:
         return None
-    try:
-        rows = tuple(tuple(row) for row in stated) if isinstance(stated, list | tuple) else ()
-    except TypeError:  # an entry is not a list
-        rows = ()
+    rows: list[tuple[Any, ...]] = []
+    if isinstance(stated, list | tuple) and all(isinstance(row, list | tuple) for row in stated):
+        rows = [tuple(row) for row in stated]
     if len(rows) != joints or len({len(row) for row in rows}) != 1 or not rows[0]:
         raise _wrong(key, stated, f"[{joints}, u] with u >= 1, rows of one length, or null")
     if not all(matches(entry, float) for row in rows for entry in row):

@@ -56,7 +56,7 @@ REFUSED = [
     (changed(label=np.array(["a", "a", "b"])), "repeated names"),
     (changed(label=np.arange(3)), "one string per trajectory"),
     (changed(needs=np.array("{not json")), "needs is not JSON"),
-    (changed(needs=np.array('{"joints": ["ball"]}')), "'revolute' and 'prismatic'"),
+    (changed(needs=np.array('{"joints": ["ball"]}')), "expected a tuple of revolute, prismatic"),
     (changed(needs=np.array('{"joints": ["revolute"]}')), "states 1 joints, but q has 2"),
     (
         changed(needs=np.array('{"joints": ["revolute", "revolute"], "wind": true}')),
@@ -68,7 +68,7 @@ REFUSED = [
         (changed(needs=np.array(json.dumps({"joints": ["revolute"] * 2, key: value}))), message)
         for key, value, message in (
             ("joint_friction", ["viscous", "rust"], "joint_friction has 'rust'; expected some of viscous, coulomb"),
-            ("joint_friction", "viscous", "joint_friction is 'viscous'; expected a list of laws"),
+            ("joint_friction", "viscous", "joint_friction: 'viscous'; expected a tuple of viscous"),
             ("joint_friction", ["asymmetric", "coulomb"], "which no data can tell apart"),
             ("joint_map", [[1, 0]], "joint_map is"),
             ("joint_map", [[1, 1], [1, 1]], "an invertible matrix"),

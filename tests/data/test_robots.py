@@ -257,7 +257,7 @@ MALFORMED = {
     "joint without a type": (ARM.replace('type="continuous"', ""), "of type 'None'"),
     "two joints of one name": (ARM.replace('joint name="elbow"', 'joint name="shoulder"'), "two joints are named"),
     "damping in words": (ARM.replace('damping="0.2"', 'damping="much"', 1), "damping in <dynamics> is 'much'"),
-    "damping that is NaN": (ARM.replace('damping="0.2"', 'damping="nan"', 1), "damping of joint"),
+    "damping that is NaN": (ARM.replace('damping="0.2"', 'damping="nan"', 1), "damping in <dynamics> is 'nan'"),
     "damping that drives": (ARM.replace('damping="0.2"', 'damping="-1"', 1), "zero or more"),
     "mass beyond all": (ARM.replace('mass value="2.0"', 'mass value="1e308"'), "inertia of joint"),
     "velocity in words": (

@@ -37,21 +37,21 @@ def check_times(data: Trajectories) -> list[Finding]:
     counts = np.unique(data.trajectory, return_counts=True)[1]
     few = f"the number of trajectories is {len(counts)}; a split by trajectory needs {LEAST_TRAJECTORIES}"
     split = Finding("warning", "split", few, "record more, or cut the log in time and number the parts")
-    findings = [split] if len(counts) < LEAST_TRAJECTORIES else []
-    if counts.max() < 2:
-        return findings
-    rate, jitter, gaps, longest, rates = timing(data.t, data.trajectory)
-    step = f"{1 / rate:.3g} s"
-    cases = (
-        (rate < SLOWEST, "error", "time-unit", f"samples are {step} apart",
-         "give t in seconds if it is in milliseconds or ticks"),
-        (gaps, "note", "gaps", f"t has {gaps} gap(s): the longest step is {longest:.3g} s, the typical one {step}",
-         "cut the log at gaps, as smooth() does; rates across them are guesses"),
-        (jitter > JITTER, "warning", "jitter", f"time steps vary by {jitter:.0%}", FILTER),
-        (np.ptp(rates) > UNEQUAL * rate, "note", "rates",
-         f"trajectories are sampled at {rates.min():.4g} to {rates.max():.4g} Hz", FILTER),
-    )  # fmt: skip
-    return findings + [Finding(*finding) for holds, *finding in cases if holds]
+    cases = [(len(counts) < LEAST_TRAJECTORIES, split)]
+    if counts.max() > 1:
+        rate, jitter, gaps, longest, rates = timing(data.t, data.trajectory)
+        step = f"{1 / rate:.3g} s"
+        gapped = f"t has {gaps} gap(s): the longest step is {longest:.3g} s, the typical one {step}"
+        unequal = f"trajectories are sampled at {rates.min():.4g} to {rates.max():.4g} Hz"
+        in_seconds = "give t in seconds if it is in milliseconds or ticks"
+        cut = "cut the log at gaps, as smooth() does; rates across them are guesses"
+        cases += [
+            (rate < SLOWEST, Finding("error", "time-unit", f"samples are {step} apart", in_seconds)),
+            (gaps > 0, Finding("note", "gaps", gapped, cut)),
+            (jitter > JITTER, Finding("warning", "jitter", f"time steps vary by {jitter:.0%}", FILTER)),
+            (np.ptp(rates) > UNEQUAL * rate, Finding("note", "rates", unequal, FILTER)),
+        ]
+    return [finding for holds, finding in cases if holds]
 
 
 def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.checks.findings import Finding, on_joints
+from dln_jax.data.checks.findings import Finding, Severity, on_joints
 from dln_jax.data.encoders.smoothing import PART, Smoothed
 from dln_jax.data.schema import Trajectories
 
@@ -42,7 +42,8 @@ def match(
     shifts, columns = np.arange(-farthest, farthest + 1), np.arange(measured.shape[1])
     inside = away_from_ends(part, farthest)
     if len(inside) < 16:
-        return Match(np.ones(len(columns)), *np.zeros((2, len(columns))), np.ones(len(columns)))
+        one, zero = np.ones(len(columns)), np.zeros(len(columns))
+        return Match(factor=one, delay=zero, correlation=zero, gained=one)
     x = derived[inside]
     along = np.array([np.sum(measured[inside + shift] * x, axis=0) for shift in shifts])
     sizes = np.array([np.sum(measured[inside + shift] ** 2, axis=0) for shift in shifts])
@@ -127,7 +128,7 @@ def _judged(key: str, formula: str, matched: Match, rate: float, moves: np.ndarr
     worst = max(matched.delay[late], key=abs, default=0.0)
     delayed = f"up to {abs(worst) / rate * 1e3:.3g} ms {'late' if worst > 0 else 'early'}"
     ratios = ", ".join(f"{factor:.3g}" for factor in matched.factor[other])
-    cases = (
+    cases: tuple[tuple[Severity, str, np.ndarray, str, str], ...] = (
         ("error", "unit", degrees, f"is 57.3 times {formula}", f"convert {key} from degrees to radians"),
         ("error", "unit", radians, f"is {formula} / 57.3", "convert q from degrees to radians"),
         ("error", "unit", milli, f"is 1000 times {formula}", "give t in seconds"),

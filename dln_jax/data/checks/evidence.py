@@ -49,7 +49,9 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
     few = np.arange(n * d).reshape(n, d)[:: -(-n * d // WEIGHED)].ravel()
     sizes = np.maximum(tau.var(axis=0), 1e-12 * tau.var(axis=0).max())
     y, noise = tau.ravel() - prior.mean, np.tile(sizes, n)
-    weights = _likeliest(_of(prior, few), y[few], noise[few], d, iterations)
+    square = np.ix_(few, few)
+    some = Prior(prior.mean[few], [part[square] for part in prior.parts], [columns[few] for columns in prior.columns])
+    weights = _likeliest(some, y[few], noise[few], d, iterations)
     inverse = _inverse(_covariance(prior, weights, noise, d))
     pull = inverse @ y
     densities, unexplained = [], []
@@ -61,17 +63,12 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
     return Explanation(weights, inverse, pull, np.array(densities), np.array(unexplained))
 
 
-def _of(prior: Prior, chosen: np.ndarray) -> Prior:
-    """Restricts the prior to some of the torques."""
-    square = np.ix_(chosen, chosen)
-    return Prior(
-        prior.mean[chosen], [part[square] for part in prior.parts], [columns[chosen] for columns in prior.columns]
-    )
-
-
 def _likeliest(prior: Prior, y: np.ndarray, noise: np.ndarray, d: int, iterations: int) -> np.ndarray:
     """Weights of parts, columns and noise [w]; the likelihood grows in every iteration."""
-    weights = np.concatenate([_start(prior, float(np.mean(y**2 / noise)), noise), np.full(d, 0.05)])
+    traces = [np.mean(np.diag(part) / noise) for part in prior.parts]
+    traces += [np.mean(np.sum(columns**2, axis=1) / noise) for columns in prior.columns]
+    start = np.mean(y**2 / noise) / np.maximum(traces, 1e-300) / max(len(traces), 1)
+    weights = np.concatenate([start, np.full(d, 0.05)])
     for _ in range(iterations):
         inverse = _inverse(_covariance(prior, weights, noise, d))
         pull = inverse @ y
@@ -110,12 +107,6 @@ def screened(now: Explanation, prior: Prior, trials: Sequence[Float[np.ndarray, 
         own = pull[block]
         densities.append(-0.5 * np.sum(own * np.linalg.solve(now.inverse[np.ix_(block, block)], own), axis=0))
     return np.array(densities) - np.array(densities)[:, :1]
-
-
-def _start(prior: Prior, size: float, noise: np.ndarray) -> np.ndarray:
-    traces = [np.mean(np.diag(part) / noise) for part in prior.parts]
-    traces += [np.mean(np.sum(columns**2, axis=1) / noise) for columns in prior.columns]
-    return np.array([size / max(trace, 1e-300) for trace in traces]) / max(len(traces), 1)
 
 
 def _inverse(K: np.ndarray) -> np.ndarray:

@@ -25,8 +25,8 @@ DECISIVE = 15.0
 MOST_BLOCKS = 0.8
 """Fraction of blocks that must agree."""
 BETTER = 0.8
-"""A change of sign or order must lower the unexplained variance to this fraction of its value: with a robot the variance
-of all joints, since its parameters couple them; without one that of the joints whose torques change."""
+"""A change of sign or order must lower the unexplained variance to this fraction. With a robot the variance is that of
+all joints, since its parameters couple them; without one it is that of the joints whose torques change."""
 LESS_LATE = 0.95
 """The same for a delay."""
 LATE = 0.2
@@ -156,9 +156,9 @@ def examine_torques(
     return Torques(first, log, now, np.arange(-farthest, farthest + 1.0), loss, likely, *_friction(log, build, now))
 
 
-def _explained(log: Log, build: Build, iterations: int = evidence.ITERATIONS) -> Explanation:
+def _explained(log: Log, build: Build) -> Explanation:
     tau = log.torques()
-    return evidence.explain(build(log.states(), tau, log.gravity), tau, iterations=iterations)
+    return evidence.explain(build(log.states(), tau, log.gravity), tau)
 
 
 def _late(log: Log, build: Build, now: Explanation, farthest: int) -> tuple[np.ndarray, float]:
@@ -190,7 +190,10 @@ def _better(
     for trial in trials:
         explained = _explained(trial, build)
         limit = LESS_LATE if trial.delay != log.delay else BETTER
-        if decisive(now, explained, limit, _concerned(log, trial) if alone else np.ones(d, bool)):
+        concerned = (trial.signs != log.signs) | (np.array(trial.order) != np.array(log.order))
+        if not alone or not concerned.any():  # a delay, the clock and the base concern all joints
+            concerned = np.ones(d, bool)
+        if decisive(now, explained, limit, concerned):
             better.append((trial, explained))
     return max(better, key=lambda pair: pair[1].densities.sum(), default=None)
 
@@ -213,12 +216,6 @@ def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
 
     now, densities = density(log), np.array([density(trial) for trial in trials])
     return [trials[place] for place in np.argsort(densities)[::-1][:CANDIDATES] if densities[place] > now]
-
-
-def _concerned(log: Log, trial: Log) -> np.ndarray:
-    """Joints whose torques change sign or column in a trial; all joints if the trial concerns time or the base."""
-    concerned = (trial.signs != log.signs) | (np.array(trial.order) != np.array(log.order))
-    return concerned if concerned.any() else np.ones(len(concerned), bool)
 
 
 def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndarray) -> bool:

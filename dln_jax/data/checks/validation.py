@@ -91,12 +91,12 @@ def _in_order(arrays: dict[str, Any]) -> tuple[dict[str, Any], tuple[Finding, ..
     order = np.lexsort((t, trajectory))
     same = np.r_[False, (np.diff(t[order]) == 0) & (np.diff(trajectory[order]) == 0)]
     backward, double = int(np.sum(np.diff(t)[np.diff(trajectory) == 0] < 0)), int(same.sum())
+    repeated, first = f"{double} sample(s) have the time of the one before", "keep one sample for each time"
     cases = (
         (backward, "time-order", f"t decreases at {backward} sample(s)", "sort each trajectory by time (done here)"),
-        (double, "time-double", f"{double} sample(s) have the time of the one before",
-         "keep one sample for each time (the first was kept here)"),
-    )  # fmt: skip
-    repaired = tuple(Finding("error", *finding) for count, *finding in cases if count)
+        (double, "time-double", repeated, f"{first} (the first was kept here)"),
+    )
+    repaired = tuple(Finding("error", check, text, remedy) for count, check, text, remedy in cases if count)
     if not repaired:
         return arrays, ()
     kept = order[~same]

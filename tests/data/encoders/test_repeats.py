@@ -46,7 +46,7 @@ def error(found, qdd, rate):
 
 
 @pytest.mark.parametrize("rate", [30.0, 125.0])
-@pytest.mark.parametrize("noise", [1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("noise", [1e-5, 1e-3])
 @pytest.mark.parametrize("keys", [("q", "tau"), ("q",)])
 def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff(rate, noise, keys):
     arrays, qdd = log(rate=rate, noise=noise, seconds=30.0)
