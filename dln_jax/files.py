@@ -97,7 +97,7 @@ def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
 def matches(value: Any, hint: Any) -> bool:
     """Whether a JSON value has a type: bool, int, float (finite), str, Path (a str), None, Literal or a union."""
     if get_origin(hint) is Literal:
-        return any(type(value) is type(each) and value == each for each in get_args(hint))
+        return any(type(value) is type(option) and value == option for option in get_args(hint))
     if options := get_args(hint):
         return any(matches(value, option) for option in options)
     if isinstance(value, int) and not isinstance(value, bool):
