@@ -6,8 +6,7 @@ import pytest
 from planar_arm import ARM, LENGTH
 
 from dln_jax.identification.base import base_parameters, determinacy, in_words, null_directions
-from dln_jax.identification.columns import columns_of, flat
-from dln_jax.identification.equations import compressed, regressor_of
+from dln_jax.identification.equations import columns_of, compressed, flat, regressor_of
 from dln_jax.identification.identify import random_states
 from dln_jax.models.rigid_tree import make_rigid_tree
 

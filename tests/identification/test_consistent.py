@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from planar_arm import ARM, FRICTION, motions
 
-from dln_jax.identification.columns import columns_of, flat
 from dln_jax.identification.consistent import fit_consistent, is_consistent, nearest_body
-from dln_jax.identification.equations import compressed, regressor_of, squares, weighted
+from dln_jax.identification.equations import columns_of, compressed, flat, regressor_of, squares, weighted
 from dln_jax.identification.weighted import fit_weighted
 from dln_jax.mechanics.trees import body_of_pseudo_inertia, inertial_parameters, moved, pseudo_inertia
 from dln_jax.models.rigid_tree import make_rigid_tree

@@ -5,8 +5,7 @@ import pytest
 
 from dln_jax.identification.base import null_directions
 from dln_jax.identification.equations import Equations, Regressor, about, compressed, residuals, squares, weighted
-from dln_jax.identification.robust import correlation_times, fit_robust, residual_statistics
-from dln_jax.identification.weighted import fit_weighted
+from dln_jax.identification.weighted import correlation_times, fit_robust, fit_weighted, residual_statistics
 from dln_jax.types import InputError
 
 NOISE = np.array([0.1, 2.0])
