@@ -5,6 +5,7 @@ six months after the release that wrote them; export older ones again from the r
 they are loaded, for the platforms that they were lowered for. Writing and reading need the package `flatbuffers`.
 """
 
+import contextlib
 import importlib.util
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,8 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import Array, export
+from jax import export
 
 from dln_jax.export.exports import described, read_export, write_exports
 from dln_jax.mechanics.arguments import require_shape
@@ -106,42 +106,30 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
     platform, platforms = export.default_export_platform(), ", ".join(exported.platforms)
     if platform not in exported.platforms:
         raise InputError(f"{path} is for {platforms}, and JAX runs on {platform}; export it with that platform")
-    if any(in_aval.dtype == "float64" for in_aval in exported.in_avals):
+    expected = exported.in_avals
+    if any(argument.dtype == "float64" for argument in expected):
         require_double_precision(str(path))
-    return _refusing(path, exported)
+
+    # The checks run while JAX traces, so once for every shape and dtype.
+    @jax.jit
+    def call(*arguments):
+        if len(arguments) != len(expected):
+            raise InputError(f"{path} takes ({', '.join(map(str, expected))}), got {len(arguments)} arguments")
+        arrays = []
+        for number, (argument, like) in enumerate(zip(arguments, expected, strict=True), 1):
+            try:
+                arrays.append(jnp.asarray(argument, like.dtype))
+            except (TypeError, ValueError) as error:
+                raise InputError(f"argument {number} is not an array; expected {like}") from error
+            require_shape(f"argument {number}", arrays[-1].shape, like.shape)
+        return exported.call(*arrays)
+
+    return call
 
 
 def note_of(path: Path) -> Path:
     """Returns the path of the note beside an artefact."""
     return path.with_suffix(".json")
-
-
-def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
-    """Returns the jitted function; it converts arguments to the exported dtypes and refuses other shapes."""
-    wanted = exported.in_avals
-    plain = exported.in_tree == jax.tree.structure(((0,) * len(wanted), {}))
-
-    def converted(name: str, argument: Any, like: Any) -> Array:
-        try:
-            array = jnp.asarray(argument, like.dtype)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{name} is not an array; expected {like}") from error
-        require_shape(name, array.shape, like.shape)
-        return array
-
-    # The checks run while JAX traces, so once for every shape and dtype.
-    @jax.jit
-    def call(*arguments):
-        if plain and len(arguments) == len(wanted):
-            names = (f"argument {number}" for number, _ in enumerate(wanted, 1))
-            arguments = list(map(converted, names, arguments, wanted))
-        try:
-            return exported.call(*arguments)
-        except (ValueError, TypeError) as error:
-            got = ", ".join(str(getattr(argument, "aval", type(argument).__name__)) for argument in arguments)
-            raise InputError(f"{path} takes ({', '.join(map(str, wanted))}), got ({got})") from error
-
-    return call
 
 
 def _require_flatbuffers() -> None:
@@ -171,14 +159,13 @@ def _artefact(
 
 
 def _shape_of(number: int, example: Any) -> jax.ShapeDtypeStruct:
-    known = (jax.ShapeDtypeStruct, jax.Array, np.ndarray, np.generic, int, float, complex)
-    try:
-        # The dtype in which JAX computes. Lists are refused: JAX would treat one as several arguments.
-        dtype = jnp.result_type(example) if isinstance(example, known) else None
-    except TypeError:
-        dtype = None
-    if dtype is None:
-        raise InputError(f"example {number} is {example!r:.40}; give an array of numbers")
-    if isinstance(example, jax.ShapeDtypeStruct) and example.dtype != dtype:
-        raise InputError(f"example {number} is {example.dtype}, but JAX is set to {dtype}; set jax_enable_x64 first")
-    return jax.ShapeDtypeStruct(jnp.shape(example), dtype)
+    """Shape of an example, and the dtype in which JAX computes."""
+    with contextlib.suppress(TypeError):
+        # A list or tuple, which JAX would treat as several arguments, stays one.
+        if isinstance(shape := jax.eval_shape(lambda x: x, example), jax.ShapeDtypeStruct):
+            if isinstance(example, jax.ShapeDtypeStruct) and example.dtype != shape.dtype:
+                raise InputError(
+                    f"example {number} is {example.dtype}, and JAX computes in {shape.dtype}; set jax_enable_x64"
+                )
+            return jax.ShapeDtypeStruct(shape.shape, shape.dtype)
+    raise InputError(f"example {number} is {example!r:.40}; give an array of numbers")
