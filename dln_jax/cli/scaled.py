@@ -73,9 +73,10 @@ def joined(member: Membership, options: Any, *, seconds: int) -> Any:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
         processes.join(member, shared, seconds=seconds)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        end_at_once(2)
+    except (InputError, KeyboardInterrupt) as error:
+        mistake = isinstance(error, InputError)
+        print(f"error: {error}" if mistake else "interrupted", file=sys.stderr)
+        end_at_once(2 if mistake else 130)
     here: dict[str, Any] = {"processes": jax.process_count(), "process_id": jax.process_index()}
     if jax.process_index():
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115  open until the process ends

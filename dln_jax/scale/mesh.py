@@ -2,8 +2,8 @@
 
 A mesh has one axis. Shared arrays, such as parameters, are replicated on every device; a batch is split along axis 0,
 and a device computes its share. `spread` gathers the results in the order of the batch, so that the rest of a program
-does not depend on the number of devices. `summed` adds the results up, in an order, and so with a rounding, that
-depends on the number of devices. A function in `on_devices` calls the collectives `total`, `mean` and `first` itself.
+does not depend on the number of devices. A function in `on_devices` calls the collectives `total`, `mean` and `first`
+itself; sums are taken in an order, and so with a rounding, that depends on the number of devices.
 Without a mesh (`None`), all of these return the function or the arrays unchanged.
 """
 
@@ -122,14 +122,6 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
         return jax.tree.map(lambda leaf: leaf[:count], results) if fillers else results
 
     return on_batch
-
-
-def summed(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """Returns the function, whose results are sums over the batch, with the batch split over the devices.
-
-    All devices get the whole sums. The number of devices must divide the batch. Take derivatives inside the function.
-    """
-    return on_devices(lambda shared, batch: total(function(shared, batch), mesh), mesh)
 
 
 def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import Array
 from jax.experimental import multihost_utils
 
 from dln_jax.types import InputError
@@ -59,11 +58,6 @@ def host_devices(count: int | None) -> None:
         raise InputError(f"--devices is {count}; expected a positive whole number")
     with contextlib.suppress(RuntimeError):  # already used; `batch_mesh` reports the number of devices
         jax.config.update("jax_num_cpu_devices", count)
-
-
-def process_key(key: Array) -> Array:
-    """Returns a random key for this process, from one that all processes share."""
-    return jax.random.fold_in(key, jax.process_index())
 
 
 def membership(
@@ -120,9 +114,13 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
     errors = []
 
     def connect() -> None:
-        timeouts = {"heartbeat_timeout_seconds": HEARTBEAT, "shutdown_timeout_seconds": SHUTDOWN}
         try:
-            jax.distributed.initialize(*member, initialization_timeout=10 * seconds, **timeouts)
+            jax.distributed.initialize(
+                *member,
+                initialization_timeout=10 * seconds,
+                heartbeat_timeout_seconds=HEARTBEAT,
+                shutdown_timeout_seconds=SHUTDOWN,
+            )
         except (RuntimeError, ValueError) as error:
             errors.append(error)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from dln_jax.cli import commands
 from dln_jax.scale.devices import backend_started
-from dln_jax.scale.mesh import batch_mesh, replicate, shard, shares, spread, summed
+from dln_jax.scale.mesh import batch_mesh, on_devices, replicate, shard, shares, spread, total
 from dln_jax.scale.processes import host_devices
 from dln_jax.types import InputError
 
@@ -24,13 +24,13 @@ def refused(function, *arguments):
 
 
 def energies(scale, batch):
-    """Of samples (x, y)."""
+    """Energies of samples (x, y)."""
     x, y = batch
     return jax.vmap(lambda x, y: {"sine": jnp.sin(scale * x) @ x, "y": scale * y})(x, y)
 
 
-def total(scale, batch):
-    """Over samples."""
+def sums(scale, batch):
+    """Sums over samples."""
     return jax.tree.map(lambda leaf: leaf.sum(0), energies(scale, batch))
 
 
@@ -58,8 +58,8 @@ for count in (8, 5, 3):  # divided, and filled up, by less than a share and by m
 batch = (np.random.default_rng(0).normal(size=(8, 3)), np.arange(8))
 jax.tree.map(
     lambda one, all: np.testing.assert_allclose(one, all, rtol=1e-14),
-    jax.jit(summed(total, None))(2.0, batch),
-    jax.jit(summed(total, mesh))(2.0, batch),
+    jax.jit(sums)(2.0, batch),
+    jax.jit(on_devices(lambda scale, batch: total(sums(scale, batch), mesh), mesh))(2.0, batch),
 )
 
 

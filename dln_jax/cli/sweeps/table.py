@@ -181,28 +181,27 @@ def _print_jobs(results: Results, title: str) -> None:
     for entry in entries:
         state = "best" if entry in results.best else entry.status.state
         again = f", attempt {entry.status.attempt}" if entry.status.attempt > 1 else ""
-        numbers = [_cell(entry.number(name)) for name in results.shown]
-        rows.append([entry.job.folder.name, *map(_short, entry.job.values.values()), *numbers, state + again])
-    _print_rows(title, ["job", *results.entries[0].job.values, *results.shown, "status"], rows)
+        numbers = {name: entry.number(name) for name in results.shown}
+        rows.append({"job": entry.job.folder.name, **entry.job.values, **numbers, "status": state + again})
+    _print_rows(title, rows)
 
 
 def _print_groups(results: Results) -> None:
     """Prints the median and worst metrics of the groups."""
-    judged = [name for name in results.shown if name != results.seconds]
     rows = []
     for group in results.groups:
-        numbers = [*map(group.medians.get, results.shown), *map(group.worst.get, judged)]
-        rows.append([*map(_short, group.values.values()), f"{group.done} of {group.jobs}", *map(_cell, numbers)])
-    columns = [*results.groups[0].values, "done", *results.shown, *(f"worst_{name}" for name in judged)]
-    _print_rows(f"medians over {', '.join(results.over)}, and the worst", columns, rows)
+        medians = {name: group.medians.get(name) for name in results.shown}
+        worst = {f"worst_{name}": group.worst.get(name) for name in results.shown if name != results.seconds}
+        rows.append({**group.values, "done": f"{group.done} of {group.jobs}", **medians, **worst})
+    _print_rows(f"medians over {', '.join(results.over)}, and the worst", rows)
 
 
-def _print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def _print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     table = Table(title=title)
-    for name in columns:
+    for name in rows[0] if rows else ():
         table.add_column(_spaced(name), justify="left" if name == "status" else "right")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(_short(cell or "") if not isinstance(cell, float) else f"{cell:.3g}" for cell in row.values()))
     Console(highlight=False, soft_wrap=True, width=WIDTH).print(table)
 
 
@@ -227,6 +226,8 @@ def write_tables(folder: Path, results: Results, **facts: Any) -> None:
 def drawn(results: Results, *, at_once: int | None) -> Figure | None:
     """Draws test error against training time, `at_once` jobs at once; `None` if no job has both."""
     entries, seconds, error = results.entries, results.seconds, results.error
+    if seconds is None or error is None:
+        return None
     problems = {problem_of(entry.job.values) for entry in entries}
     panels = len(problems) <= MOST_PANELS and len(entries) > len(problems)
     options = entries[0].job.values
@@ -263,10 +264,6 @@ def _unfinished(results: Results) -> str:
 def _short(text: str) -> str:
     """A value for a table; a path is shortened to its last part."""
     return Path(text).name if "/" in text else text
-
-
-def _cell(number: float | None) -> str:
-    return "" if number is None else f"{number:.3g}"
 
 
 def _spaced(name: str) -> str:

@@ -72,7 +72,8 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
         )
     orders = np.arange(1.0, harmonics + 1)
     # All but the first right singular vector of an equation are orthogonal to it.
-    return block_diag(*(np.linalg.svd(equation[None, :])[2][1:].T for equation in (orders, orders**2)))
+    rests = (np.linalg.svd(equation[None, :])[2][1:].T for equation in (orders, orders**2))
+    return np.asarray(block_diag(*rests))
 
 
 def require_sampling(*, period: float, harmonics: int, rate: float) -> None:
