@@ -100,13 +100,13 @@ def identify(
     free = np.ones(len(theta))
     free[columns.bodies[massless]] = 0.0
     linearise = design(model)
+    regressor, weights = regressor_of(model, known, data, free=free, linearise=linearise), None
     # The random states fill chunks of the same size as the data, so that both use one compiled program.
     samples = max(STATES * d, -(-len(data.t) // -(-len(data.t) // equations.CHUNK)))
     states = random_states(joints, samples, seed)
     general = compressed(regressor_of(model, known, states, free=free, linearise=linearise))
     A = general.triangles.reshape(-1, general.unknowns + 1)[:, :-1]
     structure, base = determinacy(null_directions(A)), base_parameters(A, columns)
-    regressor, weights = regressor_of(model, known, data, free=free, linearise=linearise), None
     if robust:
         rough, weights = fit_robust(regressor, theta, rank_tolerance=rank_tolerance)
         noise = rough.noise
