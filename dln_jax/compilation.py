@@ -1,11 +1,15 @@
-"""XLA options for programs that run for seconds on a CPU, where compilation takes as long as the run."""
+"""Compilation: XLA options for programs that run for seconds on a CPU, and a thread in which programs compile."""
 
 import functools
-from typing import Any
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 
 _OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+Result = TypeVar("Result")
+Arguments = ParamSpec("Arguments")
 
 
 def quick_compilation() -> dict[str, Any]:
@@ -20,15 +24,28 @@ def quick_compilation() -> dict[str, Any]:
 
 @functools.cache
 def _known() -> dict[str, Any]:
-    # XLA publishes no list of options: compile an empty program and see whether the option raises an error.
-    return {name: value for name, value in _OPTIONS.items() if _compiles({name: value})}
+    known = {}
+    for name, value in _OPTIONS.items():
+        # XLA publishes no list of options: compile an empty program and see whether the option raises an error.
+        try:
+            jax.jit(lambda: 0).lower().compile({name: value})
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
+        else:
+            known[name] = value
+    return known
 
 
-def _compiles(options: dict[str, Any]) -> bool:
-    try:
-        jax.jit(lambda: 0).lower().compile(options)
-    except jax.errors.JaxRuntimeError as error:
-        if "No such compile option" not in str(error):
-            raise
-        return False
-    return True
+def in_background(
+    function: Callable[Arguments, Result], *arguments: Arguments.args, **options: Arguments.kwargs
+) -> Callable[[], Result]:
+    """Starts `function(*arguments, **options)` in a thread; XLA lets go of the interpreter while it compiles or runs.
+
+    Returns:
+        A function that waits for the result and returns it, or raises the exception of `function`.
+    """
+    thread = ThreadPoolExecutor(1)
+    future = thread.submit(function, *arguments, **options)
+    thread.shutdown(wait=False)
+    return future.result

@@ -1,4 +1,4 @@
-"""Interrupts of commands: one word instead of a traceback, and a checkpoint that is being stored is completed."""
+"""Interrupts of commands: they print one word instead of a traceback, and do not break a checkpoint being stored."""
 
 import contextlib
 import io
@@ -49,18 +49,18 @@ def held_back() -> Iterator[None]:
     def note(number: int, _: FrameType | None) -> None:
         caught.append(number)
 
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before: dict[int, Any] = {each: signal.getsignal(each) for each in signals}
-    before = {each: handler for each, handler in before.items() if callable(handler)}  # Python functions
-    for each in before:
-        signal.signal(each, note)
+    handlers: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    # A handler that is not a Python function, such as SIG_IGN, could not be called below.
+    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
+    for number in handlers:
+        signal.signal(number, note)
     try:
         yield
     finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         if caught:
-            before[caught[0]](caught[0], None)
+            handlers[caught[0]](caught[0], None)
 
 
 def open_standard_streams() -> None:

@@ -38,8 +38,8 @@ def rollout(
     if inputs is None:
         require_positive(steps=count)
 
-    def advance(state: Any, given: Any) -> tuple[Any, Any]:
-        state, info = step(state, given)
+    def advance(state: Any, input: Any) -> tuple[Any, Any]:
+        state, info = step(state, input)
         return state, observe(state, info)
 
     if segment is None:

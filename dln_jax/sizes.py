@@ -50,7 +50,9 @@ def require_within(counts: Mapping[str, int]) -> None:
     """Raises `InputError` that names the first count above its bound; names may be written as options (--steps)."""
     for name, count in counts.items():
         if count > (most := MOST.get(name.removeprefix("--").replace("-", "_"), MOST_OF_OTHERS)):
-            raise InputError(f"{name} is {written(count)}; expected at most {most:,}")
+            # Python refuses to print a whole number of more than 4,300 digits.
+            value = f"{count:,}" if count < 10**18 else "a number of more than 18 digits"
+            raise InputError(f"{name} is {value}; expected at most {most:,}")
 
 
 def require_magnitude(name: str, value: float) -> None:
@@ -73,23 +75,16 @@ def require_network(*, width: int, depth: int) -> None:
 
 def require_memory(what: str, bytes_needed: float) -> None:
     """Raises `InputError` if an estimate exceeds the memory of this machine."""
-    if bytes_needed > (there := memory()):
-        raise InputError(
-            f"{what} would take about {bytes_needed / 2**30:,.3g} GiB of memory, and there are {there / 2**30:.3g} GiB "
-            "here; ask for less"
-        )
+    if bytes_needed > (available := memory()):
+        needed, here = (f"{size / 2**30:,.3g} GiB" for size in (bytes_needed, available))
+        raise InputError(f"{what} would take about {needed} of memory, and there are {here} here; ask for less")
 
 
 def memory() -> float:
     """Memory of this machine or container, whichever is less, bytes; infinite if the system does not report it."""
-    found = float("inf")
+    size = float("inf")
     try:
-        found = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-        return min(found, float(Path("/sys/fs/cgroup/memory.max").read_text()))
+        size = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        return min(size, float(Path("/sys/fs/cgroup/memory.max").read_text()))
     except (OSError, ValueError, AttributeError):  # no such system, no container, or "max"
-        return found
-
-
-def written(number: int) -> str:
-    """A whole number for a message; a number of more than 18 digits is only described."""
-    return f"{number:,}" if abs(number) < 10**18 else f"{'-' * (number < 0)}a number of more than 18 digits"
+        return size

@@ -112,18 +112,17 @@ class Needs(_Needs):
 
     __slots__ = ()
 
-    def __new__(cls, *given: Any, **named: Any) -> "Needs":
+    def __new__(cls, *values: Any, **named: Any) -> "Needs":
         """Checks the fields."""
-        fields = super().__new__(cls, *given, **named)
-        named_joints = _names_of("joints", fields.joints, get_args(JointKind))
-        if not named_joints:
+        fields = super().__new__(cls, *values, **named)
+        joints = _names_of("joints", fields.joints, get_args(JointKind))
+        if not joints:
             raise InputError("joints are empty; expected at least one")
         laws = _names_of("joint_friction", fields.joint_friction, get_args(FrictionLaw))
         for name in ("gravity", "friction"):
             if not isinstance(getattr(fields, name), bool):
                 raise InputError(f"{name} is {reprlib.repr(getattr(fields, name))}; expected True or False")
-        others = {name: getattr(fields, name) for name in fields._fields}
-        return super().__new__(cls, **{**others, "joints": named_joints, "joint_friction": laws})
+        return super().__new__(cls, **{**fields._asdict(), "joints": joints, "joint_friction": laws})
 
     @classmethod
     def _make(cls, iterable: Iterable[Any]) -> "Needs":  # type: ignore[override]  # so that `_replace` checks too
@@ -135,8 +134,8 @@ class Needs(_Needs):
         return len(self.joints)
 
 
-def _names_of(field: str, given: Any, known: tuple[str, ...]) -> tuple[Any, ...]:
+def _names_of(field: str, names: Any, known: tuple[str, ...]) -> tuple[Any, ...]:
     """Names as a tuple; `InputError` for an unknown name."""
-    if not isinstance(given, list | tuple) or not all(isinstance(each, str) and each in known for each in given):
-        raise InputError(f"{field}: {reprlib.repr(given)}; expected a tuple of {', '.join(known)}")
-    return tuple(given)
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) and name in known for name in names):
+        raise InputError(f"{field}: {reprlib.repr(names)}; expected a tuple of {', '.join(known)}")
+    return tuple(names)

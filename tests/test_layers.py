@@ -9,7 +9,6 @@ LAYERS = {
     "types": -3,  # symbols: everyone may read them
     "interrupts": -3,
     "time_limit": -3,
-    "background": -3,
     "files": -2,
     "sizes": -2,
     "precision": -2,

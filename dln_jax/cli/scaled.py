@@ -11,20 +11,22 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from dln_jax.cli.options import Scaled
 from dln_jax.files import PARTIAL
 from dln_jax.scale import processes
-from dln_jax.scale.meeting import Membership
+from dln_jax.scale.devices import backend_started
 from dln_jax.scale.mesh import batch_mesh
+from dln_jax.scale.processes import Membership
 from dln_jax.types import InputError
 
 SEEN_BY_USERS = ("figures", "low_latency")
 """Options for output that only the first process produces."""
 
 
-def mesh_of(given: Scaled) -> Mesh | None:
+def mesh_of(options: Scaled) -> Mesh | None:
     """The mesh of devices that share a command's batches; `None` for a single device.
 
     A single process defaults to one device: most networks are small, and sharing them is slower.
@@ -33,51 +35,60 @@ def mesh_of(given: Scaled) -> Mesh | None:
         InputError: the machine has fewer devices.
     """
     alone = jax.process_count() == 1
-    return batch_mesh(1 if alone and given.devices is None else given.devices)
+    return batch_mesh(1 if alone and options.devices is None else options.devices)
 
 
-def membership_in(given: Any) -> Membership | None:
+def membership_in(options: Any) -> Membership | None:
     """How this process joins others; `None` for a single process. On a CPU, sets the number of devices.
 
     Raises:
         InputError: the options or the cluster's environment variables are inconsistent, or --out is missing.
     """
-    if not isinstance(given, Scaled):
+    if not isinstance(options, Scaled):
         return None
-    processes.host_devices(given.devices)
-    member = processes.membership(given.processes, given.coordinator, given.process_id)
-    if member is not None and getattr(given, "out", None) is None:
+    processes.host_devices(options.devices)
+    member = processes.membership(options.processes, options.coordinator, options.process_id)
+    if member is not None and getattr(options, "out", None) is None:
         raise InputError("several processes share their run's folder; name one that all hosts see, by --out")
     return member
 
 
-def joined(member: Membership, given: Any, *, seconds: int) -> Any:
-    """Joins the other processes of a command and returns the arguments of this one; errors as `processes.join`."""
+def joined(member: Membership, options: Any, *, seconds: int) -> Any:
+    """Joins the other processes of a command and returns the arguments of this one.
+
+    Raises:
+        InputError: JAX has been used. Errors of `processes.join` end the process with one line and status 2.
+    """
+    if backend_started():
+        raise InputError("JAX has been used in this process; several are started before it is")
     own = {"processes", "coordinator", "process_id", "out", *SEEN_BY_USERS}
     shared = {
-        key: str(v) if isinstance(v, Path) else v for key, v in dataclasses.asdict(given).items() if key not in own
+        f"--{key.replace('_', '-')}": str(value) if isinstance(value, Path) else value
+        for key, value in dataclasses.asdict(options).items()
+        if key not in own
     }
-    _keep_standard_output_to_python()
-    processes.join(member, {f"--{key.replace('_', '-')}": value for key, value in shared.items()}, seconds=seconds)
-    here: dict[str, Any] = {"processes": jax.process_count(), "process_id": jax.process_index()}
-    if jax.process_index():
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  open until the process ends
-        here |= {name: False for name in SEEN_BY_USERS if hasattr(given, name)}
-    return dataclasses.replace(given, **here)
-
-
-def _keep_standard_output_to_python() -> None:
-    """Drops output that libraries print past Python: gloo reports every connection on standard output."""
+    # gloo reports every connection on standard output: only Python's own output goes there from now on.
     sys.stdout.flush()
     sys.stdout = open(os.dup(1), "w", buffering=1, errors=sys.stdout.errors)  # noqa: SIM115  open until the process ends
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    try:
+        processes.join(member, shared, seconds=seconds)
+    except (InputError, KeyboardInterrupt) as error:
+        mistake = isinstance(error, InputError)
+        print(f"error: {error}" if mistake else "interrupted", file=sys.stderr)
+        end_at_once(2 if mistake else 130)
+    here: dict[str, Any] = {"processes": jax.process_count(), "process_id": jax.process_index()}
+    if jax.process_index():
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  open until the process ends
+        here |= {name: False for name in SEEN_BY_USERS if hasattr(options, name)}
+    return dataclasses.replace(options, **here)
 
 
-def remedy_of(given: Any) -> str:
+def remedy_of(options: Any) -> str:
     """Advice to the user after a process was lost."""
-    if not hasattr(given, "resume"):
+    if not hasattr(options, "resume"):
         return "start all processes again"
-    return f"continue from the last checkpoint in {getattr(given, 'out', '--out')} with --resume in all processes"
+    return f"continue from the last checkpoint in {getattr(options, 'out', '--out')} with --resume in all processes"
 
 
 def end_at_once(code: int) -> NoReturn:
@@ -88,21 +99,19 @@ def end_at_once(code: int) -> NoReturn:
     os._exit(code)
 
 
-def is_first(given: Any) -> bool:
+def is_first(options: Any) -> bool:
     """Whether this process writes the results."""
-    return not getattr(given, "process_id", None)
+    return not getattr(options, "process_id", None)
 
 
-def wait_for_all(given: Any) -> None:
+def wait_for_all(options: Any) -> None:
     """Waits until all processes have reached this call."""
-    if (getattr(given, "processes", None) or 1) > 1:
-        from jax.experimental import multihost_utils  # takes long to import
-
+    if (getattr(options, "processes", None) or 1) > 1:
         multihost_utils.sync_global_devices("all are here")
 
 
 @contextlib.contextmanager
-def copied_folder(given: Any, resume: bool) -> Iterator[Path]:
+def copied_folder(options: Any, resume: bool) -> Iterator[Path]:
     """Yields a temporary folder for this process, with a copy of the run if it is resumed.
 
     Raises:
@@ -112,13 +121,13 @@ def copied_folder(given: Any, resume: bool) -> Iterator[Path]:
         folder = Path(name)
         if resume:
             try:
-                shutil.copytree(given.out, folder, ignore=shutil.ignore_patterns(f"*{PARTIAL}"), dirs_exist_ok=True)
+                shutil.copytree(options.out, folder, ignore=shutil.ignore_patterns(f"*{PARTIAL}"), dirs_exist_ok=True)
             except (OSError, shutil.Error) as error:
                 reason = getattr(error, "strerror", None) or "not all of it could be read"
                 raise InputError(
-                    f"{given.out}: cannot be copied ({reason}); it must be one that all hosts see"
+                    f"{options.out}: cannot be copied ({reason}); it must be one that all hosts see"
                 ) from None
         try:
             yield folder
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(given.out) from None
+            raise KeyboardInterrupt(options.out) from None

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics.arguments import require_shape
+from dln_jax.scale.devices import backend_started
 from dln_jax.types import InputError
 
 _SETTING = "jax_cpu_enable_async_dispatch"
@@ -33,18 +34,11 @@ def enable_low_latency() -> None:
     platforms = getattr(jax.config, "jax_platforms")  # noqa: B009  JAX adds its settings as it starts
     if platforms and platforms.split(",")[0] != "cpu":
         raise InputError(_only_on_cpu(platforms.split(",")[0]))
-    if not jax.config.read(_SETTING):
-        return
-    devices = getattr(jax.config, "jax_num_cpu_devices")  # noqa: B009  JAX adds its settings as it starts
-    try:
-        # JAX refuses another number of devices once a backend runs: the public way to learn whether one does.
-        jax.config.update("jax_num_cpu_devices", devices + 2)
-        jax.config.update("jax_num_cpu_devices", devices)
-    except RuntimeError as error:
+    if jax.config.read(_SETTING) and backend_started():
         raise InputError(
             "enable_low_latency() was called after JAX had started its backend, which reads the setting when it "
             "starts; call it before the first array, right behind the imports"
-        ) from error
+        )
     jax.config.update(_SETTING, False)
 
 

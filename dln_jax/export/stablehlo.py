@@ -1,10 +1,13 @@
 """Exports functions as `jax.export` artefacts: StableHLO that any JAX runs without this package.
 
-NAME.json, beside the artefact, states its platforms, shapes, JAX release and digest. JAX promises to read artefacts for
-six months after the release that wrote them; export older ones again from the run folder. Artefacts are compiled where
-they are loaded, for the platforms that they were lowered for. Writing and reading need the package `flatbuffers`.
+An artefact is what `jax.export` serialises (its platforms and shapes included), followed by the SHA-256 of these bytes.
+`jax.export.deserialize` ignores what follows; `load_stablehlo` checks it. JAX promises to read artefacts for six months
+after the release that wrote them; export older ones again from the run folder. Artefacts are compiled where they are
+loaded, for the platforms that they were lowered for. Writing and reading need the package `flatbuffers`.
 """
 
+import contextlib
+import hashlib
 import importlib.util
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,16 +15,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import Array, export
+from jax import export
 
-from dln_jax.export.exports import described, read_export, write_exports
+from dln_jax.export.exports import AGAIN, write_exports
 from dln_jax.mechanics.arguments import require_shape
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.precision import require_double_precision
 from dln_jax.types import InputError
 
 SUFFIX = ".stablehlo"
+DIGEST = hashlib.sha256().digest_size
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 _ARGUMENTS = {"inverse_dynamics": 3, "forward_dynamics": 3, "energy": 2, "mass_matrix": 2}
 
@@ -33,14 +36,14 @@ def export_stablehlo(
     platforms: Sequence[str] = ("cpu",),
     overwrite: bool = False,
 ) -> Path:
-    """Writes a function, for arguments like the examples, as an artefact with its JSON note, and returns the path.
+    """Writes a function, for arguments like the examples, as an artefact, and returns the path.
 
     Args:
         function: a function of arrays with its parameters closed over.
         examples: one example per argument: an array, a number, or a `jax.ShapeDtypeStruct`.
         path: path of the artefact; must end in .stablehlo.
         platforms: platforms to lower for: cpu, cuda, rocm, tpu.
-        overwrite: replace an existing artefact and its note.
+        overwrite: replace an existing artefact.
 
     Raises:
         InputError: the ending is wrong, the file exists, the folder belongs to a run, an example is not an array, JAX
@@ -49,7 +52,7 @@ def export_stablehlo(
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path} does not end in {SUFFIX}; give the file a name that does")
-    files = _artefact(path.name, function, examples, platforms)
+    files = {path.name: _artefact(function, examples, platforms)}
     return write_exports(path.parent, files, overwrite=overwrite)[0]
 
 
@@ -82,64 +85,49 @@ def export_dynamics(
     files = {}
     for name, count in _ARGUMENTS.items():
         if (function := getattr(dynamics, name, None)) is not None:
-            files |= _artefact(f"{name}{SUFFIX}", function, [state] * count, platforms)
-    return [path for path in write_exports(Path(directory), files, overwrite=overwrite) if path.suffix == SUFFIX]
+            files[f"{name}{SUFFIX}"] = _artefact(function, [state] * count, platforms)
+    return write_exports(Path(directory), files, overwrite=overwrite)
 
 
 def load_stablehlo(path: str | Path) -> Callable[..., Any]:
     """Returns the jitted function of an artefact, which takes arrays or lists of numbers of the exported shapes.
 
     Raises:
-        InputError: the file or its note is missing, altered, too old or for other platforms, the artefact is in double
-            precision while JAX computes in single, or `flatbuffers` is missing.
+        InputError: the file is missing, altered, too old or for other platforms, the artefact is in double precision
+            while JAX computes in single, or `flatbuffers` is missing.
     """
     path = Path(path)
     if path.suffix != SUFFIX or not path.is_file():
         raise InputError(f"{path}: no such file; give the {SUFFIX} file that export_stablehlo wrote")
     _require_flatbuffers()
-    data = read_export(note_of(path), (path.name,))[1][path.name]
+    data = path.read_bytes()
+    if hashlib.sha256(data[:-DIGEST]).digest() != data[-DIGEST:]:
+        raise InputError(f"{path}: truncated or altered (its SHA-256 is not the one in it); {AGAIN}")
     try:
-        exported = export.deserialize(bytearray(data))
+        exported = export.deserialize(bytearray(data[:-DIGEST]))
     except Exception as error:  # flatbuffers and struct raise exceptions without a common class
-        raise InputError(f"{path}: no artefact that JAX {jax.__version__} can read; export it again") from error
+        raise InputError(f"{path}: no artefact that JAX {jax.__version__} can read; {AGAIN}") from error
     # A GPU is "gpu" as a backend, and "cuda" or "rocm" as a platform.
     platform, platforms = export.default_export_platform(), ", ".join(exported.platforms)
     if platform not in exported.platforms:
         raise InputError(f"{path} is for {platforms}, and JAX runs on {platform}; export it with that platform")
-    if any(in_aval.dtype == "float64" for in_aval in exported.in_avals):
+    expected = exported.in_avals
+    if any(argument.dtype == "float64" for argument in expected):
         require_double_precision(str(path))
-    return _refusing(path, exported)
-
-
-def note_of(path: Path) -> Path:
-    """Returns the path of the note beside an artefact."""
-    return path.with_suffix(".json")
-
-
-def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
-    """Returns the jitted function; it converts arguments to the exported dtypes and refuses other shapes."""
-    wanted = exported.in_avals
-    plain = exported.in_tree == jax.tree.structure(((0,) * len(wanted), {}))
-
-    def converted(name: str, argument: Any, like: Any) -> Array:
-        try:
-            array = jnp.asarray(argument, like.dtype)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{name} is not an array; expected {like}") from error
-        require_shape(name, array.shape, like.shape)
-        return array
 
     # The checks run while JAX traces, so once for every shape and dtype.
     @jax.jit
     def call(*arguments):
-        if plain and len(arguments) == len(wanted):
-            names = (f"argument {number}" for number, _ in enumerate(wanted, 1))
-            arguments = list(map(converted, names, arguments, wanted))
-        try:
-            return exported.call(*arguments)
-        except (ValueError, TypeError) as error:
-            got = ", ".join(str(getattr(argument, "aval", type(argument).__name__)) for argument in arguments)
-            raise InputError(f"{path} takes ({', '.join(map(str, wanted))}), got ({got})") from error
+        if len(arguments) != len(expected):
+            raise InputError(f"{path} takes ({', '.join(map(str, expected))}), got {len(arguments)} arguments")
+        arrays = []
+        for number, (argument, like) in enumerate(zip(arguments, expected, strict=True), 1):
+            try:
+                arrays.append(jnp.asarray(argument, like.dtype))
+            except (TypeError, ValueError) as error:
+                raise InputError(f"argument {number} is not an array; expected {like}") from error
+            require_shape(f"argument {number}", arrays[-1].shape, like.shape)
+        return exported.call(*arrays)
 
     return call
 
@@ -149,36 +137,24 @@ def _require_flatbuffers() -> None:
         raise InputError("jax.export artefacts need the package flatbuffers; install the extra [export]")
 
 
-def _artefact(
-    name: str, function: Callable[..., Any], examples: Sequence[Any], platforms: Sequence[str]
-) -> dict[str, bytes]:
-    """Returns the bytes of the artefact and of its note, by file name."""
+def _artefact(function: Callable[..., Any], examples: Sequence[Any], platforms: Sequence[str]) -> bytes:
+    """Returns the serialised function, followed by its digest."""
     _require_flatbuffers()
     if isinstance(platforms, str) or not platforms or not set(platforms) <= set(PLATFORMS):
         raise InputError(f"platforms is {platforms!r}; expected a tuple of {', '.join(PLATFORMS)}")
     shapes = [_shape_of(number, example) for number, example in enumerate(examples, 1)]
-    exported = export.export(jax.jit(function), platforms=tuple(platforms))(*shapes)
-    note = {
-        "jax": jax.__version__,
-        "calling_convention_version": exported.calling_convention_version,
-        "platforms": list(exported.platforms),
-        "arguments": [str(shape) for shape in exported.in_avals],
-        "results": [str(shape) for shape in exported.out_avals],
-        "reading": "jax.export.deserialize(bytes).call(*arguments); JAX reads it for six months after its release",
-    }
-    files = {name: bytes(exported.serialize())}
-    return {**files, note_of(Path(name)).name: described(note, files)}
+    data = bytes(export.export(jax.jit(function), platforms=tuple(platforms))(*shapes).serialize())
+    return data + hashlib.sha256(data).digest()
 
 
 def _shape_of(number: int, example: Any) -> jax.ShapeDtypeStruct:
-    known = (jax.ShapeDtypeStruct, jax.Array, np.ndarray, np.generic, int, float, complex)
-    try:
-        # The dtype in which JAX computes. Lists are refused: JAX would treat one as several arguments.
-        dtype = jnp.result_type(example) if isinstance(example, known) else None
-    except TypeError:
-        dtype = None
-    if dtype is None:
-        raise InputError(f"example {number} is {example!r:.40}; give an array of numbers")
-    if isinstance(example, jax.ShapeDtypeStruct) and example.dtype != dtype:
-        raise InputError(f"example {number} is {example.dtype}, but JAX is set to {dtype}; set jax_enable_x64 first")
-    return jax.ShapeDtypeStruct(jnp.shape(example), dtype)
+    """Shape of an example, and the dtype in which JAX computes."""
+    with contextlib.suppress(TypeError):
+        # A list or tuple, which JAX would treat as several arguments, stays one.
+        if isinstance(shape := jax.eval_shape(lambda x: x, example), jax.ShapeDtypeStruct):
+            if isinstance(example, jax.ShapeDtypeStruct) and example.dtype != shape.dtype:
+                raise InputError(
+                    f"example {number} is {example.dtype}, and JAX computes in {shape.dtype}; set jax_enable_x64"
+                )
+            return jax.ShapeDtypeStruct(shape.shape, shape.dtype)
+    raise InputError(f"example {number} is {example!r:.40}; give an array of numbers")

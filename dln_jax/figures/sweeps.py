@@ -40,10 +40,10 @@ def error_against_seconds(
             `MOST_COLOURS` colours.
         note: text below the axes, for example on missing runs.
     """
-    problems = list(dict.fromkeys(point.problem for point in points)) or [""]
-    wide = len(problems) > 1
-    rows = -(-len(problems) // 2) if wide else 1
-    figure, axes = style.figure(rows, 2 if wide else 1, height=2.7 * rows + 1.1 if wide else 4.0)
+    problems = list(dict.fromkeys(point.problem for point in points))
+    columns = min(len(problems), 2)
+    rows = -(-len(problems) // columns)
+    figure, axes = style.figure(rows, columns, height=2.7 * rows + 1.1 if columns > 1 else 4.0)
     colours = _colours(list(dict.fromkeys(point.colour for point in points)))
     values = list(dict.fromkeys(point.marker for point in points))
     markers = {value: style.MARKERS[number % len(style.MARKERS)] for number, value in enumerate(values)}
@@ -52,45 +52,42 @@ def error_against_seconds(
         here = [point for point in points if point.problem == problem]
         for point in here:
             faint = medians and not point.median
-            axis.plot(
-                point.seconds, point.error, markers[point.marker], color=colours[point.colour],
-                markersize=4 if faint else 8, alpha=0.45 if faint else 1.0, zorder=2 if faint else 3,
-                markeredgewidth=0,
-            )  # fmt: skip
+            looks = {"markersize": 4, "alpha": 0.45, "zorder": 2} if faint else {"markersize": 8, "zorder": 3}
+            colour_here = {"color": colours[point.colour], "markeredgewidth": 0}
+            axis.plot(point.seconds, point.error, markers[point.marker], **looks, **colour_here)
             if point.best:
                 axis.plot(point.seconds, point.error, "o", markersize=13, color="black", fillstyle="none", zorder=4)
         axis.set_xscale(style.scale_of(point.seconds for point in here))
         axis.set_yscale(style.scale_of(point.error for point in here))
         style.title(axis, problem)
-        if number >= len(problems) - (2 if wide else 1):
+        if number >= len(problems) - columns:
             axis.set_xlabel(x)
-        if not wide or number % 2 == 0:
+        if number % columns == 0:
             axis.set_ylabel(y)
     for axis in list(axes.flat)[len(problems) :]:
         axis.axis("off")
-    listed = list(colours)[:: -(-len(colours) // MOST_COLOURS)]
-    handles = (
-        [] if not colour else [Line2D([], [], color=colours[v], linewidth=5, label=f"{colour} {v}") for v in listed]
-    )
-    handles += [] if not marker else [_handle(markers[value], f"{marker} {value}", "0.4") for value in markers]
+    handles = []
+    if colour:
+        listed = list(colours)[:: -(-len(colours) // MOST_COLOURS)]
+        handles += [Line2D([], [], color=colours[value], linewidth=5, label=f"{colour} {value}") for value in listed]
+    if marker:
+        handles += [_handle(markers[value], f"{marker} {value}") for value in markers]
     if medians:
-        handles += [_handle("o", "a run", "0.4", size=4), _handle("o", "median", "0.4", size=8)]
+        handles += [_handle("o", "a run", markersize=4), _handle("o", "median", markersize=8)]
     if any(point.best for point in points):
-        ring = Line2D([], [], linestyle="", marker="o", color="black", fillstyle="none", markersize=10)
-        ring.set_label("best in validation")
-        handles.append(ring)
+        handles.append(_handle("o", "best in validation", color="black", fillstyle="none", markersize=10))
     if handles or note:
         titled = {"title": note, "title_fontsize": style.SMALL} if note else {}
         style.legend(figure, handles=handles, loc="outside lower center", ncols=4, **titled)
     return figure
 
 
-def _handle(marker: str, label: str, colour, *, size: float | int = 6) -> Line2D:
-    return Line2D([], [], linestyle="", marker=marker, color=colour, markersize=size, markeredgewidth=0, label=label)
+def _handle(marker: str, label: str, **looks: Any) -> Line2D:
+    return Line2D([], [], linestyle="", marker=marker, label=label, **{"color": "0.4", **looks})
 
 
 def _colours(values: Sequence[str]) -> dict[str, Any]:
     """Colours in sequence, or along a colour map if there are more values than colours."""
     if len(values) <= MOST_COLOURS:
-        return {value: style.CYCLE[number] for number, value in enumerate(values)}
+        return style.colours_of(values)
     return dict(zip(values, map(tuple, colormaps["viridis"](np.linspace(0, 0.95, len(values)))), strict=True))

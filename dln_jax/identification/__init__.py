@@ -4,12 +4,16 @@
 """
 
 from dln_jax.identification.base import BaseParameters, base_parameters, determinacy, null_directions
-from dln_jax.identification.columns import Columns, columns_of, flat
 from dln_jax.identification.consistent import ConsistentFit, fit_consistent, is_consistent, nearest_body
-from dln_jax.identification.equations import Equations, compressed, regressor_of
+from dln_jax.identification.equations import Columns, Equations, columns_of, compressed, flat, regressor_of
 from dln_jax.identification.identify import Identification, identify, parameters_of, random_states
-from dln_jax.identification.robust import ResidualStatistics, fit_robust, residual_statistics
-from dln_jax.identification.weighted import WeightedFit, fit_weighted
+from dln_jax.identification.weighted import (
+    ResidualStatistics,
+    WeightedFit,
+    fit_robust,
+    fit_weighted,
+    residual_statistics,
+)
 
 __all__ = [
     "BaseParameters",

@@ -12,16 +12,19 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.identification.columns import Columns
+from dln_jax.identification.equations import Columns
 
 Determinacy = Literal["alone", "in combination", "not at all"]
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
 """The ten parameters of a body, in the order in which they are kept."""
-TOLERANCE = 1e-8
+DEPENDENT = 1e-8
 """Columns whose residual after projection on the others is shorter than this fraction of their length count as linearly
-dependent. For random states this lies well between rounding errors and true residuals."""
+dependent; so do singular values below this fraction of the largest. For random states this lies well between rounding
+errors and true residuals."""
 NEGLIGIBLE = 1e-12
 """Columns shorter than this fraction of the longest are zero up to rounding: their terms cancel."""
+SHARE = 1e-6
+"""A parameter counts as identifiable alone if its share in the undetermined directions is below this number."""
 SHOWN = 1e-7
 """Coefficients below this fraction of the largest in their combination are rounding errors and set to zero."""
 
@@ -37,44 +40,39 @@ class BaseParameters(NamedTuple):
     """Combinations as text, such as "I_xx_3 + 0.3 m_4"."""
 
 
-def base_parameters(
-    A: Float[np.ndarray, "N P"], columns: Columns, *, tolerance: float = TOLERANCE, negligible: float = NEGLIGIBLE
-) -> BaseParameters:
+def unit_columns(A: Float[np.ndarray, "N P"]) -> tuple[Float[np.ndarray, "N P"], Float[np.ndarray, " P"]]:
+    """Scales columns to unit length; returns them and their lengths, with zeros for `NEGLIGIBLE` columns."""
+    lengths = np.linalg.norm(A, axis=0)
+    lengths = np.where(lengths > NEGLIGIBLE * lengths.max(initial=0.0), lengths, 0.0)
+    return np.where(lengths > 0, A, 0.0) / np.where(lengths > 0, lengths, 1.0), lengths
+
+
+def base_parameters(A: Float[np.ndarray, "N P"], columns: Columns) -> BaseParameters:
     """Finds the base parameters by Gram-Schmidt with reorthogonalisation.
 
     Args:
         A: Phi in generic states, more of them than parameters, or its triangular factor.
         columns: names, kinds and joints of the columns.
-        tolerance: residual relative to a column's length below which the column counts as linearly dependent.
-        negligible: columns shorter than this fraction of the longest count as zero.
     """
-    norms = np.linalg.norm(A, axis=0)
-    seen = norms > negligible * norms.max(initial=0.0)
-    scaled = A / np.where(seen, norms, 1.0)
+    scaled, lengths = unit_columns(A)
     basis = np.zeros((A.shape[0], 0))
     independent: list[int] = []
     for column in _order(columns):
-        if not seen[column]:
-            continue
-        left = scaled[:, column]
+        remainder = scaled[:, column]
         for _ in range(2):
-            left = left - basis @ (basis.T @ left)
-        length = np.linalg.norm(left)
-        if length > tolerance:
-            basis = np.column_stack([basis, left / length])
+            remainder = remainder - basis @ (basis.T @ remainder)
+        length = np.linalg.norm(remainder)
+        if length > DEPENDENT:
+            basis = np.column_stack([basis, remainder / length])
             independent.append(column)
+    independent.sort()
     # Solve with columns of unit length, then scale back.
-    factors = np.linalg.lstsq(scaled[:, independent], scaled * seen, rcond=None)[0]
-    combinations = factors * np.where(seen, norms, 1.0) / norms[independent][:, None]
-    sizes = abs(factors).max(axis=1, initial=0.0)[:, None]
-    combinations[abs(factors) < SHOWN * sizes] = 0.0
-    for row, column in enumerate(independent):
-        combinations[row, independent] = 0.0
-        combinations[row, column] = 1.0
-    order = np.argsort(independent)
-    combinations, independent = combinations[order], [independent[place] for place in order]
-    words = [in_words(row, columns.names) for row in combinations]
-    return BaseParameters(combinations, tuple(independent), tuple(words))
+    factors = np.linalg.lstsq(scaled[:, independent], scaled, rcond=None)[0]
+    combinations = factors * lengths / lengths[independent][:, None]
+    combinations[abs(factors) < SHOWN * abs(factors).max(axis=1, initial=0.0)[:, None]] = 0.0
+    combinations[:, independent] = np.eye(len(independent))
+    words = tuple(in_words(row, columns.names) for row in combinations)
+    return BaseParameters(combinations, tuple(independent), words)
 
 
 def _order(columns: Columns) -> list[int]:
@@ -99,31 +97,22 @@ def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str]) -> str:
     return text
 
 
-def determinacy(unseen: Float[np.ndarray, "K P"], *, tolerance: float = 1e-6) -> tuple[Determinacy, ...]:
+def determinacy(unseen: Float[np.ndarray, "K P"]) -> tuple[Determinacy, ...]:
     """Classifies every parameter as identifiable alone, in combination or not at all.
 
     Args:
         unseen: orthonormal directions that change no force, for columns scaled to unit length; a zero column has a
             direction of its own.
-        tolerance: a parameter whose share in these directions is below it counts as identifiable alone.
     """
     shares = np.linalg.norm(unseen, axis=0)
-    return tuple("alone" if s < tolerance else "not at all" if s > 1 - tolerance else "in combination" for s in shares)
+    return tuple("alone" if s < SHARE else "not at all" if s > 1 - SHARE else "in combination" for s in shares)
 
 
-def null_directions(
-    A: Float[np.ndarray, "N P"], *, tolerance: float = TOLERANCE, negligible: float = NEGLIGIBLE
-) -> Float[np.ndarray, "K P"]:
+def null_directions(A: Float[np.ndarray, "N P"]) -> Float[np.ndarray, "K P"]:
     """Orthonormal directions of the parameters that the equations do not determine, for columns scaled to unit length.
 
     Args:
         A: Phi, or its triangular factor.
-        tolerance: singular values below this fraction of the largest count as zero.
-        negligible: columns shorter than this fraction of the longest count as zero.
     """
-    norms = np.linalg.norm(A, axis=0)
-    seen = norms > negligible * norms.max(initial=0.0)
-    scaled = np.where(seen, A, 0.0) / np.where(seen, norms, 1.0)
-    _, sizes, right = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
-    rank = int(np.sum(sizes > tolerance * sizes.max(initial=0.0)))
-    return right[rank:]
+    _, sizes, right = np.linalg.svd(np.linalg.qr(unit_columns(A)[0], mode="r"))
+    return right[int(np.sum(sizes > DEPENDENT * sizes.max(initial=0.0))) :]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.identification.columns import Columns
+from dln_jax.identification.equations import Columns
 from dln_jax.mechanics.trees.inertia import body_of_pseudo_inertia, pseudo_inertia
 from dln_jax.types import InputError, require_positive
 
@@ -56,12 +56,12 @@ class ConsistentFit(NamedTuple):
 
 def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[bool, ...]:
     """Whether the pseudo-inertia of every body is positive definite; a body with ten zeros counts as consistent."""
-    bodies = theta[np.array(columns.kinds) == "inertia"].reshape(-1, 10)
+    bodies = theta[columns.bodies]
     return tuple(bool(not body.any() or np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0) for body in bodies)
 
 
-def nearest_body(theta: Float[np.ndarray, "10"], *, smallest: float = SMALLEST) -> Float[np.ndarray, "10"]:
-    """Raises the eigenvalues of a body's pseudo-inertia to at least `smallest` times the largest.
+def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
+    """Raises the eigenvalues of a body's pseudo-inertia to at least `SMALLEST` times the largest.
 
     Raises:
         InputError: no eigenvalue is positive.
@@ -69,9 +69,9 @@ def nearest_body(theta: Float[np.ndarray, "10"], *, smallest: float = SMALLEST) 
     values, vectors = np.linalg.eigh(pseudo_inertia(np.asarray(theta, float)))
     if not values[-1] > 0:
         raise InputError("a link that is to be identified has no mass; expected a rough value for it")
-    if values[0] >= smallest * values[-1]:
+    if values[0] >= SMALLEST * values[-1]:
         return np.asarray(theta, float)
-    return np.asarray(body_of_pseudo_inertia((vectors * np.maximum(values, smallest * values[-1])) @ vectors.T))
+    return np.asarray(body_of_pseudo_inertia((vectors * np.maximum(values, SMALLEST * values[-1])) @ vectors.T))
 
 
 def fit_consistent(
@@ -80,9 +80,7 @@ def fit_consistent(
     known: Float[np.ndarray, " P"],
     *,
     regularisation: float = REGULARISATION,
-    smallest: float = SMALLEST,
     iterations: int = 500,
-    tolerance: float = TOLERANCE,
 ) -> ConsistentFit:
     """Fits physically consistent parameters by least squares, with the known values as prior.
 
@@ -93,17 +91,15 @@ def fit_consistent(
             that explains a hundredth of the torque. A body with ten zeros is absent and stays zero.
         regularisation: cost of a unit of divergence, dimensionless (in squares of the noise); positive, since data
             never determine all parameters.
-        smallest: as for `nearest_body`.
         iterations: upper limit of Newton iterations.
-        tolerance: Newton decrement, relative to 1 + F, at which to stop.
 
     Raises:
-        InputError: `regularisation` or `smallest` is not positive, or a body has no mass.
+        InputError: `regularisation` is not positive, or a body has no mass.
     """
-    require_positive(regularisation=regularisation, smallest=smallest)
-    kinds = np.array(columns.kinds)
-    inertial, positive, signed = (np.flatnonzero(kinds == kind) for kind in ("inertia", "positive", "signed"))
-    inertial = inertial.reshape(-1, 10)[known[inertial].reshape(-1, 10).any(axis=1)]
+    require_positive(regularisation=regularisation)
+    kinds, identity = np.array(columns.kinds), np.eye(len(columns.kinds))
+    inertial = columns.bodies[known[columns.bodies].any(axis=1)]
+    positive, signed = (np.flatnonzero(kinds == kind) for kind in ("positive", "signed"))
     lengths = np.linalg.norm(triangle[:, :-1], axis=0)
     typical = np.linalg.norm(triangle[:, -1]) / np.where(lengths > 0, lengths, np.inf)
     typical = np.where(typical > 0, typical, 1.0)
@@ -113,15 +109,15 @@ def fit_consistent(
     # Columns of the map to theta: ten per body, then the positive coefficients, then the signed ones.
     maps = []
     for places in inertial:
-        J = pseudo_inertia(nearest_body(known[places], smallest=smallest))
+        J = pseudo_inertia(nearest_body(known[places]))
         start[places], factor = np.asarray(body_of_pseudo_inertia(J)), np.linalg.cholesky(J)
-        maps.append(_rows(places, len(kinds)).T @ _bodies(factor @ _BASIS @ factor.T))
-    maps += [_rows(positive, len(kinds)).T * start[positive], _rows(signed, len(kinds)).T * typical[signed]]
-    problem = _Problem(triangle[:, :-1] @ np.hstack(maps), triangle[:, :-1] @ start - triangle[:, -1], len(inertial))
-    x, done, converged = _minimum(problem, len(positive), regularisation, iterations, tolerance)
-    M, _, _ = problem.parts(x, len(positive))
-    theta = start + np.hstack(maps) @ problem.directions(x, len(positive))
-    return ConsistentFit(theta, _divergences(M), done, converged)
+        directions = [np.asarray(body_of_pseudo_inertia(factor @ E @ factor.T)) for E in _BASIS]
+        maps.append(identity[:, places] @ np.stack(directions, axis=1))
+    to_theta = np.hstack([*maps, identity[:, positive] * start[positive], identity[:, signed] * typical[signed]])
+    A, r = triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1]
+    problem = _Problem(A, r, len(inertial), slice(10 * len(inertial), 10 * len(inertial) + len(positive)))
+    x, done, converged = _minimum(problem, regularisation, iterations)
+    return ConsistentFit(start + to_theta @ problem.directions(x), _divergences(problem.bodies_of(x)), done, converged)
 
 
 class _Problem(NamedTuple):
@@ -130,64 +126,61 @@ class _Problem(NamedTuple):
     A: np.ndarray
     r: np.ndarray
     bodies: int
+    z: slice
+    """Places of z in the unknowns x, which hold it in place of exp(z) - 1."""
 
-    def parts(self, x: np.ndarray, coefficients: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """M [B, 4, 4], z, and the signed parameters."""
-        numbers, z, signed = np.split(x, [10 * self.bodies, 10 * self.bodies + coefficients])
-        return np.eye(4) + np.einsum("bk,kij->bij", numbers.reshape(-1, 10), _BASIS), z, signed
+    def bodies_of(self, x: np.ndarray) -> np.ndarray:
+        """M [B, 4, 4]."""
+        return np.eye(4) + np.einsum("bk,kij->bij", x[: 10 * self.bodies].reshape(-1, 10), _BASIS)
 
-    def directions(self, x: np.ndarray, coefficients: int) -> np.ndarray:
-        """y as a function of the unknowns x, which hold z in place of exp(z) - 1."""
-        y, z = x.copy(), slice(10 * self.bodies, 10 * self.bodies + coefficients)
-        y[z] = np.expm1(x[z])
+    def directions(self, x: np.ndarray) -> np.ndarray:
+        """y as a function of the unknowns."""
+        y = x.copy()
+        y[self.z] = np.expm1(x[self.z])
         return y
 
-    def value(self, x: np.ndarray, coefficients: int, weight: float) -> float:
+    def value(self, x: np.ndarray, weight: float) -> float:
         """F; infinite where a body is not physically consistent or z exceeds 100."""
-        M, z, _ = self.parts(x, coefficients)
+        M, z = self.bodies_of(x), x[self.z]
         if (M.size and np.linalg.eigvalsh(M).min() <= 0) or z.max(initial=0.0) > 100:
             return np.inf
-        errors = self.A @ self.directions(x, coefficients) + self.r
+        errors = self.A @ self.directions(x) + self.r
         return float(errors @ errors + weight * (_divergences(M).sum() + 0.5 * z @ z))
 
-    def newton(self, x: np.ndarray, coefficients: int, weight: float) -> tuple[np.ndarray, float]:
+    def newton(self, x: np.ndarray, weight: float) -> tuple[np.ndarray, float]:
         """The Newton step, solved as a least-squares problem for numerical stability, and its decrement."""
-        M, z, signed = self.parts(x, coefficients)
-        errors = self.A @ self.directions(x, coefficients) + self.r
-        scale = np.concatenate([np.ones(10 * self.bodies), np.exp(z), np.ones(len(signed))])
-        slopes = self.A * scale
+        z, errors = x[self.z], self.A @ self.directions(x) + self.r
+        slopes = self.A.copy()
+        slopes[:, self.z] *= np.exp(z)
         rows, right = [slopes], [-errors]
-        for body, each in enumerate(M):
-            C = np.linalg.cholesky(each)
+        for body, M in enumerate(self.bodies_of(x)):
+            C = np.linalg.cholesky(M)
             inner = np.linalg.solve(C, np.linalg.solve(C, _BASIS).transpose(0, 2, 1))
             block = np.zeros((16, len(x)))
             block[:, 10 * body : 10 * body + 10] = inner.reshape(10, 16).T
             rows.append(np.sqrt(weight / 2) * block)
             right.append(-np.sqrt(weight / 2) * (C.T @ C - np.eye(4)).ravel())
         # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
-        place = 10 * self.bodies + np.arange(coefficients)
-        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, place].T @ errors, 0.0))
-        rows.append(bend[:, None] * _rows(place, len(x)))
+        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, self.z].T @ errors, 0.0))
+        rows.append(bend[:, None] * np.eye(len(x))[self.z])
         right.append(-weight / 2 * z / bend)
         system = np.concatenate(rows)
         step = np.linalg.lstsq(system, np.concatenate(right), rcond=None)[0]
         return step, float(np.sum((system @ step) ** 2))
 
 
-def _minimum(
-    problem: _Problem, coefficients: int, regularisation: float, iterations: int, tolerance: float
-) -> tuple[np.ndarray, int, bool]:
+def _minimum(problem: _Problem, regularisation: float, iterations: int) -> tuple[np.ndarray, int, bool]:
     """The unknowns that minimise F, the number of iterations, and whether they converged."""
     x = np.zeros(problem.A.shape[1])
-    weight = max(regularisation, problem.value(x, coefficients, 0.0) / max(1, len(x)))
+    weight = max(regularisation, problem.value(x, 0.0) / max(1, len(x)))
     for done in range(iterations):
-        step, decrement = problem.newton(x, coefficients, weight)
-        now, last = problem.value(x, coefficients, weight), weight == regularisation
-        if last and decrement <= tolerance * (1 + now):
+        step, decrement = problem.newton(x, weight)
+        now, last = problem.value(x, weight), weight == regularisation
+        if last and decrement <= TOLERANCE * (1 + now):
             return x, done, True
         length = 1.0
         # Armijo's condition; F is infinite for inconsistent bodies, so a step never leaves the feasible set.
-        while problem.value(x + length * step, coefficients, weight) > now - 1e-4 * length * decrement:
+        while problem.value(x + length * step, weight) > now - 1e-4 * length * decrement:
             length /= 2
             if length < 1e-12:
                 # Rounding hides any further decrease; this counts as converged if the decrement is small enough.
@@ -201,13 +194,3 @@ def _minimum(
 def _divergences(M: np.ndarray) -> np.ndarray:
     """tr M - log det M - 4 of every body."""
     return np.trace(M, axis1=1, axis2=2) - np.linalg.slogdet(M)[1] - 4
-
-
-def _bodies(J: np.ndarray) -> np.ndarray:
-    """The ten inertial parameters of every pseudo-inertia, as columns."""
-    return np.stack([np.asarray(body_of_pseudo_inertia(each)) for each in J], axis=1)
-
-
-def _rows(places: np.ndarray, count: int) -> np.ndarray:
-    """Rows of the identity matrix."""
-    return np.eye(count)[places]

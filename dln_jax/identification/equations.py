@@ -1,25 +1,77 @@
-"""Least-squares equations of a model linear in its parameters, compressed to one triangular factor per joint.
+"""Least-squares equations of a model linear in its parameters, and the names of their columns.
+
+The equations are compressed to one triangular factor per joint:
 
     |Phi_j theta - tau_j|² = |R_j (theta, -1)|²,   [Phi_j tau_j] = Q_j R_j
 
 Reweighting joints, fixing parameters and changing unknowns then act on the [P + 1, P + 1] factors, not on the data.
+
+The columns follow from the model's parameters. The leaf `inertias` [links, 10] holds the inertial parameters of the
+bodies; every other leaf has one entry per joint and gives its name to its columns. A new friction law therefore needs
+no change here.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design, design_chunks, require_linear, unravelled
-from dln_jax.models.model import Model
+from dln_jax.mechanics.trees.inertia import PARAMETERS
+from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.least_squares import triangular_factor
 from dln_jax.types import InputError
 
+Kind = Literal["inertia", "positive", "signed"]
+BODIES = "inertias"
+"""Name of the leaf with the inertial parameters, ten columns per body."""
+SIGNED = ("offset",)
+"""Endings of the names of leaves whose entries may have either sign."""
 CHUNK = 2048
 """Number of samples whose design matrix is in memory at a time."""
+
+
+class Columns(NamedTuple):
+    """Columns of P parameters in the order of the model's leaves."""
+
+    names: tuple[str, ...]
+    """Names such as "I_xx_3" or "viscous_2", joints counted from 1."""
+    kinds: tuple[Kind, ...]
+    """"inertia" for the ten columns of a body, "positive" for armature and friction, "signed" for either sign."""
+    joints: tuple[int, ...]
+    """Joint of every column, counted from 0."""
+
+    @property
+    def bodies(self) -> Int[np.ndarray, "bodies 10"]:
+        """The ten columns of every body."""
+        return np.flatnonzero(np.array(self.kinds) == "inertia").reshape(-1, 10)
+
+
+def columns_of(parameters: Parameters) -> Columns:
+    """Columns of a model with these parameters; outside `inertias` a column is named by its leaf and place in it."""
+    names: list[str] = []
+    kinds: list[Kind] = []
+    joints: list[int] = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(parameters)[0]:
+        name = "_".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)
+        shape = np.shape(leaf)
+        bodies = name == BODIES and len(shape) == 2 and shape[1] == len(PARAMETERS)
+        kind: Kind = "inertia" if bodies else "signed" if name.endswith(SIGNED) else "positive"
+        for place in range(int(np.prod(shape))):
+            joint, which = divmod(place, len(PARAMETERS)) if bodies else (place, 0)
+            names.append(f"{PARAMETERS[which] if bodies else name}_{joint + 1}")
+            kinds.append(kind)
+            joints.append(joint)
+    return Columns(tuple(names), tuple(kinds), tuple(joints))
+
+
+def flat(parameters: Parameters) -> Float[np.ndarray, " P"]:
+    """Concatenates all parameters in the order of the columns."""
+    leaves: list[Any] = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(parameters)]
+    return np.concatenate(leaves)
 
 
 class Equations(NamedTuple):
@@ -48,7 +100,7 @@ class Regressor(NamedTuple):
 
 def regressor_of(
     model: Model,
-    parameters: Any,
+    parameters: Parameters,
     data: Trajectories,
     *,
     free: np.ndarray | None = None,
@@ -68,7 +120,7 @@ def regressor_of(
     """
     if "tau" in data.estimated:
         raise InputError("the data have no tau; identification takes measured torques")
-    theta = np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(parameters)])
+    theta = flat(parameters)
     with jax.enable_x64(True):
         linearise = design(model) if linearise is None else linearise
         at = unravelled(theta, parameters)

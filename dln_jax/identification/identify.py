@@ -9,18 +9,17 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.identification import equations
-from dln_jax.identification.base import (
-    BaseParameters,
-    Determinacy,
-    base_parameters,
-    determinacy,
-    null_directions,
-)
-from dln_jax.identification.columns import Columns, columns_of, flat
+from dln_jax.identification.base import BaseParameters, Determinacy, base_parameters, determinacy, null_directions
 from dln_jax.identification.consistent import REGULARISATION, ConsistentFit, fit_consistent
-from dln_jax.identification.equations import compressed, regressor_of
-from dln_jax.identification.robust import ResidualStatistics, fit_robust, residual_statistics
-from dln_jax.identification.weighted import ROUNDING, WeightedFit, fit_weighted
+from dln_jax.identification.equations import Columns, columns_of, compressed, flat, regressor_of
+from dln_jax.identification.weighted import (
+    ROUNDING,
+    ResidualStatistics,
+    WeightedFit,
+    fit_robust,
+    fit_weighted,
+    residual_statistics,
+)
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, JointKind
@@ -97,38 +96,31 @@ def identify(
     if robust and noise is not None:
         raise InputError("noise is given, which a robust fit estimates; leave one of them out")
     columns, theta = columns_of(known), flat(known)
-    free = _with_mass(columns, theta)
+    massless = ~theta[columns.bodies].any(axis=1)
+    free = np.ones(len(theta))
+    free[columns.bodies[massless]] = 0.0
     linearise = design(model)
+    regressor, weights = regressor_of(model, known, data, free=free, linearise=linearise), None
     # The random states fill chunks of the same size as the data, so that both use one compiled program.
     samples = max(STATES * d, -(-len(data.t) // -(-len(data.t) // equations.CHUNK)))
     states = random_states(joints, samples, seed)
     general = compressed(regressor_of(model, known, states, free=free, linearise=linearise))
-    every = general.triangles.reshape(-1, general.unknowns + 1)[:, :-1]
-    structure = determinacy(null_directions(every))
-    regressor, weights = regressor_of(model, known, data, free=free, linearise=linearise), None
+    A = general.triangles.reshape(-1, general.unknowns + 1)[:, :-1]
+    structure, base = determinacy(null_directions(A)), base_parameters(A, columns)
     if robust:
         rough, weights = fit_robust(regressor, theta, rank_tolerance=rank_tolerance)
         noise = rough.noise
-    given = compressed(regressor, weights)
-    fit = fit_weighted(given, theta, noise=noise, rank_tolerance=rank_tolerance)
-    errors = equations.residuals(regressor, fit.theta)
-    statistics = residual_statistics(errors, data.trajectory, fit.noise)
-    fit = fit_weighted(given, theta, noise=fit.noise, correlation=statistics.correlation, rank_tolerance=rank_tolerance)
-    base = base_parameters(every, columns)
-    found = None
+    compact = compressed(regressor, weights)
+    fit = fit_weighted(compact, theta, noise=noise, rank_tolerance=rank_tolerance)
+    statistics = residual_statistics(equations.residuals(regressor, fit.theta), data.trajectory, fit.noise)
+    errors = {"noise": fit.noise, "correlation": statistics.correlation}
+    fit = fit_weighted(compact, theta, rank_tolerance=rank_tolerance, **errors)
+    bodies = None
     if consistent:
-        triangle = equations.weighted(given, fit.noise)
-        found = fit_consistent(triangle, columns, theta, regularisation=regularisation)
-    return Identification(
-        columns,
-        theta,
-        structure,
-        base,
-        fit,
-        seen_by(fit, base, structure),
-        statistics,
-        found,
-    )
+        triangle = equations.weighted(compact, fit.noise)
+        bodies = fit_consistent(triangle, columns, theta, regularisation=regularisation)
+    seen = seen_by(fit, base, structure)
+    return Identification(columns, theta, structure, base, fit, seen, statistics, bodies)
 
 
 def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:
@@ -151,9 +143,9 @@ def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy
     return tuple(judged(share, before) for share, before in zip(shares.tolist(), structure, strict=True))
 
 
-def parameters_of(found: Float[np.ndarray, " P"], like: Parameters) -> Parameters:
+def parameters_of(theta: Float[np.ndarray, " P"], like: Parameters) -> Parameters:
     """Parameters of the model from a vector in the order of its columns."""
-    return jax.tree.map(jnp.asarray, unravelled(found, like))
+    return jax.tree.map(jnp.asarray, unravelled(theta, like))
 
 
 def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Trajectories:
@@ -167,11 +159,3 @@ def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Tra
         "tau": np.ones((samples, d)),
     }
     return from_arrays({**arrays, "t": np.zeros(samples), "trajectory": np.arange(samples)})
-
-
-def _with_mass(columns: Columns, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    """Mask of the columns: 0 for links without mass, 1 for all others."""
-    free = np.ones(len(theta))
-    inertial = np.flatnonzero(np.array(columns.kinds) == "inertia").reshape(-1, 10)
-    free[inertial[~theta[inertial].any(axis=1)]] = 0.0
-    return free

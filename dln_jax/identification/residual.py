@@ -87,16 +87,16 @@ def fit_residual(
         InputError: the first candidate has terms, or the torques do not vary.
     """
     if not candidates or candidates[0].terms:
-        raise InputError("candidates start with a network; expected none at all first, which others have to better")
+        raise InputError("candidates start with a network; the first must be none, which the others have to improve on")
     began = time.perf_counter()
     with jax.enable_x64(True):
         scale = SCALED_TORQUE.scale(train)
         segment = segments(validation)
         of_train, of_validation = (arrays(SCALED_TORQUE, data, jnp.float64) for data in (train, validation))
         judge = jax.jit(lambda system_of, batch: residuals(SCALED_TORQUE, system_of(), batch) / scale, static_argnums=0)
-        left = np.asarray(judge(lambda: rigid.energies(parameters), of_train)) * np.asarray(scale)
-        sizes = _sizes(train, left)
-        sets = Split(train, validation, validation)
+        unexplained = np.asarray(judge(lambda: rigid.energies(parameters), of_train)) * np.asarray(scale)
+        magnitudes = {"torque_scale": unexplained, "rate_scale": train.qd, "acceleration_scale": train.qdd}
+        sizes = {name: _typical(name, values) for name, values in magnitudes.items()}
 
         def errors(system_of: Any) -> Float[np.ndarray, " segments"]:
             squares = np.sum(np.asarray(judge(system_of, of_validation)) ** 2, axis=1)
@@ -108,28 +108,20 @@ def fit_residual(
             time_left = began + seconds - time.perf_counter()
             if time_left <= 0:
                 return None, np.full(segment.max() + 1, np.inf)
-            settings = {"terms": candidate.terms, "width": candidate.width, **sizes}
+            settings = {**candidate._asdict(), **sizes}
             both = make_with_residual(rigid, make_residual(needs, **settings))
-            part = frozen(both, parameters)
-            training = fit(
-                dynamics.problem(part, sets, SCALED_TORQUE, seeds=seed),
-                GaussNewton(steps=iterations),
-                seconds=time_left,
+            problem = dynamics.problem(
+                frozen(both, parameters), Split(train, validation, validation), SCALED_TORQUE, seeds=seed
             )
-            found = ResidualParameters(parameters, training.parameters)
-            return (both, found, settings), errors(lambda: both.energies(found))
+            training = fit(problem, GaussNewton(steps=iterations), seconds=time_left)
+            whole = ResidualParameters(parameters, training.parameters)
+            return (both, whole, settings), errors(lambda: both.energies(whole))
 
         chosen, trials = grow(candidates, attempt)
-    if chosen.outcome is None:
-        return ResidualFit(rigid, parameters, chosen.candidate, {}, trials)
-    model, found, settings = chosen.outcome
-    return ResidualFit(model, found, chosen.candidate, settings, trials)
+    model, whole, settings = (rigid, parameters, {}) if chosen.outcome is None else chosen.outcome
+    return ResidualFit(model, whole, chosen.candidate, settings, trials)
 
 
-def _sizes(train: Trajectories, left: Float[np.ndarray, "N d"]) -> dict[str, tuple[float, ...]]:
-    """Typical magnitudes, to three digits, of unexplained torques, rates and accelerations."""
-    named = {"torque_scale": left, "rate_scale": train.qd, "acceleration_scale": train.qdd}
-    return {
-        name: tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, numbers))
-        for name, numbers in named.items()
-    }
+def _typical(name: str, values: Float[np.ndarray, "N d"]) -> tuple[float, ...]:
+    """Typical magnitudes by joint, to three digits."""
+    return tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, values))

@@ -2,12 +2,11 @@
 
 A mesh has one axis. Shared arrays, such as parameters, are replicated on every device; a batch is split along axis 0,
 and a device computes its share. `spread` gathers the results in the order of the batch, so that the rest of a program
-does not depend on the number of devices. `summed` adds the results up, in an order, and so with a rounding, that
-depends on the number of devices. A function in `on_devices` calls the collectives `total`, `mean` and `first` itself.
+does not depend on the number of devices. A function in `on_devices` calls the collectives `total`, `mean` and `first`
+itself; sums are taken in an order, and so with a rounding, that depends on the number of devices.
 Without a mesh (`None`), all of these return the function or the arrays unchanged.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.experimental import multihost_utils
 from jax.extend import core
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -77,18 +77,6 @@ def replicate(tree: Any, mesh: Mesh | None) -> Any:
     return tree if mesh is None else _placed(tree, NamedSharding(mesh, WHOLE))
 
 
-def gathered(tree: Any) -> Any:
-    """Returns the whole arrays, readable in every process."""
-
-    def whole(leaf: Any) -> Any:
-        split = isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated)
-        if not split:
-            return leaf
-        return _gathering(leaf.sharding.mesh)(leaf)  # pyright: ignore[reportAttributeAccessIssue]
-
-    return jax.tree.map(whole, tree)
-
-
 def program(function: Callable[..., Any], mesh: Mesh | None, **options: Any) -> Any:
     """Applies `jax.jit` to a function whose arguments and results are replicated on every device of the mesh.
 
@@ -105,10 +93,10 @@ def local(tree: Any, mesh: Mesh | None) -> Any:
 
 def of_first_process(value: bool | float, mesh: Mesh | None) -> bool | float:
     """Returns process 0's value of a number that may differ between processes, such as a time."""
-    if mesh is None:
+    if mesh is None or jax.process_count() == 1:
         return value
     # A gather over all devices reuses their connections; a broadcast would have to make others.
-    return type(value)(np.asarray(gathered(shard(np.full(mesh.size, value), mesh)))[0])
+    return type(value)(multihost_utils.process_allgather(shard(np.full(mesh.size, value), mesh), tiled=True)[0])
 
 
 def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
@@ -134,14 +122,6 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
         return jax.tree.map(lambda leaf: leaf[:count], results) if fillers else results
 
     return on_batch
-
-
-def summed(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """Returns the function, whose results are sums over the batch, with the batch split over the devices.
-
-    All devices get the whole sums. The number of devices must divide the batch. Take derivatives inside the function.
-    """
-    return on_devices(lambda shared, batch: total(function(shared, batch), mesh), mesh)
 
 
 def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
@@ -179,11 +159,6 @@ def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
         return array
     size = array.shape[axis] // mesh.size
     return lax.dynamic_slice_in_dim(array, lax.axis_index(AXIS) * size, size, axis)
-
-
-@functools.cache
-def _gathering(mesh: Mesh) -> Callable[[jax.Array], jax.Array]:
-    return jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, WHOLE))
 
 
 def _with_empty_arrays_made_inside(function: OfBatch) -> OfBatch:

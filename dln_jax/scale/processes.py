@@ -1,16 +1,23 @@
 """One program in several processes: `jax.distributed` connects them, and ends them when one is lost."""
 
 import contextlib
+import importlib.metadata
+import json
 import os
+import platform
 import re
+import socket
+import threading
+import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-from jax import Array
+import numpy as np
+from jax.experimental import multihost_utils
 
-from dln_jax.errors import InputError, ProcessLost
-from dln_jax.scale.meeting import Membership, address, meet
+from dln_jax.types import InputError
 
 HEARTBEAT = 10
 """Seconds without a heartbeat after which JAX treats a process as lost and ends the others."""
@@ -18,9 +25,25 @@ SHUTDOWN = 300
 """Seconds that the processes may take to shut down; process 0 may still write its figures."""
 JOINING = 120
 """Seconds within which all processes must have started."""
+MOST_OPTIONS = 256
+"""Largest number of options and versions that the processes compare."""
 _TASKS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 """Environment variables in which `srun` and `mpirun` state the number of their processes."""
+_ADDRESS = re.compile(r"(\[[0-9a-fA-F:.%\w]+\]|[^\s:\[\]/]+):(\d{1,5})")
 _OF_PEERS = re.compile(r"gloo|nccl|coordination|unavailable|deadline_exceeded", re.IGNORECASE)
+
+
+class ProcessLost(Exception):
+    """Another process of the program ended, or the connection to it was lost."""
+
+
+class Membership(NamedTuple):
+    """How a process joins others; if all fields are `None`, JAX reads them from the cluster's variables."""
+
+    coordinator: str | None = None
+    """host:port of process 0."""
+    processes: int | None = None
+    process: int | None = None
 
 
 def host_devices(count: int | None) -> None:
@@ -37,11 +60,6 @@ def host_devices(count: int | None) -> None:
         jax.config.update("jax_num_cpu_devices", count)
 
 
-def process_key(key: Array) -> Array:
-    """Returns a random key for this process, from one that all processes share."""
-    return jax.random.fold_in(key, jax.process_index())
-
-
 def membership(
     processes: int | None, coordinator: str | None, process: int | None, environ: Mapping[str, str] = os.environ
 ) -> Membership | None:
@@ -49,7 +67,7 @@ def membership(
 
     Args:
         processes: number of processes; 1 means a single process, also within a cluster's step.
-        coordinator: host:port of process 0.
+        coordinator: host:port of process 0; an IPv6 address stands in brackets.
         process: index of this process, from 0.
         environ: environment with the variables of `srun` or `mpirun`, read if all other arguments are None.
 
@@ -71,8 +89,10 @@ def membership(
         raise InputError(f"{' and '.join(absent)} missing beside {present}; give all three, or none for one process")
     if not 0 <= process < processes:
         raise InputError(f"--process-id is {process}; of {processes} processes, expected 0 to {processes - 1}")
-    address(coordinator)
-    return Membership(processes, coordinator, process)
+    parts = _ADDRESS.fullmatch(coordinator)
+    if not parts or not 0 < int(parts[2]) < 2**16:
+        raise InputError(f"--coordinator is {coordinator!r:.80}; expected host:port, such as node1:61440")
+    return Membership(coordinator, processes, process)
 
 
 def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINING) -> None:
@@ -84,38 +104,78 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
         seconds: time within which all processes must have started.
 
     Raises:
-        InputError: JAX has been used, the coordinator is unreachable, a process is missing, or two differ.
+        InputError: the address cannot be used, a process is missing, or two differ. JAX may go on connecting in a
+            thread, so that the caller should end the process at once.
     """
-    require_unused()
-    if member.coordinator is not None:
-        # Without this, JAX aborts with a C++ trace if a process is missing or the port is taken.
-        meet(member, options, seconds)
+    where = member.coordinator or "the cluster"
+    _require_address(member)
     # JAX's handler of SIGTERM would keep a process alive that is asked to end.
     jax.config.update("jax_enable_preemption_service", False)
-    try:
-        jax.distributed.initialize(
-            member.coordinator,
-            member.processes,
-            member.process,
-            initialization_timeout=seconds,
-            heartbeat_timeout_seconds=HEARTBEAT,
-            shutdown_timeout_seconds=SHUTDOWN,
+    errors = []
+
+    def connect() -> None:
+        try:
+            jax.distributed.initialize(
+                *member,
+                initialization_timeout=10 * seconds,
+                heartbeat_timeout_seconds=HEARTBEAT,
+                shutdown_timeout_seconds=SHUTDOWN,
+            )
+        except (RuntimeError, ValueError) as error:
+            errors.append(error)
+
+    # When JAX's own time for this is up, it aborts the process with a C++ trace. Ctrl-C would have to wait for it, too.
+    thread = threading.Thread(target=connect, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if thread.is_alive():
+        count = "the processes" if member.processes is None else f"the {member.processes} processes"
+        raise InputError(
+            f"{count} did not meet at {where} within {seconds} s; start the same command once for each --process-id, "
+            "with an address of process 0's host that all can reach"
         )
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"cannot join {member.coordinator or 'the cluster'}: {_first_line(error)}") from None
+    if errors:
+        raise InputError(f"cannot join {where}: {_first_line(errors[0])}")
+    if reason := _difference(options):
+        jax.distributed.shutdown()
+        raise InputError(f"{reason}; all processes need the same command and versions")
     if jax.process_index() == 0:
         local, kind = jax.local_device_count(), jax.default_backend()
         print(f"{jax.process_count()} processes, {local} {kind} device{'s' * (local > 1)} each")
 
 
-def require_unused() -> None:
-    """Raises `InputError` if JAX has been used, which shows in its refusal of another number of devices."""
-    devices = jax.config.values["jax_num_cpu_devices"]
+def _require_address(member: Membership) -> None:
+    """Raises `InputError` for a host without an address, or a port that is not free; JAX would wait in both cases."""
+    if member.coordinator is None:
+        return
+    host, _, port = member.coordinator.rpartition(":")
     try:
-        jax.config.update("jax_num_cpu_devices", devices + 1)
-        jax.config.update("jax_num_cpu_devices", devices)
-    except RuntimeError:
-        raise InputError("JAX has been used in this process; several are started before it is") from None
+        if member.process:
+            socket.getaddrinfo(host.strip("[]"), int(port))
+        else:
+            socket.create_server(("", int(port))).close()
+    except socket.gaierror as error:
+        raise InputError(f"cannot reach {member.coordinator} ({error.strerror}); check --coordinator") from None
+    except OSError as error:
+        raise InputError(f"port {port} of --coordinator is not free ({error.strerror}); choose another") from None
+
+
+def _difference(options: Mapping[str, Any]) -> str:
+    """Returns the first difference between the processes, the same in all of them; empty if there is none."""
+    counts = Counter(device.process_index for device in jax.devices())
+    for process, count in sorted(counts.items()):
+        if count != counts[0]:
+            return f"--devices: process 0 has {counts[0]}, process {process} has {count}"
+    packages = {name: importlib.metadata.version(name) for name in ("dln-jax", "jax", "jaxlib")}
+    record = {"Python": platform.python_version(), **packages, **options}
+    digests = np.zeros(MOST_OPTIONS, np.uint32)
+    digests[: len(record)] = [zlib.crc32(json.dumps(value).encode()) for value in record.values()]
+    gathered = multihost_utils.process_allgather(digests)
+    if not len(places := np.argwhere(gathered != gathered[0])):
+        return ""
+    process, place = places[0]
+    name, value = list(record.items())[place]
+    return f"{name} differs between process 0 and process {process}; it is {value!r:.60} in this one"
 
 
 @contextlib.contextmanager

@@ -6,8 +6,7 @@ import pytest
 from planar_arm import ARM, LENGTH
 
 from dln_jax.identification.base import base_parameters, determinacy, in_words, null_directions
-from dln_jax.identification.columns import columns_of, flat
-from dln_jax.identification.equations import compressed, regressor_of
+from dln_jax.identification.equations import columns_of, compressed, flat, regressor_of
 from dln_jax.identification.identify import random_states
 from dln_jax.models.rigid_tree import make_rigid_tree
 
@@ -43,15 +42,15 @@ def test_those_of_the_textbook(planar):
 
 def test_what_is_known_alone_in_combination_or_never(planar):
     A, columns, _ = planar
-    found = dict(zip(columns.names, determinacy(null_directions(A)), strict=True))
-    assert {name for name, each in found.items() if each == "in combination"} == {
+    kinds = dict(zip(columns.names, determinacy(null_directions(A)), strict=True))
+    assert {name for name, kind in kinds.items() if kind == "in combination"} == {
         "h_x_1",
         "I_zz_1",
         "m_2",
         "armature_1",
     }
-    assert found["m_1"] == found["I_xx_2"] == found["h_z_2"] == "not at all"
-    assert found["h_y_1"] == found["I_zz_2"] == found["armature_2"] == found["coulomb_1"] == "alone"
+    assert kinds["m_1"] == kinds["I_xx_2"] == kinds["h_z_2"] == "not at all"
+    assert kinds["h_y_1"] == kinds["I_zz_2"] == kinds["armature_2"] == kinds["coulomb_1"] == "alone"
 
 
 def test_directions_without_effect_have_none(planar):

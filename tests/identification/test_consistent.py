@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from planar_arm import ARM, FRICTION, motions
 
-from dln_jax.identification.columns import columns_of, flat
 from dln_jax.identification.consistent import fit_consistent, is_consistent, nearest_body
-from dln_jax.identification.equations import compressed, regressor_of, squares, weighted
+from dln_jax.identification.equations import columns_of, compressed, flat, regressor_of, squares, weighted
 from dln_jax.identification.weighted import fit_weighted
 from dln_jax.mechanics.trees import body_of_pseudo_inertia, inertial_parameters, moved, pseudo_inertia
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -22,9 +21,9 @@ def noisy():
     """An arm known roughly, and noisy equations of it."""
     model = make_rigid_tree(ARM, friction=True)
     known = model.init(jax.random.key(0))._replace(inertias=jnp.asarray(0.6 * ARM.inertias))
-    given = compressed(regressor_of(model, known, motions(0, noise=0.2, trajectories=3)))
-    fit = fit_weighted(given, flat(known))
-    return given, columns_of(known), flat(known), fit
+    equations = compressed(regressor_of(model, known, motions(0, noise=0.2, trajectories=3)))
+    fit = fit_weighted(equations, flat(known))
+    return equations, columns_of(known), flat(known), fit
 
 
 def test_a_pseudo_inertia_is_a_body():
@@ -42,31 +41,31 @@ def test_the_nearest_body():
 
 
 def test_all_exist_and_it_costs_little(noisy):
-    given, columns, known, fit = noisy
-    found = fit_consistent(weighted(given, fit.noise), columns, known)
-    assert all(is_consistent(found.theta, columns)) and found.converged
+    equations, columns, known, fit = noisy
+    result = fit_consistent(weighted(equations, fit.noise), columns, known)
+    assert all(is_consistent(result.theta, columns)) and result.converged
     positive = np.array(columns.kinds) == "positive"
-    assert (found.theta[positive] > 0).all()
+    assert (result.theta[positive] > 0).all()
     # Least squares is the least there is; a body that exists explains as much but for some standard errors.
-    free, bound = squares(given, fit.theta), squares(given, found.theta)
+    free, bound = squares(equations, fit.theta), squares(equations, result.theta)
     assert (bound <= free * 1.03).all()
     # Friction, which data show alone, is what it was.
     errors = fit.standard_errors(np.eye(len(known)))
     for law, values in FRICTION.items():
         for joint, value in enumerate(values):
             k = columns.names.index(f"{law}_{joint + 1}")
-            assert abs(found.theta[k] - value) < 5 * errors[k] + 0.01
+            assert abs(result.theta[k] - value) < 5 * errors[k] + 0.01
     assert not all(is_consistent(fit.theta, columns))
 
 
 def test_regularisation_keeps_what_is_known(noisy):
     """A hundred million measurements' worth of trust leave the bodies where they were, and none lets them go."""
-    given, columns, known, fit = noisy
-    triangle = weighted(given, fit.noise)
+    equations, columns, known, fit = noisy
+    triangle = weighted(equations, fit.noise)
     inertial = np.array(columns.kinds) == "inertia"
-    found = [fit_consistent(triangle, columns, known, regularisation=each) for each in (1e8, 1.0, 1e-3)]
-    np.testing.assert_allclose(found[0].theta[inertial], known[inertial], rtol=1e-2, atol=1e-3)
-    departures = [each.divergence.sum() for each in found]
+    results = [fit_consistent(triangle, columns, known, regularisation=strength) for strength in (1e8, 1.0, 1e-3)]
+    np.testing.assert_allclose(results[0].theta[inertial], known[inertial], rtol=1e-2, atol=1e-3)
+    departures = [fit.divergence.sum() for fit in results]
     assert departures[0] < 1e-3 < departures[1] < departures[2]
     with pytest.raises(InputError, match="regularisation"):
         fit_consistent(triangle, columns, known, regularisation=0.0)
@@ -76,7 +75,7 @@ def sum_of(theta, triangle, columns, known):
     """F by its definition, with unit regularisation, as a function of logarithms of the coefficients."""
     kinds = np.array(columns.kinds)
     errors = triangle[:, :-1] @ theta - triangle[:, -1]
-    bodies, before = (each[kinds == "inertia"].reshape(-1, 10) for each in (theta, known))
+    bodies, before = (values[kinds == "inertia"].reshape(-1, 10) for values in (theta, known))
     total = errors @ errors
     for body, other in zip(bodies, before, strict=True):
         M = np.linalg.solve(pseudo_inertia(other), pseudo_inertia(body))
@@ -87,20 +86,20 @@ def sum_of(theta, triangle, columns, known):
 @pytest.mark.parametrize("spoiled", [False, True])
 def test_no_direction_decreases_the_sum(noisy, spoiled):
     """Also with a torque turned round, where bodies lie at the edge of those that exist."""
-    given, columns, known, fit = noisy
-    triangle = weighted(given, fit.noise)
+    equations, columns, known, fit = noisy
+    triangle = weighted(equations, fit.noise)
     if spoiled:
         triangle = np.linalg.qr(np.vstack([triangle[:, :-1].T, -triangle[:, -1] + triangle[:, 0]]).T, mode="r")
     positive = np.array(columns.kinds) == "positive"
     known = np.where(positive & (known == 0), 0.1, known)
-    found = fit_consistent(triangle, columns, known)
-    assert found.converged and found.iterations < 200 and all(is_consistent(found.theta, columns))
-    least = sum_of(found.theta, triangle, columns, known)
+    result = fit_consistent(triangle, columns, known)
+    assert result.converged and result.iterations < 200 and all(is_consistent(result.theta, columns))
+    least = sum_of(result.theta, triangle, columns, known)
     random = np.random.default_rng(0)
     for size in (1e-2, 1e-4):
         for _ in range(20):
             # Relative steps of each parameter; those that leave the consistent bodies have no sum.
-            theta = found.theta * np.exp(size * random.normal(size=len(known)))
+            theta = result.theta * np.exp(size * random.normal(size=len(known)))
             if all(is_consistent(theta, columns)):
                 assert sum_of(theta, triangle, columns, known) >= least * (1 - 1e-9)
     short = fit_consistent(triangle, columns, known, iterations=3)

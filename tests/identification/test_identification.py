@@ -41,29 +41,29 @@ def test_torques_of_other_motions_are_predicted(clean):
 
 
 def test_noise_is_estimated_and_bodies_exist():
-    found = identify(MODEL, ROUGH, motions(2, noise=0.1, trajectories=4))
-    np.testing.assert_allclose(found.fit.noise, 0.1, rtol=0.1)
-    assert found.consistent is not None and all(is_consistent(found.theta, found.columns))
-    rows = base_rows(found)
-    true = found.base.combinations @ np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(TRUE)])
+    result = identify(MODEL, ROUGH, motions(2, noise=0.1, trajectories=4))
+    np.testing.assert_allclose(result.fit.noise, 0.1, rtol=0.1)
+    assert result.consistent is not None and all(is_consistent(result.theta, result.columns))
+    rows = base_rows(result)
+    true = result.base.combinations @ np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(TRUE)])
     assert all(abs(row["value"] - value) < 5 * row["standard_error"] for row, value in zip(rows, true, strict=True))
     robust = identify(MODEL, ROUGH, motions(2, noise=0.1, trajectories=4), robust=True, consistent=False)
     np.testing.assert_allclose(robust.fit.noise, 0.1, rtol=0.15)
 
 
 def test_a_joint_that_never_moves_is_said():
-    """The other's parameters are found; what only its motion shows stays as the file has it."""
+    """The other's parameters are result; what only its motion shows stays as the file has it."""
     data = motions(3, noise=0.01, still=(1,))
-    found = identify(MODEL, ROUGH, data)
-    names = found.columns.names
-    lines = findings(found, data, ARM.names)
+    result = identify(MODEL, ROUGH, data)
+    names = result.columns.names
+    lines = findings(result, data, ARM.names)
     assert lines[0].startswith("elbow: does not move; ")
-    assert "armature_2" in lost(found) and "viscous_2" in lost(found)
+    assert "armature_2" in lost(result) and "viscous_2" in lost(result)
     k = names.index("viscous_1")
-    assert found.seen[k] == "alone" and abs(found.fit.theta[k] - FRICTION["viscous"][0]) < 0.05
+    assert result.seen[k] == "alone" and abs(result.fit.theta[k] - FRICTION["viscous"][0]) < 0.05
     unseen = names.index("viscous_2")
-    assert found.fit.theta[unseen] == found.known[unseen]
-    np.testing.assert_array_equal(found.fit.standard_errors(np.eye(len(names)))[unseen], np.inf)
+    assert result.fit.theta[unseen] == result.known[unseen]
+    np.testing.assert_array_equal(result.fit.standard_errors(np.eye(len(names)))[unseen], np.inf)
 
 
 def test_words_and_rows(clean):
@@ -83,9 +83,9 @@ def test_links_without_mass_stay_so():
     tree = serial(*frames, [np.zeros(10), body], axes=[[1, 0, 0], [0, 1, 0]])
     model = make_rigid_tree(tree)
     data = motions(0, noise=1e-3, friction=False, tree=tree)
-    found = identify(model, model.init(jax.random.key(0)), data)
-    assert not found.theta[:10].any() and all(is_consistent(found.theta, found.columns))
-    np.testing.assert_allclose(found.theta[10], 1.0, rtol=0.3)
+    result = identify(model, model.init(jax.random.key(0)), data)
+    assert not result.theta[:10].any() and all(is_consistent(result.theta, result.columns))
+    np.testing.assert_allclose(result.theta[10], 1.0, rtol=0.3)
 
 
 def test_mistakes():

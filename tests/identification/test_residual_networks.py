@@ -44,25 +44,25 @@ def test_a_network_is_added_only_where_it_helps(stiffness, added):
     train, validation, test = (select(data, which) for which in ([0, 1, 2], [3, 4], [5]))
     rigid = make_rigid_tree(ARM, friction=True)
     identified = fit_linear(rigid, train, negligible=1e-12).parameters
-    found = fit_residual(rigid, identified, ARM.needs, train, validation, candidates=CANDIDATES, iterations=30)
-    assert bool(found.chosen.terms) == added
+    result = fit_residual(rigid, identified, ARM.needs, train, validation, candidates=CANDIDATES, iterations=30)
+    assert bool(result.chosen.terms) == added
 
     def error(model, parameters):
         tau = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))(test.q, test.qd, test.qdd)
         return float(np.mean((tau - test.tau) ** 2))
 
     if added:
-        assert isinstance(found.parameters, ResidualParameters)
-        assert error(found.model, found.parameters) < 0.2 * error(rigid, identified)
+        assert isinstance(result.parameters, ResidualParameters)
+        assert error(result.model, result.parameters) < 0.2 * error(rigid, identified)
     else:
-        assert found.model is rigid
+        assert result.model is rigid
 
 
 def test_segments_stay_within_trajectories():
     data = log(0.0)
     numbers = segments(data, 1.0)
     assert len(set(numbers)) == 6 * 4  # the last sample, at 3 s, begins a segment of its own
-    assert all(len(set(data.trajectory[numbers == each])) == 1 for each in set(numbers))
+    assert all(len(set(data.trajectory[numbers == number])) == 1 for number in set(numbers))
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,7 @@ import pytest
 
 from dln_jax.identification.base import null_directions
 from dln_jax.identification.equations import Equations, Regressor, about, compressed, residuals, squares, weighted
-from dln_jax.identification.robust import correlation_times, fit_robust, residual_statistics
-from dln_jax.identification.weighted import fit_weighted
+from dln_jax.identification.weighted import correlation_times, fit_robust, fit_weighted, residual_statistics
 from dln_jax.types import InputError
 
 NOISE = np.array([0.1, 2.0])
@@ -33,12 +32,12 @@ def test_triangles_have_all_that_data_say():
     random = np.random.default_rng(0)
     Phi, theta = design(0), random.normal(size=5)
     tau = random.normal(size=(300, 2))
-    given = compressed(regressor(Phi, tau))
+    equations = compressed(regressor(Phi, tau))
     errors = tau - Phi @ theta
-    np.testing.assert_allclose(squares(given, theta), np.sum(errors**2, axis=0), rtol=1e-10)
+    np.testing.assert_allclose(squares(equations, theta), np.sum(errors**2, axis=0), rtol=1e-10)
     np.testing.assert_allclose(residuals(regressor(Phi, tau), theta), errors, atol=1e-12)
-    np.testing.assert_allclose(squares(about(given, theta), 0 * theta), np.sum(errors**2, axis=0), rtol=1e-10)
-    whole = weighted(given, NOISE) @ np.append(theta, -1.0)
+    np.testing.assert_allclose(squares(about(equations, theta), 0 * theta), np.sum(errors**2, axis=0), rtol=1e-10)
+    whole = weighted(equations, NOISE) @ np.append(theta, -1.0)
     np.testing.assert_allclose(whole @ whole, np.sum((errors / NOISE) ** 2), rtol=1e-10)
     weights = random.uniform(0.1, 1, (300, 2))
     np.testing.assert_allclose(
@@ -50,16 +49,18 @@ def test_standard_errors_are_those_of_repeated_experiments():
     """Of 300 repetitions, and noise is found as it was; what is dependent has no error of its own."""
     Phi = design(1, dependent=True)
     combinations = np.array([[0, 0, 1.0, 0, 0], [0, 0, 0, 1, 0], [1, 0, 0, 0, 1], [0, 1, 0, 0, 1]])
-    found, errors, noises = [], [], []
+    fitted, errors, noises = [], [], []
     for seed in range(300):
         tau = Phi @ TRUE + NOISE * np.random.default_rng(seed).normal(size=(300, 2))
         fit = fit_weighted(compressed(regressor(Phi, tau)), np.zeros(5))
-        found.append(combinations @ fit.theta)
+        fitted.append(combinations @ fit.theta)
         errors.append(fit.standard_errors(combinations))
         noises.append(fit.noise)
     np.testing.assert_allclose(np.mean(noises, axis=0), NOISE, rtol=0.02)
-    np.testing.assert_allclose(np.std(found, axis=0), np.mean(errors, axis=0), rtol=0.12)
-    np.testing.assert_allclose(np.mean(found, axis=0), combinations @ TRUE, atol=5 * np.mean(errors, axis=0).max() / 17)
+    np.testing.assert_allclose(np.std(fitted, axis=0), np.mean(errors, axis=0), rtol=0.12)
+    np.testing.assert_allclose(
+        np.mean(fitted, axis=0), combinations @ TRUE, atol=5 * np.mean(errors, axis=0).max() / 17
+    )
     assert fit.rank == 4 and len(fit.without_effect) == 1
     np.testing.assert_array_equal(np.isinf(fit.standard_errors(np.eye(5))), [True, True, False, False, True])
 
@@ -69,9 +70,9 @@ def test_weights_beat_equal_ones():
     Phi, ours, equal = design(2), [], []
     for seed in range(30):
         tau = Phi @ TRUE + NOISE * np.random.default_rng(seed).normal(size=(300, 2))
-        given = compressed(regressor(Phi, tau))
-        ours.append(fit_weighted(given, np.zeros(5)).theta - TRUE)
-        equal.append(fit_weighted(given, np.zeros(5), noise=np.ones(2)).theta - TRUE)
+        equations = compressed(regressor(Phi, tau))
+        ours.append(fit_weighted(equations, np.zeros(5)).theta - TRUE)
+        equal.append(fit_weighted(equations, np.zeros(5), noise=np.ones(2)).theta - TRUE)
     assert (np.std(ours, axis=0) < 0.2 * np.std(equal, axis=0)).all()
 
 
@@ -110,18 +111,18 @@ def test_statistics_of_residuals():
         following[k] = 0.8 * following[k - 1] + random.normal()
     trajectory = np.repeat([0, 1], samples // 2)
     errors = np.stack([white, following], axis=1)
-    found = residual_statistics(errors, trajectory, np.array([1.0, 1 / 0.6]))
-    np.testing.assert_allclose(found.rms, [1.0, 1 / 0.6], rtol=0.05)
-    np.testing.assert_allclose(found.correlation, [1.0, 9.0], rtol=0.25)  # (1 + 0.8) / (1 - 0.8)
-    np.testing.assert_allclose(found.share_beyond_three, 0.0027, atol=2e-3)
-    np.testing.assert_allclose(found.excess_kurtosis, 0, atol=0.3)
+    statistics = residual_statistics(errors, trajectory, np.array([1.0, 1 / 0.6]))
+    np.testing.assert_allclose(statistics.rms, [1.0, 1 / 0.6], rtol=0.05)
+    np.testing.assert_allclose(statistics.correlation, [1.0, 9.0], rtol=0.25)  # (1 + 0.8) / (1 - 0.8)
+    np.testing.assert_allclose(statistics.share_beyond_three, 0.0027, atol=2e-3)
+    np.testing.assert_allclose(statistics.excess_kurtosis, 0, atol=0.3)
     np.testing.assert_array_equal(correlation_times(errors[:5], np.arange(5)), 1.0)
 
 
 def test_residuals_that_follow_each_other_make_errors_larger():
-    given = compressed(regressor(design(5), NOISE * np.random.default_rng(0).normal(size=(300, 2))))
-    one = fit_weighted(given, np.zeros(5), noise=NOISE)
-    nine = fit_weighted(given, np.zeros(5), noise=NOISE, correlation=np.array([9.0, 9.0]))
+    equations = compressed(regressor(design(5), NOISE * np.random.default_rng(0).normal(size=(300, 2))))
+    one = fit_weighted(equations, np.zeros(5), noise=NOISE)
+    nine = fit_weighted(equations, np.zeros(5), noise=NOISE, correlation=np.array([9.0, 9.0]))
     np.testing.assert_allclose(nine.standard_errors(np.eye(5)), 3 * one.standard_errors(np.eye(5)), rtol=1e-10)
 
 
@@ -133,9 +134,9 @@ def test_residuals_that_follow_each_other_make_errors_larger():
     ],
 )
 def test_mistakes(settings, message):
-    given = compressed(regressor(design(0), design(0) @ TRUE))
+    equations = compressed(regressor(design(0), design(0) @ TRUE))
     with pytest.raises(InputError, match=message):
-        fit_weighted(given, np.zeros(5), **settings)
+        fit_weighted(equations, np.zeros(5), **settings)
 
 
 def test_too_little_data():

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.cli import commands
-from dln_jax.scale.mesh import batch_mesh, gathered, replicate, shard, shares, spread, summed
-from dln_jax.scale.processes import host_devices, require_unused
+from dln_jax.scale.devices import backend_started
+from dln_jax.scale.mesh import batch_mesh, on_devices, replicate, shard, shares, spread, total
+from dln_jax.scale.processes import host_devices
 from dln_jax.types import InputError
 
 
@@ -23,20 +24,20 @@ def refused(function, *arguments):
 
 
 def energies(scale, batch):
-    """Of samples (x, y)."""
+    """Energies of samples (x, y)."""
     x, y = batch
     return jax.vmap(lambda x, y: {"sine": jnp.sin(scale * x) @ x, "y": scale * y})(x, y)
 
 
-def total(scale, batch):
-    """Over samples."""
+def sums(scale, batch):
+    """Sums over samples."""
     return jax.tree.map(lambda leaf: leaf.sum(0), energies(scale, batch))
 
 
 jax.config.update("jax_enable_x64", True)
 for module in pkgutil.iter_modules(commands.__path__):
     importlib.import_module(f"{commands.__name__}.{module.name}")
-require_unused()  # a command that is imported has used no device
+assert not backend_started()  # importing a command uses no device
 host_devices(4)
 assert batch_mesh(1) is None
 mesh = batch_mesh()
@@ -57,8 +58,8 @@ for count in (8, 5, 3):  # divided, and filled up, by less than a share and by m
 batch = (np.random.default_rng(0).normal(size=(8, 3)), np.arange(8))
 jax.tree.map(
     lambda one, all: np.testing.assert_allclose(one, all, rtol=1e-14),
-    jax.jit(summed(total, None))(2.0, batch),
-    jax.jit(summed(total, mesh))(2.0, batch),
+    jax.jit(sums)(2.0, batch),
+    jax.jit(on_devices(lambda scale, batch: total(sums(scale, batch), mesh), mesh))(2.0, batch),
 )
 
 
@@ -78,11 +79,12 @@ def extended(scale, batch, outer):
 
 # XLA of jaxlib 0.11.2 ends in a segmentation fault where such an array comes into a `shard_map` and is used there.
 scale = np.array([1.0, 2.0, 3.0])
-found = extended(scale, (batch[0], np.zeros((8, 0))), np.zeros(0))
-np.testing.assert_array_equal(found, scale * batch[0])
+result = extended(scale, (batch[0], np.zeros((8, 0))), np.zeros(0))
+np.testing.assert_array_equal(result, scale * batch[0])
 split = shard(batch, mesh)
 assert [part.data.shape for part in split[0].addressable_shards] == [(2, 3)] * 4
-jax.tree.map(np.testing.assert_array_equal, gathered(split), batch)
+jax.tree.map(np.testing.assert_array_equal, split, batch)
+assert backend_started()
 assert replicate(batch, mesh)[0].is_fully_replicated and shares(mesh, 8, "rows") == 2
 assert "6 seeds cannot be split over 4 devices; give a multiple of 4" in refused(shares, mesh, 6, "seeds")
 assert "cannot be split over 4 devices" in refused(shard, np.zeros((6, 2)), mesh)

@@ -1,4 +1,4 @@
-"""Commands in several processes, each of its own: what they compute, how they refuse, and how they lose another."""
+"""Commands in several processes: results, refusals, and the loss of a process."""
 
 import os
 import signal
@@ -11,8 +11,7 @@ import pytest
 from interpreters import Program, interpreters
 from safetensors.numpy import load_file
 
-from dln_jax.scale.meeting import Membership
-from dln_jax.scale.processes import membership
+from dln_jax.scale.processes import Membership, membership
 from dln_jax.types import InputError
 
 TINY = '''
@@ -27,8 +26,7 @@ from dln_jax.cli.progress import progress
 from dln_jax.cli.running import run
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.scaled import mesh_of
-from dln_jax.scale.mesh import gathered, shard, spread, summed
-from dln_jax.scale.processes import process_key
+from dln_jax.scale.mesh import of_first_process, shard, spread
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import load_tree, save_tree
 
@@ -50,27 +48,24 @@ def lose(process):
         subprocess.Popen(["sh", "-c", f"sleep 30; kill -9 {os.getpid()}"])  # nothing else ends one that is stopped
     os.kill(os.getpid(), getattr(signal, how))
 
-def main(given):
-    mesh = mesh_of(given)
+def main(options):
+    mesh = mesh_of(options)
     places = shard(np.arange(4.0), mesh)
     step = jax.jit(spread(lambda state, places: jnp.cos(3.0 * jnp.sum(state) + places), mesh))
-    total = jax.jit(summed(lambda scale, places: scale * jnp.sum(places), mesh))
-    with command_folder(given, "tiny") as folder, progress(8) as show:
+    with command_folder(options, "tiny") as folder, progress(8) as show:
         print("I am the first")
         state = {"done": np.array(0), "places": np.zeros(4)}
-        if given.resume:
+        if options.resume:
             state = load_tree(folder, "state", state)
         for done in range(int(state["done"]) + 1, 9):
             state = {"done": np.array(done), "places": np.asarray(step(np.asarray(state["places"]), places))}
             save_tree(folder, "state", state, {}, number=done)
             show(done, "")
             if done == 4:
-                lose(given.process_id or 0)
-        assert float(total(2.0, places)) == 12.0
-        key = np.asarray(jax.random.key_data(process_key(jax.random.key(0))))
-        keys = gathered(shard(np.tile(key, (4, 1)), mesh))
+                lose(options.process_id or 0)
+        assert of_first_process(float(jax.process_index()), mesh) == 0.0
         devices = np.array(mesh.size if mesh else 1)
-        save_tree(folder, "result", {**state, "keys": np.asarray(keys), "devices": devices}, {})
+        save_tree(folder, "result", {**state, "devices": devices}, {})
 
 code = 0
 try:
@@ -86,8 +81,8 @@ os._exit(code)  # a second sooner
 MESH = Path(__file__).with_name("on_four_devices.py")
 
 
-class Started(NamedTuple):
-    """What became of processes that were started together."""
+class Ended(NamedTuple):
+    """Results of processes that were started together."""
 
     codes: tuple[int, ...]
     out: list[str]
@@ -101,8 +96,8 @@ class Started(NamedTuple):
 
 @pytest.fixture(scope="module")
 def run_programs():
-    told = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "SLURM_"))}
-    with interpreters(told) as run:
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "SLURM_"))}
+    with interpreters(environment) as run:
         yield run
 
 
@@ -114,28 +109,28 @@ def run_tiny(run_programs, tmp_path_factory):
 
     def run(*runs):
         programs, folders = [], []
-        for processes, told, folder in runs:
+        for processes, shared, folder in runs:
             folder = folder or tmp_path_factory.mktemp("run")
             folders.append(folder)
             for options, more in processes:
                 environment = {key: value for key, value in os.environ.items() if not key.startswith("SLURM_")}
-                programs.append(Program(path, folder, {**environment, **told, **more}, ("--out", "run", *options)))
+                programs.append(Program(path, folder, {**environment, **shared, **more}, ("--out", "run", *options)))
         results = iter(run_programs(path.parent, *programs))
-        started = []
+        ended_runs = []
         for (processes, _, _), folder in zip(runs, folders, strict=True):
-            each = [next(results) for _ in processes]
-            codes = tuple(result.returncode for result in each)
-            texts = ([getattr(result, name) for result in each] for name in ("stdout", "stderr"))
-            started.append(Started(codes, *texts, folder))
-        return started
+            ended = [next(results) for _ in processes]
+            codes = tuple(result.returncode for result in ended)
+            texts = ([getattr(result, name) for result in ended] for name in ("stdout", "stderr"))
+            ended_runs.append(Ended(codes, *texts, folder))
+        return ended_runs
 
     return run
 
 
 def free_port():
-    with socket.socket() as asked:
-        asked.bind(("127.0.0.1", 0))
-        return asked.getsockname()[1]
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def pair(*more, first=(), second=(), host="127.0.0.1", port=None):
@@ -145,19 +140,33 @@ def pair(*more, first=(), second=(), host="127.0.0.1", port=None):
 
 
 def slurm_pair(*more):
-    """What Slurm says to two tasks of a step, on this host."""
+    """Environments that Slurm gives two tasks of a step, on this host."""
     step = {"SLURM_JOB_ID": str(free_port()), "SLURM_STEP_NUM_TASKS": "2", "SLURM_NTASKS": "2"}
     step |= {"SLURM_STEP_NODELIST": "localhost"}
     return [(more, {**step, "SLURM_PROCID": str(k), "SLURM_LOCALID": str(k)}) for k in range(2)]
 
 
+RUNS = {"alone": lambda: [((), {})], "two": pair, "1 SIGKILL": pair}
+LOST = ("1 SIGSTOP", "0 SIGKILL", "1 error")
+MORE_RUNS = {"slurm": lambda: slurm_pair("--devices", "2"), **dict.fromkeys(LOST, pair)}
+"""Processes by the way in which they are started, or in which one of them is lost."""
+
+
+def started(run_tiny, runs):
+    losses = {how: {"LOST": how} if how[0].isdigit() else {} for how in runs}
+    return dict(zip(runs, run_tiny(*((runs[how](), losses[how], None) for how in runs)), strict=True))
+
+
 @pytest.fixture(scope="module")
 def trained(run_tiny):
-    """One process, two, two by Slurm, and two of which one is lost in each of several ways."""
-    lost = ("1 SIGKILL", "1 SIGSTOP", "0 SIGKILL", "1 error")
-    runs = [([((), {})], {}, None), (pair(), {}, None), (slurm_pair("--devices", "2"), {}, None)]
-    started = run_tiny(*runs, *((pair(), {"LOST": how}, None) for how in lost))
-    return dict(zip(("alone", "two", "slurm", *lost), started, strict=True))
+    """One process, two, and two of which one is lost."""
+    return started(run_tiny, RUNS)
+
+
+@pytest.fixture(scope="module")
+def trained_more(run_tiny):
+    """Two processes by Slurm, and two of which one is lost in other ways."""
+    return started(run_tiny, MORE_RUNS)
 
 
 def assert_same_result(started, alone):
@@ -165,31 +174,29 @@ def assert_same_result(started, alone):
     assert started.result["done"] == 8
 
 
-@pytest.mark.parametrize("way", ["two", "slurm"])
-def test_two_processes_give_what_one_gives(trained, way):
-    started, alone = trained[way], trained["alone"]
-    assert (started.codes, started.err) == ((0, 0), ["", ""])
-    assert_same_result(started, alone)
-    assert (started.result["devices"], alone.result["devices"]) == (2 if way == "two" else 4, 1)
-    assert len(np.unique(started.result["keys"], axis=0)) == 2
+def assert_is_one_program(result, alone, devices):
+    assert (result.codes, result.err) == ((0, 0), ["", ""])
+    assert_same_result(result, alone)
+    assert (result.result["devices"], alone.result["devices"]) == (devices, 1)
+    first, second = result.out
+    assert first.startswith("2 processes, ") and "I am the first" in first and "Gloo" not in first and not second
 
 
-@pytest.mark.parametrize("way", ["two", "slurm"])
-def test_the_first_process_alone_prints_and_writes(trained, way):
-    out = trained[way].out
-    assert out[0].startswith("2 processes, ") and "I am the first" in out[0] and "Gloo" not in out[0] and not out[1]
+def test_two_processes_give_what_one_gives_and_the_first_alone_prints(trained):
+    assert_is_one_program(trained["two"], trained["alone"], devices=2)
 
 
-LOSSES = {"1 SIGKILL": (3, -9), "0 SIGKILL": (-9, 3), "1 error": (3, 2), "1 SIGSTOP": (-signal.SIGABRT, -9)}
+@pytest.mark.slow
+def test_tasks_of_slurm_give_what_one_process_gives(trained, trained_more):
+    assert_is_one_program(trained_more["slurm"], trained["alone"], devices=4)
 
 
-@pytest.mark.parametrize("how", LOSSES)
-def test_a_lost_process_ends_the_others(trained, how):
+def assert_ended_by_loss(result, how):
     """With a line that says how to go on, unless JAX's own runtime is the first to notice, and aborts."""
-    started, expected = trained[how], LOSSES[how]
+    expected = LOSSES[how]
     remaining = 1 - expected.index(-9 if -9 in expected else 2)
-    code, err = started.codes[remaining], started.err[remaining]
-    assert started.codes[1 - remaining] == expected[1 - remaining]
+    code, err = result.codes[remaining], result.err[remaining]
+    assert result.codes[1 - remaining] == expected[1 - remaining]
     if how in ("1 SIGKILL", "1 error"):
         assert code == 3 and err.startswith("error: another process is lost") and len(err.splitlines()) == 1
         assert "run with --resume in all processes" in err
@@ -197,21 +204,51 @@ def test_a_lost_process_ends_the_others(trained, how):
         assert code in (3, -signal.SIGABRT) and "another" in err
 
 
+LOSSES = {"1 SIGKILL": (3, -9), "0 SIGKILL": (-9, 3), "1 error": (3, 2), "1 SIGSTOP": (-signal.SIGABRT, -9)}
+
+
+def test_a_killed_process_ends_the_other(trained):
+    assert_ended_by_loss(trained["1 SIGKILL"], "1 SIGKILL")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", LOST)
+def test_a_lost_process_ends_the_other(trained_more, how):
+    assert_ended_by_loss(trained_more[how], how)
+
+
+def assert_continued(result, alone):
+    assert set(result.codes) == {0} and not any(result.err)
+    assert_same_result(result, alone)
+    assert "process" not in (result.folder / "run" / "config.json").read_text()
+
+
 def test_a_broken_run_continues_as_if_unbroken(run_tiny, trained):
-    """In two processes, whichever was lost, and in one alone."""
-    broken = [trained[how] for how in ("1 SIGKILL", "0 SIGKILL", "1 SIGSTOP")]
-    for each in broken:
-        assert not (each.folder / "run" / "result.json").exists()
-    processes = [pair("--resume"), pair("--resume"), [(("--resume",), {})]]
-    for started in run_tiny(*((each, {}, was.folder) for each, was in zip(processes, broken, strict=True))):
-        assert set(started.codes) == {0} and not any(started.err)
-        assert_same_result(started, trained["alone"])
-        assert (started.folder / "run" / "config.json").read_text().find("process") < 0
+    broken = trained["1 SIGKILL"].folder
+    assert not (broken / "run" / "result.json").exists()
+    for result in run_tiny((pair("--resume"), {}, broken)):
+        assert_continued(result, trained["alone"])
 
 
-@pytest.fixture(scope="module")
-def refused(run_tiny):
-    """Pairs that cannot be one program, all beside each other."""
+@pytest.mark.slow
+def test_a_broken_run_continues_in_one_process_or_without_its_first(run_tiny, trained, trained_more):
+    ways = [("0 SIGKILL", pair("--resume")), ("1 SIGSTOP", [(("--resume",), {})])]
+    for result in run_tiny(*((processes, {}, trained_more[how].folder) for how, processes in ways)):
+        assert_continued(result, trained["alone"])
+
+
+REFUSED = {
+    "arguments": ("--seed differs between process 0 and process 1; it is 1", "it is 2 in this one"),
+    "devices": ("--devices: process 0 has 1, process 1 has 3",) * 2,
+    "twice": ("the 2 processes did not meet at 127.0.0.1:",),
+    "absent": ("the 2 processes did not meet at 127.0.0.1:",),
+    "port": ("of --coordinator is not free", "did not meet at localhost"),
+    "address": ("did not meet at no-such-host.invalid", "cannot reach no-such-host.invalid"),
+}
+
+
+def assert_refused(run_tiny, *reasons):
+    """Pairs that cannot be one program, all beside each other, end with one line each."""
     taken = socket.socket()
     taken.bind(("", 0))
     taken.listen()
@@ -225,27 +262,22 @@ def refused(run_tiny):
         "address": (pair(host="no-such-host.invalid"), hurried, None),
     }
     with taken:
-        return dict(zip(runs, run_tiny(*runs.values()), strict=True))
+        results = run_tiny(*(runs[reason] for reason in reasons))
+    for reason, result in zip(reasons, results, strict=True):
+        lines = [err.splitlines() for err in result.err]
+        assert set(result.codes) == {2}, reason
+        assert all(len(text) == 1 and text[0].startswith("error: ") for text in lines), reason
+        assert all(any(message in err for err in result.err) for message in REFUSED[reason]), reason
+        assert not list(result.folder.iterdir()), f"{reason}: something is left"
 
 
-REFUSED = {
-    "arguments": ("--seed is 1 in process 0 and 2 in process 1; all processes need the same command",) * 2,
-    "devices": ("--devices is None in process 0 and 3 in process 1",) * 2,
-    "twice": ("processes [1] of 2 did not come", "of --coordinator is not free"),
-    "absent": ("processes [1] of 2 did not come",),
-    "port": ("of --coordinator is not free", "cannot reach"),
-    "address": ("processes [1] of 2 did not come", "cannot reach no-such-host.invalid"),
-}
+def test_different_options_and_absent_processes_are_one_line(run_tiny):
+    assert_refused(run_tiny, "arguments", "absent")
 
 
-@pytest.mark.parametrize("why", REFUSED)
-def test_what_cannot_be_one_program_is_one_line_in_all_processes(refused, why):
-    started = refused[why]
-    lines = [err.splitlines() for err in started.err]
-    assert set(started.codes) == {2} and all(len(each) == 1 and each[0].startswith("error: ") for each in lines)
-    # Of two processes with one number either may be the first.
-    assert all(any(message in err for err in started.err) for message in REFUSED[why])
-    assert not list(started.folder.iterdir()), "something is left"
+@pytest.mark.slow
+def test_other_processes_that_do_not_fit_are_one_line(run_tiny):
+    assert_refused(run_tiny, "devices", "twice", "port", "address")
 
 
 def test_devices_of_one_process_share_batches(run_programs, tmp_path):
@@ -257,8 +289,8 @@ TASK = {"SLURM_STEP_NUM_TASKS": "4"}
 
 
 def test_options_are_a_membership_and_go_before_a_cluster():
-    assert membership(2, "node1:5000", 1, TASK) == Membership(2, "node1:5000", 1)
-    assert membership(2, "[fe80::1]:5000", 1, {}) == Membership(2, "[fe80::1]:5000", 1)
+    assert membership(2, "node1:5000", 1, TASK) == Membership("node1:5000", 2, 1)
+    assert membership(2, "[fe80::1]:5000", 1, {}) == Membership("[fe80::1]:5000", 2, 1)
     assert membership(None, None, None, TASK) == Membership()
     assert membership(None, None, None, {}) is None
     assert membership(1, None, None, TASK) is None

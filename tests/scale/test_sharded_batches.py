@@ -21,7 +21,7 @@ def results(tmp_path_factory):
 
 
 def test_each_ran_on_its_devices(results):
-    assert {name: int(found["devices"]) for name, found in results.items()} == {
+    assert {name: int(outcome["devices"]) for name, outcome in results.items()} == {
         "four devices": 4,
         "one device": 1,
         "first of two": 2,
@@ -37,9 +37,9 @@ def test_each_ran_on_its_devices(results):
     ],
 )
 def test_results_are_those_of_one_device(results, name, subject):
-    expected, found = results["one device"], results[name]
+    expected, outcome = results["one device"], results[name]
     keys = [key for key in expected if key.startswith(subject)]
-    assert keys and keys == [key for key in found if key.startswith(subject)]
+    assert keys and keys == [key for key in outcome if key.startswith(subject)]
     for key in keys:
         assert np.isfinite(expected[key]).all()
-        np.testing.assert_allclose(found[key], expected[key], rtol=1e-12, atol=1e-12, err_msg=key)
+        np.testing.assert_allclose(outcome[key], expected[key], rtol=1e-12, atol=1e-12, err_msg=key)

@@ -3,11 +3,13 @@
 The grid is for example 'width=8,16 seed=0:10 data=a.npz,b.npz': values by commas, a:b and a:b:step for whole numbers
 without b, and all combinations of them. Options are checked before anything starts. A sweep's folder gets a folder for
 each job, table.csv with all their metrics, sweep.json and sweep.png: error against seconds, and the best by validation
-alone. Jobs that fail are listed with their one line, and the exit status is 1; --resume does only what is not done.
-slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
+alone. Jobs that fail are listed with their error message, and the exit status is 1; --resume runs only the jobs that
+are not done. slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
 """
 
 import importlib
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -15,11 +17,19 @@ from typing import ClassVar, Literal
 from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.options import Resumable
-from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.cli.sweeps.grid import fixed_of, grid_of, pairs
-from dln_jax.cli.sweeps.plan import closest, plan
-from dln_jax.cli.sweeps.sweep import Asked, sweep
+from dln_jax.cli.progress import progress
+from dln_jax.cli.running import command_folder
+from dln_jax.cli.sweeps.executors import cores, here, ray, run, slurm
+from dln_jax.cli.sweeps.grid import closest, grid_of, jobs_of, pairs
+from dln_jax.cli.sweeps.job import Job, status_of
+from dln_jax.cli.sweeps.table import compared, drawn, print_results, write_tables
+from dln_jax.files import write_figure
 from dln_jax.types import InputError
+
+LATER = "jobs.sh"
+"""File in the sweep's folder with the command lines of the jobs, for --where later."""
+MOST_IN_ARRAY = 1000
+"""Largest number of jobs in an array, Slurm's default MaxArraySize."""
 
 
 @dataclass(frozen=True)
@@ -35,51 +45,59 @@ class Arguments(Resumable):
     fixed: str = ""
     """Options that all jobs have: 'steps=500 figures=no test=e,q,v'; a comma is part of the value."""
     where: Unstated[Literal["here", "slurm", "ray", "later"]] = None
-    """What runs the jobs: processes on this machine, an array of the Slurm cluster, Ray, or what you have: later only
-    writes the jobs' lines (default: here)."""
+    """What runs the jobs: processes on this machine, an array of the Slurm cluster, or Ray. later only writes the jobs'
+    command lines, for any other scheduler (default: here)."""
     jobs: Unstated[int] = None
-    """Jobs at once (default: as many as there are cores; of Slurm, what it allows). Times are those beside others."""
+    """Jobs at once (default: as many as there are cores; with Slurm, as many as it allows). Jobs that run side by side
+    slow each other down."""
     gpus: Unstated[int] = None
     """here and ray: accelerators of this machine; each job has one to itself (default: 0, jobs see none)."""
     slurm: Unstated[str] = None
-    """Options of sbatch: 'partition=gpu time=60 gpus_per_node=1', time in minutes (default: 60); a job whose time is up
-    is queued again and continues."""
+    """Options of sbatch: 'partition=gpu time=60 gpus_per_node=1', time in minutes (default: 60). A job that reaches its
+    time limit is queued again and continues."""
     metric: Unstated[str] = None
-    """Metric to select by, of metrics.json (default: the command's validation error)."""
+    """Metric of metrics.json that chooses the best job (default: the command's validation error)."""
     best: Unstated[Literal["smallest", "largest"]] = None
     """Which --metric is the best (default: smallest)."""
     error: Unstated[str] = None
-    """Metric that is shown beside it, and not selected by (default: the command's test error)."""
+    """Metric that is shown beside it and does not affect the choice (default: the command's test error)."""
     over: Unstated[str] = None
     """Options, separated by commas, over which medians and the worst are taken (default: seed)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Checks the grid, runs the jobs and shows the results; raises `SystemExit` with 1 if a job is not done."""
-    require_positive_if_given(given, ("jobs", "gpus"))
-    grid, fixed = grid_of(given.grid or ""), fixed_of(given.fixed)
-    if given.jobs is not None and given.jobs > (given.gpus or given.jobs):
-        raise InputError(f"--jobs {given.jobs} for --gpus {given.gpus}; each job has one: give fewer jobs")
-    asked = Asked(
-        where=given.where or "here",
-        at_once=given.jobs,
-        gpus=given.gpus or 0,
-        slurm=given.slurm or "",
-        metric=given.metric,
-        largest=given.best == "largest",
-        error=given.error,
-        over=over_of(given.over, grid),
-    )
-    if given.slurm is not None and asked.where not in ("slurm", "later"):
-        raise InputError(f"--slurm is for --where slurm; leave it out of --where {asked.where}")
-    if given.slurm is not None:
-        pairs("--slurm", given.slurm)
-    name = given.command.replace("-", "_")
-    arguments = arguments_of(name)
-    plan(name, arguments, grid, fixed, Path())  # refused before there is a folder
-    with command_folder(given, "sweep") as folder:
-        jobs = plan(name, arguments, grid, fixed, folder.absolute())
-        if not sweep(jobs, asked, folder.absolute()):
+    require_positive_if_given(options, ("jobs", "gpus"))
+    grid, fixed, over = grid_of(options.grid or ""), pairs("--fixed", options.fixed), options.over
+    if options.jobs is not None and options.jobs > (options.gpus or options.jobs):
+        raise InputError(f"--jobs {options.jobs} for --gpus {options.gpus}; each job has one: give fewer jobs")
+    names = [name.strip().replace("-", "_") for name in over.split(",")] if over else ["seed"] * ("seed" in grid)
+    if unknown := [name for name in names if name not in grid]:
+        raise InputError(f"--over: {unknown[0]!r:.40} is not in --grid; choose from {', '.join(grid)}")
+    if options.slurm is not None and options.where not in ("slurm", "later"):
+        raise InputError(f"--slurm is for --where slurm; leave it out of --where {options.where or 'here'}")
+    pairs("--slurm", options.slurm or "")
+    command = options.command.replace("-", "_")
+    arguments = arguments_of(command)
+    jobs_of(command, arguments, grid, fixed, Path())  # refused before there is a folder
+    with command_folder(options, "sweep") as out:
+        folder = out.absolute()
+        jobs = jobs_of(command, arguments, grid, fixed, folder)
+        left = [job for job in jobs if status_of(job.folder).state != "done"]
+        if options.where == "later":
+            (folder / LATER).write_text("".join(f"{shlex.join(job.line(job.folder / 'run'))}\n" for job in left))
+            print(f"{len(left)} jobs, a line each in {folder / LATER}, to be run from {Path.cwd()}")
+            print(f"the table is made by: --out {folder} --resume --where here")
+            return
+        if left:
+            execute(left, len(jobs), options, folder)
+        results = compared(jobs, names, metric=options.metric, error=options.error, largest=options.best == "largest")
+        facts = {"command": command, "where": options.where or "here", "at_once": at_once(options)}
+        write_tables(folder, results, **facts)
+        if figure := drawn(results, at_once=at_once(options)):
+            write_figure(folder / "sweep.png", figure)
+        print_results(results, command, folder)
+        if any(entry.status.state != "done" for entry in results.entries):
             raise SystemExit(1)
 
 
@@ -92,11 +110,27 @@ def arguments_of(command: str) -> type:
     return importlib.import_module(f"dln_jax.cli.commands.{command}").Arguments
 
 
-def over_of(text: str | None, grid: dict[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """Options named by --over, by default seed if the grid has it; `InputError` for one that is not in the grid."""
-    if text is None:
-        return ("seed",) if "seed" in grid else ()
-    names = tuple(name.strip().replace("-", "_") for name in text.split(","))
-    if unknown := [name for name in names if name not in grid]:
-        raise InputError(f"--over: {unknown[0]!r:.40} is not in --grid; choose from {', '.join(grid)}")
-    return names
+def execute(left: Sequence[Job], jobs: int, options: Arguments, folder: Path) -> None:
+    """Runs the jobs that are left of `jobs`, with progress.
+
+    Raises:
+        InputError: the executor is missing or refuses the jobs.
+        KeyboardInterrupt: running jobs have been interrupted and can be resumed.
+    """
+    where, beside = options.where or "here", at_once(options)
+    if where == "slurm":
+        if len(left) > MOST_IN_ARRAY:
+            raise InputError(f"{len(left)} jobs for one Slurm array; expected at most {MOST_IN_ARRAY}; split the grid")
+        executor = slurm(folder, beside, options.slurm or "")
+    else:
+        executor = (ray if where == "ray" else here)(beside or 1, options.gpus or 0)
+    done = f", {jobs - len(left)} are done" if len(left) < jobs else ""
+    share = "an array of the cluster" if beside is None else f"{beside} at once"
+    with executor as (submit, together), progress(len(left), "jobs") as show:
+        print(f"{left[0].command}: {len(left)} of {jobs} jobs{done}; {where}, {share}", flush=True)
+        run(left, submit, together, lambda ended, bad: show(ended, f"{bad} not done" if bad else ""))
+
+
+def at_once(options: Arguments) -> int | None:
+    """Number of jobs at once; `None` if Slurm decides."""
+    return options.jobs or (None if options.where == "slurm" else options.gpus or cores())

@@ -1,4 +1,7 @@
-"""Executors of a sweep: contexts that yield a function from jobs to futures (`done()`, `cancel()`)."""
+"""Runs the jobs of a sweep by any executor with futures.
+
+The executors here are contexts that yield the arguments `submit` and `together` of `run`.
+"""
 
 import contextlib
 import importlib
@@ -7,28 +10,74 @@ import os
 import queue
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from subprocess import Popen
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from dln_jax.cli.sweeps.grid import pairs
-from dln_jax.cli.sweeps.job import Job, end_processes
+from dln_jax.cli.sweeps.job import SECONDS_BETWEEN_LOOKS, STATUS, Job, run_job, status_of
+from dln_jax.files import write_json
 from dln_jax.types import InputError
 
-Submit = Callable[[Sequence[Job]], Sequence[Any]]
-"""Jobs -> their futures."""
-MOST_JOBS = 1000
-"""Largest number of jobs in an array, Slurm's default MaxArraySize."""
+Submit = Callable[[Callable[..., None], Job], Any]
+"""(function, job) -> future with `done()` and `cancel()`, such as `concurrent.futures.ProcessPoolExecutor().submit`."""
+Together = Callable[[], contextlib.AbstractContextManager[Any]]
+"""Context of all submissions."""
 MINUTES, TIMEOUTS = 60, 20
 """Time limit of a Slurm job in minutes, and how often submitit requeues a job that reaches it."""
 
 
+def run(
+    jobs: Sequence[Job],
+    submit: Submit,
+    together: Together = contextlib.nullcontext,
+    report: Callable[[int, int], None] = lambda ended, bad: None,
+) -> None:
+    """Runs jobs until all have ended; records jobs that ended without a status as killed.
+
+    Args:
+        jobs: the jobs; the executor's processes must see their folders.
+        submit: submits one job.
+        together: context of the submissions, for executors that start all jobs at once.
+        report: called with the number of jobs that have ended, and how many of these are not done.
+    """
+    for job in jobs:
+        job.folder.mkdir(parents=True, exist_ok=True)
+        write_json(job.folder / STATUS, status_of(job.folder)._replace(state="missing", line="")._asdict())
+    with together():
+        waiting = [(job, submit(run_job, job)) for job in jobs]
+    bad = 0
+    try:
+        while waiting:
+            ended = [(job, future) for job, future in waiting if future.done()]
+            if not ended:
+                time.sleep(SECONDS_BETWEEN_LOOKS)
+            waiting = [pair for pair in waiting if pair not in ended]
+            bad += sum(_final_state(job, future) != "done" for job, future in ended)
+            report(len(jobs) - len(waiting), bad)
+    except BaseException:
+        for _, future in waiting:
+            future.cancel()
+        raise
+
+
+def _final_state(job: Job, future: Any) -> str:
+    """State of a job whose future is done; a job that has not stored its end is recorded as killed."""
+    status = status_of(job.folder)
+    if status.state in ("missing", "running"):
+        word = getattr(future, "state", "")  # Slurm's state, such as OUT_OF_MEMORY
+        how = "did not start" if status.state == "missing" else "ended without a word"
+        status = status._replace(state="killed", line=f"{how} ({word})" if isinstance(word, str) and word else how)
+        write_json(job.folder / STATUS, status._asdict())
+    return status.state
+
+
 @contextlib.contextmanager
-def here(at_once: int, gpus: int) -> Iterator[Submit]:
-    """Runs jobs as processes of this machine.
+def here(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
+    """Runs jobs as processes of this machine; leaving the context interrupts the ones that still run.
 
     A process gets its share of the cores as XLA threads, one BLAS thread, and one GPU or none, of those that the user's
     CUDA_VISIBLE_DEVICES names. Other variables that the user has set keep their values.
@@ -36,43 +85,33 @@ def here(at_once: int, gpus: int) -> Iterator[Submit]:
     Raises:
         InputError: CUDA_VISIBLE_DEVICES names fewer GPUs.
     """
-    running: list[Popen] = []
-    ending = threading.Event()
-    free = queue.SimpleQueue[str]()
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     names = visible.split(",") if visible else [str(number) for number in range(gpus)]
     if len(names) < gpus:
         raise InputError(f"--gpus is {gpus}, but CUDA_VISIBLE_DEVICES names {len(names)} of them: {visible}")
+    free = queue.SimpleQueue[str]()
     for name in names[:gpus]:
         free.put(name)
     shares = {"OPENBLAS_NUM_THREADS": "1", "NPROC": str(max(1, cores() // at_once))}
+    interrupt = threading.Event()
 
-    def started(process: Popen) -> None:
-        running.append(process)
-        if ending.is_set():
-            process.terminate()
-
-    def work(job: Job) -> None:
+    def work(function: Callable[..., None], job: Job) -> None:
         device = free.get() if gpus else ""
         try:
-            job({**shares, **os.environ, "CUDA_VISIBLE_DEVICES": device}, started)
+            function(job, {**shares, **os.environ, "CUDA_VISIBLE_DEVICES": device}, interrupt)
         finally:
             free.put(device)
 
     pool = ThreadPoolExecutor(at_once)
     try:
-        yield lambda jobs: [pool.submit(work, job) for job in jobs]
-    except BaseException:
-        ending.set()
-        pool.shutdown(wait=False, cancel_futures=True)
-        end_processes([process for process in running if process.poll() is None])
-        raise
+        yield lambda function, job: pool.submit(work, function, job), contextlib.nullcontext
     finally:
-        pool.shutdown()
+        interrupt.set()
+        pool.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
-def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Submit]:
+def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[tuple[Submit, Together]]:
     """Runs jobs as one array of a Slurm cluster, by submitit.
 
     Args:
@@ -81,7 +120,7 @@ def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Submit]:
         options: options of sbatch under submitit's names: "partition=gpu time=60 gpus_per_node=1".
 
     Raises:
-        InputError: Slurm is not installed here, the array is too large, or submitit does not know an option.
+        InputError: Slurm is not installed here or refuses the array, or submitit does not know an option.
     """
     submitit = required("submitit", "sweep")
     if missing := [name for name in ("sbatch", "srun", "sacct", "scancel") if shutil.which(name) is None]:
@@ -93,26 +132,40 @@ def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Submit]:
     except (NameError, TypeError, ValueError, AssertionError) as error:
         raise InputError(f"--slurm: {' '.join(str(error).split())[:300]}") from None
 
-    def submit(jobs: Sequence[Job]) -> Sequence[Any]:
-        if len(jobs) > MOST_JOBS:
-            raise InputError(f"{len(jobs)} jobs for one Slurm array; expected at most {MOST_JOBS}; split the grid")
+    @contextlib.contextmanager
+    def array() -> Iterator[None]:
         try:
             with contextlib.redirect_stderr(io.StringIO()), executor.batch():  # submitit prints what it raises
-                futures = [executor.submit(job) for job in jobs]
+                yield
         except submitit.core.utils.FailedJobError as error:
             raise InputError(f"--where slurm: {' '.join(str(error).split())[-300:]}") from None
-        return futures
 
     try:
-        yield submit
+        yield lambda function, job: executor.submit(Requeued(function), job), array
     finally:
         # submitit exchanges jobs and results as pickles; nothing reads them again.
-        for left in (folder / "submitit").glob("*.pkl"):
-            left.unlink(missing_ok=True)
+        for pickle in (folder / "submitit").glob("*.pkl"):
+            pickle.unlink(missing_ok=True)
+
+
+class Requeued(NamedTuple):
+    """A function whose job submitit queues again, unchanged, after a timeout or preemption."""
+
+    function: Callable[..., None]
+
+    def __call__(self, *arguments: Any) -> None:
+        """Calls the function."""
+        self.function(*arguments)
+
+    def checkpoint(self, *arguments: Any) -> Any:
+        """Called by submitit before the job is queued again."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, *arguments)
 
 
 @contextlib.contextmanager
-def ray(at_once: int, gpus: int) -> Iterator[Submit]:
+def ray(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
     """Runs jobs as Ray tasks, on the cluster of RAY_ADDRESS or on this machine, with one core and at most one GPU."""
     package = required("ray", "ray")
     if os.environ.get("RAY_ADDRESS"):
@@ -121,27 +174,22 @@ def ray(at_once: int, gpus: int) -> Iterator[Submit]:
         own = {"num_cpus": at_once, "num_gpus": gpus, "include_dashboard": False}
         package.init(address="local", log_to_driver=False, logging_level="ERROR", **own)
     threads = {"env_vars": {"OPENBLAS_NUM_THREADS": "1", "NPROC": "1"}}
-    task = package.remote(num_cpus=1, num_gpus=min(gpus, 1), max_retries=0, runtime_env=threads)(perform)
+    task = package.remote(num_cpus=1, num_gpus=min(gpus, 1), max_retries=0, runtime_env=threads)
     try:
-        yield lambda jobs: [task.remote(job).future() for job in jobs]
+        yield lambda function, job: task(function).remote(job).future(), contextlib.nullcontext
     finally:
         package.shutdown()
 
 
-def perform(job: Job) -> None:
-    """Runs a job: a plain function, for executors that accept no other callable."""
-    job()
-
-
 def sbatch_options(text: str) -> dict[str, Any]:
     """Parses --slurm into submitit's parameters; `InputError` if the time is not in whole minutes."""
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for name, value in pairs("--slurm", text).items():
         number = value.isdecimal() and len(value) < 10
         if name == "time" and not number:
             raise InputError(f"--slurm: time is {value!r:.40}; expected whole minutes")
-        found[name] = int(value) if number else [value] if name in ("setup", "teardown") else value
-    return found
+        options[name] = int(value) if number else [value] if name in ("setup", "teardown") else value
+    return options
 
 
 def cores() -> int:

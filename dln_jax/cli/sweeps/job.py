@@ -1,14 +1,13 @@
 """One job of a sweep: a command in its own process, and a status file in its folder that records how it ended."""
 
-import os
 import re
 import reprlib
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_type_hints
 
@@ -24,6 +23,7 @@ OUTPUT = "output.txt"
 METRICS = "metrics.json"
 """File in the run's folder with the numbers to compare."""
 INTERRUPTED = 130
+SECONDS_BETWEEN_LOOKS = 0.1
 SECONDS_TO_END = 10.0
 """Time that an interrupted command has to store its last checkpoint, before it is killed."""
 _RUN = re.compile(r"run(-\d{1,9})?")
@@ -44,13 +44,8 @@ class Status(NamedTuple):
     """Duration of the last attempt."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """One run of a command; any executor may call it in any process that sees its folder.
-
-    A finished job is not repeated. An interrupted one continues with --resume if its command supports that, else it
-    starts again in another folder. If two processes call the same job, the second waits for the first.
-    """
+class Job(NamedTuple):
+    """One run of a command."""
 
     folder: Path
     command: str
@@ -63,52 +58,48 @@ class Job:
     directory: Path
     """Working directory of the command."""
 
-    def __call__(
-        self, environment: Mapping[str, str] = os.environ, started: Callable[[subprocess.Popen], None] | None = None
-    ) -> None:
-        """Runs the command and stores its status.
-
-        Args:
-            environment: environment variables of the command.
-            started: called with the command's process.
-        """
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(self.folder / LOCK):
-            before = status_of(self.folder)
-            if before.state == "done":
-                return
-            attempt, run = before.attempt + 1, self.folder / before.run
-            resume = self.resumes and (run / CONFIG).is_file()
-            if run.exists() and not resume:
-                run = self.folder / f"run-{attempt}"
-            status = Status("running", attempt=attempt, run=run.name)
-            write_json(self.folder / STATUS, status._asdict())
-            line = [*self.line(run), *["--resume"] * resume]
-            began = time.monotonic()
-            with (self.folder / OUTPUT).open("ab") as output:
-                first = output.tell()
-                streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
-                process = subprocess.Popen(line, cwd=self.directory, env=dict(environment), **streams)
-                if started:
-                    started(process)
-                try:
-                    code = process.wait()
-                except BaseException:
-                    end_processes([process])
-                    raise
-            state, reason = _outcome(code, self.folder / OUTPUT, first)
-            status = status._replace(state=state, line=reason, seconds=time.monotonic() - began)
-            write_json(self.folder / STATUS, status._asdict())
-
     def line(self, run: Path) -> list[str]:
         """The command line that writes its run into this folder."""
         return [sys.executable, "-m", "dln_jax", self.command, *self.arguments, f"--out={run}"]
 
-    def checkpoint(self, *arguments: Any) -> Any:
-        """Called by submitit on a timeout or preemption: requeues the same job, which then resumes."""
-        from submitit.helpers import DelayedSubmission
 
-        return DelayedSubmission(self, *arguments)
+def run_job(job: Job, environment: Mapping[str, str] | None = None, interrupt: threading.Event | None = None) -> None:
+    """Runs a job's command and stores its status; any executor may call this in a process that sees the job's folder.
+
+    A finished job is not repeated. An interrupted one continues with --resume if its command supports that, else it
+    starts again in another folder. If two processes call the same job, the second waits for the first.
+
+    Args:
+        job: what to run.
+        environment: environment variables of the command; default: those of this process.
+        interrupt: ends the command when it is set.
+    """
+    interrupt = interrupt or threading.Event()
+    job.folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(job.folder / LOCK):
+        before = status_of(job.folder)
+        if before.state == "done":
+            return
+        attempt, run = before.attempt + 1, job.folder / before.run
+        resume = job.resumes and (run / CONFIG).is_file()
+        if run.exists() and not resume:
+            run = job.folder / f"run-{attempt}"
+        status = Status("running", attempt=attempt, run=run.name)
+        write_json(job.folder / STATUS, status._asdict())
+        began = time.monotonic()
+        with (job.folder / OUTPUT).open("ab") as output:
+            first = output.tell()
+            streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
+            line = [*job.line(run), *["--resume"] * resume]
+            process = subprocess.Popen(line, cwd=job.directory, env=environment and dict(environment), **streams)
+            try:
+                while process.poll() is None and not interrupt.wait(SECONDS_BETWEEN_LOOKS):
+                    pass
+            finally:
+                _end(process)
+        state, reason = _outcome(process.returncode, job.folder / OUTPUT, first)
+        status = status._replace(state=state, line=reason, seconds=time.monotonic() - began)
+        write_json(job.folder / STATUS, status._asdict())
 
 
 def status_of(folder: Path) -> Status:
@@ -132,17 +123,14 @@ def status_of(folder: Path) -> Status:
     return status
 
 
-def end_processes(processes: list[subprocess.Popen]) -> None:
-    """Interrupts commands so that they store a checkpoint, and kills the ones that do not end in time."""
-    for process in processes:
-        process.terminate()  # our commands treat it as Ctrl-C; a background process would ignore Ctrl-C itself
-    until = time.monotonic() + SECONDS_TO_END
-    for process in processes:
-        try:
-            process.wait(max(until - time.monotonic(), 0.0))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+def _end(process: subprocess.Popen) -> None:
+    """Interrupts a command that still runs, so that it stores a checkpoint; kills it if it does not end in time."""
+    process.terminate()  # our commands treat it as Ctrl-C; a background process would ignore Ctrl-C itself
+    try:
+        process.wait(SECONDS_TO_END)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _outcome(code: int, output: Path, first: int) -> tuple[State, str]:

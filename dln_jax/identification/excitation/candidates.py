@@ -44,7 +44,7 @@ class Design(NamedTuple):
 
 def functions_at(task: Task, t: Float[np.ndarray, " N"]) -> list[np.ndarray]:
     """Harmonic functions and their first two derivatives at all times, [N, 2 H] each."""
-    return [np.asarray(each) for each in jax.vmap(lambda t: harmonic_functions(task.harmonics, task.period, t))(t)]
+    return [*map(np.asarray, jax.vmap(lambda t: harmonic_functions(task.harmonics, task.period, t))(t))]
 
 
 def grid(task: Task, finer: int = 1) -> Float[np.ndarray, " N"]:
@@ -54,14 +54,14 @@ def grid(task: Task, finer: int = 1) -> Float[np.ndarray, " N"]:
 
 def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple[Any, Any, Any]:
     """q, qd, qdd [N, d]."""
-    q, qd, qdd = (each @ jnp.asarray(coefficients).T for each in functions)
+    q, qd, qdd = (values @ jnp.asarray(coefficients).T for values in functions)
     return offset + q, qd, qdd
 
 
 def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
     """The largest excess on the fine grid, and the name of that limit."""
     motions = states(functions_at(task, grid(task, FINER)), motion.offset, motion.coefficients)
-    parts = zip(*(np.split(np.asarray(each), FINER) for each in motions), strict=True)
+    parts = zip(*(np.split(np.asarray(array), FINER) for array in motions), strict=True)
     return max(worst(task.samples(*part)[2]) for part in parts)
 
 
@@ -116,17 +116,16 @@ def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
     """
     require_positive(count=count)
     require_seed(seed)
-    drawn, found, why = _draws(task, np.random.default_rng(seed)), [], ""
-    failed = 0
-    while len(found) < count:
-        design, why = kept(task, next(drawn))
+    drawn, designs, failed = _draws(task, np.random.default_rng(seed)), [], 0
+    while len(designs) < count:
+        design, broken = kept(task, next(drawn))
         if design is not None:
-            found.append(design)
-        else:
-            failed += 1
-        if failed >= DRAWS * max(1, len(found)):
-            raise InputError(f"{failed} random motions broke the limits even when small, the last of {why}; widen it")
-    return found
+            designs.append(design)
+        elif (failed := failed + 1) >= DRAWS * max(1, len(designs)):
+            raise InputError(
+                f"{failed} random motions broke the limits even when small, the last of {broken}; widen it"
+            )
+    return designs
 
 
 def _draws(task: Task, random: np.random.Generator) -> Iterator[FourierMotion]:
@@ -137,7 +136,7 @@ def _draws(task: Task, random: np.random.Generator) -> Iterator[FourierMotion]:
     spectrum = 1 / np.tile(np.arange(1, task.harmonics + 1), 2)
     while True:
         coefficients = random.normal(size=(len(lower), 2 * task.harmonics)) * spectrum @ basis @ basis.T
-        q, qd, qdd = (each @ coefficients.T for each in functions)
+        q, qd, qdd = (values @ coefficients.T for values in functions)
         sizes = [np.ptp(q, axis=0) / (upper - lower)]
         sizes += [abs(rate).max(axis=0) / bound for rate, bound in ((qd, limits.velocity), (qdd, limits.acceleration))]
         scale = (1 - 2 * MARGIN) / np.max(sizes, axis=0)

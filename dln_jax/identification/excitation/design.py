@@ -12,7 +12,7 @@ does not is designed again with a larger margin or shrunk.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -70,13 +70,6 @@ def condition(A: Float[Array, "B B"]) -> Scalar:
 CRITERIA: dict[str, Criterion] = {"information": information, "condition": condition}
 
 
-class _Scale(NamedTuple):
-    """Scale that makes the unknowns dimensionless."""
-
-    middle: np.ndarray
-    half: np.ndarray
-
-
 def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Optimiser:
     """Makes an optimiser that is compiled once for all starts.
 
@@ -87,29 +80,29 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
         iterations: L-BFGS iterations per round.
     """
     functions, basis = functions_at(task, grid(task)), rest_basis(task.harmonics)
-    scale = _Scale(task.limits.position.mean(axis=1), np.diff(task.limits.position, axis=1)[:, 0] / 2)
+    middle, half = task.limits.position.mean(axis=1), np.diff(task.limits.position, axis=1)[:, 0] / 2
 
     def series(x: Any) -> tuple[Any, Any]:
-        unknowns = x.reshape(len(scale.half), -1)
-        return scale.middle + scale.half * unknowns[:, 0], scale.half[:, None] * (unknowns[:, 1:] @ basis.T)
+        """Offset and coefficients of dimensionless unknowns."""
+        unknowns = x.reshape(len(half), -1)
+        return middle + half * unknowns[:, 0], half[:, None] * (unknowns[:, 1:] @ basis.T)
 
     def problem(x: Array, known: Array, margin: Array) -> tuple[Array, Array]:
         motion = states(functions, *series(x))
         Phi, _, beyond = jax.vmap(task.observe)(*motion)
         W = weighted(task, Phi).reshape(-1, task.columns.size)
         A = known + W.T @ W / task.steps
-        return criterion(A), jnp.concatenate([each.ravel() + margin for each in jax.tree.leaves(beyond)])
+        return criterion(A), jnp.concatenate([limit.ravel() + margin for limit in jax.tree.leaves(beyond)])
 
     minimise = make_minimiser(problem, rounds=rounds, iterations=iterations)
 
     def optimise(start: Design, known: Any = None) -> Design | None:
-        given = start.motion
-        place = (np.asarray(given.offset) - scale.middle) / scale.half
-        x = np.column_stack([place, np.asarray(given.coefficients) / scale.half[:, None] @ basis]).ravel()
-        there, margin = np.zeros_like(start.information) if known is None else np.asarray(known), FIRST_MARGIN
-        motion = given
+        motion, margin = start.motion, FIRST_MARGIN
+        posture = (np.asarray(motion.offset) - middle) / half
+        x = np.column_stack([posture, np.asarray(motion.coefficients) / half[:, None] @ basis]).ravel()
+        known = np.zeros_like(start.information) if known is None else np.asarray(known)
         for _ in range(TIGHTENINGS):
-            x = minimise(x, there, margin).x
+            x = minimise(x, known, margin).x
             offset, coefficients = series(x)
             motion = FourierMotion(np.asarray(offset), np.asarray(coefficients), task.period)
             beyond = furthest(task, motion)[0]
@@ -138,15 +131,14 @@ def best_design(
     """
     if not starts:
         raise InputError("there are no starts; expected at least one design")
-    found = [optimise(start, known) for start in starts]
-    there = np.zeros_like(starts[0].information) if known is None else known
-    every = [*(each for each in found if each is not None), *starts]
-    return min(every, key=lambda each: _worth(criterion, there + each.information))
+    optimised = [design for start in starts if (design := optimise(start, known)) is not None]
 
+    def worth(design: Design) -> float:
+        A = design.information if known is None else known + design.information
+        value = float(criterion(jnp.asarray(A)))
+        return value if np.isfinite(value) else np.inf
 
-def _worth(criterion: Criterion, A: np.ndarray) -> float:
-    value = float(criterion(jnp.asarray(A)))
-    return value if np.isfinite(value) else np.inf
+    return min([*optimised, *starts], key=worth)
 
 
 def design_set(
@@ -177,20 +169,19 @@ def design_set(
         raise InputError(f"{len(drawn)} starts are fewer than the {trajectories + 1} motions; expected one for each")
     judge = CRITERIA[criterion]
     optimise = make_optimiser(task, judge)
-    found: list[Design] = []
+    designs: list[Design] = []
     for place in range(trajectories + 1):
         own = drawn[place * starts : (place + 1) * starts]
-        known = sum(each.information for each in found) if 0 < place < trajectories else None
-        found.append(best_design(task, optimise, judge, own, known=known))
-        say(place + 1, f"condition {found[-1].condition:.3g}")
-    return found[:-1], found[-1]
+        known = sum(design.information for design in designs) if 0 < place < trajectories else None
+        designs.append(best_design(task, optimise, judge, own, known=known))
+        say(place + 1, f"condition {designs[-1].condition:.3g}")
+    return designs[:-1], designs[-1]
 
 
 def together(designs: Sequence[Design]) -> tuple[float, float]:
     """Condition and log det A of several motions of equal length taken together."""
-    A = np.mean([each.information for each in designs], axis=0)
-    lengths = np.sqrt(np.diag(A))
-    sizes = np.linalg.eigvalsh(A / lengths[:, None] / lengths)
+    scaled, lengths = map(np.asarray, _scaled(jnp.asarray(np.mean([design.information for design in designs], axis=0))))
+    sizes = np.linalg.eigvalsh(scaled)
     if not sizes[0] > 0:
         return np.inf, -np.inf
     return float(np.sqrt(sizes[-1] / sizes[0])), float(np.sum(np.log(sizes)) + 2 * np.sum(np.log(lengths)))
@@ -223,7 +214,7 @@ def as_trajectories(
         require_sampling(period=motion.period, harmonics=motion.harmonics, rate=rate)
     period = motions[0].period
     t = np.linspace(0.0, period, round(period * rate) + 1)
-    q, qd, qdd = (np.concatenate(each) for each in zip(*(sampled(motion, t) for motion in motions), strict=True))
+    q, qd, qdd = map(np.concatenate, zip(*(sampled(motion, t) for motion in motions), strict=True))
     force = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
     index = np.repeat(np.arange(len(motions)), len(t))
     states = {"q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(force(q, qd, qdd))}

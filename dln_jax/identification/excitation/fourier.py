@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
@@ -41,13 +42,13 @@ class FourierMotion(NamedTuple):
 def state(motion: FourierMotion, t: Scalar | float) -> tuple[Vector, Vector, Vector]:
     """q, qd and qdd [d] at a time t, s."""
     values = harmonic_functions(motion.harmonics, motion.period, t)
-    q, qd, qdd = (motion.coefficients @ each for each in values)
+    q, qd, qdd = (motion.coefficients @ functions for functions in values)
     return motion.offset + q, qd, qdd
 
 
 def sampled(motion: FourierMotion, t: Any) -> tuple[Float[Array, "N d"], Float[Array, "N d"], Float[Array, "N d"]]:
     """q, qd and qdd at the times t [N], s."""
-    return jax.vmap(lambda each: state(motion, each))(jnp.asarray(t))
+    return jax.vmap(lambda time: state(motion, time))(jnp.asarray(t))
 
 
 def harmonic_functions(harmonics: int, period: float, t: Scalar | float) -> tuple[Vector, Vector, Vector]:
@@ -70,13 +71,9 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
             f"harmonics is {harmonics}; expected 2, with which a motion can start and end at rest, to {MOST_HARMONICS}"
         )
     orders = np.arange(1.0, harmonics + 1)
-    basis = np.zeros((2 * harmonics, 2 * harmonics - 2))
-    for place, equation in enumerate((orders, orders**2)):
-        rows = slice(place * harmonics, (place + 1) * harmonics)
-        columns = slice(place * (harmonics - 1), (place + 1) * (harmonics - 1))
-        # All but the first right singular vector are orthogonal to the equation.
-        basis[rows, columns] = np.linalg.svd(equation[None, :])[2][1:].T
-    return basis
+    # All but the first right singular vector of an equation are orthogonal to it.
+    rests = (np.linalg.svd(equation[None, :])[2][1:].T for equation in (orders, orders**2))
+    return np.asarray(block_diag(*rests))
 
 
 def require_sampling(*, period: float, harmonics: int, rate: float) -> None:

@@ -59,14 +59,14 @@ def require_limits(limits: MotionLimits, degrees_of_freedom: int, names: tuple[s
         array = np.asarray(getattr(limits, kind))
         if array.shape != shape:
             raise InputError(f"limits of {kind} have shape {array.shape}; expected {shape}")
-        for joint, given in enumerate(array):
+        for joint, limit in enumerate(array):
             name = names[joint] if names else str(joint)
-            if np.isnan(given).any() or (kind != "force" and np.isinf(given).any()):
+            if np.isnan(limit).any() or (kind != "force" and np.isinf(limit).any()):
                 raise InputError(f"joint '{name}' has no limit of {kind}; state one")
-            if np.isinf(given).any() and not (given[0] == -np.inf and given[1] == np.inf):
-                raise InputError(f"joint '{name}' has a limit of {kind} on one side, {given}; expected both or none")
-            if not (given[0] < given[1] if len(shape) == 2 else given > 0):
-                raise InputError(f"joint '{name}' has limits of {kind} {given}; expected lower < upper, and rates > 0")
+            if np.isinf(limit).any() and not (limit[0] == -np.inf and limit[1] == np.inf):
+                raise InputError(f"joint '{name}' has a limit of {kind} on one side, {limit}; expected both or none")
+            if not (limit[0] < limit[1] if len(shape) == 2 else limit > 0):
+                raise InputError(f"joint '{name}' has limits of {kind} {limit}; expected lower < upper, and rates > 0")
 
 
 def limits_of_robot(
@@ -96,65 +96,51 @@ def limits_of_robot(
         InputError: a joint that is not in `allow_unlimited` lacks a limit, a limit of velocity or of a prismatic
             joint's position is missing, a pattern matches no joint, or an argument has the wrong number of limits.
     """
-    tree, said = robot.tree, []
+    tree, assumed = robot.tree, []
     d, names = tree.degrees_of_freedom, tree.names or tuple(map(str, range(tree.degrees_of_freedom)))
-    given = {"position": position, "velocity": velocity, "acceleration": acceleration, "force": force}
-    for kind, each in given.items():
-        if each is not None and np.size(each) not in (1, d):
-            raise InputError(f"{kind} has {np.size(each)} numbers; expected one, or one for each of the {d} joints")
-    sizes = {kind: None if each is None else np.broadcast_to(np.ravel(each), d) for kind, each in given.items()}
-
-    def about_zero(half: Any) -> np.ndarray:
-        return np.stack([-np.asarray(half), np.asarray(half)], axis=1)
-
-    positions = robot.position_limits if sizes["position"] is None else about_zero(sizes["position"])
-    allowed = _matching(allow_unlimited, names)
-    free = np.logical_not(np.isfinite(positions).all(axis=1)) & (np.array(tree.joints) == "revolute")
-    _require_allowed("position", free & ~allowed, names)
-    if free.any():
-        said.append(f"no limits of position for {_listed(names, free)}: pi to either side is assumed")
-        positions = np.where(free[:, None], about_zero(np.full(d, np.pi)), positions)
-    velocities = np.broadcast_to(robot.velocity_limits, d) if sizes["velocity"] is None else sizes["velocity"]
-    accelerations = sizes["acceleration"]
-    if accelerations is None:
-        said.append(f"no limits of acceleration: full velocity in {SECONDS_TO_SPEED} s is assumed")
-        accelerations = velocities / SECONDS_TO_SPEED
-    forces = robot.force_limits if sizes["force"] is None else about_zero(sizes["force"])
-    unbounded = np.logical_not(np.isfinite(forces).all(axis=1))
-    _require_allowed("force", unbounded & ~allowed, names)
-    if unbounded.any():
-        said.append(f"no limits of force for {_listed(names, unbounded)}: any is allowed")
-    limits = MotionLimits(positions, velocities, accelerations, forces)
-    require_limits(limits, d, names)
-    return limits, said
-
-
-def _matching(patterns: Sequence[str], names: tuple[str, ...]) -> np.ndarray:
-    """Mask of the joints that match one of the patterns."""
-    for pattern in patterns:
+    stated = {"position": position, "velocity": velocity, "acceleration": acceleration, "force": force}
+    stated = {kind: limit for kind, limit in stated.items() if limit is not None}
+    for kind, limit in stated.items():
+        if np.size(limit) not in (1, d):
+            raise InputError(f"{kind} has {np.size(limit)} numbers; expected one, or one for each of the {d} joints")
+        sizes = np.broadcast_to(np.ravel(limit), d)
+        stated[kind] = np.stack([-sizes, sizes], axis=1) if kind in ("position", "force") else sizes
+    for pattern in allow_unlimited:
         if not fnmatch.filter(names, pattern):
             raise InputError(f"there is no joint '{pattern}' to allow without limits; it has {', '.join(names)}")
-    return np.array([any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns) for name in names])
+    allowed = np.array([any(fnmatch.fnmatchcase(name, pattern) for pattern in allow_unlimited) for name in names])
 
+    def unlimited(kind: str, option: str, absent: np.ndarray) -> str:
+        """Names of the joints without a limit, which must be allowed; empty if there are none."""
+        if (refused := absent & ~allowed).any():
+            name = names[int(np.argmax(refused))]
+            raise InputError(
+                f"joint '{name}' has no limit of {kind}: state it ({option}, or in the file), or give "
+                f"--allow-unlimited {name} if it may go anywhere and take any torque"
+            )
+        return "any joint" if absent.all() else ", ".join(np.array(names)[absent])
 
-def _require_allowed(kind: str, which: np.ndarray, names: tuple[str, ...]) -> None:
-    """Raises `InputError` that names the first joint with a missing limit."""
-    if which.any():
-        name, option = names[int(np.argmax(which))], {"position": "--position", "force": "--torque"}[kind]
-        raise InputError(
-            f"joint '{name}' has no limit of {kind}: state it ({option}, or in the file), or give --allow-unlimited "
-            f"{name} if it may go anywhere and take any torque"
-        )
-
-
-def _listed(names: tuple[str, ...], which: np.ndarray) -> str:
-    return "any joint" if which.all() else ", ".join(name for name, there in zip(names, which, strict=True) if there)
+    positions = stated.get("position", robot.position_limits)
+    free = ~np.isfinite(positions).all(axis=1) & (np.array(tree.joints) == "revolute")
+    if listed := unlimited("position", "--position", free):
+        assumed.append(f"no limits of position for {listed}: pi to either side is assumed")
+        positions = np.where(free[:, None], [-np.pi, np.pi], positions)
+    velocities = stated.get("velocity", np.broadcast_to(robot.velocity_limits, d))
+    if "acceleration" not in stated:
+        assumed.append(f"no limits of acceleration: full velocity in {SECONDS_TO_SPEED} s is assumed")
+    accelerations = stated.get("acceleration", velocities / SECONDS_TO_SPEED)
+    forces = stated.get("force", robot.force_limits)
+    if listed := unlimited("force", "--torque", ~np.isfinite(forces).all(axis=1)):
+        assumed.append(f"no limits of force for {listed}: any is allowed")
+    limits = MotionLimits(positions, velocities, accelerations, forces)
+    require_limits(limits, d, names)
+    return limits, assumed
 
 
 def heights_above(tree: Tree, height: float) -> Clearance | None:
     """Heights above the plane z = height (m) of all link origins that can move vertically; `None` if none can."""
-    drawn = np.random.default_rng(0).uniform(-1, 1, (20, tree.degrees_of_freedom))
-    rising = np.ptp([world_frames(tree, jnp.asarray(q))[1][:, 2] for q in drawn], axis=0) > 1e-9
+    postures = np.random.default_rng(0).uniform(-1, 1, (20, tree.degrees_of_freedom))
+    rising = np.ptp([world_frames(tree, jnp.asarray(q))[1][:, 2] for q in postures], axis=0) > 1e-9
     return (lambda q: world_frames(tree, q)[1][rising, 2] - height) if rising.any() else None
 
 
@@ -190,8 +176,6 @@ def _beyond(bounds: np.ndarray, x: Array) -> Array:
     return jnp.abs(x - middle) / half - 1
 
 
-def worst(found: Excess) -> tuple[float, str]:
+def worst(beyond: Excess) -> tuple[float, str]:
     """The largest excess over all samples, and its limit; fields as of `excess`, with sample axes in front."""
-    largest = {kind: float(np.max(each)) for kind, each in found._asdict().items() if each is not None}
-    kind = max(largest, key=lambda each: largest[each])
-    return largest[kind], kind
+    return max((float(np.max(values)), kind) for kind, values in beyond._asdict().items() if values is not None)

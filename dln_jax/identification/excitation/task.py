@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from dln_jax.compilation import quick_compilation
+from dln_jax.identification.base import unit_columns
 from dln_jax.identification.excitation.fourier import rest_basis
 from dln_jax.identification.excitation.limits import Clearance, Excess, MotionLimits, excess, require_limits
 from dln_jax.mechanics.equations import dynamics
@@ -27,10 +28,8 @@ from dln_jax.types import InputError, require_positive, require_seed
 SAMPLES = 20
 """Samples per shortest period on the design grid."""
 DEPENDENT = 1e-2
-"""A column counts as dependent if the part that others do not explain is below this fraction of it: right angles that a
+"""The design ignores columns whose part that others do not explain is below this fraction of them: right angles that a
 file writes as 1.57 leave 8e-4 each."""
-NEGLIGIBLE = 1e-12
-"""Columns shorter than this fraction of the longest are zero up to rounding: their terms cancel."""
 STATES = 300
 """Number of random states from which the independent columns are found."""
 
@@ -62,7 +61,6 @@ def make_task(
     harmonics: int = 5,
     clearance: Clearance | None = None,
     noise: Any = 1.0,
-    dependent: float = DEPENDENT,
     seed: int = 0,
 ) -> Task:
     """Makes a task for a model whose force is linear in its parameters, such as `models.rigid_tree.make_rigid_tree`.
@@ -77,14 +75,13 @@ def make_task(
         harmonics: harmonics of the series, at least 2.
         clearance: q -> [K], m, that must stay positive.
         noise: standard deviation of the measured force of each joint [d], or one for all; only ratios matter.
-        dependent: as `DEPENDENT`; the design ignores weaker columns.
         seed: seed of the random states that determine the base parameters.
 
     Raises:
         InputError: missing limits, a setting out of range, or no identifiable parameter.
     """
     require_double_precision("excitation")
-    limits = MotionLimits(*(np.asarray(each, float) for each in limits))
+    limits = MotionLimits(*(np.asarray(limit, float) for limit in limits))
     d = limits.velocity.size
     require_limits(limits, d)
     require_positive(period=period)
@@ -106,7 +103,7 @@ def make_task(
         q = random.uniform(limits.position[:, 0], limits.position[:, 1], (steps, d))
         qd, qdd = (bound * random.uniform(-1, 1, (steps, d)) for bound in (limits.velocity, limits.acceleration))
         seen.append(np.asarray(samples(q, qd, qdd)[0]).reshape(steps * d, -1))
-    columns = independent_columns(np.concatenate(seen), dependent=dependent)
+    columns = independent_columns(np.concatenate(seen))
     if not columns.size:
         raise InputError("no parameter of the model shows in its force; expected some that do")
     return Task(observe, samples, steps, columns, deviation, limits, float(period), harmonics)
@@ -140,15 +137,14 @@ def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Ar
     return regressor, np.asarray(theta)
 
 
-def independent_columns(A: Float[np.ndarray, "N P"], *, dependent: float = DEPENDENT) -> Int[np.ndarray, " B"]:
+def independent_columns(A: Float[np.ndarray, "N P"]) -> Int[np.ndarray, " B"]:
     """Sorted indices of independent columns that span all others, by QR with pivoting of unit-length columns."""
     from scipy.linalg import qr
 
-    lengths = np.linalg.norm(A, axis=0)
-    seen = np.flatnonzero(lengths > NEGLIGIBLE * lengths.max(initial=0.0))
-    if not seen.size:
-        return seen
-    factors: Any = qr(A[:, seen] / lengths[seen], mode="r", pivoting=True)
+    scaled, lengths = unit_columns(A)
+    if not lengths.any():
+        return np.zeros(0, int)
+    factors: Any = qr(scaled, mode="r", pivoting=True)
     triangle, order = factors[-2:]
-    left = np.abs(np.diagonal(triangle))
-    return np.sort(seen[order[: len(left)][left > dependent * left[0]]])
+    remainders = np.abs(np.diagonal(triangle))
+    return np.sort(order[: len(remainders)][remainders > DEPENDENT * remainders[0]])

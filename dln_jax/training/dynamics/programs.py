@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.background import in_background
-from dln_jax.compilation import quick_compilation
+from dln_jax.compilation import in_background, quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design
 from dln_jax.mechanics.equations import dynamics

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax import figures as drawing
-from dln_jax.background import in_background
+from dln_jax.compilation import in_background
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
 from dln_jax.learning.engine.problem import Training

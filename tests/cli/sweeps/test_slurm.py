@@ -1,11 +1,11 @@
-"""An array of jobs on a cluster that is pretended by four programs on the PATH: what it is told, and what it says."""
+"""Arrays of jobs on a Slurm cluster that four programs on the PATH simulate."""
 
 import pytest
 from calls import command, refused
 
 from dln_jax.cli.commands import sweep
-from dln_jax.cli.sweeps import sweep as course
-from dln_jax.cli.sweeps.job import Job
+from dln_jax.cli.sweeps.executors import Requeued
+from dln_jax.cli.sweeps.job import Job, run_job
 
 pytest.importorskip("submitit")
 PROGRAMS = {
@@ -18,7 +18,7 @@ PROGRAMS = {
 
 @pytest.fixture
 def cluster(tmp_path, monkeypatch):
-    """A folder of programs, in which what the array is and what was cancelled is written."""
+    """A folder of programs, which write there the submitted script and the cancelled jobs."""
     folder = tmp_path / "cluster"
     folder.mkdir()
     for name, text in PROGRAMS.items():
@@ -26,7 +26,6 @@ def cluster(tmp_path, monkeypatch):
         (folder / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
     monkeypatch.setenv("SUBMITIT_LOG_LEVEL", "NOCONFIG")
-    monkeypatch.setattr(course, "SECONDS_BETWEEN_LOOKS", 0.01)
     import submitit
 
     submitit.SlurmJob.watcher.clear()
@@ -36,14 +35,14 @@ def cluster(tmp_path, monkeypatch):
 GRID = ("--grid", "width=4,8,16", "--where", "slurm")
 
 
-def test_an_array_is_submitted_and_what_slurm_ends_is_said(cluster, tmp_path, capsys):
+def test_array_is_submitted_and_slurm_s_reasons_are_printed(cluster, tmp_path, capsys):
     (cluster / "states").write_text("7_0|OUT_OF_MEMORY|a\n7_1|TIMEOUT|a\n7_2|CANCELLED by 0|a\n")
     with pytest.raises(SystemExit) as stop:
         command(
             sweep, *GRID, "--slurm", "partition=gpu time=30 gpus_per_node=1", "--jobs", "2", "--out", tmp_path / "s"
         )
-    said = capsys.readouterr().out
-    assert stop.value.code == 1 and "0000 killed: did not start (OUT_OF_MEMORY)" in said and "(TIMEOUT)" in said
+    text = capsys.readouterr().out
+    assert stop.value.code == 1 and "0000 killed: did not start (OUT_OF_MEMORY)" in text and "(TIMEOUT)" in text
     script = (cluster / "scripts").read_text()
     for line in (
         "--array=0-2%2",
@@ -60,8 +59,8 @@ def test_an_array_is_submitted_and_what_slurm_ends_is_said(cluster, tmp_path, ca
 
 def test_a_job_that_is_queued_again_is_the_same_job(tmp_path):
     job = Job(tmp_path, "train_delan", ("--width=4",), {"width": "4"}, resumes=True, directory=tmp_path)
-    queued = job.checkpoint()
-    assert queued.function is job and not queued.args and not queued.kwargs
+    queued = Requeued(run_job).checkpoint(job)
+    assert queued.function == Requeued(run_job) and queued.args == (job,) and not queued.kwargs
 
 
 @pytest.mark.parametrize(
@@ -77,12 +76,12 @@ def test_options_of_sbatch_are_checked(cluster, tmp_path, capsys, options, messa
     assert message in refused(capsys, sweep, *GRID, "--slurm", options, "--out", tmp_path / "s")
 
 
-def test_an_array_has_an_end(cluster, tmp_path, capsys):
+def test_a_larger_array_than_slurm_s_is_refused(cluster, tmp_path, capsys):
     line = refused(capsys, sweep, "--grid", "seed=0:1001", "--where", "slurm", "--out", tmp_path / "s")
     assert "1001 jobs for one Slurm array" in line
 
 
-def test_what_sbatch_refuses_is_one_line(cluster, tmp_path, capsys):
+def test_refusal_by_sbatch_is_one_line(cluster, tmp_path, capsys):
     (cluster / "sbatch").write_text("#!/bin/sh\necho 'invalid partition specified: gpu' >&2; exit 1\n")
     line = refused(capsys, sweep, *GRID, "--out", tmp_path / "s")
     assert "invalid partition specified: gpu" in line

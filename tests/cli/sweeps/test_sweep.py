@@ -1,4 +1,4 @@
-"""A sweep from the shell: what is done, fails and is killed, what is chosen; --resume does only what is left."""
+"""Sweeps from the shell: states of jobs, choice of the best job, and --resume of the jobs that are not done."""
 
 import contextlib
 import csv
@@ -16,9 +16,8 @@ import pytest
 from calls import command, refused
 
 from dln_jax.cli.commands import sweep
-from dln_jax.cli.sweeps import sweep as course
 from dln_jax.cli.sweeps.executors import here
-from dln_jax.cli.sweeps.job import Job, Status, status_of
+from dln_jax.cli.sweeps.job import Job, Status, run_job, status_of
 from dln_jax.data import schema
 from dln_jax.figures.sweeps import Point, error_against_seconds
 from dln_jax.scenes.datasets import generators
@@ -26,10 +25,10 @@ from dln_jax.scenes.registry import scene_named
 from dln_jax.types import InputError
 
 WIDTHS = {"2": 3e-3, "4": 1e-4, "8": 2e-4}
-"""Validation errors of pretended trainings; seeds add to them."""
+"""Validation errors of simulated trainings by width; seeds add to them."""
 
 
-class Over:
+class Done:
     """A future that is done."""
 
     state = "OUT_OF_MEMORY"
@@ -39,7 +38,7 @@ class Over:
 
 
 def trained(job, resumed):
-    """Pretends to be a run of a job: its test error is smallest where its validation error is largest."""
+    """Simulates a run of a job, whose test error is smallest where its validation error is largest."""
     width, seed = job.values["width"], int(job.values["seed"])
     before = status_of(job.folder)
     if before.attempt and not job.resumes:
@@ -58,20 +57,24 @@ def trained(job, resumed):
     return status._replace(state="done")
 
 
+def use(monkeypatch, submit):
+    """Lets the command submit its jobs to this function in place of processes."""
+    monkeypatch.setattr(sweep, "here", lambda *_: contextlib.nullcontext((submit, contextlib.nullcontext)))
+
+
 @pytest.fixture
 def executor(monkeypatch):
-    """Jobs one after the other; the first time one fails, and one is killed as it begins."""
+    """Simulates jobs one after the other; one fails at its first attempt, and one is killed as it begins."""
     begun = []
 
-    def submit(jobs):
-        for job in jobs:
-            begun.append(job.values)
-            status = trained(job, resumed=begun.count(job.values) > 1)
-            (job.folder / "status.json").write_text(json.dumps(status._asdict()))
-        return [Over() for _ in jobs]
+    def submit(function, job):
+        assert function is run_job
+        begun.append(job.values)
+        status = trained(job, resumed=begun.count(job.values) > 1)
+        (job.folder / "status.json").write_text(json.dumps(status._asdict()))
+        return Done()
 
-    monkeypatch.setattr(course, "SECONDS_BETWEEN_LOOKS", 0.0)
-    monkeypatch.setattr(course, "executor_of", lambda asked, folder: contextlib.nullcontext(submit))
+    use(monkeypatch, submit)
     return begun
 
 
@@ -80,43 +83,45 @@ def test_unknown_metrics_are_refused_and_jobs_are_kept(tmp_path, executor, capfd
     out = tmp_path / "sweep"
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=4 seed=0:2", "--out", out, f"--{option}", "torque_msee")
-    said = capfd.readouterr().err
+    message = capfd.readouterr().err
     assert stop.value.code == 2 and not (out / "table.csv").exists()
-    assert f"--{option}: no job has the metric 'torque_msee'; choose from torque_mse, train_seconds, valid" in said
+    assert f"--{option}: no job has the metric 'torque_msee'; choose from torque_mse, train_seconds, valid" in message
     begun = len(executor)
     command(sweep, "--out", out, "--resume", f"--{option}", "torque_mse")
     assert len(executor) == begun == 2 and (out / "table.csv").is_file()
 
 
-def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, executor, capfd):
+def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
     out = tmp_path / "sweep"
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=2,4,8 seed=0:3", "--fixed", "steps=3", "--out", out)
-    said = capfd.readouterr().out
+    text = capfd.readouterr().out
     assert stop.value.code == 1 and len(executor) == 9
-    found = json.loads((out / "sweep.json").read_text())
-    states = [job["state"] for job in found["jobs"]]
+    results = json.loads((out / "sweep.json").read_text())
+    states = [job["state"] for job in results["jobs"]]
     assert states == ["done", "killed", *["done"] * 5, "failed", "done"]
-    assert "0001 killed: ended without a word (OUT_OF_MEMORY)" in said
-    assert "0007 failed: the loss stopped being finite" in said
+    assert "0001 killed: ended without a word (OUT_OF_MEMORY)" in text
+    assert "0007 failed: the loss stopped being finite" in text
     assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
-    # Validation chooses, and the test errors are such that it is the worst of them.
-    (best,) = [job["values"] for job in found["jobs"] if job["best"]]
+    # The job with the best validation error has the worst test error.
+    (best,) = [job["values"] for job in results["jobs"] if job["best"]]
     assert best == {"width": "4", "seed": "0"}
     with (out / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 9 and float(rows[3]["validation_error"]) == 1e-4 and rows[7]["validation_error"] == ""
     assert max(rows, key=lambda row: float(row["torque_mse"] or 0))["best"] == "1"
     # Medians over seeds, by hand.
-    of = {group["values"]["width"]: group for group in found["groups"]}
-    assert of["4"]["medians"]["validation_error"] == pytest.approx(2e-4) and of["4"]["worst"]["train_seconds"] == 3.0
-    assert of["2"]["done"] == 2 and of["2"]["medians"]["validation_error"] == pytest.approx(np.median([3e-3, 9e-3]))
+    four, two = (
+        next(group for group in results["groups"] if group["values"]["width"] == width) for width in ("4", "2")
+    )
+    assert four["medians"]["validation_error"] == pytest.approx(2e-4) and four["worst"]["train_seconds"] == 3.0
+    assert two["done"] == 2 and two["medians"]["validation_error"] == pytest.approx(np.median([3e-3, 9e-3]))
 
     command(sweep, "--out", out, "--resume", "--best", "largest")
     assert executor[9:] == [{"width": "2", "seed": "1"}, {"width": "8", "seed": "1"}]
-    found = json.loads((out / "sweep.json").read_text())
-    assert {job["state"] for job in found["jobs"]} == {"done"}
-    (best,) = [job for job in found["jobs"] if job["best"]]
+    results = json.loads((out / "sweep.json").read_text())
+    assert {job["state"] for job in results["jobs"]} == {"done"}
+    (best,) = [job for job in results["jobs"] if job["best"]]
     assert best["values"] == {"width": "2", "seed": "2"}
     # What was begun was continued, in its folder.
     assert status_of(out / "jobs" / "0007")[:4] == ("done", "", 2, "run")
@@ -124,7 +129,7 @@ def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, executor,
     assert len(executor) == 11
 
 
-def test_jobs_for_later_are_done_by_anything(tmp_path, executor, capsys):
+def test_any_scheduler_may_run_the_lines_of_later(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=2,4 seed=0", "--where", "later", "--out", out)
     assert "2 jobs, a line each" in capsys.readouterr().out and not (out / "sweep.json").exists()
@@ -138,18 +143,17 @@ def test_jobs_for_later_are_done_by_anything(tmp_path, executor, capsys):
     assert not executor and "best by validation_error: width=4" in capsys.readouterr().out
 
 
-def test_a_job_is_not_done_twice_and_continues_where_its_command_can(tmp_path):
-    """With a command that is no training: what it prints and how it ends is what a job stores."""
+def test_failed_job_is_repeated_in_another_folder_and_finished_job_is_not(tmp_path):
     job = Job(tmp_path / "0", "check_data", ("--data=none.npz",), {}, resumes=False, directory=tmp_path)
-    (job.folder / "run").mkdir(parents=True)  # of somebody else
-    for attempt in (1, 2):
-        job()
-        status = status_of(job.folder)
-        assert (status.state, status.attempt, status.run) == ("failed", attempt, "run-1")
-        assert "none.npz" in status.line and "none.npz" in (job.folder / "output.txt").read_text()
+    (job.folder / "run").mkdir(parents=True)  # made by another program
+    (job.folder / "status.json").write_text(json.dumps(Status("killed", attempt=1)._asdict()))
+    run_job(job)
+    status = status_of(job.folder)
+    assert (status.state, status.attempt, status.run) == ("failed", 2, "run-2")
+    assert "none.npz" in status.line and "none.npz" in (job.folder / "output.txt").read_text()
     (job.folder / "status.json").unlink()
     (job.folder / "run" / "metrics.json").write_text("{}")
-    job()
+    run_job(job)
     assert not (job.folder / "status.json").exists()
 
 
@@ -165,16 +169,23 @@ STATUS = {
 
 
 @pytest.mark.parametrize("damage", STATUS)
-def test_a_status_that_is_not_a_job_s_own_is_refused(tmp_path, executor, capsys, damage):
+def test_damaged_status_is_refused(tmp_path, damage):
+    (tmp_path / "status.json").write_text(json.dumps({**Status("done", attempt=1)._asdict(), **STATUS[damage]}))
+    with pytest.raises(InputError, match=r"status\.json"):
+        status_of(tmp_path)
+
+
+def test_damaged_status_is_one_line(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
-    command(sweep, "--grid", "width=4 seed=0", "--out", out)
-    path = out / "jobs" / "0000" / "status.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **STATUS[damage]}))
+    (out / "jobs" / "0000").mkdir(parents=True)
+    (out / "jobs" / "0000" / "status.json").write_text('{"run": "../../X"}')
+    command(sweep, "--grid", "width=2 seed=0", "--where", "later", "--out", tmp_path / "other")
+    (out / "config.json").write_bytes((tmp_path / "other" / "config.json").read_bytes())
     assert "status.json" in refused(capsys, sweep, "--out", out, "--resume")
-    assert not (tmp_path / "X").exists() and len(executor) == 1
+    assert not (tmp_path / "X").exists() and not executor
 
 
-def test_a_job_that_is_done_without_a_run_is_done_again(tmp_path, executor):
+def test_finished_job_whose_run_is_gone_is_repeated(tmp_path, executor):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=4 seed=0", "--out", out)
     for run in (out / "jobs" / "0000" / "run").iterdir():
@@ -183,7 +194,7 @@ def test_a_job_that_is_done_without_a_run_is_done_again(tmp_path, executor):
     assert len(executor) == 2
 
 
-def test_the_best_is_of_each_problem(tmp_path, executor):
+def test_every_problem_has_its_best_job(tmp_path, executor):
     for name in "ab":
         (tmp_path / name).touch()
     command(
@@ -195,12 +206,12 @@ def test_the_best_is_of_each_problem(tmp_path, executor):
         "--out",
         tmp_path / "s",
     )
-    found = json.loads((tmp_path / "s" / "sweep.json").read_text())
-    assert [job["values"]["width"] for job in found["jobs"] if job["best"]] == ["4", "4"]
-    assert [group["jobs"] for group in found["groups"]] == [4, 4]
+    results = json.loads((tmp_path / "s" / "sweep.json").read_text())
+    assert [job["values"]["width"] for job in results["jobs"] if job["best"]] == ["4", "4"]
+    assert [group["jobs"] for group in results["groups"]] == [4, 4]
 
 
-def test_an_interrupt_cancels_the_jobs(tmp_path, executor, monkeypatch, capsys):
+def test_an_interrupt_cancels_the_jobs(tmp_path, monkeypatch, capsys):
     cancelled = []
 
     class Future:
@@ -210,8 +221,7 @@ def test_an_interrupt_cancels_the_jobs(tmp_path, executor, monkeypatch, capsys):
         def cancel(self):
             cancelled.append(self)
 
-    submit = contextlib.nullcontext(lambda jobs: [Future() for _ in jobs])
-    monkeypatch.setattr(course, "executor_of", lambda asked, folder: submit)
+    use(monkeypatch, lambda function, job: Future())
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
     assert stop.value.code == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
@@ -219,10 +229,10 @@ def test_an_interrupt_cancels_the_jobs(tmp_path, executor, monkeypatch, capsys):
 
 
 def test_an_interrupt_ends_the_processes_of_this_machine(tmp_path):
-    """And leaves jobs that are not begun."""
+    """Jobs that have not begun never start."""
     jobs = [Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
-    with pytest.raises(KeyboardInterrupt), here(1, 0) as submit:
-        futures = submit(jobs)
+    with pytest.raises(KeyboardInterrupt), here(1, 0) as (submit, _):
+        futures = [submit(run_job, job) for job in jobs]
         until = time.monotonic() + 60
         while status_of(jobs[0].folder).state != "running" and time.monotonic() < until:
             time.sleep(0.01)
@@ -236,18 +246,17 @@ def test_jobs_get_the_gpus_that_the_user_has_made_visible(visible, expected, mon
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if visible is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    together, seen = threading.Barrier(2, timeout=60), set()
+    together, devices = threading.Barrier(2, timeout=60), set()
 
-    class Waiting(Job):
-        def __call__(self, environment, started=None):
-            seen.add(environment["CUDA_VISIBLE_DEVICES"])
-            together.wait()  # both run at once, each with a GPU of its own
+    def wait_for_the_other(job, environment, interrupt):
+        devices.add(environment["CUDA_VISIBLE_DEVICES"])
+        together.wait()  # both run at once, each with a GPU of its own
 
-    jobs = [Waiting(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
-    with here(2, 2) as submit:
-        for future in submit(jobs):
+    jobs = [Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
+    with here(2, 2) as (submit, _):
+        for future in [submit(wait_for_the_other, job) for job in jobs]:
             future.result()
-    assert seen == expected
+    assert devices == expected
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     with pytest.raises(InputError, match="names 1 of them: 3"), here(2, 2):
         pass
@@ -274,7 +283,7 @@ def test_mistakes_are_one_line_and_leave_nothing(arguments, message, tmp_path, c
 
 
 @pytest.mark.parametrize(("where", "package", "extra"), [("slurm", "submitit", "sweep"), ("ray", "ray", "ray")])
-def test_an_executor_that_is_missing_is_named(where, package, extra, tmp_path, capsys, monkeypatch):
+def test_missing_executor_is_named_with_its_extra(where, package, extra, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, package, None)
     line = refused(capsys, sweep, "--grid", "width=8", "--where", where, "--out", tmp_path / "s")
     assert f"pip install 'dln-jax[{extra}]'" in line and not (tmp_path / "s").exists()
@@ -299,17 +308,17 @@ def test_the_figure_shows_every_run_and_rings_the_best():
 def kill_as_it_begins(job):
     """SIGKILL to a job's command as soon as it runs."""
     until = time.monotonic() + 60
-    found = ""
-    while time.monotonic() < until and not found:
-        found = subprocess.run(["pgrep", "-f", f"out={job}"], capture_output=True, text=True).stdout
+    processes = ""
+    while time.monotonic() < until and not processes:
+        processes = subprocess.run(["pgrep", "-f", f"out={job}"], capture_output=True, text=True).stdout
         time.sleep(0.01)
-    os.kill(int(found.split()[0]), signal.SIGKILL)
+    os.kill(int(processes.split()[0]), signal.SIGKILL)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("where", "package"), [("here", "dln_jax"), ("ray", "ray")])
 def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
-    """One is done, one fails, and one is killed from outside."""
+    """One is done, one fails, and one is killed by a signal."""
     pytest.importorskip(package)
     recorded = generators.uniform(scene_named("pendulum"), samples=50)
     for name in ("good", "killed"):

@@ -1,12 +1,9 @@
-"""Grids: which jobs a text is, and that what is wrong with it is one line before anything starts."""
-
-import math
+"""Grids: the jobs that a text means, and refusals before anything starts."""
 
 import pytest
 
 from dln_jax.cli.commands import check_data, train_delan, train_locomotion
-from dln_jax.cli.sweeps.grid import combinations, fixed_of, grid_of
-from dln_jax.cli.sweeps.plan import plan
+from dln_jax.cli.sweeps.grid import grid_of, jobs_of, pairs
 from dln_jax.types import InputError
 
 GRIDS = [
@@ -20,14 +17,12 @@ GRIDS = [
 
 
 @pytest.mark.parametrize(("text", "grid"), GRIDS)
-def test_a_text_is_a_grid(text, grid):
+def test_grid_of_a_text(text, grid):
     assert grid_of(text) == grid
-    every = combinations(grid)
-    assert len(every) == math.prod(map(len, grid.values())) == len({tuple(each.items()) for each in every})
 
 
 def test_fixed_values_keep_their_commas():
-    assert fixed_of("test=e,q,v steps=5") == {"test": "e,q,v", "steps": "5"}
+    assert pairs("--fixed", "test=e,q,v steps=5") == {"test": "e,q,v", "steps": "5"}
 
 
 MISTAKES = [
@@ -55,9 +50,9 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("text", "message"), MISTAKES)
-def test_what_is_wrong_is_said_before_anything_starts(text, message, tmp_path):
+def test_mistakes_are_refused_before_anything_starts(text, message, tmp_path):
     with pytest.raises(InputError, match=message.replace("?", r"\?")) as error:
-        plan("train_delan", train_delan.Arguments, grid_of(text), {"depth": "2"}, tmp_path)
+        jobs_of("train_delan", train_delan.Arguments, grid_of(text), {"depth": "2"}, tmp_path)
     assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
 
@@ -66,20 +61,22 @@ def test_jobs_are_command_lines(tmp_path):
     (tmp_path / "a.npz").touch()
     grid, fixed = (
         grid_of(f"width=8,16 data={tmp_path}/a.npz"),
-        fixed_of("low-latency=no compilation-cache=yes test=e,q"),
+        pairs("--fixed", "low-latency=no compilation-cache=yes test=e,q"),
     )
-    first, second = plan("train_delan", train_delan.Arguments, grid, fixed, tmp_path)
+    first, second = jobs_of("train_delan", train_delan.Arguments, grid, fixed, tmp_path)
     common = ("--no-low-latency", "--compilation-cache", "--test=e,q", "--processes=1")
     assert first.arguments == (*common, "--width=8", f"--data={tmp_path}/a.npz")
     assert second.values == {"width": "16", "data": f"{tmp_path}/a.npz"} and second.folder == tmp_path / "jobs" / "0001"
     assert first.resumes
+    jobs = jobs_of("train_delan", train_delan.Arguments, grid_of("width=2,4 seed=0:3"), {}, tmp_path)
+    assert [tuple(job.values.values()) for job in jobs] == [(w, s) for w in "24" for s in "012"]
 
 
 def test_a_job_continues_where_its_command_can(tmp_path):
-    jobs = plan("train_locomotion", train_locomotion.Arguments, grid_of("method=gradient,evolution"), {}, tmp_path)
+    jobs = jobs_of("train_locomotion", train_locomotion.Arguments, grid_of("method=gradient,evolution"), {}, tmp_path)
     assert [job.resumes for job in jobs] == [True, True]
-    # An option without a default is given with each that is checked.
+    # An option without a default accompanies every option that is checked.
     (tmp_path / "log.npz").touch()
     fixed = {"data": str(tmp_path / "log.npz")}
-    (job, _) = plan("check_data", check_data.Arguments, grid_of("figures=no,yes"), fixed, tmp_path)
+    (job, _) = jobs_of("check_data", check_data.Arguments, grid_of("figures=no,yes"), fixed, tmp_path)
     assert not job.resumes and job.arguments[-1] == "--no-figures"
