@@ -25,8 +25,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.growth import Trial, grow, significantly_better
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
-from dln_jax.models.linearisation import linearised
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, Needs, require_positive

@@ -16,11 +16,10 @@ from dln_jax.mechanics.plain import InverseForward
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.coverage import coverage
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.linearisation import linearised
-from dln_jax.models.model import Model
+from dln_jax.models.model import Model, linearised
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
-from dln_jax.models.uncertainty import outside, predictive, scores
+from dln_jax.models.uncertainty import out_of_distribution, predictive, scores
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
@@ -89,7 +88,7 @@ def test_bands_cover_what_they_promise(fitted):
 
 def test_far_states_are_flagged_and_near_ones_are_not(fitted):
     parameters, found = fitted
-    flag = jax.jit(jax.vmap(outside(ARM, parameters, found.uncertainty)))
+    flag = jax.jit(jax.vmap(out_of_distribution(ARM, parameters, found.uncertainty)))
     near, far = drawn(5, reach=0.99), drawn(6, reach=6.0)
     assert np.mean(flag(near.q, near.qd, near.qdd)) <= 0.02
     away = (far.q, far.qd, far.qdd)
@@ -111,7 +110,7 @@ def test_exact_linear_model_is_nowhere_outside():
     truth = jax.vmap(dynamics(scene.energies).inverse_dynamics)(*away)
     error = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*away) - truth
     assert np.abs(error).max() < 1e-8 * np.abs(truth).max()
-    assert not jax.vmap(outside(model, parameters, found.uncertainty))(*away).any()
+    assert not jax.vmap(out_of_distribution(model, parameters, found.uncertainty))(*away).any()
 
 
 @pytest.mark.parametrize(("motions", "samples"), [(4, 50), (8, 200), (400, 1)])
@@ -181,7 +180,7 @@ def test_a_network_is_uncertain_where_it_has_seen_nothing():
     predicted = torque(near.q, near.qd, near.qdd)
     assert 0.9 < coverage(predicted - near.tau, std(near.q, near.qd, near.qdd), levels=(0.95,)).shares.mean() < 0.99
     assert np.median(std(far.q, far.qd, far.qdd)) > 2 * np.median(std(near.q, near.qd, near.qdd))
-    flag = jax.jit(jax.vmap(outside(model, truth, found.uncertainty)))
+    flag = jax.jit(jax.vmap(out_of_distribution(model, truth, found.uncertainty)))
     assert np.mean(flag(far.q, far.qd, far.qdd)) > 0.95 and np.mean(flag(near.q, near.qd, near.qdd)) < 0.05
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.networks import joint_features
+from dln_jax.models.model import joint_features
 from dln_jax.types import Needs
 
 

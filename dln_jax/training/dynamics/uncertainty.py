@@ -14,7 +14,7 @@ from dln_jax.learning.linear import linearised_chunks
 from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.models.model import Model
-from dln_jax.models.uncertainty import Uncertainty, highest, scores_of_rows, torque_deviation
+from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
 from dln_jax.training.dynamics.programs import CHUNK, Programs
 from dln_jax.training.dynamics.task import Task
 from dln_jax.types import InputError
@@ -93,4 +93,5 @@ def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Traject
 @jax.jit
 @partial(jax.vmap, in_axes=(None, 0, 0))
 def _bands(uncertainty: Uncertainty, rows: Any, state: tuple[Any, ...]) -> tuple[Any, Any]:
-    return torque_deviation(rows, uncertainty), ~(highest(scores_of_rows(rows, state, uncertainty)) <= 1)
+    std = deviation_of_rows(rows, uncertainty.factor, uncertainty.noise, uncertainty.inflation)
+    return std, exceeds(scores_of_rows(rows, state, uncertainty))

@@ -33,9 +33,15 @@ from dln_jax.metrics.frames import (
     recoded,
 )
 from dln_jax.metrics.phase_space import summary
-from dln_jax.models.latent_phase import Field, LatentModel, through_components
+from dln_jax.models.latent_phase import (
+    Components,
+    Field,
+    LatentModel,
+    compress,
+    principal_components,
+    through_components,
+)
 from dln_jax.models.model import Parameters
-from dln_jax.models.principal_components import Components, compress, principal_components
 from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, FRAMES, TRAJECTORIES, FrameSplit, split, swinging_rod
 from dln_jax.zoo.descriptions import Description, build, describe
 

@@ -20,9 +20,16 @@ from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics import frames as frame_metrics
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.models.latent_phase import LatentModel, LatentPhase, latent_field, make_latent_phase, through_components
+from dln_jax.models.latent_phase import (
+    LatentModel,
+    LatentPhase,
+    compress,
+    latent_field,
+    make_latent_phase,
+    principal_components,
+    through_components,
+)
 from dln_jax.models.model import Model
-from dln_jax.models.principal_components import compress, principal_components
 from dln_jax.precision import with_float64
 from dln_jax.scenes.datasets import pendulum_frames
 from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, split, swinging_rod
