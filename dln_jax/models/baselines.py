@@ -11,8 +11,8 @@ nothing.
 
 The last one is a Helmholtz decomposition, published in the same paper with the same canonical J and the same names. The
 solenoidal part J grad H has no divergence and conserves H, the conservative part grad F has no rotation. H and F are
-networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): that of a
-damped spring is F = -½ c p². Fields of harmonic functions have neither divergence nor rotation and may be in either
+networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): that of
+a damped spring is F = -½ c p². Fields of harmonic functions have neither divergence nor rotation and may be in either
 part.
 """
 

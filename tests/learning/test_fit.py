@@ -14,8 +14,7 @@ from dln_jax.learning.engine import descent, newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, fingerprint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
-from dln_jax.learning.engine.problem import Problem, Stop
-from dln_jax.learning.engine.sharing import Sharing
+from dln_jax.learning.engine.problem import Problem, Sharing, Stop
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.cart_pole import cart_pole
