@@ -26,7 +26,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
 from dln_jax.learning.engine.problem import Problem, Progress, Report, Training, mean_square, silent, unmonitored
-from dln_jax.learning.growth import Trial, grow
+from dln_jax.learning.model_selection import Trial, grow
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.growth import Trial
 from dln_jax.learning.marginal_likelihood import Equations, compiled_covariance, likeliest
-from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
+from dln_jax.learning.model_selection import Trial
+from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.torque_covariance import States
@@ -135,9 +135,9 @@ def choose_kernel(
         fit = fit_kernel(needs, train, samples=samples, serial=serial)
         with jax.enable_x64(True):
             model = CATALOGUE["trigonometric-kernel"].factory(needs, samples=fit.samples, serial=serial)
-            judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))  # noqa: B023
-            errors = judge(fit.parameters, arrays(TORQUE, validation, jnp.float64)) / torque_scale(train)
-        trials.append(Trial(serial, fit, np.sum(np.asarray(errors) ** 2, axis=1)))
+            scale = np.asarray(torque_scale(train))
+        errors = squared_torque_errors(model, fit.parameters, validation, scale)
+        trials.append(Trial(serial, fit, np.sum(errors, axis=1)))
     return min(trials, key=lambda trial: trial.validation), trials
 
 

@@ -6,9 +6,9 @@ This works for any `Model` of that kind, such as `models.trigonometric`. Phi is 
 respect to the parameters, exact because the model is linear in them.
 
 `choose_degrees` selects the size of a trigonometric basis. One degree for all joints grows until it no longer helps
-(`learning.growth`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not significantly
-worse. A joint that neither changes the mass matrix nor lifts a weight, such as an arm's first vertical axis, ends at
-degree 0, which divides the size of the basis by 2 n + 1.
+(`learning.model_selection`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not
+significantly worse. A joint that neither changes the mass matrix nor lifts a weight, such as an arm's first vertical
+axis, ends at degree 0, which divides the size of the basis by 2 n + 1.
 """
 
 import functools
@@ -23,8 +23,8 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.growth import Trial, grow, significantly_better
-from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
+from dln_jax.learning.model_selection import Trial, grow, significantly_better
+from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
@@ -197,10 +197,9 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
     def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
         with jax.enable_x64(True):
             model = make(needs, degree=degrees)
-            found = fit_linear(model, train)
-            judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))
-            errors = judge(found.parameters, arrays(TORQUE, validation, jnp.float64))
-        return found, np.sum((np.asarray(errors) / scale) ** 2, axis=1)
+            solution = fit_linear(model, train)
+        errors = squared_torque_errors(model, solution.parameters, validation, scale)
+        return solution, np.sum(errors, axis=1)
 
     def fits(degree: int) -> bool:
         size = parameters_of_degree(needs, degree)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from dln_jax.data.magnitudes import on_device, spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.equations import Energies, System, driving_force, dynamics, hamiltonian_of
+from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Vector
 from dln_jax.zoo.catalogue import CATALOGUE
 
@@ -156,6 +157,16 @@ def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array,
 def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
     """Residuals of a batch, in SI units."""
     return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
+
+
+def squared_torque_errors(
+    model: Model, parameters: Parameters, data: Trajectories, scale: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "N d"]:
+    """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
+    with jax.enable_x64(True):
+        judge = jax.jit(lambda theta, batch: residuals(TORQUE, model.energies(theta), batch))
+        errors = np.asarray(judge(parameters, arrays(TORQUE, data, jnp.float64)))
+    return (errors / scale) ** 2
 
 
 def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dln_jax.learning.growth import grow, significantly_better
+from dln_jax.learning.model_selection import grow, significantly_better
 
 RANDOM = np.random.default_rng(0)
 NOISE = RANDOM.normal(size=400) ** 2
