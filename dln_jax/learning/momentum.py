@@ -17,16 +17,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from dln_jax.data.encoders import smooth
-from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.segments import segments
-from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, momentum_and_rest, window_weights
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import InputError, require_positive
 
 
 class MomentumWindows(NamedTuple):
@@ -63,7 +62,7 @@ def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> Momen
 
 def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt: float) -> Array:
     """Residual of one window's equations [d], in N m or N."""
-    w, slope = (jnp.asarray(each) for each in window_weights(q.shape[0] - 1, dt))
+    w, slope = map(jnp.asarray, window_weights(q.shape[0] - 1, dt))
     p, rest = jax.vmap(lambda q, qd: momentum_and_rest(plant, q, qd))(q, qd)
     return w @ rest - slope @ p - impulse
 
@@ -103,18 +102,12 @@ def momentum_problem(
             f"windows have {windows.q.shape[1]} samples, those for validation {validation.q.shape[1]}; cut both alike"
         )
     sizes = jnp.asarray(unit)
-    fitted, held_out = (
-        tuple(on_device(key, getattr(each, key), jnp.float64) for key in ("q", "qd", "impulse"))
-        for each in (windows, validation)
-    )
 
     def residual(parameters: Parameters, *window: Array) -> Array:
         return momentum_errors(dynamics(model.energies(parameters)), *window, dt=windows.dt) / sizes
 
-    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
-        return unmonitored(mean_square(lambda *window: residual(parameters, *window), held_out))
-
-    return Problem(residual, parameters, fitted, score, seed)
+    fitted, held_out = (arrays_of(part, ("q", "qd", "impulse")) for part in (windows, validation))
+    return selected_by(held_out, residual, parameters, fitted, seed)
 
 
 def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
