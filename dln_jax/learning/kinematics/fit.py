@@ -13,9 +13,17 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import drawn
-from dln_jax.learning.kinematics.descent import Program, State, compiled, descend
 from dln_jax.learning.kinematics.frames import Frames
-from dln_jax.learning.kinematics.projection import Samples, Structure, design, inertias_of
+from dln_jax.learning.kinematics.projection import (
+    Descent,
+    Program,
+    Samples,
+    Structure,
+    compiled,
+    descend,
+    design,
+    inertias_of,
+)
 from dln_jax.learning.kinematics.search import ALIKE, Search, agreeing, search
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree, rotation_vector
@@ -109,17 +117,17 @@ def fit_tree(
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(train))
         program = compiled(structure, ridge=ridge)
-        found = search(structure, program, _some(train, settings.samples, settings.seed), scale, settings)
-        lowest = float(found[0].at.loss)
-        report(f"{len(found)} descents, {agreeing(found)} of them to the lowest loss, {lowest:.3g}")
-        every = _some(train, most_samples, settings.seed)
-        refined = [_refined(program, structure, each, every, scale, settings) for each in _finalists(found, validation)]
+        descents = search(structure, program, _some(train, settings.samples, settings.seed), scale, settings)
+        losses = np.array([float(descent.at.loss) for descent in descents])
+        report(f"{len(descents)} descents, {agreeing(descents)} of them to the lowest loss, {losses[0]:.3g}")
+        every, finalists = _some(train, most_samples, settings.seed), _finalists(descents, validation)
+        refined = [_refined(program, structure, descent, every, scale, settings) for descent in finalists]
         columns = _columns(structure)
-        solved = [_solved(columns, state, unit, train, rank_tolerance) for state, unit in refined]
-        pairs = [(state.frames, solution.x) for (state, _), solution in zip(refined, solved, strict=True)]
+        solved = [_solved(columns, descent, unit, train, rank_tolerance) for descent, unit in refined]
+        pairs = [(descent.frames, solution.x) for (descent, _), solution in zip(refined, solved, strict=True)]
         errors = [_joint_errors(columns, *pair, train) for pair in pairs]
         judged = [_joint_errors(columns, *pair, validation or train) for pair in pairs]
-        best = int(np.argmin([np.sum(each / scale**2) for each in judged]))
+        best = int(np.argmin([np.sum(squares / scale**2) for squares in judged]))
         (frames, linear), solution = pairs[best], solved[best]
         parameters = _parameters(structure, frames, linear)
     return TreeFit(
@@ -131,8 +139,8 @@ def fit_tree(
         parameter_count=len(refined[best][0].at.slope) + structure.linear_count,
         rank=solution.rank,
         condition=solution.condition,
-        losses=np.array([float(each.at.loss) for each in found]),
-        agreeing=agreeing(found),
+        losses=losses,
+        agreeing=agreeing(descents),
         agreement=settings.agreement,
         seconds=time.perf_counter() - began,
     )
@@ -144,25 +152,25 @@ def _some(data: Trajectories, most: int, seed: int) -> Samples:
     return Samples(some.q, some.qd, some.qdd, some.tau)
 
 
-def _finalists(found: list[State], validation: Trajectories | None) -> list[State]:
-    """Returns the lowest state of every local minimum that validation may prefer to the lowest of all."""
-    kept = found[:1]
-    for state in found[1:]:
-        loss, last = float(state.at.loss), float(kept[-1].at.loss)
-        near = loss <= NEAR * float(found[0].at.loss)
+def _finalists(descents: list[Descent], validation: Trajectories | None) -> list[Descent]:
+    """Returns the lowest descent of every local minimum that validation may prefer to the lowest of all."""
+    kept = descents[:1]
+    for descent in descents[1:]:
+        loss, last = float(descent.at.loss), float(kept[-1].at.loss)
+        near = loss <= NEAR * float(descents[0].at.loss)
         if validation is not None and near and loss > (1 + ALIKE) * last and len(kept) < FINALISTS:
-            kept.append(state)
+            kept.append(descent)
     return kept
 
 
 def _refined(
     program: Program,
     structure: Structure,
-    state: State,
+    state: Descent,
     samples: Samples,
     scale: Float[np.ndarray, " d"],
     settings: Search,
-) -> tuple[State, Float[np.ndarray, " d"]]:
+) -> tuple[Descent, Float[np.ndarray, " d"]]:
     """Continues the descent on all samples, then with the joints' residual torques as units."""
     unit = scale
     for last in range(ROUNDS + 1):
@@ -173,7 +181,7 @@ def _refined(
 
 
 def _solved(
-    columns: Callable, state: State, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
+    columns: Callable, state: Descent, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
 ) -> least_squares.Solution:
     """Solves for the linear parameters of known frames on all data, by singular values."""
 
@@ -208,7 +216,7 @@ def _designs(
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
     """Parameters of the model."""
     armature, *friction = linear[len(structure.inertial) :].reshape(-1, len(structure.joints))
-    turns = np.array([rotation_vector(each) for each in np.asarray(frames.rotations)])
+    turns = np.array([rotation_vector(R) for R in np.asarray(frames.rotations)])
     inertias = inertias_of(structure, jnp.asarray(linear))
     parts = (turns, frames.positions, inertias, armature, *(friction or (None, None, None)))
     return SerialTreeParameters(*(None if part is None else jnp.asarray(part) for part in parts))
