@@ -22,7 +22,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Progress, Report, silent
-from dln_jax.learning.frames import Matching, Weights
+from dln_jax.learning.frames import Matching, TermWeights
 from dln_jax.metrics.frames import (
     FrameMotions,
     energy_errors,
@@ -47,7 +47,7 @@ from dln_jax.zoo.descriptions import Description, build, describe
 
 MODELS: tuple[Field, ...] = ("black-box-hnn", "phase-network")
 """Models in the latent plane."""
-MATCHING = Matching(weights=Weights(field=10.0))
+MATCHING = Matching(weights=TermWeights(field=10.0))
 """The same for both models. Weight, components and training length were chosen with seed 0 by validation films.
 Matching one step at a time, as published, was chosen over windows of ten steps, for which both models were alike (1e-6
 J² over a hundred frames, their decoder's error), with test films in view."""

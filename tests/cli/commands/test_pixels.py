@@ -13,7 +13,7 @@ from dln_jax.figures.phase_space import injection_figure
 from dln_jax.learning import frames as learning_frames
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
-from dln_jax.learning.frames import Matching, Weights, problem, terms, windows
+from dln_jax.learning.frames import Matching, TermWeights, problem, terms, windows
 from dln_jax.mechanics.dynamics import PlainFlow
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
@@ -180,7 +180,7 @@ def test_loss_by_hand(relative):
     np.testing.assert_allclose(found.coordinate, np.mean(change**2) / sizes[2], rtol=1e-9)
     by_hand = np.mean((moved - q)[:, 1:] ** 2) / sizes[1] + np.mean((pushed - p)[:, 1:] ** 2) / sizes[2]
     np.testing.assert_allclose(found.field, by_hand / 2, rtol=1e-4)
-    matching = Matching(weights=Weights(2.0, 3.0, 5.0), relative=relative)
+    matching = Matching(weights=TermWeights(2.0, 3.0, 5.0), relative=relative)
     total = learning_frames.loss(oscillator(scale), matching, {"factor": jnp.array([factor])}, jnp.asarray(frames))
     np.testing.assert_allclose(total, 2 * found[0] + 3 * found[1] + 5 * found[2], rtol=1e-9)
 
