@@ -93,11 +93,11 @@ def with_joint_friction(
 
     def energies(parameters: Parameters) -> Any:
         friction = parameters["friction"]
-        coefficients, found = friction_of(friction, start, linear=linear)
-        dissipation = joint_dissipation(**coefficients._asdict(), **found._asdict(), joint_map=needs.joint_map)
+        coefficients, fitted = friction_of(friction, start, linear=linear)
+        dissipation = joint_dissipation(**coefficients._asdict(), **fitted._asdict(), joint_map=needs.joint_map)
         load = None
         if "load" in friction.shape:
-            load = Load(jax.nn.sigmoid(friction.shape["load"]), found.velocity_scale, needs.joint_map)
+            load = Load(jax.nn.sigmoid(friction.shape["load"]), fitted.velocity_scale, needs.joint_map)
         return with_friction(model.energies(parameters["model"]), dissipation, load)
 
     return Model(init, energies)

@@ -87,7 +87,7 @@ def make_rigid_tree(
     laws = USUAL if friction is True else friction or ()
     require_laws(laws, "friction")
     shape = FrictionShape(velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift)
-    shape = FrictionShape(*(np.asarray(each) if isinstance(each, tuple) else each for each in shape))
+    shape = FrictionShape(*(np.asarray(value) if isinstance(value, tuple) else value for value in shape))
     require_shape(shape)
     shares = load if isinstance(load, tuple) else (load,)
     if not all(0 <= share < 1 for share in shares):
