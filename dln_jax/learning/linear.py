@@ -149,27 +149,14 @@ def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:
 
 
 def design_chunks(
-    linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int
+    linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int, *, even: bool = True
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi, the model's tau and the measured tau, in chunks of equal length; the last one may be shorter."""
-    samples = len(data.tau)
-    return _chunks(linearise, parameters, data, -(-samples // -(-samples // chunk_size)))
+    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= chunk_size samples at a time.
 
-
-def linearised_chunks(
-    model: Model, parameters: Parameters, data: Trajectories, length: int = 256
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= length samples at a time.
-
-    One program serves any number of samples, in the dtype of the parameters.
+    Even chunks waste no work; chunks that are not, of `chunk_size` samples, share one program for any number of them.
     """
-    return _chunks(design(model), parameters, data, length)
-
-
-def _chunks(
-    linearise: Callable, parameters: Parameters, data: Trajectories, length: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     samples = len(data.tau)
+    length = -(-samples // -(-samples // chunk_size)) if even else chunk_size
     for first in range(0, samples, length):
         # The last chunk is padded with its first sample, so that one program serves all chunks.
         rows = np.arange(first, first + length)

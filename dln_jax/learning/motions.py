@@ -21,7 +21,7 @@ problems"), which omits a term that is small if the residual is.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -83,11 +83,6 @@ def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows
     return Windows(t - t[:, :1], state, rate, weight)
 
 
-def take(windows: Windows, chosen: Sequence[int] | np.ndarray) -> Windows:
-    """Selects windows by index."""
-    return jax.tree.map(lambda array: array[np.asarray(chosen, int)], windows)
-
-
 def motion(field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int) -> Float[Array, "T two_d"]:
     """States (q, p) at the times t from `start` [2 d], by RK4."""
     d = start.shape[0] // 2
@@ -119,14 +114,12 @@ def problem(
     validation: Windows,
     *,
     weights: Weights,
-    free_starts: bool = True,
     substeps: int = 4,
     seed: int = 0,
 ) -> Problem:
     """Builds the problem of fitting a model to windows, in float64, with parameters {"model": ..., "starts": ...}.
 
-    The validation windows select the parameters, by the distance of simulated motions; free starts are fitted there
-    too.
+    The validation windows select the parameters, by the distance of simulated motions after fitting their starts too.
 
     Args:
         model: a phase model with float64 parameters.
@@ -134,7 +127,6 @@ def problem(
         windows: windows to fit.
         validation: windows that select the parameters.
         weights: of the residuals.
-        free_starts: whether starts are unknowns; otherwise windows start at their measured states.
         substeps: RK4 steps between two samples.
         seed: seed of the order of the windows.
 
@@ -146,15 +138,13 @@ def problem(
     error = functools.partial(window_residual, weights=weights, substeps=substeps)
 
     def residual(unknowns, index: Array, *window: Array) -> Array:
-        start = unknowns["starts"][index] if free_starts else window[1][0]
-        return error(flow(model.energies(unknowns["model"])), start, window)
+        return error(flow(model.energies(unknowns["model"])), unknowns["starts"][index], window)
 
     def closest(unknowns, *window: Array) -> Array:
         from_start = functools.partial(error, flow(model.energies(unknowns["model"])), window=window)
-        start = window[1][0]
-        return from_start(nearest(from_start, start) if free_starts else start)
+        return from_start(nearest(from_start, window[1][0]))
 
-    unknowns = {"model": parameters} | ({"starts": fitted[1][:, 0]} if free_starts else {})
+    unknowns = {"model": parameters, "starts": fitted[1][:, 0]}
     return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
 
 

@@ -33,7 +33,7 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, select_samples
-from dln_jax.learning.linear import linearised_chunks
+from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, left_out, posterior, spectrum
 from dln_jax.models.model import Model, Parameters
@@ -55,6 +55,8 @@ HARMLESS = 0.01
 torque's standard deviation."""
 STILL = 1e-3
 """Range in rad, m, 1/s or 1/s² of a coordinate that rests in all data."""
+CHUNK = 256
+"""Samples per call of the program that linearises the model."""
 UPPER = 0.975
 """Quantile of two-sided bands of 95 %, by which `scatter` widens bands from few motions."""
 TINY = np.finfo(np.float64).tiny
@@ -273,7 +275,7 @@ def _left_out(
 
 
 def _rows(model: Model, parameters: Parameters, data: Trajectories, basis: np.ndarray | None = None) -> Rows:
-    for columns, tau, measured in linearised_chunks(model, parameters, data):
+    for columns, tau, measured in design_chunks(design(model), parameters, data, CHUNK, even=False):
         yield columns if basis is None else columns @ basis, tau - measured
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures.uncertainty import torque_bands
 from dln_jax.files import write_figure
-from dln_jax.learning.linear import linearised_chunks
+from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.models.model import Model
@@ -82,7 +82,7 @@ def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Traject
     found, first = [], 0
     with jax.enable_x64(True):
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
-        for rows, *_ in linearised_chunks(model, parameters, data, CHUNK):
+        for rows, *_ in design_chunks(design(model), parameters, data, CHUNK, even=False):
             part = slice(first, first + len(rows))
             found.append(_bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part])))
             first = part.stop
