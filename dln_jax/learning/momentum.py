@@ -85,7 +85,7 @@ def momentum_problem(
     """Builds the problem of fitting a model's parameters to windows, selected by validation windows, in float64.
 
     Args:
-        model: of energies in coordinates and velocities.
+        model: model of energies in coordinates and velocities.
         parameters: initial parameters.
         windows: windows to fit.
         validation: windows that select the parameters.
@@ -99,7 +99,8 @@ def momentum_problem(
         require_positive(unit=float(size))
     if windows.q.shape[1] != validation.q.shape[1]:
         raise InputError(
-            f"windows have {windows.q.shape[1]} samples, those for validation {validation.q.shape[1]}; cut both alike"
+            f"windows have {windows.q.shape[1]} samples, those for validation {validation.q.shape[1]}; cut both to one "
+            "length"
         )
     sizes = jnp.asarray(unit)
 
@@ -117,7 +118,7 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     after it. The first torques of a trajectory, before the first command, are zero.
 
     Args:
-        data: with the commanded torques.
+        data: recording with commanded torques.
         delay: delay of the commands in samples.
 
     Raises:
@@ -137,7 +138,7 @@ def delay_of_torques(model: Model, recording: Trajectories, *, most: int, window
     """Estimates the delay of torques in samples: the smallest residual of a model linear in its parameters decides.
 
     Args:
-        model: for example `models.make_trigonometric`.
+        model: model that is linear in its parameters, such as `models.make_trigonometric`.
         recording: q and the commanded torques.
         most: largest delay that is tried; the smallest is 0.
         window: length of a window in s.

@@ -61,9 +61,9 @@ class Weights(NamedTuple):
     """Standard deviations that divide the residuals; a larger one gives less weight."""
 
     state: tuple[float, ...] | float
-    """Of q and p, one number or 2 d; infinite for quantities that were not measured."""
+    """Standard deviations of q and p, one number or 2 d; infinite for quantities that were not measured."""
     rate: tuple[float, ...] | float | None = None
-    """Of qd and pd, one number or 2 d; `None` leaves measured rates out."""
+    """Standard deviations of qd and pd, one number or 2 d; `None` leaves measured rates out."""
 
 
 def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows:
@@ -126,7 +126,7 @@ def problem(
         parameters: initial parameters, for example from a fit of rates.
         windows: windows to fit.
         validation: windows that select the parameters.
-        weights: of the residuals.
+        weights: standard deviations that divide the residuals.
         substeps: RK4 steps between two samples.
         seed: seed of the order of the windows.
 

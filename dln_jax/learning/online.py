@@ -100,7 +100,7 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
     held-out samples, or on the fitted ones if none are held out.
 
     Args:
-        model: with parameters and energies in float64.
+        model: model with parameters and energies in float64.
         rounds: number of rounds.
         iterations: Levenberg-Marquardt iterations per round.
 
@@ -187,9 +187,9 @@ def learn_online(
     Args:
         references: in the order in which they are driven; only `drive` reads them.
         drive: (parameters, reference) -> outcome, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
-        refit: from `make_refit` or `make_linear_refit`.
-        parameters: of the model that drives the first reference.
-        replay: with places for all recordings.
+        refit: result of `make_refit` or `make_linear_refit`.
+        parameters: parameters that drive the first reference.
+        replay: replay with places for all recordings.
 
     Raises:
         InputError: a recording that `appended` refuses.

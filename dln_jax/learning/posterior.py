@@ -57,7 +57,7 @@ def spectrum(
     """Computes the spectrum of all rows; takes about N d P² operations, and memory for d P² numbers.
 
     Args:
-        rows: of the training data.
+        rows: columns and residuals of the training data.
         unit: scales by which the fit divided the joints' residuals.
         rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: as for `solvers.least_squares.solve`.
@@ -89,8 +89,8 @@ def left_out(
     ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
 
     Args:
-        spectrum: of all training data.
-        noise: from `posterior`.
+        spectrum: spectrum of all training data.
+        noise: standard deviations from `posterior`.
         columns: Phi D⁻¹ V of the samples.
         residual: tau_hat - tau of the samples.
     """
@@ -136,7 +136,7 @@ def leading_directions(
         unit: scales by which the fit divided the joints' residuals.
         count: K.
         passes: over the data; the first computes D.
-        seed: of the initial subspace.
+        seed: seed of the initial subspace.
     """
     squares = sum(np.sum((columns / unit[:, None]) ** 2, axis=(0, 1)) for columns, _ in rows())
     scale = np.sqrt(np.where(squares > 0, squares, 1.0))

@@ -43,9 +43,9 @@ def problem(
 
     Args:
         model: a phase model.
-        train: with p and pd.
+        train: trajectories with p and pd.
         validation: trajectories that select the parameters, with p and pd; `data.splits.hold_out` draws some.
-        seed: of the initial parameters, of the drawn samples, and of their order.
+        seed: seed of the initial parameters, of the drawn samples, and of their order.
         most_samples: largest number of samples to fit, and to validate; larger sets are drawn from.
 
     Raises:

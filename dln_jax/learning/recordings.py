@@ -79,8 +79,8 @@ def prepare(recording: Trajectories, *, delay: int | None = None, validation: in
     """Computes rates and acting torques, and splits the episodes into those to fit and one for validation.
 
     Args:
-        recording: of several episodes, with its needs.
-        delay: of the torques, in samples (default: estimated).
+        recording: several episodes, with the needs of the plant.
+        delay: delay of the torques in samples (default: estimated).
         validation: index of the validation episode (default: the middle one).
 
     Raises:
@@ -134,9 +134,9 @@ def learned(
 
     Args:
         prepared: the recording.
-        needs: of the plant.
+        needs: needs of the plant.
         steps: Gauss-Newton iterations.
-        seed: of the initial parameters.
+        seed: seed of the initial parameters.
         report: as for `learning.engine.fit`.
         keywords: width, depth and activation, as for `models.make_delan`.
 

@@ -62,11 +62,11 @@ def identify(
     """Fits theta so that the simulated motions come closest to the observed ones.
 
     Args:
-        stepper: of `make_step`.
+        stepper: result of `make_step`.
         params_of: theta -> the scene's parameters.
         guess: initial theta, float64 arrays.
         motions: observed motions.
-        noise: of the positions, in m: the unit of the residuals.
+        noise: standard deviation of the positions, in m, which divides the residuals.
         iterations: largest number of Levenberg-Marquardt iterations.
         mesh: devices that share the motions; every device simulates its own.
 

@@ -97,7 +97,7 @@ def estimate(
         unit: scales by which the fit divided the joints' residuals, N m or N; by default `torque_scale`.
         rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: the value that `fit_linear` used.
-        quantile: of the data, for the thresholds of `out_of_distribution`.
+        quantile: quantile of the data that sets the thresholds of `out_of_distribution`.
         margin: factor on the thresholds: held-out motions of the same kind go a little further.
 
     Raises:
@@ -151,7 +151,7 @@ def calibration(
     """Returns (a, b) of a noise² + b variance for the residuals of one joint, and their mean negative log-likelihood.
 
     Args:
-        residual: of the validation, N m or N.
+        residual: residuals of the validation, N m or N.
         noise: standard deviation, of the training.
         variance: due to parameters.
         samples: number of independent residuals.

@@ -145,9 +145,9 @@ def make_dissipative(
 
     Args:
         model: conservative, built for needs without friction.
-        needs: of the scene; without friction nothing is added.
+        needs: needs of the scene; without friction nothing is added.
         initial_friction: approximate initial value of c, in N m s or N s/m.
-        width, depth, activation, dtype: of the network for c, as described in `models.model`.
+        width, depth, activation, dtype: keywords of the network for c, as described in `models.model`.
 
     Raises:
         InputError: a width, depth or friction that is not positive.

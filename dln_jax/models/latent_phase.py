@@ -135,7 +135,7 @@ def make_latent_phase(
 
     Args:
         field: model of the latent plane, from `latent_field`.
-        mean: of the two frames, over the training data.
+        mean: mean of the two frames over the training data.
         framewise: encode the frames one by one; the published autoencoder encodes both at once.
         scale: typical difference of a pixel from its mean.
         width: hidden units per layer of both networks.

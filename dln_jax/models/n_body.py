@@ -47,7 +47,7 @@ def make_pairwise_hamiltonian(
     Args:
         bodies: at least two.
         dimension: coordinates per body.
-        order: of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
+        order: order of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
         alike: whether all bodies share one mass and all pairs one energy; otherwise they have their own.
         features: names from `FEATURES`.
         distance_scale: typical distance in m, by which distances are divided.

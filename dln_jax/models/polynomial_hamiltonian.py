@@ -29,7 +29,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
     """Returns the (init, energies) pair; the parameters are the vector c, initially zero.
 
     Args:
-        needs: of the scene, with the kinds of its joints. Friction is refused, because it would not be linear beside H.
+        needs: needs of the scene. Friction is refused, because it would not be linear in c.
         degree: the largest total degree of a term.
 
     Raises:

@@ -78,7 +78,7 @@ def make_rigid_tree(
         friction: laws whose coefficients are also parameters, as in `mechanics.friction.laws`; True: `USUAL`.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
         load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
-        dtype: of the parameters.
+        dtype: type of the parameters.
 
     Raises:
         InputError: an unknown law, two laws for the same friction, a velocity or slope that is not positive, or a share

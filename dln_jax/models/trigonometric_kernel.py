@@ -105,7 +105,7 @@ def make_trigonometric_kernel(
         needs: kinds of joints, gravity, and viscous friction of the coordinates.
         samples: n, number of samples whose torques define the energy; the fit takes n³ d³ operations.
         serial: whether joints form a serial chain; otherwise nothing is assumed about their order.
-        dtype: of the parameters; weights have either sign and cancel, so that f32 costs accuracy.
+        dtype: type of the parameters; weights have either sign and cancel, so that f32 costs accuracy.
 
     Raises:
         InputError: no samples.

@@ -86,9 +86,9 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
     """Returns the rows under a key of a manifest.
 
     Args:
-        path: of the manifest, for messages.
+        path: path of the manifest, for messages.
         manifest: JSON values.
-        key: of the rows.
+        key: key of the rows.
         row: type of a row, such as `tuple[int, float | None]`.
 
     Raises:

@@ -92,11 +92,11 @@ def fit_tree(
         train: samples to fit, with accelerations.
         validation: samples that choose the local minimum; the training error chooses without them.
         parents: parent link of every link; a serial chain by default.
-        acceleration: of gravity, m/s².
-        velocity_scale: of dry friction, 1/s or m/s.
+        acceleration: acceleration of gravity, m/s².
+        velocity_scale: velocity scale of dry friction, 1/s or m/s.
         settings: starts, samples and limits of the search.
-        ridge: of the elimination, relative to the squared length of the columns.
-        rank_tolerance: of the final linear problem, as in `solvers.least_squares.solve`.
+        ridge: ridge of the elimination, relative to the squared length of the columns.
+        rank_tolerance: tolerance of the final linear problem, as in `solvers.least_squares.solve`.
         most_samples: largest number of samples for refining frames; the final linear problem uses all.
         report: called with lines of text about the search.
 

@@ -89,7 +89,7 @@ def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
 
 
 def mirrored(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
-    """Returns the mirror image: it moves alike under the same torques if the inertias are mirrored too.
+    """Returns the mirror image: it moves in the same way under the same torques if the inertias are mirrored too.
 
     Reflecting x in every frame reverses the rotation of revolute joints; reversing y and z of their links restores it.
     """
@@ -119,7 +119,7 @@ def frames_of_axes(
     """Returns frames with z along the joints' axes and the origin at their points, relative to the parent link.
 
     Args:
-        axes: of the joints in space at q = 0, of any length.
+        axes: directions of the joints in space at q = 0, of any length.
         points: on the axes, m.
         parents: parent link of every link, -1 for the ground; a serial chain by default.
 
