@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from dln_jax.data.encoders import smooth
@@ -21,7 +20,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.segments import segments
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, momentum_and_rest, window_weights
+from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, fit_momentum, momentum_and_rest, window_weights
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
@@ -134,32 +133,22 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     return data._replace(tau=acting)
 
 
-def delay_of_torques(model: Model, recording: Trajectories, *, most: int, window: float = WINDOW) -> int:
+def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> int:
     """Estimates the delay of torques in samples: the smallest residual of a model linear in its parameters decides.
 
     Args:
         model: model that is linear in its parameters, such as `models.make_trigonometric`.
         recording: q and the commanded torques.
         most: largest delay that is tried; the smallest is 0.
-        window: length of a window in s.
 
     Raises:
-        InputError: as for `smooth` and `cut_momentum_windows`.
+        InputError: as for `smooth` and `fit_momentum`.
     """
     smoothed = smooth(recording)
-    windows = cut_momentum_windows(smoothed.data, window=window)
-    zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, model.init(jax.random.key(0))))
-
-    def left(theta: Array, q: Array, qd: Array) -> Array:
-        return momentum_errors(dynamics(model.energies(unravel(theta))), q, qd, jnp.zeros(q.shape[1]), dt=windows.dt)
-
-    columns = np.asarray(jax.jit(jax.vmap(lambda q, qd: jax.jacrev(left)(zero, q, qd)))(windows.q, windows.qd))
     unit = np.asarray(torque_scale(smoothed.data))
-    A = (columns / unit[:, None]).reshape(-1, zero.size)
 
     def misfit(delay: int) -> float:
         late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
-        b = (cut_momentum_windows(late, window=window).impulse / unit).ravel()
-        return float(np.sum((A @ np.linalg.lstsq(A, b, rcond=None)[0] - b) ** 2))
+        return fit_momentum(model, late, noise=unit).residual
 
     return min(range(most + 1), key=misfit)

@@ -28,6 +28,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.sampling import EVEN
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.segments import segments
+from dln_jax.learning.linear import unravelled
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
@@ -57,6 +58,8 @@ class WeakFit(NamedTuple):
     """Number of windows, times the number of joints for the momentum."""
     mse: float
     """Mean over windows of the squared error of the mean torque, summed over joints, or of the power; (N m)² or W²."""
+    residual: float
+    """Root of the sum of squares of all equations, divided by the deviations of the noise [1]."""
 
 
 class Form(NamedTuple):
@@ -108,27 +111,25 @@ def fit_form(
 ) -> WeakFit:
     """Fits any equations of windows; arguments and errors as for `fit_momentum`."""
     require_positive(window=window)
+    d, like = data.degrees_of_freedom, _shapes(model)
     with jax.enable_x64(True):
-        zero, unravel = ravel_pytree(model.init(jax.random.key(0)))
-        zero = jnp.zeros(zero.shape, jnp.float64)
         scale = np.asarray(torque_scale(data)) if noise is None else np.asarray(noise, float)
-        if scale.shape != (data.degrees_of_freedom,) or not (scale > 0).all():
-            raise InputError(
-                f"noise is {scale}; expected a positive number for each of {data.degrees_of_freedom} joints"
-            )
-        equations = list(_equations(model, unravel, zero, data, form, scale, window))
+        if scale.shape != (d,) or not (scale > 0).all():
+            raise InputError(f"noise is {scale}; expected a positive number for each of {d} joints")
+        equations = list(_equations(_columns(form.left, model), data, form, scale, window))
     if not equations:
         raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
-    weighted = (((A / unit[..., None]).reshape(-1, zero.size), (b / unit).ravel()) for A, b, unit in equations)
+    weighted = (((A / unit[..., None]).reshape(b.size, -1), (b / unit).ravel()) for A, b, unit in equations)
     solution = least_squares.solve_chunks(weighted, **tolerances)
     squares = sum(float(np.sum((A @ solution.x - b) ** 2)) for A, b, _ in equations)
     return WeakFit(
-        parameters=unravel(jnp.asarray(solution.x, zero.dtype)),
-        parameter_count=zero.size,
+        parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), unravelled(solution.x, like), like),
+        parameter_count=solution.x.size,
         rank=solution.rank,
         condition=solution.condition,
         equations=sum(b.size for _, b, _ in equations),
         mse=squares / sum(len(b) for _, b, _ in equations),
+        residual=solution.residual,
     )
 
 
@@ -145,25 +146,33 @@ def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return w / w.sum(), slope / w.sum()
 
 
+@functools.lru_cache(maxsize=4)
+def _columns(left: Callable[..., tuple[Array, Array]], model: Model) -> Callable[..., Array]:
+    """(q, qd as [N, d]) -> derivatives [N, 2 k, P] of both parts of `Form.left`, compiled."""
+    zero, unravel = ravel_pytree(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), _shapes(model)))
+
+    def columns(q: Vector, qd: Vector) -> Array:
+        def both(theta: Array) -> Array:
+            return jnp.concatenate(left(dynamics(model.energies(unravel(theta))), q, qd))
+
+        values, pull_back = jax.vjp(both, zero)
+        return jax.vmap(pull_back)(jnp.eye(values.shape[0], dtype=values.dtype))[0]
+
+    return jax.jit(jax.vmap(columns), compiler_options=quick_compilation())
+
+
+def _shapes(model: Model) -> Parameters:
+    return jax.eval_shape(model.init, jax.random.key(0))
+
+
 def _equations(
-    model: Model,
-    unravel: Any,
-    zero: Array,
+    program: Callable[..., Array],
     data: Trajectories,
     form: Form,
     noise: Float[np.ndarray, " d"],
     window: float,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Columns [W, k, P], right-hand sides and their deviations [W, k] of windows, one chunk after the other."""
-
-    def both(theta: Parameters, q: Vector, qd: Vector) -> Array:
-        return jnp.concatenate(form.left(dynamics(model.energies(unravel(theta))), q, qd))
-
-    def columns(q: Vector, qd: Vector) -> Array:
-        values, pull_back = jax.vjp(functools.partial(both, q=q, qd=qd), zero)
-        return jax.vmap(pull_back)(jnp.eye(values.shape[0], dtype=values.dtype))[0]
-
-    program = jax.jit(jax.vmap(columns), compiler_options=quick_compilation())
     pieces = segments(data.t, data.trajectory)
     length = min(CHUNK, max(len(piece) for piece in pieces))
     for piece in pieces:

@@ -61,7 +61,7 @@ def make_planar_chain(
         coordinates: q_i is the angle of link i relative to the one before ("relative") or to the vertical ("absolute").
         symmetric: whether B and h are left out.
         armature: whether joints 2, .., d have armature (the inertia of motors or gears).
-        velocity_scale: velocity scale of dry friction, rad/s, as for `mechanics.friction.joint_dissipation`; not fitted.
+        velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
         dtype: type of the parameters.
 
     Raises:

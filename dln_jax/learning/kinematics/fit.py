@@ -1,6 +1,5 @@
 """Fits a tree of unknown kinematics to states and torques: search, refinement, and a final linear problem."""
 
-import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -8,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
@@ -25,6 +24,7 @@ from dln_jax.learning.kinematics.projection import (
     inertias_of,
 )
 from dln_jax.learning.kinematics.search import ALIKE, Search, agreeing, search
+from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree, rotation_vector
 from dln_jax.solvers import least_squares
@@ -35,6 +35,8 @@ FINALISTS, NEAR = 3, 2.0
 the lowest."""
 ROUNDS = 2
 """Rounds of weighting the joints by their unexplained torques; further rounds change the weights by percents."""
+CHUNK = 4096
+"""Samples whose columns are in memory at a time."""
 LEAST_NOISE = 1e-7
 """Lower bound on a joint's noise in the weights, relative to its torque."""
 
@@ -186,7 +188,7 @@ def _solved(
     """Solves for the linear parameters of known frames on all data, by singular values."""
 
     def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for Phi, tau in _designs(columns, state.frames, data):
+        for Phi, _, tau in design_chunks(columns, state.frames, data, CHUNK):
             yield (Phi / unit[:, None]).reshape(-1, Phi.shape[-1]), (tau / unit).ravel()
 
     return least_squares.solve_chunks(equations(), rank_tolerance=rank_tolerance, negligible=1e-12)
@@ -194,23 +196,17 @@ def _solved(
 
 def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
     """Mean squared error of every joint's torque."""
-    squares = [np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, tau in _designs(columns, frames, data)]
-    return np.sum(squares, axis=0) / len(data.tau)
+    chunks = design_chunks(columns, frames, data, CHUNK)
+    return np.sum([np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, _, tau in chunks], axis=0) / len(data.tau)
 
 
 def _columns(structure: Structure) -> Callable:
-    """(frames, q, qd, qdd) -> Phi [N, d, P]."""
-    batched = jax.vmap(functools.partial(design, structure), in_axes=(None, 0, 0, 0))
-    return jax.jit(batched, compiler_options=quick_compilation())
+    """(frames, q, qd, qdd) -> Phi [N, d, P] and zeros [N, d], for `design_chunks`."""
 
+    def one(frames: Frames, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+        return design(structure, frames, q, qd, qdd), jnp.zeros_like(q)
 
-def _designs(
-    columns: Callable, frames: Frames, data: Trajectories, *, length: int = 4096
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Phi [n, d, P] and tau [n, d], at most `length` samples at a time."""
-    for first in range(0, len(data.tau), length):
-        rows = slice(first, first + length)
-        yield np.asarray(columns(frames, data.q[rows], data.qd[rows], data.qdd[rows])), data.tau[rows]
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
