@@ -27,7 +27,7 @@ from jaxtyping import Float
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.segments import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
-from dln_jax.learning.motions import nearest, require_windows, without_start
+from dln_jax.learning.motions import nearest, require_windows, weighted, without_start
 from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
@@ -199,10 +199,8 @@ def _residual(
     start, push = start[: 2 * d], start[2 * d :]
     pushed = tau if noise.tau is None else tau + push
     states = motion(system, start, t, pushed, torque=torque, substeps=substeps)
-    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
-    errors = [size * (states[:, :d] - q) / jnp.asarray(noise.q)]
+    errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
     if noise.qd is not None:
-        errors.append(size * (states[:, d:] - qd) / jnp.asarray(noise.qd))
-    if noise.tau is not None:
-        errors.append(push / jnp.asarray(noise.tau))
-    return jnp.concatenate([jnp.ravel(error) for error in errors])
+        errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
+    residual = weighted(weight, *errors)
+    return residual if noise.tau is None else jnp.concatenate([residual, push / jnp.asarray(noise.tau)])

@@ -96,15 +96,18 @@ def window_residual(
     """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
     t, measured, weight, *rate = window
     states = motion(field, start, t, substeps=substeps)
-    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
-    errors = [size * (states - measured) / jnp.asarray(weights.state, start.dtype)]
+    errors = [(states - measured) / jnp.asarray(weights.state, start.dtype)]
     if weights.rate is not None:
-        d = start.shape[0] // 2
-        velocity, force = jax.vmap(field.rates)(states[:, :d], states[:, d:])
-        errors.append(
-            size * (jnp.concatenate([velocity, force], axis=1) - rate[0]) / jnp.asarray(weights.rate, start.dtype)
-        )
-    return jnp.concatenate([jnp.ravel(error) for error in errors])
+        q, p = jnp.split(states, 2, axis=1)
+        rates = jnp.concatenate(jax.vmap(field.rates)(q, p), axis=1)
+        errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
+    return weighted(weight, *errors)
+
+
+def weighted(weight: Array, *errors: Array) -> Array:
+    """Concatenates errors [T, n] of a window, weighted so that their squares sum to a mean over its samples."""
+    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
+    return jnp.concatenate([jnp.ravel(size * error) for error in errors])
 
 
 def problem(

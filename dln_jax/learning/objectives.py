@@ -9,8 +9,9 @@ import numpy as np
 from jax import Array, vmap
 from jaxtyping import Float
 
-from dln_jax.data.magnitudes import on_device, spread
+from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
+from dln_jax.learning.engine.problem import arrays_of
 from dln_jax.mechanics.equations import Energies, System, driving_force, dynamics, hamiltonian_of
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Vector
@@ -151,7 +152,7 @@ def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array,
     missing = [key for key in objective.keys if getattr(data, key) is None]
     if missing:
         raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
-    return tuple(on_device(key, getattr(data, key), dtype) for key in objective.keys)
+    return arrays_of(data, objective.keys, dtype)
 
 
 def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:

@@ -7,10 +7,9 @@ import pytest
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import split
-from dln_jax.learning import uncertainty as learning
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
-from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
+from dln_jax.learning.uncertainty import DIRECTIONS, MOST_PARAMETERS, calibration, effective_samples, estimate, scatter
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.plain import InverseForward
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
@@ -135,8 +134,8 @@ def test_bands_with_scatter_hold_for_new_motions():
         known, new = errors[fitted : fitted + 10].ravel(), errors[50:]
         std = np.sqrt(np.mean(known**2))
         raised = std * np.sqrt(scatter(known / std, motion))
-        for shares, each in ((plain, std), (scattered, raised)):
-            shares.append([coverage(x[:, None], np.full((200, 1), each), levels=levels).shares[0, 0] for x in new])
+        for shares, band in ((plain, std), (scattered, raised)):
+            shares.append([coverage(x[:, None], np.full((200, 1), band), levels=levels).shares[0, 0] for x in new])
     assert np.min(scattered) > np.min(plain) + 0.03
     assert np.mean(np.array(scattered) >= 0.9) > 0.75 > np.mean(np.array(plain) >= 0.9)
 
@@ -186,7 +185,7 @@ def test_a_network_is_uncertain_where_it_has_seen_nothing():
     assert np.mean(flag(far.q, far.qd, far.qdd)) > 0.95 and np.mean(flag(near.q, near.qd, near.qdd)) < 0.05
 
 
-def test_leading_directions_are_those_of_the_singular_value_decomposition(monkeypatch):
+def test_leading_directions_are_those_of_the_singular_value_decomposition():
     random = np.random.default_rng(0)
     Phi = random.normal(size=(60, 1, 12)) * 10.0 ** -np.arange(12) @ np.linalg.qr(random.normal(size=(12, 12)))[0]
     unit = np.array([2.0])
@@ -195,10 +194,11 @@ def test_leading_directions_are_those_of_the_singular_value_decomposition(monkey
     _, _, right = np.linalg.svd(scaled, full_matrices=False)
     basis = found * np.linalg.norm(Phi[:, 0] / unit, axis=0)[:, None]
     np.testing.assert_allclose(np.linalg.norm(right[:3] @ basis, axis=1), 1.0, atol=1e-3)
-    monkeypatch.setattr(learning, "MOST_PARAMETERS", 10)
-    monkeypatch.setattr(learning, "DIRECTIONS", 6)
-    small = estimate(ARM, TRUTH, drawn(0), drawn(1)).uncertainty
-    assert small.factor.shape == (28, 6)
+    network = make_delan(Needs(joints=("revolute", "revolute")), width=32, depth=2, dtype=jnp.float64)
+    parameters = jax.jit(network.init)(jax.random.key(0))
+    factor = estimate(network, parameters, drawn(0), drawn(1)).uncertainty.factor
+    size = sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    assert size > MOST_PARAMETERS and factor.shape == (size, DIRECTIONS)
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.1])
