@@ -1,5 +1,7 @@
 """Five revolute joints that are no rigid chain in the order of their coordinates: torques of unseen motions."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -57,9 +59,9 @@ def recorded(plant: str, seed: int, first: int, count: int, *, every: int = 25, 
     tau = np.asarray(jax.jit(jax.vmap(lambda *state: trees.newton_euler(tree, *state)))(q, qd, qdd))
     tau = tau + np.array(springs) * q
     tau = tau + noise * tau.std(axis=0) * np.random.default_rng([13, seed, first]).normal(size=tau.shape)
-    arrays = (array[:, order] for array in (q, qd, qdd, tau))
+    q, qd, qdd, tau = (array[:, order] for array in (q, qd, qdd, tau))
     index, label = np.repeat(np.arange(count), len(t)), np.array([str(number) for number in range(count)])
-    return Trajectories(np.tile(t, count), *arrays, index, label, needs=NEEDS)
+    return Trajectories(np.tile(t, count), q, qd, qdd, tau, index, label, needs=NEEDS)
 
 
 def rows(plant: str, seeds: range) -> list[Row]:
@@ -68,7 +70,8 @@ def rows(plant: str, seeds: range) -> list[Row]:
     for seed in seeds:
         train, validation = recorded(plant, seed, 0, 5), recorded(plant, seed, 500, 1)
         suited = dynamics.suited_network(NEEDS, train)
-        network = make_delan(NEEDS, **suited.keywords, dtype=float)
+        keywords: dict[str, Any] = suited.keywords
+        network = make_delan(NEEDS, **keywords, dtype=float)
         optimiser = GaussNewton(steps=200) if suited.optimizer == "gauss-newton" else Adam(steps=suited.steps)
         sets = Split(train, validation, validation)
         task = dynamics.problem(network, sets, objectives.SCALED_TORQUE, seeds=seed)
