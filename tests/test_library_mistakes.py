@@ -14,8 +14,7 @@ from dln_jax import sizes
 from dln_jax.data import schema
 from dln_jax.learning.engine import newton
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.engine.problem import Problem
-from dln_jax.learning.engine.sharing import sharing
+from dln_jax.learning.engine.problem import Problem, sharing
 from dln_jax.mechanics.trees import make_tree
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.scenes.datasets.generators import uniform

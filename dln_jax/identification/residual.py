@@ -20,7 +20,7 @@ from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.growth import Trial, grow, segments
+from dln_jax.learning.model_selection import Trial, grow, segments
 from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual

@@ -21,9 +21,9 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training
 from dln_jax.learning.friction import fit_friction
-from dln_jax.learning.growth import grow
 from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.linear import choose_degrees, fit_linear
+from dln_jax.learning.model_selection import grow
 from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, FORWARD, TORQUE, Objective, objective_of
 from dln_jax.learning.online import empty_replay, learn_online, make_linear_refit, make_refit
 from dln_jax.learning.rates import match_linear

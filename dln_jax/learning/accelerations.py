@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.data.arrays import on_device, spread
+from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.data.splits import select_samples
+from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.learning.measured_motions import Gauge, check_gauge, gauge_error
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import require_positive
 
 KEYS = ("q", "qd", "qdd", "tau")
 
@@ -46,9 +47,7 @@ def problem(
         InputError: motions without torques and without a gauge, or numbers that are too large.
     """
     require_positive(most_samples=most_samples)
-    if gauge is None and not np.any(data.tau):
-        raise InputError("motions without torques fit any multiple of an energy; give a gauge")
-    check_gauge(gauge, data.degrees_of_freedom)
+    check_gauge(gauge, data.tau, data.degrees_of_freedom)
     size = spread("qdd", data.qdd)
     scale = jnp.asarray(np.where(size > 0, size, 1.0))
 
@@ -59,15 +58,9 @@ def problem(
         return jnp.append(error(parameters, *sample), gauge_error(dynamics(model.energies(parameters)), gauge))
 
     fitted, held_out = (
-        tuple(on_device(key, getattr(each, key)[rows], jnp.float64) for key in KEYS)
-        for each in (data, validation)
-        for rows in [drawn(len(each.t), most_samples, seed)]
+        arrays_of(select_samples(part, drawn(len(part.t), most_samples, seed)), KEYS) for part in (data, validation)
     )
-
-    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
-        return unmonitored(mean_square(lambda *sample: error(parameters, *sample), held_out))
-
-    return Problem(residual, parameters, fitted, score, seed)
+    return selected_by(held_out, residual, parameters, fitted, seed, error=error)
 
 
 def drawn(samples: int, most: int, seed: int) -> np.ndarray:

@@ -32,7 +32,7 @@ from dln_jax.models.model import Parameters
 from dln_jax.types import InputError, Scalar
 
 
-class Weights(NamedTuple):
+class TermWeights(NamedTuple):
     """Weights of the terms of the loss."""
 
     autoencoder: float = 1.0
@@ -45,7 +45,7 @@ class Matching(NamedTuple):
 
     window: int = 2
     """Images (of two frames) per window."""
-    weights: Weights = Weights()
+    weights: TermWeights = TermWeights()
     relative: bool = True
     """Whether errors of latent states are relative to their variances; the published ones are not."""
 
@@ -84,8 +84,8 @@ def terms(
 
 def loss(model: LatentModel, matching: Matching, parameters: Parameters, windows: Array) -> Scalar:
     """The weighted sum of `terms`."""
-    found, weights = terms(model, parameters, windows, matching.relative), matching.weights
-    return weights.autoencoder * found.autoencoder + weights.coordinate * found.coordinate + weights.field * found.field
+    (autoencoder, coordinate, field), weights = terms(model, parameters, windows, matching.relative), matching.weights
+    return weights.autoencoder * autoencoder + weights.coordinate * coordinate + weights.field * field
 
 
 def windows(frames: Float[np.ndarray, "K T pixels"], length: int) -> Float[np.ndarray, "N length pixels"]:

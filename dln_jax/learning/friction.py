@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
+from dln_jax.learning.engine.problem import arrays_of
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.mechanics.friction import (
     FrictionShape,
@@ -108,18 +109,16 @@ def fit_friction(
         weights = np.asarray(torque_scale(data) if noise is None else np.broadcast_to(noise, d), float)
         if not (np.isfinite(weights).all() and (weights > 0).all()):
             raise InputError(f"noise is {noise}; expected a positive number, or one for each joint")
-        state = [jnp.asarray(each, jnp.float64) for each in (data.q, data.qd, data.qdd)]
+        state = arrays_of(data, ("q", "qd", "qdd"))
         columns = jax.jit(jax.vmap(functools.partial(regressor, tree)), compiler_options=quick_compilation())
         log = _Log(columns(*state), state[1], jnp.asarray(data.tau), jnp.asarray(weights))
         equations = functools.partial(_equations, laws, learned, start)
         unknowns = np.concatenate([np.broadcast_to(_unknown(name, start), d) for name in learned])
         settings = {"iterations": iterations, "negligible": negligible, "longest_step": LONGEST_STEP}
         solution = _solve(equations, unknowns, log, settings, rounds="load" in laws)
-        found = {name: np.asarray(each) for name, each in _shapes(learned, solution.nonlinear, d).items()}
+        fitted = {name: np.asarray(values) for name, values in _shapes(learned, solution.nonlinear, d).items()}
     left = solution.residuals.reshape(-1, d) * weights
-    keywords = {name: tuple(each.tolist()) for name, each in found.items()}
-    constant = {name: _plain(value) for name, value in start._asdict().items()}
-    shaped: dict[str, Any] = constant | keywords
+    shaped: dict[str, Any] = {name: _plain(value) for name, value in (start._asdict() | fitted).items()}
     model = make_rigid_tree(tree, friction=laws, **shaped)
     errors = np.sqrt(np.diagonal(solution.covariance))
     count = solution.linear.size
@@ -128,8 +127,8 @@ def fit_friction(
         model=model,
         parameters=_parameters(solution.linear, laws, d),
         standard_errors=_parameters(errors[:count], laws, d),
-        shape=found,
-        shape_errors={name: _slope(name, found[name]) * each for name, each in by_shape.items()},
+        shape=fitted,
+        shape_errors={name: _slope(name, fitted[name]) * deviation for name, deviation in by_shape.items()},
         rank=solution.rank,
         condition=solution.condition,
         torque_mse=float(np.mean(np.sum(left**2, axis=1))),
@@ -154,9 +153,9 @@ class _Log(NamedTuple):
 def _equations(laws: tuple[FrictionLaw, ...], learned: tuple[str, ...], start: FrictionShape, unknowns: Any, log: _Log):
     """Weighted columns and torques, [N d, P] and [N d]."""
     links, qd, tau, weights, signs = log
-    found = _shapes(learned, unknowns, qd.shape[1])
-    share = found.pop("load", None)
-    shape = start._replace(**found)
+    shapes = _shapes(learned, unknowns, qd.shape[1])
+    share = shapes.pop("load", None)
+    shape = start._replace(**shapes)
     columns = [
         jax.vmap(lambda u, name=name: jnp.diag(unit_force(name, u, shape)))(qd) for name in coefficients_of(laws)
     ]

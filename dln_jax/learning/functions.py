@@ -26,7 +26,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
 from dln_jax.learning.engine.problem import Problem, Progress, Report, Training, mean_square, silent, unmonitored
-from dln_jax.learning.growth import Trial, grow
+from dln_jax.learning.model_selection import Trial, grow
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -145,20 +145,20 @@ def train(
     Raises:
         InputError: raised by `targets` or `fit`.
     """
-    members = network.members if isinstance(optimiser, Adam) else 1
+    together = isinstance(optimiser, Adam)
+    members = network.members if together else 1
 
     def mean(at: Progress) -> Progress:
-        return at._replace(
-            loss=float(np.mean(at.loss)) / members, validation=float(np.mean(at.validation)), monitor=np.nan
-        )
+        loss, validation = float(np.mean(at.loss)) / members, float(np.mean(at.validation))
+        return at._replace(loss=loss, validation=validation, monitor=np.nan)
 
-    given = problem(sets, network, each_member_by_itself=not isinstance(optimiser, Adam))
-    training = fit(given, optimiser, checkpoint=checkpoint, report=lambda at: report(mean(at)), mesh=mesh)
+    task = problem(sets, network, together=together)
+    training = fit(task, optimiser, checkpoint=checkpoint, report=lambda at: report(mean(at)), mesh=mesh)
     return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
 
 
-def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool) -> Problem:
-    """Builds the problem of fitting an ensemble: members as seeds (for Gauss-Newton), or the sum of their losses.
+def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
+    """Builds the problem of an ensemble: the sum of its members' losses, or (for Gauss-Newton) members as seeds.
 
     Raises:
         InputError: raised by `targets`.
@@ -171,22 +171,22 @@ def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool)
     function = activation(network.activation)
     of_member = functools.partial(mean_loss, activation=function)
 
-    def together(layers: Layers, batch: Targets) -> Scalar:
+    def total(layers: Layers, batch: Targets) -> Scalar:
         """The sum of losses leaves every member's gradient, and so its training, the same as alone."""
         if network.members == 1:
             # An axis of one member would turn all products into batched ones, at two or three times the cost.
             return of_member(jax.tree.map(lambda leaf: leaf[0], layers), batch)
         return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
 
-    if each_member_by_itself:
+    if not together:
         seeds = jnp.full(network.members, network.seed)
         of_sample = functools.partial(residual, activation=function)
         return Problem(of_sample, layers, ours, lambda member: unmonitored(of_member(member, theirs)), seeds)
 
     def score(layers: Layers) -> tuple[Scalar, Scalar]:
-        return unmonitored(together(layers, theirs) / network.members)
+        return unmonitored(total(layers, theirs) / network.members)
 
-    return Problem(None, layers, ours, score, network.seed, together)
+    return Problem(None, layers, ours, score, network.seed, total)
 
 
 def grow_width(

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.growth import Trial
-from dln_jax.learning.marginal_likelihood import Equations, compiled_covariance, likeliest
-from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
+from dln_jax.learning.marginal_likelihood import TorqueEquations, compiled_covariance, likeliest
+from dln_jax.learning.model_selection import Trial
+from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.torque_covariance import States
@@ -104,17 +104,17 @@ def fit_kernel(
         covariance += every.friction @ every.friction.T
         factor, noise = _factor(covariance, noise, unit)
         weights = cho_solve(factor, every.tau.ravel())
-    found = deviations * (every.friction.T @ weights)
+    coefficients = deviations * (every.friction.T @ weights)
     diagonal = np.log(np.diagonal(factor[0])).sum() + 0.5 * weights.size * np.log(2 * np.pi)
     weights = weights.reshape(every.tau.shape)
     return KernelFit(
-        parameters=_parameters(needs, scales, every.states, weights, found),
+        parameters=_parameters(needs, scales, every.states, weights, coefficients),
         noise=noise,
         likelihood=float(-(0.5 * np.vdot(every.tau, weights) + diagonal) / weights.size),
         # The residual of the equations is noise² weights.
         torque_mse=float(np.mean(np.sum((noise**2 * weights) ** 2, axis=1))),
         samples=len(weights),
-        parameter_count=weights.size + found.size,
+        parameter_count=weights.size + coefficients.size,
         seconds=time.perf_counter() - began,
     )
 
@@ -135,9 +135,9 @@ def choose_kernel(
         fit = fit_kernel(needs, train, samples=samples, serial=serial)
         with jax.enable_x64(True):
             model = CATALOGUE["trigonometric-kernel"].factory(needs, samples=fit.samples, serial=serial)
-            judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))  # noqa: B023
-            errors = judge(fit.parameters, arrays(TORQUE, validation, jnp.float64)) / torque_scale(train)
-        trials.append(Trial(serial, fit, np.sum(np.asarray(errors) ** 2, axis=1)))
+            scale = np.asarray(torque_scale(train))
+        errors = squared_torque_errors(model, fit.parameters, validation, scale)
+        trials.append(Trial(serial, fit, np.sum(errors, axis=1)))
     return min(trials, key=lambda trial: trial.validation), trials
 
 
@@ -169,25 +169,25 @@ def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "
     shape = FrictionShape(velocity_scale=needs.velocity_scale)
     names, rates = coefficients_of(needs.joint_friction), jnp.asarray(qd @ lever)
     units = [jax.vmap(lambda u, name=name: unit_force(name, u, shape))(rates) for name in names]
-    columns = [lever * np.asarray(each)[:, None, :] for each in units]
+    columns = [lever * np.asarray(unit)[:, None, :] for unit in units]
     if needs.friction:
         columns.insert(0, np.eye(d) * qd[:, None, :])
     return np.concatenate([np.zeros((len(qd), d, 0)), *columns], axis=2)
 
 
-def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: int) -> Equations:
+def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: int) -> TorqueEquations:
     rows = np.unique(np.round(np.linspace(0, len(data.tau) - 1, min(most, len(data.tau)))).astype(int))
-    states = States(*(np.asarray(each[rows], float) for each in (data.q, data.qd, data.qdd)))
-    return Equations(states, friction[rows].reshape(data.tau[rows].size, -1), np.asarray(data.tau[rows], float))
+    states = States(*(np.asarray(array[rows], float) for array in (data.q, data.qd, data.qdd)))
+    return TorqueEquations(states, friction[rows].reshape(data.tau[rows].size, -1), np.asarray(data.tau[rows], float))
 
 
 def _parameters(needs: Needs, scales: KernelScales, states: States, weights: np.ndarray, friction: np.ndarray) -> Any:
     """Parameters of the catalogue's model."""
     d = needs.degrees_of_freedom
     own, of_laws = np.split(friction, [d if needs.friction else 0])
-    found = jax.tree.map(jnp.asarray, KernelParameters(*states, weights, scales, own if needs.friction else None))
+    kernel = jax.tree.map(jnp.asarray, KernelParameters(*states, weights, scales, own if needs.friction else None))
     if not needs.joint_friction:
-        return found
+        return kernel
     names = coefficients_of(needs.joint_friction)
     coefficients = dict(zip(names, map(jnp.asarray, of_laws.reshape(-1, d)), strict=True))
-    return {"model": found, "friction": FrictionParameters(coefficients, {})}
+    return {"model": kernel, "friction": FrictionParameters(coefficients, {})}

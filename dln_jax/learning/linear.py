@@ -6,9 +6,9 @@ This works for any `Model` of that kind, such as `models.trigonometric`. Phi is 
 respect to the parameters, exact because the model is linear in them.
 
 `choose_degrees` selects the size of a trigonometric basis. One degree for all joints grows until it no longer helps
-(`learning.growth`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not significantly
-worse. A joint that neither changes the mass matrix nor lifts a weight, such as an arm's first vertical axis, ends at
-degree 0, which divides the size of the basis by 2 n + 1.
+(`learning.model_selection`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not
+significantly worse. A joint that neither changes the mass matrix nor lifts a weight, such as an arm's first vertical
+axis, ends at degree 0, which divides the size of the basis by 2 n + 1.
 """
 
 import functools
@@ -23,10 +23,9 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.growth import Trial, grow, significantly_better
-from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
-from dln_jax.models.linearisation import linearised
-from dln_jax.models.model import Model, Parameters
+from dln_jax.learning.model_selection import Trial, grow, significantly_better
+from dln_jax.learning.objectives import squared_torque_errors, torque_scale
+from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, Needs, require_positive
@@ -150,27 +149,14 @@ def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:
 
 
 def design_chunks(
-    linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int
+    linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int, *, even: bool = True
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi, the model's tau and the measured tau, in chunks of equal length; the last one may be shorter."""
-    samples = len(data.tau)
-    return _chunks(linearise, parameters, data, -(-samples // -(-samples // chunk_size)))
+    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= chunk_size samples at a time.
 
-
-def linearised_chunks(
-    model: Model, parameters: Parameters, data: Trajectories, length: int = 256
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= length samples at a time.
-
-    One program serves any number of samples, in the dtype of the parameters.
+    Even chunks waste no work; chunks that are not, of `chunk_size` samples, share one program for any number of them.
     """
-    return _chunks(design(model), parameters, data, length)
-
-
-def _chunks(
-    linearise: Callable, parameters: Parameters, data: Trajectories, length: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     samples = len(data.tau)
+    length = -(-samples // -(-samples // chunk_size)) if even else chunk_size
     for first in range(0, samples, length):
         # The last chunk is padded with its first sample, so that one program serves all chunks.
         rows = np.arange(first, first + length)
@@ -198,10 +184,9 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
     def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
         with jax.enable_x64(True):
             model = make(needs, degree=degrees)
-            found = fit_linear(model, train)
-            judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))
-            errors = judge(found.parameters, arrays(TORQUE, validation, jnp.float64))
-        return found, np.sum((np.asarray(errors) / scale) ** 2, axis=1)
+            solution = fit_linear(model, train)
+        errors = squared_torque_errors(model, solution.parameters, validation, scale)
+        return solution, np.sum(errors, axis=1)
 
     def fits(degree: int) -> bool:
         size = parameters_of_degree(needs, degree)

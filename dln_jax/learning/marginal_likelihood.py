@@ -31,7 +31,7 @@ _REFUSED = 1e10
 """Objective of scales whose covariance is indefinite due to rounding."""
 
 
-class Equations(NamedTuple):
+class TorqueEquations(NamedTuple):
     """Torques of samples, and the regressor of their friction."""
 
     states: States
@@ -50,7 +50,7 @@ class Unknowns(NamedTuple):
 
 
 def likeliest(
-    needs: Needs, serial: bool, equations: Equations, unit: np.ndarray, *, iterations: int, least_noise: float
+    needs: Needs, serial: bool, equations: TorqueEquations, unit: np.ndarray, *, iterations: int, least_noise: float
 ) -> Unknowns:
     """Returns the scales and noise that maximise the marginal likelihood."""
     from scipy.optimize import minimize
@@ -60,7 +60,7 @@ def likeliest(
     ends = np.cumsum([leaf.size for leaf in leaves])
 
     def unknowns_of(x: np.ndarray) -> Unknowns:
-        parts = [each.reshape(leaf.shape) for each, leaf in zip(np.split(x, ends[:-1]), leaves, strict=True)]
+        parts = [part.reshape(leaf.shape) for part, leaf in zip(np.split(x, ends[:-1]), leaves, strict=True)]
         return jax.tree.unflatten(structure, parts)
 
     evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
@@ -72,16 +72,16 @@ def likeliest(
             return _REFUSED, np.zeros_like(x)
         return float(value), slope
 
-    lowest = [(None, None)] * (ends[-1] - unit.size) + [(each, None) for each in np.log(least_noise * unit)]
+    lowest = [(None, None)] * (ends[-1] - unit.size) + [(lower, None) for lower in np.log(least_noise * unit)]
     first = np.concatenate([leaf.ravel() for leaf in leaves])
     options = {"maxiter": iterations, "maxcor": 30}
     return unknowns_of(minimize(objective, first, jac=True, method="L-BFGS-B", bounds=lowest, options=options).x)
 
 
-def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknowns, Equations], Any]:
+def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknowns, TorqueEquations], Any]:
     """(unknowns, equations) -> minus the log likelihood per torque, without the constant, and its gradient."""
 
-    def evaluate(unknowns: Unknowns, equations: Equations) -> Any:
+    def evaluate(unknowns: Unknowns, equations: TorqueEquations) -> Any:
         states, friction, tau = equations
         count = tau.size
 
@@ -97,19 +97,19 @@ def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknown
         W = 0.5 * (inverse - jnp.outer(weights, weights))
         scales = jax.grad(lambda scales: jnp.vdot(W, covariance(scales)))(unknowns.scales)
         by_joint = 2 * variance * jnp.sum(jnp.diagonal(W).reshape(tau.shape), axis=0)
-        return value / count, jax.tree.map(lambda each: each / count, Unknowns(scales, by_joint))
+        return value / count, jax.tree.map(lambda slope: slope / count, Unknowns(scales, by_joint))
 
     return evaluate
 
 
-def start_of(needs: Needs, serial: bool, equations: Equations, unit: np.ndarray) -> KernelScales:
+def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.ndarray) -> KernelScales:
     """Returns logarithms of scales at which the energies explain torques of the measured size, with random frames.
 
     A randomly rotated vector keeps on average a third of its squared length along the joint's axis.
     """
     d = needs.degrees_of_freedom
     bodies = d if serial else 1
-    q, _, qdd = (np.sqrt(np.mean(each**2, axis=0)) for each in equations.states)
+    q, _, qdd = (np.sqrt(np.mean(array**2, axis=0)) for array in equations.states)
     slides = np.array([joint == "prismatic" for joint in needs.joints])
     rotated = np.tile([1 / 3, 2 / 3], (d, 1))
     slid = np.stack([np.full(d, 2 / 3), 1 / (3 * np.where(q > 0, q, 1.0) ** 2)], axis=1)
@@ -117,7 +117,7 @@ def start_of(needs: Needs, serial: bool, equations: Equations, unit: np.ndarray)
     rates = unit / np.where(qdd > 0, qdd, 1.0)
     ones, none = np.ones(bodies), np.zeros(bodies)
     scales = KernelScales(rates / rates.mean(), ones, pairs, *((ones, pairs) if needs.gravity else (None, None)))
-    few = States(*(each[:: max(1, len(each) // FEW)] for each in equations.states))
+    few = States(*(array[:: max(1, len(array) // FEW)] for array in equations.states))
 
     def size(scales: KernelScales) -> float:
         """Mean variance of torques in units of the measured ones; 1 if nothing moves."""

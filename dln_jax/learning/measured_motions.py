@@ -7,7 +7,7 @@ energies of `mechanics.equations.dynamics` work. The residual of a window of T s
 
 with the second part only if qd was measured. The fit minimises the sum over windows of |r_w|² over theta and all starts
 z_w. Starts are eliminated window by window: Gauss-Newton solves for z_w(theta), and the derivative of the remaining r_w
-is that of Kaufman (`learning.starts`). The problem's parameters are those of the model alone, for any number of
+is that of Kaufman (`learning.motions`). The problem's parameters are those of the model alone, for any number of
 windows.
 
 Torque errors drive simulated motions off course. With `Noise.tau` every window has an unknown constant torque e_w and a
@@ -24,17 +24,16 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.data.arrays import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import GAP, window_indices
-from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
-from dln_jax.learning.starts import nearest, without_start
-from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
+from dln_jax.data.segments import GAP, window_indices
+from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
+from dln_jax.learning.motions import nearest, require_windows, weighted, without_start
+from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import looped_rk4
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import InputError, require_positive
 
 GAUGE_TOLERANCE = 0.01
 """Relative distance from a gauge that counts as one standard deviation; the fit meets the gauge exactly."""
@@ -143,10 +142,8 @@ def problem(
     """
     require_positive(substeps=substeps)
     d = windows.q.shape[2]
-    fitted, held_out = _arrays(windows, validation, noise)
-    if gauge is None and not np.any(windows.tau):
-        raise InputError("motions without torques fit any multiple of an energy; give a gauge")
-    check_gauge(gauge, d)
+    require_windows(windows, validation, noise_q=noise.q, noise_qd=noise.qd, noise_tau=noise.tau)
+    check_gauge(gauge, windows.tau, d)
 
     def first(window: tuple[Array, ...]) -> Array:
         _, q, qd, *_ = window
@@ -163,20 +160,18 @@ def problem(
         )
         return jnp.append(left, gauge_error(system, gauge))
 
-    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
+    def closest(parameters: Parameters, *window: Array) -> Array:
         system = dynamics(model.energies(parameters))
+        return error(system, nearest(lambda start: error(system, start, window), first(window)), window)
 
-        def closest(*window: Array) -> Array:
-            return error(system, nearest(lambda start: error(system, start, window), first(window)), window)
-
-        return unmonitored(mean_square(closest, held_out))
-
-    return Problem(residual, parameters, fitted, score, seed)
+    return selected_by(arrays_of(validation), residual, parameters, arrays_of(windows), seed, error=closest)
 
 
-def check_gauge(gauge: Gauge | None, d: int) -> None:
-    """Raises `InputError` for a gauge with another number of coordinates, or a mass that is not positive."""
+def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
+    """Raises `InputError` for motions without torques and gauge, or a gauge of another size or a mass <= 0."""
     if gauge is None:
+        if not np.any(tau):
+            raise InputError("motions without torques fit any multiple of an energy; give a gauge")
         return
     require_positive(gauge_mass=gauge.mass)
     if len(gauge.q) != d:
@@ -205,22 +200,8 @@ def _residual(
     start, push = start[: 2 * d], start[2 * d :]
     pushed = tau if noise.tau is None else tau + push
     states = motion(system, start, t, pushed, torque=torque, substeps=substeps)
-    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
-    errors = [size * (states[:, :d] - q) / jnp.asarray(noise.q)]
+    errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
     if noise.qd is not None:
-        errors.append(size * (states[:, d:] - qd) / jnp.asarray(noise.qd))
-    if noise.tau is not None:
-        errors.append(push / jnp.asarray(noise.tau))
-    return jnp.concatenate([jnp.ravel(each) for each in errors])
-
-
-def _arrays(windows: MeasuredWindows, validation: MeasuredWindows, noise: Noise) -> list[tuple[Array, ...]]:
-    for key, deviations in noise._asdict().items():
-        for deviation in np.ravel(deviations) if deviations is not None else ():
-            require_positive(**{f"noise_{key}": float(deviation)})
-    if not len(windows.t) or not len(validation.t):
-        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
-    return [
-        tuple(on_device(key, array, jnp.float64) for key, array in each._asdict().items())
-        for each in (windows, validation)
-    ]
+        errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
+    residual = weighted(weight, *errors)
+    return residual if noise.tau is None else jnp.concatenate([residual, push / jnp.asarray(noise.tau)])

@@ -1,31 +1,104 @@
-"""Model selection for one recording: fits candidates, most structured and cheapest first, and chooses one.
+"""Model selection by validation: the first of several candidates that no other betters significantly.
 
-Candidates are fitted to the training motions and compared on the validation motions by squared torque errors in units
-of the joints' variances, so that a wrist counts as much as a shoulder. The choice is the first candidate whose mean
-error no other betters by more than the standard error of their difference over time segments (`learning.growth`). The
-selection ends early if the errors equal the noise of the torques, or rounding, and when time is up.
+A larger network always fits its training samples better, and soon fits their noise. One candidate is better than
+another if its validation error is lower by more than the standard error of their paired difference over the validation
+samples (the one-standard-error rule of Breiman et al. 1984, paired). `grow` trains candidates of growing size.
+
+`select_model` fits models of one recording, most structured and cheapest first. They are compared on the validation
+motions by squared torque errors in units of the joints' variances, so that a wrist counts as much as a shoulder, and
+the differences are taken over time segments. The selection ends early if the errors equal the noise of the torques, or
+rounding, and when time is up.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.growth import Trial, segments, smallest_enough
-from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
+from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
 
+SEGMENT = 0.5
+"""Length in s of a segment whose mean error counts as one measurement: neighbouring samples are not independent."""
 EXACT = 1e-12
 """No further candidate is tried once the normalised error of every joint is below this."""
 LEAST_NOISE, MOST_NOISE = 0.5, 1.2
 """Range of a joint's error, relative to the noise's share of the torque's variance, that counts as that noise. A lower
 error shows that the estimate of the noise is wrong."""
+
+
+class Trial(NamedTuple):
+    """Candidate, outcome of its training, and validation errors."""
+
+    candidate: Any
+    outcome: Any
+    """First result of `fit`, for example a `Training`."""
+    errors: Float[np.ndarray, " N"]
+    """Squared error of every validation sample."""
+
+    @property
+    def validation(self) -> float:
+        """Mean squared error; inf if it is not finite."""
+        mean = float(np.mean(self.errors))
+        return mean if np.isfinite(mean) else float("inf")
+
+
+def significantly_better(errors: Float[np.ndarray, " N"], others: Float[np.ndarray, " N"]) -> bool:
+    """Whether `errors` are lower than `others` on average, by more than the standard error of the difference."""
+    if not np.isfinite(np.mean(errors)) or not np.isfinite(np.mean(others)):
+        return bool(np.isfinite(np.mean(errors)))
+    gain = others - errors
+    standard_error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return bool(gain.mean() > standard_error)
+
+
+def grow(
+    candidates: Iterable[Any],
+    fit: Callable[[Any], tuple[Any, Float[np.ndarray, " N"]]],
+    *,
+    patience: int = 2,
+    target: float | None = None,
+) -> tuple[Trial, list[Trial]]:
+    """Trains candidates in order, smallest first; returns the chosen trial and all trials.
+
+    The choice is the first candidate whose error no other betters significantly.
+
+    Args:
+        candidates: in order of size.
+        fit: candidate -> outcome, and the squared error of every validation sample.
+        patience: stop after this many candidates in a row without significant improvement.
+        target: mean squared error at which to stop at once.
+    """
+    trials: list[Trial] = []
+    best, waited = None, 0
+    for candidate in candidates:
+        trial = Trial(candidate, *fit(candidate))
+        trials.append(trial)
+        if best is None or significantly_better(trial.errors, best.errors):
+            best, waited = trial, 0
+        else:
+            waited += 1
+        if waited >= patience or (target is not None and trial.validation <= target):
+            break
+    return smallest_enough(trials), trials
+
+
+def smallest_enough(trials: Sequence[Trial]) -> Trial:
+    """Returns the first trial whose error no other betters significantly."""
+    lowest = min(trials, key=lambda trial: trial.validation)
+    return next(trial for trial in trials if not significantly_better(lowest.errors, trial.errors))
+
+
+def segments(data: Trajectories, seconds: float = SEGMENT) -> Int[np.ndarray, " N"]:
+    """Returns the index of every sample's time segment; segments end at the ends of trajectories."""
+    within = np.floor(data.t / seconds).astype(int)
+    within -= within.min()
+    _, numbers = np.unique(data.trajectory * (within.max() + 1) + within, return_inverse=True)
+    return numbers
 
 
 class FittedModel(NamedTuple):
@@ -100,8 +173,7 @@ def select_model(
     began, steps, ended = time.perf_counter(), [], ""
     scale = np.asarray(torque_scale(train))
     for candidate in candidates:
-        since = time.perf_counter()
-        left = seconds - (since - began)
+        left = seconds - (time.perf_counter() - began)
         if ended or (left <= 0 and any(step.fitted for step in steps)):
             ended = ended or "time is out"
             step = Assessment(candidate.name, None, None, None, 0.0, ended, tried=False)
@@ -121,16 +193,6 @@ def select_model(
     return Selection(best.candidate, best.outcome, tuple(steps), ended)
 
 
-def torque_errors(
-    model: Model, parameters: Parameters, data: Trajectories, scale: Float[np.ndarray, " d"]
-) -> Float[np.ndarray, "N d"]:
-    """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
-    with jax.enable_x64(True):
-        judge = jax.jit(lambda given, batch: residuals(TORQUE, model.energies(given), batch))
-        errors = np.asarray(judge(parameters, arrays(TORQUE, data, jnp.float64)))
-    return (errors / scale) ** 2
-
-
 def _tried(
     candidate: Candidate, left: float, scale: Float[np.ndarray, " d"], train: Trajectories, validation: Trajectories
 ) -> Assessment:
@@ -142,7 +204,7 @@ def _tried(
     spent = time.perf_counter() - since
     if isinstance(fitted, str):
         return Assessment(candidate.name, None, None, None, spent, fitted)
-    squares = torque_errors(fitted.model, fitted.parameters, validation, scale)
+    squares = squared_torque_errors(fitted.model, fitted.parameters, validation, scale)
     segment = segments(validation)
     counts = np.bincount(segment)
     errors = np.stack([np.bincount(segment, column) / counts for column in squares.T], axis=1)

@@ -13,20 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from dln_jax.data.arrays import on_device
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import segments
-from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.data.segments import segments
+from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, momentum_and_rest, window_weights
+from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, fit_momentum, momentum_and_rest, window_weights
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import InputError, require_positive
 
 
 class MomentumWindows(NamedTuple):
@@ -63,7 +62,7 @@ def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> Momen
 
 def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt: float) -> Array:
     """Residual of one window's equations [d], in N m or N."""
-    w, slope = (jnp.asarray(each) for each in window_weights(q.shape[0] - 1, dt))
+    w, slope = map(jnp.asarray, window_weights(q.shape[0] - 1, dt))
     p, rest = jax.vmap(lambda q, qd: momentum_and_rest(plant, q, qd))(q, qd)
     return w @ rest - slope @ p - impulse
 
@@ -86,7 +85,7 @@ def momentum_problem(
     """Builds the problem of fitting a model's parameters to windows, selected by validation windows, in float64.
 
     Args:
-        model: of energies in coordinates and velocities.
+        model: model of energies in coordinates and velocities.
         parameters: initial parameters.
         windows: windows to fit.
         validation: windows that select the parameters.
@@ -100,21 +99,16 @@ def momentum_problem(
         require_positive(unit=float(size))
     if windows.q.shape[1] != validation.q.shape[1]:
         raise InputError(
-            f"windows have {windows.q.shape[1]} samples, those for validation {validation.q.shape[1]}; cut both alike"
+            f"windows have {windows.q.shape[1]} samples, those for validation {validation.q.shape[1]}; cut both to one "
+            "length"
         )
     sizes = jnp.asarray(unit)
-    fitted, held_out = (
-        tuple(on_device(key, getattr(each, key), jnp.float64) for key in ("q", "qd", "impulse"))
-        for each in (windows, validation)
-    )
 
     def residual(parameters: Parameters, *window: Array) -> Array:
         return momentum_errors(dynamics(model.energies(parameters)), *window, dt=windows.dt) / sizes
 
-    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
-        return unmonitored(mean_square(lambda *window: residual(parameters, *window), held_out))
-
-    return Problem(residual, parameters, fitted, score, seed)
+    fitted, held_out = (arrays_of(part, ("q", "qd", "impulse")) for part in (windows, validation))
+    return selected_by(held_out, residual, parameters, fitted, seed)
 
 
 def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
@@ -124,7 +118,7 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     after it. The first torques of a trajectory, before the first command, are zero.
 
     Args:
-        data: with the commanded torques.
+        data: recording with commanded torques.
         delay: delay of the commands in samples.
 
     Raises:
@@ -140,32 +134,22 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     return data._replace(tau=acting)
 
 
-def delay_of_torques(model: Model, recording: Trajectories, *, most: int, window: float = WINDOW) -> int:
+def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> int:
     """Estimates the delay of torques in samples: the smallest residual of a model linear in its parameters decides.
 
     Args:
-        model: for example `models.make_trigonometric`.
+        model: model that is linear in its parameters, such as `models.make_trigonometric`.
         recording: q and the commanded torques.
         most: largest delay that is tried; the smallest is 0.
-        window: length of a window in s.
 
     Raises:
-        InputError: as for `smooth` and `cut_momentum_windows`.
+        InputError: as for `smooth` and `fit_momentum`.
     """
     smoothed = smooth(recording)
-    windows = cut_momentum_windows(smoothed.data, window=window)
-    zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, model.init(jax.random.key(0))))
-
-    def left(theta: Array, q: Array, qd: Array) -> Array:
-        return momentum_errors(dynamics(model.energies(unravel(theta))), q, qd, jnp.zeros(q.shape[1]), dt=windows.dt)
-
-    columns = np.asarray(jax.jit(jax.vmap(lambda q, qd: jax.jacrev(left)(zero, q, qd)))(windows.q, windows.qd))
     unit = np.asarray(torque_scale(smoothed.data))
-    A = (columns / unit[:, None]).reshape(-1, zero.size)
 
     def misfit(delay: int) -> float:
         late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
-        b = (cut_momentum_windows(late, window=window).impulse / unit).ravel()
-        return float(np.sum((A @ np.linalg.lstsq(A, b, rcond=None)[0] - b) ** 2))
+        return fit_momentum(model, late, noise=unit).residual
 
     return min(range(most + 1), key=misfit)

@@ -11,11 +11,18 @@ Free starts average out noise, whereas derivative matching evaluates the field a
 Windows never reach across a gap, that is, a time step of more than 1.5 times the median. Gauss-Newton solves for
 theta and all starts at once; its matrix has a row for every unknown. Adam, for networks that are too large for that,
 takes batches of windows, and the cost of its steps does not depend on the number of windows.
+
+`without_start` eliminates the unknowns z of one window from a residual with other parameters:
+
+    z(theta) = argmin over z of |r(theta, z)|²,   dr/dtheta = (1 - U Uᵀ) dr/dtheta at fixed z,   U a basis of dr/dz
+
+This is the derivative of Kaufman (1975, "A variable projection method for solving separable nonlinear least squares
+problems"), which omits a term that is small if the residual is.
 """
 
 import functools
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,19 +30,18 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.data.arrays import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import GAP, window_indices
-from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.data.segments import GAP, window_indices
+from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.mechanics.dynamics import Flow, PlainFlow
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.elimination import solve
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import InputError, require_positive
 
 START_STEPS = 3
-"""Gauss-Newton steps that fit the start of a validation window."""
+"""Gauss-Newton steps from the measured start of a window to the nearest one."""
 
 
 class Windows(NamedTuple):
@@ -55,9 +61,9 @@ class Weights(NamedTuple):
     """Standard deviations that divide the residuals; a larger one gives less weight."""
 
     state: tuple[float, ...] | float
-    """Of q and p, one number or 2 d; infinite for quantities that were not measured."""
+    """Standard deviations of q and p, one number or 2 d; infinite for quantities that were not measured."""
     rate: tuple[float, ...] | float | None = None
-    """Of qd and pd, one number or 2 d; `None` leaves measured rates out."""
+    """Standard deviations of qd and pd, one number or 2 d; `None` leaves measured rates out."""
 
 
 def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows:
@@ -77,11 +83,6 @@ def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows
     return Windows(t - t[:, :1], state, rate, weight)
 
 
-def take(windows: Windows, chosen: Sequence[int] | np.ndarray) -> Windows:
-    """Selects windows by index."""
-    return jax.tree.map(lambda array: array[np.asarray(chosen, int)], windows)
-
-
 def motion(field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int) -> Float[Array, "T two_d"]:
     """States (q, p) at the times t from `start` [2 d], by RK4."""
     d = start.shape[0] // 2
@@ -95,15 +96,18 @@ def window_residual(
     """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
     t, measured, weight, *rate = window
     states = motion(field, start, t, substeps=substeps)
-    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
-    errors = [size * (states - measured) / jnp.asarray(weights.state, start.dtype)]
+    errors = [(states - measured) / jnp.asarray(weights.state, start.dtype)]
     if weights.rate is not None:
-        d = start.shape[0] // 2
-        velocity, force = jax.vmap(field.rates)(states[:, :d], states[:, d:])
-        errors.append(
-            size * (jnp.concatenate([velocity, force], axis=1) - rate[0]) / jnp.asarray(weights.rate, start.dtype)
-        )
-    return jnp.concatenate([jnp.ravel(error) for error in errors])
+        q, p = jnp.split(states, 2, axis=1)
+        rates = jnp.concatenate(jax.vmap(field.rates)(q, p), axis=1)
+        errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
+    return weighted(weight, *errors)
+
+
+def weighted(weight: Array, *errors: Array) -> Array:
+    """Concatenates errors [T, n] of a window, weighted so that their squares sum to a mean over its samples."""
+    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
+    return jnp.concatenate([jnp.ravel(size * error) for error in errors])
 
 
 def problem(
@@ -113,22 +117,19 @@ def problem(
     validation: Windows,
     *,
     weights: Weights,
-    free_starts: bool = True,
     substeps: int = 4,
     seed: int = 0,
 ) -> Problem:
     """Builds the problem of fitting a model to windows, in float64, with parameters {"model": ..., "starts": ...}.
 
-    The validation windows select the parameters, by the distance of simulated motions; free starts are fitted there
-    too.
+    The validation windows select the parameters, by the distance of simulated motions after fitting their starts too.
 
     Args:
         model: a phase model with float64 parameters.
         parameters: initial parameters, for example from a fit of rates.
         windows: windows to fit.
         validation: windows that select the parameters.
-        weights: of the residuals.
-        free_starts: whether starts are unknowns; otherwise windows start at their measured states.
+        weights: standard deviations that divide the residuals.
         substeps: RK4 steps between two samples.
         seed: seed of the order of the windows.
 
@@ -140,21 +141,14 @@ def problem(
     error = functools.partial(window_residual, weights=weights, substeps=substeps)
 
     def residual(unknowns, index: Array, *window: Array) -> Array:
-        start = unknowns["starts"][index] if free_starts else window[1][0]
-        return error(flow(model.energies(unknowns["model"])), start, window)
+        return error(flow(model.energies(unknowns["model"])), unknowns["starts"][index], window)
 
-    def score(unknowns) -> tuple[Scalar, Scalar]:
-        field = flow(model.energies(unknowns["model"]))
+    def closest(unknowns, *window: Array) -> Array:
+        from_start = functools.partial(error, flow(model.energies(unknowns["model"])), window=window)
+        return from_start(nearest(from_start, window[1][0]))
 
-        def closest(*window: Array) -> Array:
-            from_start = functools.partial(error, field, window=window)
-            start = window[1][0]
-            return from_start(_nearest(from_start, start) if free_starts else start)
-
-        return unmonitored(mean_square(closest, held_out))
-
-    unknowns = {"model": parameters} | ({"starts": fitted[1][:, 0]} if free_starts else {})
-    return Problem(residual, unknowns, (jnp.arange(len(windows.t)), *fitted), score, seed)
+    unknowns = {"model": parameters, "starts": fitted[1][:, 0]}
+    return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
 
 
 def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
@@ -163,27 +157,48 @@ def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tupl
     Raises:
         InputError: as for `problem`.
     """
-    for deviation in np.ravel(weights.state):
-        require_positive(state_weight=float(deviation))
-    if weights.rate is not None:
-        for deviation in np.ravel(weights.rate):
-            require_positive(rate_weight=float(deviation))
-        if windows.rate is None or validation.rate is None:
-            raise InputError("the weights count rates, which the windows lack; leave their weight out")
+    require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
+    if weights.rate is not None and (windows.rate is None or validation.rate is None):
+        raise InputError("the weights count rates, which the windows lack; leave their weight out")
+    keys = ("t", "state", "weight", *(["rate"] if weights.rate is not None else []))
+    return [arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation)]
+
+
+def require_windows(windows: Any, validation: Any, **deviations: tuple[float, ...] | float | None) -> None:
+    """Raises `InputError` for a set without windows, or a standard deviation that is not positive."""
+    for name, values in deviations.items():
+        for deviation in np.ravel(values) if values is not None else ():
+            require_positive(**{name: float(deviation)})
     if not len(windows.t) or not len(validation.t):
         raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
-    keys = ("t", "state", "weight", *(["rate"] if weights.rate is not None else []))
-    return [
-        tuple(on_device(key, getattr(each, key), jnp.result_type(float)) for key in keys)
-        for each in (windows, validation)
-    ]
 
 
-def _nearest(residual: Callable[[Array], Array], start: Array) -> Array:
-    """Returns a start of lower residual, by a few steps of Gauss-Newton."""
+def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], Array], start: Array) -> Array:
+    """Returns the residual at its nearest start, with Kaufman's derivative by parameters that `frozen` holds constant.
 
-    def step(start: Array, _) -> tuple[Array, None]:
-        slope, value = jax.jacfwd(residual)(start), residual(start)
-        return start - solve(slope.T @ slope, slope.T @ value), None
+    Args:
+        frozen: start -> residual, with constant parameters.
+        residual: the same function, differentiable by the parameters.
+        start: initial value.
+    """
+    start, slope = jax.lax.stop_gradient(_descended(frozen, start, START_STEPS))
+    left = residual(start)
+    change = left - jax.lax.stop_gradient(left)  # zero, with the derivative of `left`
+    return left - slope @ solve(slope.T @ slope, slope.T @ change)
 
-    return jax.lax.scan(step, start, length=START_STEPS)[0]
+
+def nearest(residual: Callable[[Array], Array], start: Array, *, steps: int = START_STEPS) -> Array:
+    """Returns a start of lower residual, by steps of Gauss-Newton."""
+    return _descended(residual, start, steps)[0]
+
+
+def _descended(residual: Callable[[Array], Array], start: Array, steps: int) -> tuple[Array, Array]:
+    """Returns the start after some steps, and dr/dz at the beginning of the last one."""
+    linearised = jax.jacfwd(lambda start: (residual(start),) * 2, has_aux=True)
+
+    def step(at: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+        slope, value = linearised(at[0])
+        return (at[0] - solve(slope.T @ slope, slope.T @ value), slope), None
+
+    nothing = jnp.zeros((jax.eval_shape(residual, start).shape[0], start.shape[0]), start.dtype)
+    return jax.lax.scan(step, (start, nothing), length=steps)[0]

@@ -9,9 +9,11 @@ import numpy as np
 from jax import Array, vmap
 from jaxtyping import Float
 
-from dln_jax.data.arrays import on_device, spread
+from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
+from dln_jax.learning.engine.problem import arrays_of
 from dln_jax.mechanics.equations import Energies, System, driving_force, dynamics, hamiltonian_of
+from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Vector
 from dln_jax.zoo.catalogue import CATALOGUE
 
@@ -124,7 +126,7 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Ob
     """Returns the objective of a model of the catalogue; a Hamiltonian needs momenta, and otherwise fits torques.
 
     Args:
-        name: of the model.
+        name: name of the model in the catalogue.
         data: training data.
         stated: name from `STATED` that overrides the model's own objective.
 
@@ -150,12 +152,22 @@ def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array,
     missing = [key for key in objective.keys if getattr(data, key) is None]
     if missing:
         raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
-    return tuple(on_device(key, getattr(data, key), dtype) for key in objective.keys)
+    return arrays_of(data, objective.keys, dtype)
 
 
 def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
     """Residuals of a batch, in SI units."""
     return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
+
+
+def squared_torque_errors(
+    model: Model, parameters: Parameters, data: Trajectories, scale: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "N d"]:
+    """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
+    with jax.enable_x64(True):
+        judge = jax.jit(lambda theta, batch: residuals(TORQUE, model.energies(theta), batch))
+        errors = np.asarray(judge(parameters, arrays(TORQUE, data, jnp.float64)))
+    return (errors / scale) ** 2
 
 
 def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:

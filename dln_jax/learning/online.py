@@ -71,26 +71,22 @@ def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int
         InputError: numbers that are not finite, arrays of other shapes, or more samples than places.
     """
     require_positive(blocks=blocks)
-    used, arrays = replay.recorded, tuple(np.asarray(each, float) for each in (q, qd, qdd, tau))
+    used, arrays = replay.recorded, tuple(np.asarray(array, float) for array in (q, qd, qdd, tau))
     capacity, d = np.shape(replay.q)
     samples = len(arrays[0])
-    if any(each.shape != (samples, d) for each in arrays):
-        shapes = ", ".join(str(each.shape) for each in arrays)
+    if any(array.shape != (samples, d) for array in arrays):
+        shapes = ", ".join(str(array.shape) for array in arrays)
         raise InputError(f"q, qd, qdd and tau have shapes {shapes}; expected the same [n, {d}] for each")
-    if not all(np.isfinite(each).all() for each in arrays):
+    if not all(np.isfinite(array).all() for array in arrays):
         raise InputError("the recording has numbers that are not finite; leave those samples out")
     if used + samples > capacity:
         raise InputError(f"the replay has {capacity - used} empty places for {samples} samples; make it larger")
     places = slice(used, used + samples)
     held_out = (np.arange(samples) * blocks // max(samples, 1) == blocks // 2) & (samples >= blocks > 1)
-    rows = (*arrays, 1.0 - held_out, held_out.astype(float))
-    return Replay(*(_with_rows(old, places, new) for old, new in zip(replay, rows, strict=True)))
-
-
-def _with_rows(array: Any, places: slice, rows: np.ndarray) -> np.ndarray:
-    copy = np.array(array)
-    copy[places] = rows
-    return copy
+    longer = Replay(*map(np.array, replay))
+    for array, rows in zip(longer, (*arrays, 1.0 - held_out, held_out), strict=True):
+        array[places] = rows
+    return longer
 
 
 Refit = Callable[[Parameters, Replay], Parameters]
@@ -104,7 +100,7 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
     held-out samples, or on the fitted ones if none are held out.
 
     Args:
-        model: with parameters and energies in float64.
+        model: model with parameters and energies in float64.
         rounds: number of rounds.
         iterations: Levenberg-Marquardt iterations per round.
 
@@ -119,7 +115,7 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
     @partial(jax.jit, compiler_options=quick_compilation())
     def refit(parameters: Parameters, replay: Replay) -> Parameters:
         unit = _scale(replay)
-        fitted, held_out = (jnp.sqrt(each)[:, None] / unit for each in (replay.fitted, replay.held_out))
+        fitted, held_out = (jnp.sqrt(weight)[:, None] / unit for weight in (replay.fitted, replay.held_out))
         judged = jnp.where(jnp.sum(replay.held_out) > 0, held_out, fitted)
         samples = replay.q, replay.qd, replay.qdd, replay.tau
 
@@ -150,7 +146,7 @@ def make_linear_refit(model: Model, *, negligible: float = 1e-12) -> Refit:
 
     def refit(parameters: Parameters, replay: Replay) -> Parameters:
         zero = jax.tree.map(jnp.zeros_like, parameters)
-        columns, _ = columns_of(zero, *(jnp.asarray(each) for each in replay[:3]))
+        columns, _ = columns_of(zero, *map(jnp.asarray, replay[:3]))
         used = np.asarray(replay.fitted + replay.held_out) > 0
         unit = np.asarray(_scale(replay))
         left = (np.asarray(columns)[used] / unit[:, None]).reshape(-1, np.shape(columns)[-1])
@@ -191,9 +187,9 @@ def learn_online(
     Args:
         references: in the order in which they are driven; only `drive` reads them.
         drive: (parameters, reference) -> outcome, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
-        refit: from `make_refit` or `make_linear_refit`.
-        parameters: of the model that drives the first reference.
-        replay: with places for all recordings.
+        refit: result of `make_refit` or `make_linear_refit`.
+        parameters: parameters that drive the first reference.
+        replay: replay with places for all recordings.
 
     Raises:
         InputError: a recording that `appended` refuses.

@@ -17,8 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.solvers.least_squares import triangular_factor
-
 Rows = Iterator[tuple[np.ndarray, np.ndarray]]
 """Phi [n, d, P] and tau_hat - tau [n, d], some samples at a time."""
 ALONE = 1e-6
@@ -59,24 +57,24 @@ def spectrum(
     """Computes the spectrum of all rows; takes about N d P² operations, and memory for d P² numbers.
 
     Args:
-        rows: of the training data.
+        rows: columns and residuals of the training data.
         unit: scales by which the fit divided the joints' residuals.
         rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: as for `solvers.least_squares.solve`.
     """
     triangles, samples = _triangles(rows, len(unit))
-    squares = np.array([np.sum(each[:, -1] ** 2) for each in triangles])
-    weighted = [each[:, :-1] / size for each, size in zip(triangles, unit, strict=True)]
+    squares = np.array([np.sum(triangle[:, -1] ** 2) for triangle in triangles])
+    weighted = [triangle[:, :-1] / size for triangle, size in zip(triangles, unit, strict=True)]
     P = weighted[0].shape[1]
-    norms = np.sqrt(sum(np.sum(each**2, axis=0) for each in weighted))
+    norms = np.sqrt(sum(np.sum(triangle**2, axis=0) for triangle in weighted))
     seen = norms > negligible * norms.max(initial=0.0)
     scale = np.where(seen, norms, 1.0)
-    scaled = [np.where(seen, each, 0.0) / scale for each in weighted]
-    _, found, right = np.linalg.svd(np.linalg.qr(np.concatenate(scaled), mode="r"), full_matrices=True)
-    sizes = np.concatenate([found, np.zeros(P - len(found))])
+    scaled = [np.where(seen, triangle, 0.0) / scale for triangle in weighted]
+    _, sizes, right = np.linalg.svd(np.linalg.qr(np.concatenate(scaled), mode="r"), full_matrices=True)
+    sizes = np.concatenate([sizes, np.zeros(P - len(sizes))])
     tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P) if rank_tolerance is None else rank_tolerance
     sizes = np.where(sizes > tolerance * sizes.max(initial=0.0), sizes, 0.0)
-    return Spectrum(scale, sizes, right.T, [each @ right.T for each in scaled], squares, unit, samples)
+    return Spectrum(scale, sizes, right.T, [triangle @ right.T for triangle in scaled], squares, unit, samples)
 
 
 def left_out(
@@ -91,8 +89,8 @@ def left_out(
     ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
 
     Args:
-        spectrum: of all training data.
-        noise: from `posterior`.
+        spectrum: spectrum of all training data.
+        noise: standard deviations from `posterior`.
         columns: Phi D⁻¹ V of the samples.
         residual: tau_hat - tau of the samples.
     """
@@ -115,16 +113,14 @@ def left_out(
 
 def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:
     """Returns the triangular factors of the joints' [Phi_i r_i], and the number of samples."""
-    folded: list[np.ndarray | None] = [None] * d
+    folded: list[np.ndarray] = []
     samples = 0
     for columns, residual in rows:
         samples += len(residual)
-        for joint in range(d):
-            A, b = columns[:, joint], residual[:, joint]
-            if (above := folded[joint]) is not None:
-                A, b = np.concatenate([above[:, :-1], A]), np.concatenate([above[:, -1], b])
-            folded[joint] = triangular_factor(A, b)
-    return [each for each in folded if each is not None], samples
+        both = np.concatenate([columns, residual[:, :, None]], axis=2)
+        parts = [np.concatenate([*folded[joint : joint + 1], both[:, joint]]) for joint in range(d)]
+        folded = [np.linalg.qr(part, mode="r") for part in parts]
+    return folded, samples
 
 
 def leading_directions(
@@ -140,7 +136,7 @@ def leading_directions(
         unit: scales by which the fit divided the joints' residuals.
         count: K.
         passes: over the data; the first computes D.
-        seed: of the initial subspace.
+        seed: seed of the initial subspace.
     """
     squares = sum(np.sum((columns / unit[:, None]) ** 2, axis=(0, 1)) for columns, _ in rows())
     scale = np.sqrt(np.where(squares > 0, squares, 1.0))
@@ -158,8 +154,8 @@ def posterior(spectrum: Spectrum, ridge: float) -> Posterior:
     """Returns the posterior for a ridge; with 0, undetermined directions have no variance."""
     counts = (spectrum.sizes > 0) | (ridge > 0)
     damped = np.sqrt(spectrum.sizes[counts] ** 2 + ridge)
-    shares = [each[:, counts] / damped for each in spectrum.triangles]
-    dof = np.array([np.sum(each**2) for each in shares])
+    shares = [triangle[:, counts] / damped for triangle in spectrum.triangles]
+    dof = np.array([np.sum(share**2) for share in shares])
     noise = np.sqrt(spectrum.squares / np.maximum(spectrum.samples - dof, 1.0))
     relative = (noise / spectrum.unit) ** 2
     inner = np.diag(relative.mean() * ridge / damped**2)

@@ -23,22 +23,17 @@ from jaxtyping import Float
 
 from dln_jax.data.arrays import on_device
 from dln_jax.data.schema import Trajectories, momenta
-from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, mean_square, unmonitored
+from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, selected_by
 from dln_jax.mechanics.equations import flow
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
-from dln_jax.types import Scalar, require_positive, require_seed
+from dln_jax.types import require_positive, require_seed
 
 
 def residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
     """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d]; the sum of its squares is the sample's part of the loss."""
     velocity, force = flow(model.energies(parameters)).rates(q, p)
     return jnp.concatenate([velocity - qd, force - pd]) / math.sqrt(2 * q.shape[0])
-
-
-def loss(model: Model, parameters: Parameters, arrays: tuple[Array, ...]) -> Scalar:
-    """Mean square of rates - (qd, pd) over samples and components; the arrays are q, p, qd and pd, of shape [N, d]."""
-    return mean_square(functools.partial(residual, model, parameters), arrays)
 
 
 def problem(
@@ -48,9 +43,9 @@ def problem(
 
     Args:
         model: a phase model.
-        train: with p and pd.
+        train: trajectories with p and pd.
         validation: trajectories that select the parameters, with p and pd; `data.splits.hold_out` draws some.
-        seed: of the initial parameters, of the drawn samples, and of their order.
+        seed: seed of the initial parameters, of the drawn samples, and of their order.
         most_samples: largest number of samples to fit, and to validate; larger sets are drawn from.
 
     Raises:
@@ -62,11 +57,7 @@ def problem(
     dtype = jnp.result_type(*jax.tree.leaves(parameters))
     orders = (np.random.default_rng(seed).permutation(len(part.t))[:most_samples] for part in (train, validation))
     fitted, held_out = (samples(part, dtype, order) for part, order in zip((train, validation), orders, strict=True))
-
-    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
-        return unmonitored(loss(model, parameters, held_out))
-
-    return Problem(functools.partial(residual, model), parameters, fitted, score, seed)
+    return selected_by(held_out, functools.partial(residual, model), parameters, fitted, seed)
 
 
 def match_linear(
@@ -86,14 +77,14 @@ def match_linear(
         arrays = samples(data)
         design = np.asarray(jax.jit(jax.vmap(columns, in_axes=(None, 0, 0, 0, 0)))(zero, *arrays))
         target = -np.asarray(jax.jit(jax.vmap(functools.partial(residual, model, zero)))(*arrays))
-        found = least_squares.solve(design.reshape(-1, design.shape[-1]), target.ravel())
+        solution = least_squares.solve(design.reshape(-1, design.shape[-1]), target.ravel())
         seconds = time.perf_counter() - began
         judged = arrays if validation is None else samples(validation)
-        errors = jax.vmap(functools.partial(residual, model, jnp.asarray(found.x)))(*judged)
+        errors = jax.vmap(functools.partial(residual, model, jnp.asarray(solution.x)))(*judged)
         squares = np.sum(np.asarray(errors) ** 2, axis=1)
-    fitted = found.residual**2 / len(arrays[0])
+    fitted = solution.residual**2 / len(arrays[0])
     at = Progress(1, fitted, float(squares.mean()), float("nan"), seconds)
-    return Training(jnp.asarray(found.x), [at], Stop("finished", 1), 1, 0.0), squares
+    return Training(jnp.asarray(solution.x), [at], Stop("finished", 1), 1, 0.0), squares
 
 
 def samples(data: Trajectories, dtype: Any = jnp.float64, chosen: Any = slice(None)) -> tuple[Array, ...]:

@@ -26,7 +26,6 @@ from dln_jax.learning.momentum import (
     driven_torques,
     momentum_problem,
 )
-from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
@@ -50,8 +49,8 @@ FLOOR = 0.05
 """Lower bound on the diagonal of a network's Cholesky factor, relative to its typical size."""
 
 
-class Fitted(NamedTuple):
-    """Description and parameters of a model, as `zoo.run.save` stores them."""
+class FittedPlant(NamedTuple):
+    """Description and parameters of a plant's model, as `zoo.run.save` stores them."""
 
     description: Description
     parameters: Any
@@ -59,13 +58,12 @@ class Fitted(NamedTuple):
     @property
     def dynamics(self) -> Dynamics:
         """Dynamics of the model."""
-        found = dynamics(build(self.description).energies(self.parameters))
-        if not isinstance(found, Dynamics):
-            raise InputError(f"a {self.description['name']} has no energy; take a model that has")
-        return found
+        of_model = dynamics(build(self.description).energies(self.parameters))
+        assert isinstance(of_model, Dynamics)  # both models have energies
+        return of_model
 
 
-class Prepared(NamedTuple):
+class PreparedRecording(NamedTuple):
     """A recording that is ready for fits."""
 
     train: Trajectories
@@ -77,12 +75,12 @@ class Prepared(NamedTuple):
     """Cut-off frequency of the filter, Hz."""
 
 
-def prepare(recording: Trajectories, *, delay: int | None = None, validation: int | None = None) -> Prepared:
+def prepare(recording: Trajectories, *, delay: int | None = None, validation: int | None = None) -> PreparedRecording:
     """Computes rates and acting torques, and splits the episodes into those to fit and one for validation.
 
     Args:
-        recording: of several episodes, with its needs.
-        delay: of the torques, in samples (default: estimated).
+        recording: several episodes, with the needs of the plant.
+        delay: delay of the torques in samples (default: estimated).
         validation: index of the validation episode (default: the middle one).
 
     Raises:
@@ -101,62 +99,60 @@ def prepare(recording: Trajectories, *, delay: int | None = None, validation: in
         delay = delay_of_torques(build(_linear(recording.needs)), recording, most=MOST_DELAY)
     chosen = smooth(driven_torques(recording, delay=delay))
     rest = np.setdiff1d(present, held_out)
-    return Prepared(select(chosen.data, rest), select(chosen.data, [held_out]), delay, chosen.cutoff)
+    return PreparedRecording(select(chosen.data, rest), select(chosen.data, [held_out]), delay, chosen.cutoff)
+
+
+def _described(name: str, needs: Needs, **keywords: Any) -> Description:
+    return describe(name, precision="f64", needs=needs._replace(joint_friction=LAWS, friction=False), **keywords)
 
 
 def _linear(needs: Needs) -> Description:
-    return describe(
-        "trigonometric",
-        precision="f64",
-        needs=needs._replace(joint_friction=LAWS, friction=False),
-        degree=[DEGREES[joint] for joint in needs.joints],
-    )
+    return _described("trigonometric", needs, degree=[DEGREES[joint] for joint in needs.joints])
 
 
-def identified(data: Trajectories, needs: Needs) -> Fitted:
+def identified(data: Trajectories, needs: Needs) -> FittedPlant:
     """Fits the trigonometric model with viscous and dry friction; raises the errors of `fit_momentum`."""
     description = _linear(needs)
     model, windows = build(description), cut_momentum_windows(data)
-    unit = np.asarray(torque_scale(data))
-    found = fit_momentum(model, data, noise=unit)
+    plant = FittedPlant(description, fit_momentum(model, data).parameters)
     for _ in range(ROUNDS - 1):
-        unit = deviations(Fitted(description, found.parameters).dynamics, windows)
-        found = fit_momentum(model, data, noise=unit)
-    return Fitted(description, found.parameters)
+        noise = deviations(plant.dynamics, windows)
+        plant = plant._replace(parameters=fit_momentum(model, data, noise=noise).parameters)
+    return plant
 
 
 def learned(
-    prepared: Prepared, needs: Needs, *, steps: int = STEPS, seed: int = 0, report: Report = silent, **keywords: Any
-) -> Fitted:
+    prepared: PreparedRecording,
+    needs: Needs,
+    *,
+    steps: int = STEPS,
+    seed: int = 0,
+    report: Report = silent,
+    **keywords: Any,
+) -> FittedPlant:
     """Trains a structured DeLaN with viscous and dry friction and keeps the parameters that are best in validation.
 
     Args:
         prepared: the recording.
-        needs: of the plant.
+        needs: needs of the plant.
         steps: Gauss-Newton iterations.
-        seed: of the initial parameters.
+        seed: seed of the initial parameters.
         report: as for `learning.engine.fit`.
         keywords: width, depth and activation, as for `models.make_delan`.
 
     Raises:
         InputError: as for `fit`.
     """
-    windows, held_out = (cut_momentum_windows(each) for each in (prepared.train, prepared.validation))
+    windows, held_out = map(cut_momentum_windows, (prepared.train, prepared.validation))
     unit = deviations(identified(prepared.train, needs).dynamics, windows)
     size = _size_of_factor(prepared.train)
-    description = describe(
-        "structured-delan",
-        precision="f64",
-        needs=needs._replace(joint_friction=LAWS, friction=False),
-        diagonal_shift=_inverse_softplus(size),
-        diagonal_floor=FLOOR * size,
-        **{**NETWORK, **keywords},
-    )
+    diagonal = {"diagonal_shift": _inverse_softplus(size), "diagonal_floor": FLOOR * size}
+    description = _described("structured-delan", needs, **diagonal, **{**NETWORK, **keywords})
     model = build(description)
     start = _of_size(model.init(jax.random.key(seed)), size, torque=float(np.max(prepared.train.tau.std(axis=0))))
     problem = momentum_problem(model, start, windows, held_out, unit=unit, seed=seed)
     training = fit(problem, GaussNewton(steps=steps), report=report)
-    return Fitted(description, training.parameters)
+    return FittedPlant(description, training.parameters)
 
 
 def _size_of_factor(data: Trajectories) -> float:

@@ -38,7 +38,7 @@ class ObservedMotions(NamedTuple):
     """Positions after every step, in m; not finite for vertices that were not seen."""
 
 
-class Fitted(NamedTuple):
+class SoftBodyFit(NamedTuple):
     """Result of an identification or a design."""
 
     parameters: Any
@@ -58,15 +58,15 @@ def identify(
     noise: float = 1e-3,
     iterations: int = 30,
     mesh: Mesh | None = None,
-) -> Fitted:
+) -> SoftBodyFit:
     """Fits theta so that the simulated motions come closest to the observed ones.
 
     Args:
-        stepper: of `make_step`.
+        stepper: result of `make_step`.
         params_of: theta -> the scene's parameters.
         guess: initial theta, float64 arrays.
         motions: observed motions.
-        noise: of the positions, in m: the unit of the residuals.
+        noise: standard deviation of the positions, in m, which divides the residuals.
         iterations: largest number of Levenberg-Marquardt iterations.
         mesh: devices that share the motions; every device simulates its own.
 
@@ -77,9 +77,8 @@ def identify(
     init, step = stepper
 
     def residual(theta: Any, x0: Array, v0: Array, controls: Array, observed: Array) -> Array:
-        given = controls if controls.shape[1] else None
-        advance = functools.partial(step, params_of(theta))
-        _, x = rollout(advance, init(x0, v0), given, steps=observed.shape[0], observe=lambda state, info: state.x)
+        advance, inputs = functools.partial(step, params_of(theta)), controls if controls.shape[1] else None
+        _, x = rollout(advance, init(x0, v0), inputs, steps=observed.shape[0], observe=lambda state, info: state.x)
         return _seen_difference(x, observed) / noise
 
     residuals = spread(lambda theta, motions: jax.vmap(functools.partial(residual, theta))(*motions), mesh)
@@ -94,7 +93,7 @@ def design(
     *,
     noise: float = 1e-3,
     iterations: int = 30,
-) -> Fitted:
+) -> SoftBodyFit:
     """Finds theta (a rest shape, say) whose equilibrium is closest to the wanted positions.
 
     Held vertices stay where the scene's own rest shape has them; coordinates of `wanted` that are not finite do not
@@ -111,22 +110,21 @@ def design(
     return _fitted(residual, guess, iterations)
 
 
-def _seen_difference(x: Array, given: Array) -> Array:
+def _seen_difference(x: Array, observed: Array) -> Array:
     """Difference of positions, zero with finite derivatives where the observed ones are not finite."""
-    seen = jnp.isfinite(given)
-    return jnp.where(seen, x - jnp.where(seen, given, 0), 0)
+    seen = jnp.isfinite(observed)
+    return jnp.where(seen, x - jnp.where(seen, observed, 0), 0)
 
 
-def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int, mesh: Mesh | None = None) -> Fitted:
-    # Forward mode, because there are few parameters and thousands of residuals.
+def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int, mesh: Mesh | None = None) -> SoftBodyFit:
     solver = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+    # Forward mode, because there are few parameters and thousands of residuals.
+    settings = {"options": {"jac": "fwd"}, "max_steps": iterations, "throw": False}
 
     def solve(guess: Any) -> tuple[Any, Array, Array]:
-        found = optimistix.least_squares(
-            lambda theta, _: residual(theta), solver, guess, options={"jac": "fwd"}, max_steps=iterations, throw=False
-        )
-        misfit = jnp.sqrt(jnp.mean(residual(found.value) ** 2))
-        return found.value, misfit, found.stats["num_steps"]
+        solution = optimistix.least_squares(lambda theta, _: residual(theta), solver, guess, **settings)
+        misfit = jnp.sqrt(jnp.mean(residual(solution.value) ** 2))
+        return solution.value, misfit, solution.stats["num_steps"]
 
     theta, misfit, count = program(solve, mesh, compiler_options=quick_compilation())(guess)
-    return Fitted(local(theta, mesh), float(misfit), int(count))
+    return SoftBodyFit(local(theta, mesh), float(misfit), int(count))

@@ -1,7 +1,7 @@
 """Estimates the uncertainty of a fitted model from its training data, calibrated on validation trajectories.
 
-    found = estimate(model, parameters, train, validation, ridge=0.0)
-    torque_std = predictive(model, parameters, found.uncertainty.factor, found.uncertainty.noise)
+    uncertainty = estimate(model, parameters, train, validation, ridge=0.0).uncertainty
+    torque_std = predictive(model, parameters, uncertainty.factor, uncertainty.noise)
 
 The covariance of the parameters is that of the least-squares fit (`learning.posterior`). For models that are linear in
 them, as `fit_linear` fits them, `ridge=0.0` is exact. A network trained on torques is linearised about its parameters
@@ -32,8 +32,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import select
-from dln_jax.learning.linear import linearised_chunks
+from dln_jax.data.splits import select, select_samples
+from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, left_out, posterior, spectrum
 from dln_jax.models.model import Model, Parameters
@@ -55,6 +55,8 @@ HARMLESS = 0.01
 torque's standard deviation."""
 STILL = 1e-3
 """Range in rad, m, 1/s or 1/s² of a coordinate that rests in all data."""
+CHUNK = 256
+"""Samples per call of the program that linearises the model."""
 UPPER = 0.975
 """Quantile of two-sided bands of 95 %, by which `scatter` widens bands from few motions."""
 TINY = np.finfo(np.float64).tiny
@@ -95,7 +97,7 @@ def estimate(
         unit: scales by which the fit divided the joints' residuals, N m or N; by default `torque_scale`.
         rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: the value that `fit_linear` used.
-        quantile: of the data, for the thresholds of `outside`.
+        quantile: quantile of the data that sets the thresholds of `out_of_distribution`.
         margin: factor on the thresholds: held-out motions of the same kind go a little further.
 
     Raises:
@@ -116,21 +118,21 @@ def estimate(
             basis = None
         else:
             basis = leading_directions(lambda: _rows(model, parameters, thinned(train, MOST_SAMPLES)), unit, DIRECTIONS)
-        found = spectrum(
+        known = spectrum(
             _rows(model, parameters, train, basis), unit, rank_tolerance=rank_tolerance, negligible=negligible
         )
-        fitted = _along(found, _rows(model, parameters, thinned(train, MOST_SAMPLES), basis))[0]
-        judged, residual = _along(found, _rows(model, parameters, held_out, basis))
-        folds = [] if ridge != 0 else _left_out(model, parameters, train, found)
+        fitted = _along(known, _rows(model, parameters, thinned(train, MOST_SAMPLES), basis))[0]
+        judged, residual = _along(known, _rows(model, parameters, held_out, basis))
+        folds = [] if ridge != 0 else _left_out(model, parameters, train, known)
     tried = [
-        _calibrated(posterior(found, each), each, judged, residual, held_out.trajectory, folds)
-        for each in (RIDGES if ridge is None else (ridge,))
+        _calibrated(known, size, judged, residual, held_out.trajectory, folds)
+        for size in (RIDGES if ridge is None else (ridge,))
     ]
-    chosen = min(tried, key=lambda each: each.unlikeliness)
+    chosen = min(tried, key=lambda calibrated: calibrated.unlikeliness)
     along = chosen.posterior.along
     limits = np.concatenate([np.linalg.norm(part @ along, axis=2) for part in (fitted, judged)])
-    factor, scale = (found.directions @ along) / found.scale[:, None], found.scale
-    undetermined = found.directions[:, found.sizes == 0] if chosen.ridge == 0 else np.zeros((len(scale), 0))
+    factor, scale = (known.directions @ along) / known.scale[:, None], known.scale
+    undetermined = known.directions[:, known.sizes == 0] if chosen.ridge == 0 else np.zeros((len(scale), 0))
     if basis is not None:
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
     limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), TINY)
@@ -149,7 +151,7 @@ def calibration(
     """Returns (a, b) of a noise² + b variance for the residuals of one joint, and their mean negative log-likelihood.
 
     Args:
-        residual: of the validation, N m or N.
+        residual: residuals of the validation, N m or N.
         noise: standard deviation, of the training.
         variance: due to parameters.
         samples: number of independent residuals.
@@ -190,11 +192,11 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
         relative: residuals in units of their predicted standard deviations.
         trajectory: motion of every residual; with fewer than three motions the factor is 1.
     """
-    motions = [relative[trajectory == each] for each in np.unique(trajectory)]
+    motions = [relative[trajectory == index] for index in np.unique(trajectory)]
     if len(motions) < 3:
         return 1.0
-    M, squares = len(motions), np.array([np.mean(each**2) for each in motions])
-    n = 1 / np.mean([1 / effective_samples(each, np.zeros(len(each))) for each in motions])
+    M, squares = len(motions), np.array([np.mean(motion**2) for motion in motions])
+    n = 1 / np.mean([1 / effective_samples(motion, np.zeros(len(motion))) for motion in motions])
     chance = 2 / n * (1 + 2 * np.sqrt(2 / (M - 1) + 12 / (n * M)))
     beyond = np.var(squares, ddof=1) - chance * np.mean(squares) ** 2
     if not beyond > 0:
@@ -223,9 +225,8 @@ def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray)
 
 def thinned(data: Trajectories, most: int) -> Trajectories:
     """Returns at most `most` samples, evenly spaced."""
-    rows = np.unique(np.linspace(0, len(data.t) - 1, min(most, len(data.t))).round().astype(int))
-    keys = ("t", "q", "qd", "qdd", "tau", "trajectory")
-    return data._replace(**{key: getattr(data, key)[rows] for key in keys})
+    rows = np.linspace(0, len(data.t) - 1, min(most, len(data.t))).round().astype(int)
+    return select_samples(data, np.unique(rows))
 
 
 class _Calibrated(NamedTuple):
@@ -237,56 +238,56 @@ class _Calibrated(NamedTuple):
 
 
 def _calibrated(
-    found: Posterior,
+    known: Spectrum,
     ridge: float,
     rows: np.ndarray,
     residual: np.ndarray,
     trajectory: np.ndarray,
     folds: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
 ) -> _Calibrated:
-    variances = np.sum((rows @ found.along) ** 2, axis=2)
-    parts = [(residual, variances, trajectory), *folds]
-    residual, variances, trajectory = (np.concatenate(each) for each in zip(*parts, strict=True))
+    fitted = posterior(known, ridge)
+    variances = np.sum((rows @ fitted.along) ** 2, axis=2)
+    parts = zip((residual, variances, trajectory), *folds, strict=True)
+    residual, variances, trajectory = (np.concatenate(part) for part in parts)
     joints = [
         calibration(r, float(noise), variance, effective_samples(r / np.sqrt(noise**2 + variance), trajectory))
-        for r, noise, variance in zip(residual.T, found.noise, variances.T, strict=True)
+        for r, noise, variance in zip(residual.T, fitted.noise, variances.T, strict=True)
     ]
-    a, b, unlikeliness = (np.array(each) for each in zip(*joints, strict=True))
-    expected = np.maximum(a * found.noise**2 + b * variances, TINY)
-    factors = np.array([scatter(each, trajectory) for each in (residual / np.sqrt(expected)).T])
-    a, b = factors * a, factors * b
-    return _Calibrated(found, ridge, np.sqrt(a) * found.noise, b, float(unlikeliness.mean()))
+    a, b, unlikeliness = np.array(joints).T
+    expected = np.maximum(a * fitted.noise**2 + b * variances, TINY)
+    factors = np.array([scatter(relative, trajectory) for relative in (residual / np.sqrt(expected)).T])
+    return _Calibrated(fitted, ridge, np.sqrt(factors * a) * fitted.noise, factors * b, float(unlikeliness.mean()))
 
 
 def _left_out(
-    model: Model, parameters: Parameters, train: Trajectories, found: Spectrum
+    model: Model, parameters: Parameters, train: Trajectories, known: Spectrum
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Residuals, variances and trajectories of training data as if held out, a fold of trajectories at a time."""
-    noise, present = posterior(found, 0.0).noise, np.unique(train.trajectory)
+    noise, present = posterior(known, 0.0).noise, np.unique(train.trajectory)
     if len(present) < 2:
         return []
     folds = []
     for indices in np.array_split(present, min(FOLDS, len(present))):
         data = select(train, indices)
-        columns, residual = _along(found, _rows(model, parameters, data))
-        folds.append((*left_out(found, noise, columns, residual), data.trajectory))
+        columns, residual = _along(known, _rows(model, parameters, data))
+        folds.append((*left_out(known, noise, columns, residual), data.trajectory))
     return folds
 
 
 def _rows(model: Model, parameters: Parameters, data: Trajectories, basis: np.ndarray | None = None) -> Rows:
-    for columns, tau, measured in linearised_chunks(model, parameters, data):
+    for columns, tau, measured in design_chunks(design(model), parameters, data, CHUNK, even=False):
         yield columns if basis is None else columns @ basis, tau - measured
 
 
-def _along(found: Spectrum, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+def _along(known: Spectrum, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     """Phi D⁻¹ V [N, d, P] and the residuals [N, d] of some data."""
-    parts = [(columns / found.scale @ found.directions, residual) for columns, residual in rows]
+    parts = [(columns / known.scale @ known.directions, residual) for columns, residual in rows]
     columns, residuals = zip(*parts, strict=True)
     return np.concatenate(columns), np.concatenate(residuals)
 
 
 def _reach(train: Trajectories, validation: Trajectories, quantile: float) -> tuple[np.ndarray, np.ndarray]:
     """Middle of the range of (q, qd, qdd) in training, and the quantile of all data's distance from it, both [3 d]."""
-    states, others = (np.concatenate([each.q, each.qd, each.qdd], axis=1) for each in (train, validation))
+    states, others = (np.concatenate([data.q, data.qd, data.qdd], axis=1) for data in (train, validation))
     centre = (states.max(axis=0) + states.min(axis=0)) / 2
     return centre, np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)

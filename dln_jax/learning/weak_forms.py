@@ -8,8 +8,7 @@ the rest of the Coriolis forces. Multiplied by a window w(t) that is zero at bot
 (modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987.) Both sides are linear in
 the parameters, with one equation per joint and window. No acceleration appears, whose noise grows with the square of
 the frequency. Both sides pass through the same low-pass, so that dry friction is not distorted, and the result hardly
-depends on the cut-off of q. The energy E = T + V satisfies the same form with the power of motors and of friction
-(Gautier and Khalil 1988), qdᵀ tau = dE/dt + qdᵀ dD/dqd: one equation for all joints, cheaper but with less information.
+depends on the cut-off of q. `fit_form` fits other equations of that kind.
 
 The windows are sin⁴ (pi t / W), with weights that make plain sums over samples exact to the smoothness of the motion.
 """
@@ -28,7 +27,8 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.sampling import EVEN
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import segments
+from dln_jax.data.segments import segments
+from dln_jax.learning.linear import unravelled
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
@@ -58,9 +58,11 @@ class WeakFit(NamedTuple):
     """Number of windows, times the number of joints for the momentum."""
     mse: float
     """Mean over windows of the squared error of the mean torque, summed over joints, or of the power; (N m)² or W²."""
+    residual: float
+    """Root of the sum of squares of all equations, divided by the deviations of the noise [1]."""
 
 
-class _Form(NamedTuple):
+class Form(NamedTuple):
     """Equations of the windows: `right` = d/dt of the first of `left` + the second."""
 
     left: Callable[[Dynamics, Vector, Vector], tuple[Array, Array]]
@@ -77,9 +79,7 @@ def fit_momentum(
     *,
     window: float = WINDOW,
     noise: Float[np.ndarray, " d"] | None = None,
-    ridge: float = 0.0,
-    rank_tolerance: float | None = None,
-    negligible: float = 0.0,
+    **tolerances: Any,
 ) -> WeakFit:
     """Fits the momenta of windows by least squares, in float64; qdd is not read.
 
@@ -90,84 +90,53 @@ def fit_momentum(
         window: length in s, at least `FEWEST` steps.
         noise: standard deviations of the torques' noise, by which the equations are divided (default: those of the
             torques themselves).
-        ridge: as in `solvers.least_squares.solve`, like `rank_tolerance` and `negligible`.
+        tolerances: ridge, rank_tolerance and negligible of `solvers.least_squares.solve`.
 
     Raises:
         InputError: steps that are not equal, no segment as long as a window, torques that do not vary, or settings out
             of range.
     """
-    form = _Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
-    tolerances = {"ridge": ridge, "rank_tolerance": rank_tolerance, "negligible": negligible}
-    return _fit(model, data, form, window, noise, tolerances)
+    form = Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
+    return fit_form(form, model, data, window=window, noise=noise, **tolerances)
 
 
-def fit_energy(
+def fit_form(
+    form: Form,
     model: Model,
     data: Trajectories,
     *,
     window: float = WINDOW,
     noise: Float[np.ndarray, " d"] | None = None,
-    ridge: float = 0.0,
-    rank_tolerance: float | None = None,
-    negligible: float = 0.0,
+    **tolerances: Any,
 ) -> WeakFit:
-    """Fits the energies of windows by least squares; arguments and errors as for `fit_momentum`."""
-    form = _Form(
-        energy_and_loss,
-        lambda qd, tau: np.sum(qd * tau, axis=1, keepdims=True),
-        lambda qd, noise: np.linalg.norm(qd * noise, axis=1, keepdims=True),
-    )
-    tolerances = {"ridge": ridge, "rank_tolerance": rank_tolerance, "negligible": negligible}
-    return _fit(model, data, form, window, noise, tolerances)
-
-
-def _fit(
-    model: Model,
-    data: Trajectories,
-    form: _Form,
-    window: float,
-    noise: Float[np.ndarray, " d"] | None,
-    tolerances: dict[str, Any],
-) -> WeakFit:
+    """Fits any equations of windows; arguments and errors as for `fit_momentum`."""
     require_positive(window=window)
+    d, like = data.degrees_of_freedom, _shapes(model)
     with jax.enable_x64(True):
-        zero, unravel = ravel_pytree(model.init(jax.random.key(0)))
-        zero = jnp.zeros(zero.shape, jnp.float64)
         scale = np.asarray(torque_scale(data)) if noise is None else np.asarray(noise, float)
-        if scale.shape != (data.degrees_of_freedom,) or not (scale > 0).all():
-            raise InputError(
-                f"noise is {scale}; expected a positive number for each of {data.degrees_of_freedom} joints"
-            )
-        equations = list(_equations(model, unravel, zero, data, form, scale, window))
+        if scale.shape != (d,) or not (scale > 0).all():
+            raise InputError(f"noise is {scale}; expected a positive number for each of {d} joints")
+        equations = list(_equations(_columns(form.left, model), data, form, scale, window))
     if not equations:
         raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
-    weighted = ((_divided(A, unit).reshape(-1, zero.size), (b / unit).ravel()) for A, b, unit in equations)
+    weighted = (((A / unit[..., None]).reshape(b.size, -1), (b / unit).ravel()) for A, b, unit in equations)
     solution = least_squares.solve_chunks(weighted, **tolerances)
     squares = sum(float(np.sum((A @ solution.x - b) ** 2)) for A, b, _ in equations)
-    windows = sum(len(b) for _, b, _ in equations)
     return WeakFit(
-        parameters=unravel(jnp.asarray(solution.x, zero.dtype)),
-        parameter_count=zero.size,
+        parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), unravelled(solution.x, like), like),
+        parameter_count=solution.x.size,
         rank=solution.rank,
         condition=solution.condition,
         equations=sum(b.size for _, b, _ in equations),
-        mse=squares / windows,
+        mse=squares / sum(len(b) for _, b, _ in equations),
+        residual=solution.residual,
     )
-
-
-def _divided(A: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    return A / unit[..., None]
 
 
 def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
     """p = M qd and s = tau(q, qd, 0) - dM/dt qd of one state: tau = dp/dt + s."""
     p, change = jax.jvp(lambda place: plant.mass_matrix(place) @ qd, (q,), (qd,))
     return p, plant.inverse_dynamics(q, qd, jnp.zeros_like(qd)) - change
-
-
-def energy_and_loss(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-    """E = T + V and the power lost to friction, of one state: qdᵀ tau = dE/dt + loss."""
-    return plant.energy(q, qd)[None], (qd @ plant.friction(q, qd))[None]
 
 
 def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -177,25 +146,33 @@ def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return w / w.sum(), slope / w.sum()
 
 
+@functools.lru_cache(maxsize=4)
+def _columns(left: Callable[..., tuple[Array, Array]], model: Model) -> Callable[..., Array]:
+    """(q, qd as [N, d]) -> derivatives [N, 2 k, P] of both parts of `Form.left`, compiled."""
+    zero, unravel = ravel_pytree(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), _shapes(model)))
+
+    def columns(q: Vector, qd: Vector) -> Array:
+        def both(theta: Array) -> Array:
+            return jnp.concatenate(left(dynamics(model.energies(unravel(theta))), q, qd))
+
+        values, pull_back = jax.vjp(both, zero)
+        return jax.vmap(pull_back)(jnp.eye(values.shape[0], dtype=values.dtype))[0]
+
+    return jax.jit(jax.vmap(columns), compiler_options=quick_compilation())
+
+
+def _shapes(model: Model) -> Parameters:
+    return jax.eval_shape(model.init, jax.random.key(0))
+
+
 def _equations(
-    model: Model,
-    unravel: Any,
-    zero: Array,
+    program: Callable[..., Array],
     data: Trajectories,
-    form: _Form,
+    form: Form,
     noise: Float[np.ndarray, " d"],
     window: float,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Columns [W, k, P], right-hand sides and their deviations [W, k] of windows, one chunk after the other."""
-
-    def both(theta: Parameters, q: Vector, qd: Vector) -> Array:
-        return jnp.concatenate(form.left(dynamics(model.energies(unravel(theta))), q, qd))
-
-    def columns(q: Vector, qd: Vector) -> Array:
-        values, pull_back = jax.vjp(functools.partial(both, q=q, qd=qd), zero)
-        return jax.vmap(pull_back)(jnp.eye(values.shape[0], dtype=values.dtype))[0]
-
-    program = jax.jit(jax.vmap(columns), compiler_options=quick_compilation())
     pieces = segments(data.t, data.trajectory)
     length = min(CHUNK, max(len(piece) for piece in pieces))
     for piece in pieces:
@@ -211,13 +188,13 @@ def _equations(
         for begin in range(0, len(piece) - steps, max(1, length - steps)):
             mine = starts[(starts >= begin) & (starts < begin + max(1, length - steps))]
             rows = piece[np.minimum(np.arange(begin, begin + max(length, steps + 1)), len(piece) - 1)]
-            found = np.asarray(program(data.q[rows], data.qd[rows]))
-            k = found.shape[1] // 2
+            values = np.asarray(program(data.q[rows], data.qd[rows]))
+            k = values.shape[1] // 2
             A, b, unit = [], [], []
             for start in mine:
                 part = slice(start - begin, start - begin + steps + 1)
                 qd, tau = data.qd[rows[part]], data.tau[rows[part]]
-                A.append(np.tensordot(w, found[part, k:], 1) - np.tensordot(slope, found[part, :k], 1))
+                A.append(np.tensordot(w, values[part, k:], 1) - np.tensordot(slope, values[part, :k], 1))
                 b.append(w @ form.right(qd, tau))
                 unit.append(np.sqrt(w**2 @ form.noise(qd, noise) ** 2))
             if A:

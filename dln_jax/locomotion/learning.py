@@ -193,6 +193,6 @@ def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -
     manifest = checkpoints.load_manifest(directory, name)
     if manifest.get("settings") != finite_values(identity["settings"]):
         raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
-    rows = stored_rows(directory / f"{name}.json", manifest, "records", (int, float, float | None, int))
+    rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int])
     records = [Record(steps, seconds, math.nan if d is None else d, n) for steps, seconds, d, n in rows]
     return checkpoints.load_tree(directory, name, like), records

@@ -17,19 +17,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import GAP
-from dln_jax.learning import motions, starts
+from dln_jax.data.segments import GAP
+from dln_jax.learning import motions
 from dln_jax.learning.measured_motions import MeasuredWindows, motion
-from dln_jax.learning.starts import nearest
-from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
-from dln_jax.mechanics.dynamics import Dynamics, InverseForward
+from dln_jax.learning.motions import nearest
+from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
+from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.integrators import looped_rk4
 from dln_jax.metrics.rollouts import valid_prediction_time
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
-START_STEPS = 2 * starts.STEPS
+START_STEPS = 2 * motions.START_STEPS
 """Gauss-Newton steps to the initial state of a prediction."""
 
 

@@ -1,9 +1,9 @@
 """Models: energies built from networks and bases for the needs of a scene."""
 
 from dln_jax.models.baselines import make_feed_forward, make_phase_network
-from dln_jax.models.dissipative import make_dissipative
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,
+    make_dissipative,
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )

@@ -1,26 +1,33 @@
-"""Baselines without physics: networks for inverse and forward dynamics, or for the rates of a phase space.
+"""Networks for inverse and forward dynamics, and for the rates of a phase space.
 
     tau = tau_scale network([features(q), qd / rate_scale, qdd / acceleration_scale])
     qdd = acceleration_scale network([features(q), qd / rate_scale, tau / tau_scale])
     (qd, pd) = rate_scale network([features(q), p / momentum_scale])
+    (qd, pd) = J grad H + grad F,   J grad H = (dH/dp, -dH/dq),   grad F = (dF/dq, dF/dp)
 
-The first two are separate networks, so one need not invert the other. The last is the baseline of Greydanus, Dzamba and
-Yosinski (2019). There is no energy, no mass matrix and no decomposition of forces, so an absent force saves nothing.
+The first two are separate networks, so one need not invert the other. The third is the baseline of Greydanus, Dzamba
+and Yosinski (2019). These three have no energy, no mass matrix and no decomposition of forces, so an absent force saves
+nothing.
+
+The last one is a Helmholtz decomposition, published in the same paper with the same canonical J and the same names. The
+solenoidal part J grad H has no divergence and conserves H, the conservative part grad F has no rotation. H and F are
+networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): that of
+a damped spring is F = -½ c p². Fields of harmonic functions have neither divergence nor rotation and may be in either
+part.
 """
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
-from jax import Array
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
-from dln_jax.models.model import Model, model_of
-from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, unsaturated
+from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.models.model import Model, Scale, inputs_of, model_of, per_coordinate, perceptrons, unsaturated
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.nn.activations import activation as activation_of
-from dln_jax.sizes import require_network
-from dln_jax.types import Needs, Vector
+from dln_jax.types import InputError, Needs, Scalar, Vector
+
+FIELDS = ("solenoidal", "conservative", "both")
 
 
 def make_feed_forward(
@@ -42,15 +49,14 @@ def make_feed_forward(
         tau_scale: typical size of tau.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
-    require_network(width=width, depth=depth)
-    activation = activation_of(activation)
+    networks = perceptrons(width, depth, activation)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     accelerations = per_coordinate(needs, "acceleration_scale", acceleration_scale)
     forces = per_coordinate(needs, "tau_scale", tau_scale)
 
     def network(name: str, sizes: tuple[float, ...], output: tuple[float, ...], q: Vector, qd: Vector, x: Vector):
-        inputs = jnp.concatenate([joint_features(needs, q), _scaled(qd, rates), _scaled(x, sizes)])
-        return jnp.asarray(output, qd.dtype) * perceptron(name, width, depth, len(output), activation)(inputs)
+        inputs = inputs_of(needs, q, (unsaturated(qd), rates), (unsaturated(x), sizes))
+        return jnp.asarray(output, qd.dtype) * networks(name, len(output))(inputs)
 
     terms = {
         "inverse_dynamics": partial(network, "inverse", accelerations, forces),
@@ -76,19 +82,63 @@ def make_phase_network(
         rate_scale: typical size of qd and pd.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
-    require_network(width=width, depth=depth)
-    activation = activation_of(activation)
+    networks = perceptrons(width, depth, activation)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     d = needs.degrees_of_freedom
 
     def network(q: Vector, p: Vector):
-        inputs = jnp.concatenate([joint_features(needs, q), _scaled(p, momenta)])
-        outputs = perceptron("rates", width, depth, 2 * d, activation)(inputs) * jnp.asarray(rates * 2, p.dtype)
+        outputs = networks("rates", 2 * d)(inputs_of(needs, q, (unsaturated(p), momenta))) * jnp.asarray(
+            rates * 2, p.dtype
+        )
         return outputs[:d], outputs[d:]
 
     return model_of(PhaseRates, lambda: {"rates": network}, d, dtype)
 
 
-def _scaled(x: Vector, sizes: tuple[float, ...]) -> Array:
-    return unsaturated(x / jnp.asarray(sizes, x.dtype))
+def make_helmholtz(
+    needs: Needs,
+    *,
+    field: str = "both",
+    width: int = 64,
+    depth: int = 2,
+    activation: Activation | str = tanh,
+    momentum_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """Returns the (init, energies) pair of a field of rates; H of a solenoidal part is the energy of its flow.
+
+    Args:
+        field: parts of the field: "solenoidal" is a Hamiltonian network, "conservative" a gradient, or "both".
+        momentum_scale: typical size of p, by which the networks' input is divided.
+        needs, width, depth, activation, dtype: as described in `models.model`; friction in the needs has no effect.
+
+    Raises:
+        InputError: an unknown field, or numbers that are not positive.
+    """
+    if field not in FIELDS:
+        raise InputError(f"field is {field!r}; expected one of {', '.join(FIELDS)}")
+    networks = perceptrons(width, depth, activation)
+    momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
+
+    def scalar(name: str, q: Vector, p: Vector) -> Scalar:
+        return networks(name, 1)(inputs_of(needs, q, (p, momenta)))[0]
+
+    def record(hamiltonian=None, potential=None) -> PhaseRates:
+        def rates(q: Vector, p: Vector) -> tuple[Vector, Vector]:
+            qd, pd = jnp.zeros_like(q), jnp.zeros_like(p)
+            if hamiltonian is not None:
+                force, velocity = jax.grad(hamiltonian, argnums=(0, 1))(q, p)
+                qd, pd = velocity, -force
+            if potential is not None:
+                along_q, along_p = jax.grad(potential, argnums=(0, 1))(q, p)
+                qd, pd = qd + along_q, pd + along_p
+            return qd, pd
+
+        return PhaseRates(rates, hamiltonian)
+
+    terms = {
+        "hamiltonian": None if field == "conservative" else partial(scalar, "hamiltonian"),
+        "potential": None if field == "solenoidal" else partial(scalar, "potential"),
+    }
+    return model_of(record, lambda: terms, needs.degrees_of_freedom, dtype)

@@ -1,8 +1,9 @@
-"""Hamiltonian neural networks, structured, black-box and separable.
+"""Hamiltonian neural networks, structured, black-box and separable, and their dissipation.
 
-    structured:  H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
-    black-box:   H = network([features(q), p / momentum_scale])
-    separable:   H = T(p / momentum_scale) + V(features(q)), with two networks
+    structured:   H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
+    black-box:    H = network([features(q), p / momentum_scale])
+    separable:    H = T(p / momentum_scale) + V(features(q)), with two networks
+    dissipative:  D = ½ sum_j c_j(q) qd_j²,   c = softplus(network(features(q))) > 0,   dH/dt = -2 D <= 0
 
 The black-box model is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured one
 follows Lutter and Peters 2021, whose network gives the inverse mass matrix, and the separable one Chen et al. 2020,
@@ -15,17 +16,27 @@ any kinetic energy of p.
 
 from functools import partial
 
+import haiku as hk
+import jax
 import jax.numpy as jnp
+from jax import Array
 from jax.typing import DTypeLike
 
+from dln_jax.mechanics.equations import Canonical
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
-from dln_jax.mechanics.natural import NaturalHamiltonian
-from dln_jax.models.lagrangian import one_network, structured_networks
-from dln_jax.models.model import Model, model_of
-from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.models.lagrangian import black_box_terms, structured_terms
+from dln_jax.models.model import (
+    Model,
+    Parameters,
+    Scale,
+    joint_features,
+    model_of,
+    per_coordinate,
+    perceptrons,
+    viscous_dissipation,
+)
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.nn.activations import activation as activation_of
-from dln_jax.sizes import require_network
 from dln_jax.types import Needs, Scalar, Vector, require_positive
 
 
@@ -46,11 +57,8 @@ def make_structured_hamiltonian(
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M⁻¹.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
-    require_network(width=width, depth=depth)
-    activation = activation_of(activation)
-    terms = partial(
-        structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, factor="inverse_factor"
-    )
+    networks = perceptrons(width, depth, activation)
+    terms = partial(structured_terms, needs, networks, "inverse_factor", diagonal_shift, diagonal_floor)
     return model_of(NaturalHamiltonian, terms, needs.degrees_of_freedom, dtype)
 
 
@@ -77,11 +85,9 @@ def make_black_box_hamiltonian(
         initial_guess: (q, qd) -> initial p [d] of these steps; zero by default.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
-    require_network(width=width, depth=depth)
     require_positive(iterations=iterations)
-    activation = activation_of(activation)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
-    terms = partial(one_network, needs, "hamiltonian", width, depth, activation, momenta)
+    terms = partial(black_box_terms, needs, perceptrons(width, depth, activation), "hamiltonian", momenta)
     record = partial(HamiltonianSystem, iterations=iterations, initial_guess=initial_guess)
     return model_of(record, terms, needs.degrees_of_freedom, dtype)
 
@@ -97,26 +103,19 @@ def make_separable_hamiltonian(
     initial_guess: Guess | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Returns the (init, energies) pair of T(p) + V(q).
+    """Returns the (init, energies) pair of T(p) + V(q), without V if there is no gravity.
 
-    Without gravity there is no V. Momenta and activation are as for `make_black_box_hamiltonian`.
-
-    Args:
-        momentum_scale: typical size of p, by which the network's input is divided.
-        iterations: Newton steps to p(qd), as in `mechanics.hamiltonian.conjugate`.
-        initial_guess: (q, qd) -> initial p [d] of these steps; zero by default.
-        needs, width, depth, activation, dtype: as described in `models.model`.
+    Arguments and the activation are as for `make_black_box_hamiltonian`; `initial_guess` gives p(qd).
     """
-    require_network(width=width, depth=depth)
-    activation = activation_of(activation)
     require_positive(iterations=iterations)
+    networks = perceptrons(width, depth, activation)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
 
     def kinetic(p: Vector) -> Scalar:
-        return perceptron("kinetic", width, depth, 1, activation)(p / jnp.asarray(momenta, p.dtype))[0]
+        return networks("kinetic", 1)(p / jnp.asarray(momenta, p.dtype))[0]
 
     def potential(q: Vector) -> Scalar:
-        return perceptron("potential", width, depth, 1, activation)(joint_features(needs, q))[0]
+        return networks("potential", 1)(joint_features(needs, q))[0]
 
     def energies(kinetic, potential=None, dissipation=None) -> HamiltonianSystem:
         def total(q: Vector, p: Vector) -> Scalar:
@@ -130,3 +129,49 @@ def make_separable_hamiltonian(
         "dissipation": viscous_dissipation if needs.friction else None,
     }
     return model_of(energies, lambda: terms, needs.degrees_of_freedom, dtype)
+
+
+def make_dissipative(
+    model: Model,
+    needs: Needs,
+    *,
+    width: int = 8,
+    depth: int = 1,
+    activation: Activation | str = tanh,
+    initial_friction: float = 0.05,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """Adds friction that depends on q to a Hamiltonian `Model`, so that it loses energy for any parameters.
+
+    Args:
+        model: conservative, built for needs without friction.
+        needs: needs of the scene; without friction nothing is added.
+        initial_friction: approximate initial value of c, in N m s or N s/m.
+        width, depth, activation, dtype: keywords of the network for c, as described in `models.model`.
+
+    Raises:
+        InputError: a width, depth or friction that is not positive.
+    """
+    networks = perceptrons(width, depth, activation)
+    require_positive(initial_friction=initial_friction)
+    if not needs.friction:
+        return model
+    d = needs.degrees_of_freedom
+    shift = jnp.log(jnp.expm1(jnp.asarray(initial_friction, dtype)))
+
+    @hk.without_apply_rng
+    @hk.transform
+    def coefficients(q: Vector) -> Vector:
+        return jax.nn.softplus(networks("friction", d)(joint_features(needs, q)) + shift)
+
+    def init(key: Array) -> Parameters:
+        first, second = jax.random.split(key)
+        return {"energy": model.init(first), "friction": coefficients.init(second, jnp.zeros(d, dtype))}
+
+    def energies(parameters: Parameters) -> Canonical:
+        def dissipation(q: Vector, qd: Vector) -> Scalar:
+            return 0.5 * jnp.sum(coefficients.apply(parameters["friction"], q) * qd**2)
+
+        return model.energies(parameters["energy"])._replace(dissipation=dissipation)
+
+    return Model(init, energies)

@@ -56,13 +56,13 @@ def with_joint_friction(
     """Returns the model with joint friction, with parameters {"model": its own, "friction": `FrictionParameters`}.
 
     Args:
-        model: of coordinates, of a phase space, or without an energy; built for needs without joint friction.
+        model: model of coordinates, of a phase space, or without an energy; built for needs without joint friction.
         needs: `joint_friction` names the laws, `joint_map` maps coordinates to joints, and `velocity_scale` is that of
             dry friction. Without laws the model is returned unchanged.
         linear: keeps a model linear in its parameters.
         shape: initial values of learned shapes and fixed values of the others; by default with the velocity scale of
             the needs.
-        dtype: of the parameters of friction.
+        dtype: type of the friction parameters.
 
     Raises:
         InputError: an unknown law, two laws for the same friction, load in a linear model, or a shape that is not
@@ -92,11 +92,11 @@ def with_joint_friction(
 
     def energies(parameters: Parameters) -> Any:
         friction = parameters["friction"]
-        coefficients, found = friction_of(friction, start, linear=linear)
-        dissipation = joint_dissipation(**coefficients._asdict(), **found._asdict(), joint_map=needs.joint_map)
+        coefficients, fitted = friction_of(friction, start, linear=linear)
+        dissipation = joint_dissipation(**coefficients._asdict(), **fitted._asdict(), joint_map=needs.joint_map)
         load = None
         if "load" in friction.shape:
-            load = Load(jax.nn.sigmoid(friction.shape["load"]), found.velocity_scale, needs.joint_map)
+            load = Load(jax.nn.sigmoid(friction.shape["load"]), fitted.velocity_scale, needs.joint_map)
         return with_friction(model.energies(parameters["model"]), dissipation, load)
 
     return Model(init, energies)

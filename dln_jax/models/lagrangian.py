@@ -16,6 +16,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,12 +25,21 @@ from jaxtyping import Array, Float
 
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.models.model import Model, model_of
-from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
+from dln_jax.models.model import (
+    Model,
+    Scale,
+    inputs_of,
+    joint_features,
+    model_of,
+    per_coordinate,
+    perceptrons,
+    viscous_dissipation,
+)
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.nn.activations import activation as activation_of
-from dln_jax.sizes import require_network
 from dln_jax.types import Matrix, Needs, Scalar, Vector
+
+Networks = Callable[[str, int], hk.nets.MLP]
+"""(name, outputs) -> network, from `perceptrons`."""
 
 
 def make_delan(
@@ -52,10 +62,9 @@ def make_delan(
         shared_trunk: whether factor and potential are outputs of one network instead of two.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
-    require_network(width=width, depth=depth)
-    activation = activation_of(activation)
+    networks = perceptrons(width, depth, activation)
     terms = partial(
-        structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
+        structured_terms, needs, networks, "cholesky", diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
     return model_of(NaturalSystem, terms, needs.degrees_of_freedom, dtype)
 
@@ -77,10 +86,8 @@ def make_black_box_lagrangian(
         rate_scale: typical size of qd, by which the network's input is divided.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
-    require_network(width=width, depth=depth)
-    activation = activation_of(activation)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
-    terms = partial(one_network, needs, "lagrangian", width, depth, activation, rates)
+    terms = partial(black_box_terms, needs, perceptrons(width, depth, activation), "lagrangian", rates)
     return model_of(LagrangianSystem, terms, needs.degrees_of_freedom, dtype)
 
 
@@ -90,34 +97,21 @@ def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, f
     return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
 
 
-def structured_networks(
-    needs: Needs,
-    width: int,
-    depth: int,
-    activation: Activation,
-    shift: float,
-    floor: float,
-    *,
-    shared_trunk: bool = False,
-    factor: str = "cholesky",
+def structured_terms(
+    needs: Needs, networks: Networks, factor: str, shift: float, floor: float, *, shared_trunk: bool = False
 ) -> dict[str, Callable[..., Any] | None]:
     """Returns L(q) under the name of the factor, and the potential and dissipation."""
     d = needs.degrees_of_freedom
     entries = d * (d + 1) // 2
     shared = shared_trunk and needs.gravity
-
-    def network(name: str, outputs: int):
-        layers = perceptron(name, width, depth, outputs, activation)
-        return lambda q: layers(joint_features(needs, q))
-
-    first = network("energies", entries + 1) if shared else network("cholesky", entries)
-    second = first if shared else network("potential", 1)
+    first = networks("energies", entries + 1) if shared else networks("cholesky", entries)
+    second = first if shared else networks("potential", 1)
 
     def cholesky(q: Vector) -> Matrix:
-        return cholesky_factor(first(q)[:entries], d, shift=shift, floor=floor)
+        return cholesky_factor(first(joint_features(needs, q))[:entries], d, shift=shift, floor=floor)
 
     def potential(q: Vector) -> Scalar:
-        return second(q)[-1]
+        return second(joint_features(needs, q))[-1]
 
     return {
         factor: cholesky,
@@ -126,13 +120,12 @@ def structured_networks(
     }
 
 
-def one_network(
-    needs: Needs, name: str, width: int, depth: int, activation: Activation, sizes: tuple[float, ...]
+def black_box_terms(
+    needs: Needs, networks: Networks, name: str, sizes: tuple[float, ...]
 ) -> dict[str, Callable[[Vector, Vector], Scalar] | None]:
     """Returns the energy network([features(q), x / sizes]) -> scalar under `name`, and the dissipation."""
 
     def energy(q: Vector, x: Vector) -> Scalar:
-        inputs = jnp.concatenate([joint_features(needs, q), x / jnp.asarray(sizes, x.dtype)])
-        return perceptron(name, width, depth, 1, activation)(inputs)[0]
+        return networks(name, 1)(inputs_of(needs, q, (x, sizes)))[0]
 
     return {name: energy, "dissipation": viscous_dissipation if needs.friction else None}

@@ -12,7 +12,10 @@ networks have four layers, the hidden ones residual:
     h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
 
 The rates come from an energy of one coordinate, or from a network: any `Model`. The unit of latent time is a frame.
-The networks see images as differences from the mean image, divided by their typical size.
+The networks see images as differences from the mean image, divided by their typical size. Images may enter as their
+principal components: fewer numbers with nearly the same distances, up to the variance that is lost,
+
+    c = B (x - mean),   x_hat = mean + Bᵀ c,   rows of B [C, n]: the eigenvectors of the covariance, largest first
 """
 
 import functools
@@ -33,7 +36,6 @@ from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.principal_components import Components
 from dln_jax.nn.activations import Activation, silu, tanh
 from dln_jax.nn.activations import activation as activation_of
 from dln_jax.sizes import require_network
@@ -132,7 +134,7 @@ def make_latent_phase(
 
     Args:
         field: model of the latent plane, from `latent_field`.
-        mean: of the two frames, over the training data.
+        mean: mean of the two frames over the training data.
         framewise: encode the frames one by one; the published autoencoder encodes both at once.
         scale: typical difference of a pixel from its mean.
         width: hidden units per layer of both networks.
@@ -185,6 +187,38 @@ def make_latent_phase(
         )
 
     return LatentModel(init, apply, field)
+
+
+class Components(NamedTuple):
+    """An orthonormal basis of images."""
+
+    mean: Float[np.ndarray, " n"]
+    basis: Float[np.ndarray, "C n"]
+    scale: float
+    """Root mean square of a coefficient."""
+    lost: float
+    """Share of the variance outside the basis."""
+
+
+def principal_components(images: Float[np.ndarray, "*samples n"], count: int) -> Components:
+    """Returns the components with the largest variance.
+
+    Raises:
+        InputError: a count outside 1..n.
+    """
+    n = images.shape[-1]
+    if not 1 <= count <= n:
+        raise InputError(f"components is {count}; expected 1 to {n}, the number of pixels")
+    flat = images.reshape(-1, n).astype(float)
+    mean = flat.mean(axis=0)
+    variances, vectors = np.linalg.eigh((flat - mean).T @ (flat - mean) / len(flat))
+    kept = variances[-count:].sum()
+    return Components(mean, vectors[:, ::-1][:, :count].T, float(np.sqrt(kept / count)), 1 - kept / variances.sum())
+
+
+def compress(components: Components, images: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples C"]:
+    """Coefficients of images, in the dtype of the images."""
+    return ((images - components.mean) @ components.basis.T).astype(images.dtype)
 
 
 def through_components(model: LatentModel, components: Components) -> LatentModel:

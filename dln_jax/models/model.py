@@ -1,4 +1,4 @@
-"""The type of all models: parameters, and the energies that they define.
+"""The type of all models (parameters, and the energies that they define), and the parts that models share.
 
 Factories share these keywords: `width` hidden units in all of the `depth` hidden layers of the model's networks; their
 `activation`, which must be smooth if forces are derivatives of an energy; `dtype` of the parameters. `needs` describes
@@ -12,14 +12,22 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import haiku as hk
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jaxtyping import Array, Float
 
 from dln_jax.mechanics.arguments import OfSize
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.nn.activations import Activation
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Needs, Scalar, Vector, require_positive
 
 Parameters = Any
 """A pytree of arrays."""
+Scale = float | tuple[float, ...]
+"""Typical size of a quantity, in its unit: one number, or one per coordinate."""
 
 
 class Model(NamedTuple):
@@ -44,15 +52,15 @@ def model_of(
         record: takes functions of one state as keywords; absent terms are not passed.
         terms: builds Haiku modules and returns functions that use them, by name; `None` for absent terms.
         d: degrees of freedom. The parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
-        dtype: of the parameters.
+        dtype: type of the parameters.
     """
 
     def build():
         functions = {name: term for name, term in terms().items() if term is not None}
 
         def initialise(q: Array) -> None:
-            for each in functions.values():
-                each(*[q] * len(inspect.signature(each).parameters))
+            for function in functions.values():
+                function(*[q] * len(inspect.signature(function).parameters))
 
         return initialise, functions
 
@@ -60,6 +68,70 @@ def model_of(
     return Model(
         init=lambda key: networks.init(key, jnp.asarray(np.arange(d), dtype)),
         energies=lambda parameters: record(
-            **{name: OfSize(partial(each, parameters), d) for name, each in networks.apply.items()}
+            **{name: OfSize(partial(function, parameters), d) for name, function in networks.apply.items()}
         ),
     )
+
+
+def linearised(
+    model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector
+) -> tuple[Float[Array, "d P"], Vector]:
+    """Returns Phi = d tau / d theta of one state, with columns in the order of `ravel_pytree(parameters)`, and tau."""
+
+    def torque(parameters: Parameters) -> Vector:
+        return dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd)
+
+    # Reverse mode takes d pull-backs; forward mode would take a push-forward for all P parameters.
+    tau, pull_back = jax.vjp(torque, parameters)
+    (rows,) = jax.vmap(pull_back)(np.eye(tau.shape[0], dtype=tau.dtype))
+    return jnp.concatenate([leaf.reshape(tau.shape[0], -1) for leaf in jax.tree.leaves(rows)], axis=1), tau
+
+
+def perceptrons(width: int, depth: int, activation: Activation | str) -> Callable[[str, int], hk.nets.MLP]:
+    """Checks a model's keywords and returns (name, outputs) -> network, for use inside a transformed function.
+
+    Networks have `depth` hidden layers of `width` units and a linear output.
+    """
+    require_network(width=width, depth=depth)
+    function = activation_of(activation).value
+    return lambda name, outputs: hk.nets.MLP([width] * depth + [outputs], activation=function, name=name)
+
+
+def joint_features(needs: Needs, q: Vector) -> Float[Array, " features"]:
+    """cos and sin of revolute joints, so that a full turn changes nothing; prismatic joints enter directly.
+
+    A kind of joint that the scene lacks adds no operation.
+    """
+    revolute = np.array([joint == "revolute" for joint in needs.joints])
+    angles = q[np.flatnonzero(revolute)]
+    features = [jnp.cos(angles), jnp.sin(angles)] if revolute.any() else []
+    if not revolute.all():
+        features.append(unsaturated(q[np.flatnonzero(~revolute)]))
+    return jnp.concatenate(features)
+
+
+def inputs_of(needs: Needs, q: Vector, *scaled: tuple[Vector, tuple[float, ...]]) -> Float[Array, " inputs"]:
+    """Inputs of a network: the features of q, and other vectors x divided by their sizes, as pairs (x, sizes)."""
+    return jnp.concatenate([joint_features(needs, q), *(x / jnp.asarray(sizes, x.dtype) for x, sizes in scaled)])
+
+
+def unsaturated(x: Float[Array, " inputs"]) -> Float[Array, " inputs"]:
+    """Returns x, with NaN in place of infinities, for which a saturated network would return a plausible number."""
+    return x + 0 * x
+
+
+def viscous_dissipation(q: Vector, qd: Vector) -> Scalar:
+    """D = ½ Σ b qd², with one learned coefficient b = softplus(x) > 0 per coordinate; inside a transformed function."""
+    coefficients = hk.get_parameter("viscous_friction", qd.shape, qd.dtype, hk.initializers.Constant(-3.0))
+    return 0.5 * jnp.sum(jax.nn.softplus(coefficients) * qd**2)
+
+
+def per_coordinate(needs: Needs, name: str, scale: Scale) -> tuple[float, ...]:
+    """Returns one positive size per coordinate; raises InputError otherwise."""
+    d = needs.degrees_of_freedom
+    sizes = scale if isinstance(scale, tuple) else (scale,) * d
+    if len(sizes) != d:
+        raise InputError(f"{name} has {len(sizes)} sizes; expected one number, or one for each of {d} coordinates")
+    for size in sizes:
+        require_positive(**{name: size})
+    return sizes

@@ -20,12 +20,9 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.natural import NaturalHamiltonian
-from dln_jax.models.model import Model, model_of
-from dln_jax.models.networks import perceptron
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.models.model import Model, model_of, perceptrons
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.nn.activations import activation as activation_of
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
 
 FEATURES = {"distance": lambda r: r, "inverse": lambda r: 1 / r, "logarithm": jnp.log}
@@ -50,7 +47,7 @@ def make_pairwise_hamiltonian(
     Args:
         bodies: at least two.
         dimension: coordinates per body.
-        order: of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
+        order: order of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
         alike: whether all bodies share one mass and all pairs one energy; otherwise they have their own.
         features: names from `FEATURES`.
         distance_scale: typical distance in m, by which distances are divided.
@@ -61,8 +58,7 @@ def make_pairwise_hamiltonian(
             features.
     """
     require_positive(dimension=dimension, distance_scale=distance_scale)
-    require_network(width=width, depth=depth)
-    activation = activation_of(activation)
+    networks = perceptrons(width, depth, activation)
     if bodies < 2:
         raise InputError(f"bodies is {bodies}; expected at least 2, since the energy is one of pairs")
     if order not in ("bodies", "axes"):
@@ -76,8 +72,7 @@ def make_pairwise_hamiltonian(
 
     def pair_energies(r: Float[Array, " pairs"]) -> Float[Array, "pairs kinds"]:
         seen = jnp.stack([FEATURES[name](r / distance_scale) for name in features], axis=1)
-        network = perceptron("pair", width, depth, kinds, activation)
-        return hk.Linear(kinds, with_bias=False, name="pair_linear")(seen) + network(seen)
+        return hk.Linear(kinds, with_bias=False, name="pair_linear")(seen) + networks("pair", kinds)(seen)
 
     def potential(q: Vector) -> Scalar:
         positions = q.reshape(bodies, dimension) if order == "bodies" else q.reshape(dimension, bodies).T

@@ -59,10 +59,10 @@ def make_planar_chain(
     Args:
         needs: revolute joints only; friction adds viscous and dry friction in all joints.
         coordinates: q_i is the angle of link i relative to the one before ("relative") or to the vertical ("absolute").
-        symmetric: leave out B and h.
-        armature: of the motors, or gears, of joints 2, .., d.
-        velocity_scale: of dry friction, rad/s, as for `mechanics.friction.joint_dissipation`; it is not fitted.
-        dtype: of the parameters.
+        symmetric: whether B and h are left out.
+        armature: whether joints 2, .., d have armature (the inertia of motors or gears).
+        velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
+        dtype: type of the parameters.
 
     Raises:
         InputError: a prismatic joint, other coordinates, or a scale that is not positive.

@@ -29,7 +29,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
     """Returns the (init, energies) pair; the parameters are the vector c, initially zero.
 
     Args:
-        needs: of the scene, with the kinds of its joints. Friction is refused, because it would not be linear beside H.
+        needs: needs of the scene. Friction is refused, because it would not be linear in c.
         degree: the largest total degree of a term.
 
     Raises:
@@ -46,7 +46,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
     powers = list(range(degree + 1))
     harmonics = [(place + 1) // 2 for place in range(2 * degree + 1)]
     choices = [harmonics if joint == "revolute" else powers for joint in needs.joints] + [powers] * d
-    most = math.prod(len(each) for each in choices)
+    most = math.prod(map(len, choices))
     if most > MOST_TERMS * 100:
         raise InputError(f"{d} coordinates to degree {degree} make too many terms; lower the degree")
     terms = np.array(

@@ -17,8 +17,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.residual import Residual, with_residual
-from dln_jax.models.model import Model, Parameters, model_of
-from dln_jax.models.networks import Scale, joint_features, per_coordinate
+from dln_jax.models.model import Model, Parameters, Scale, joint_features, model_of, per_coordinate
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.nn.activations import activation as activation_of
 from dln_jax.sizes import require_network
@@ -77,8 +76,8 @@ def make_residual(
     if not terms or set(terms) - set(TERMS) or len(set(terms)) < len(terms):
         raise InputError(f"terms are {list(terms)}; expected some of {', '.join(TERMS)}, each once")
     d = needs.degrees_of_freedom
-    given = {"torque_scale": torque_scale, "rate_scale": rate_scale, "acceleration_scale": acceleration_scale}
-    s, r, a = (np.array(per_coordinate(needs, name, scale)) for name, scale in given.items())
+    scales = {"torque_scale": torque_scale, "rate_scale": rate_scale, "acceleration_scale": acceleration_scale}
+    s, r, a = (np.array(per_coordinate(needs, name, scale)) for name, scale in scales.items())
     slow = np.array(per_coordinate(needs, "velocity_scale", velocity_scale))
 
     def network(name: str, outputs: int, inputs: Array) -> Array:

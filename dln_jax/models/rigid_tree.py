@@ -77,7 +77,7 @@ def make_rigid_tree(
         friction: laws whose coefficients are also parameters, as in `mechanics.friction.laws`; True: `USUAL`.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
         load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
-        dtype: of the parameters.
+        dtype: type of the parameters.
 
     Raises:
         InputError: an unknown law, two laws for the same friction, a velocity or slope that is not positive, or a share
@@ -86,7 +86,7 @@ def make_rigid_tree(
     laws = USUAL if friction is True else friction or ()
     require_laws(laws, "friction")
     shape = FrictionShape(velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift)
-    shape = FrictionShape(*(np.asarray(each) if isinstance(each, tuple) else each for each in shape))
+    shape = FrictionShape(*(np.asarray(value) if isinstance(value, tuple) else value for value in shape))
     require_shape(shape)
     shares = load if isinstance(load, tuple) else (load,)
     if not all(0 <= share < 1 for share in shares):

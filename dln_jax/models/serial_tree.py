@@ -61,9 +61,9 @@ def make_serial_tree(
     Args:
         needs: kinds of joints, gravity and friction (viscous, dry and an offset in every joint).
         parents: parent link of every link, -1 for the ground; by default the one before.
-        acceleration: of gravity, m/s².
-        velocity_scale: of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
-        dtype: of the parameters.
+        acceleration: acceleration of gravity, m/s².
+        velocity_scale: velocity scale of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
+        dtype: type of the parameters.
 
     Raises:
         InputError: parents that are not earlier links, an acceleration or scale that is not positive, or needs with an

@@ -51,10 +51,12 @@ def torque_covariance(
     """cov(tau(state), tau(other)) of N and M states, with the joints of a state adjacent; (N m)²."""
     N, d = np.shape(states.q)
     states, others = _on_device(states), _on_device(others)
-    columns = _joints_first(States(*(each[None] for each in others)))
+    columns = _joints_first(States(*(array[None] for array in others)))
 
     def block(rows: Array) -> Array:
-        return _block(joints, serial, scales, _joints_first(States(*(each[rows][:, None] for each in states))), columns)
+        return _block(
+            joints, serial, scales, _joints_first(States(*(array[rows][:, None] for array in states))), columns
+        )
 
     return _by_rows(block, N, len(others.q)).transpose(0, 2, 1, 3).reshape(N * d, -1)
 
@@ -71,16 +73,16 @@ def own_covariance(
     following = (np.arange(N)[:, None] + np.arange(N // 2 + 1)) % N
 
     def block(rows: Array) -> Array:
-        x, y = (States(*(each[at] for each in states)) for at in (rows[:, None], jnp.asarray(following)[rows]))
+        x, y = (States(*(array[at] for array in states)) for at in (rows[:, None], jnp.asarray(following)[rows]))
         return _block(joints, serial, scales, _joints_first(x), _joints_first(y))
 
     pairs = _by_rows(block, N, N // 2 + 1)
     row, column = np.indices((N, N))
     ahead = (column - row) % N
     follows = ahead <= N // 2
-    found = pairs[np.where(follows, row, column), np.where(follows, ahead, (row - column) % N)]
-    found = jnp.where(follows[..., None, None], found, found.swapaxes(2, 3))
-    return found.transpose(0, 2, 1, 3).reshape(N * d, N * d)
+    blocks = pairs[np.where(follows, row, column), np.where(follows, ahead, (row - column) % N)]
+    blocks = jnp.where(follows[..., None, None], blocks, blocks.swapaxes(2, 3))
+    return blocks.transpose(0, 2, 1, 3).reshape(N * d, N * d)
 
 
 def _on_device(states: States) -> States:
@@ -88,7 +90,7 @@ def _on_device(states: States) -> States:
 
 
 def _joints_first(states: States) -> States:
-    return States(*(jnp.moveaxis(each, 2, 0) for each in states))
+    return States(*(jnp.moveaxis(array, 2, 0) for array in states))
 
 
 def _by_rows(block: Callable[[Array], Array], N: int, width: int) -> Float[Array, "N K d d"]:
@@ -98,8 +100,8 @@ def _by_rows(block: Callable[[Array], Array], N: int, width: int) -> Float[Array
     """
     rows = max(1, min(N, PAIRS // width))
     places = np.arange(-(-N // rows) * rows) % N
-    found = lax.map(jax.checkpoint(block), jnp.asarray(places.reshape(-1, rows)))
-    return found.transpose(0, 3, 4, 1, 2).reshape(len(places), width, *found.shape[1:3])[:N]
+    blocks = lax.map(jax.checkpoint(block), jnp.asarray(places.reshape(-1, rows)))
+    return blocks.transpose(0, 3, 4, 1, 2).reshape(len(places), width, *blocks.shape[1:3])[:N]
 
 
 def _block(
@@ -113,7 +115,7 @@ def _block(
     lifts = _factors(lift_factor, joints, scales.lifts, x.q, y.q) if has_potential else None
     unit = jnp.eye(d + 1, dtype=pairs.dtype)[:d]
     # Without the order of a chain only the last body has an energy, and all rates enter before the first joint.
-    of_body = (lambda each: each) if serial else (lambda each: jnp.zeros(d, each.dtype).at[-1].set(each[0]))
+    of_body = (lambda scale: scale) if serial else (lambda scale: jnp.zeros(d, scale.dtype).at[-1].set(scale[0]))
 
     def entered(products: Products, joint: Any, rate: Array) -> Products:
         at, (_, u, a), (_, w, b) = joint
@@ -121,7 +123,7 @@ def _block(
         P, P_other, Q, Q_other = e + last * u, e + last * w, last * a, last * b
         pairs = ((P, P_other), (P, Q_other), (Q, P_other), (Q, Q_other))
         return Products(
-            *(each + rate * left[:, None] * right[None] for each, (left, right) in zip(products, pairs, strict=True))
+            *(X + rate * left[:, None] * right[None] for X, (left, right) in zip(products, pairs, strict=True))
         )
 
     def link(carry: tuple, at: tuple) -> tuple[tuple, None]:
@@ -140,9 +142,9 @@ def _block(
     products = Products(nothing, nothing, nothing, nothing)
     joint_axes = (unit, x, y)
     if not serial:
-        for each in range(d):
-            one = jax.tree.map(lambda leaf, each=each: leaf[each], joint_axes)
-            products = entered(products, one, scales.rates[each])
+        for joint in range(d):
+            one = jax.tree.map(lambda leaf, joint=joint: leaf[joint], joint_axes)
+            products = entered(products, one, scales.rates[joint])
     heights = nothing.at[d, d].set(1.0) if has_potential else None
     weight = of_body(scales.weight) if has_potential else None
     links = (joint_axes, scales.rates, turns, of_body(scales.inertia), lifts, weight)
@@ -151,9 +153,9 @@ def _block(
 
 
 def _factors(factor: Any, joints: tuple[JointKind, ...], pairs: Any, x: Array, y: Array) -> Any:
-    each = [factor(kind, pairs[joint], x[joint], y[joint]) for joint, kind in enumerate(joints)]
+    factors = [factor(kind, pairs[joint], x[joint], y[joint]) for joint, kind in enumerate(joints)]
     # Derivatives for a prismatic joint do not vary along both axes.
-    return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves, x[0] + y[0])[:-1]), *each)
+    return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves, x[0] + y[0])[:-1]), *factors)
 
 
 def _turned(products: Products, c: Any, joint: Any) -> Products:

@@ -59,8 +59,8 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
     `init` ignores its key: M = 1, V = 0, no friction. The number of parameters grows as (2 degree + 1)^d d²/2.
 
     Args:
-        degree: of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential has at
-            least degree 2 (a linear spring).
+        degree: degree of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential
+            has at least degree 2 (a linear spring).
 
     Raises:
         InputError: a degree that is not a whole number >= 0, a wrong number of degrees, or a basis that is too large to

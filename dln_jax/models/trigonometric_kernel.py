@@ -72,7 +72,7 @@ class KernelParameters(NamedTuple):
     """Viscous friction of the coordinates [d], in N m s or N s/m."""
 
 
-class Factor(NamedTuple):
+class JointFactor(NamedTuple):
     """c(x, y) and its derivatives, as arrays that broadcast."""
 
     value: Array
@@ -105,7 +105,7 @@ def make_trigonometric_kernel(
         needs: kinds of joints, gravity, and viscous friction of the coordinates.
         samples: n, number of samples whose torques define the energy; the fit takes n³ d³ operations.
         serial: whether joints form a serial chain; otherwise nothing is assumed about their order.
-        dtype: of the parameters; weights have either sign and cancel, so that f32 costs accuracy.
+        dtype: type of the parameters; weights have either sign and cancel, so that f32 costs accuracy.
 
     Raises:
         InputError: no samples.
@@ -130,22 +130,24 @@ def make_trigonometric_kernel(
     return Model(init, lambda parameters: _system(parameters, needs.joints, serial))
 
 
-def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
+def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> JointFactor:
     """c of a joint."""
     a, b = pair
     if joint == "prismatic":
-        return Factor(a + b * x * y, b * y, b * x, b * jnp.ones_like(x * y))
+        return JointFactor(a + b * x * y, b * y, b * x, b * jnp.ones_like(x * y))
     cosine = b * (jnp.cos(x) * jnp.cos(y) + jnp.sin(x) * jnp.sin(y))
     sine = b * (jnp.sin(x) * jnp.cos(y) - jnp.cos(x) * jnp.sin(y))
-    return Factor(a + cosine, -sine, sine, cosine)
+    return JointFactor(a + cosine, -sine, sine, cosine)
 
 
-def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
+def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> JointFactor:
     """h of a joint."""
     c = turn_factor(joint, pair, x, y)
     if joint == "revolute":
         return c
-    return Factor(c.value**2, 2 * c.value * c.by_x, 2 * c.value * c.by_y, 2 * (c.by_x * c.by_y + c.value * c.by_both))
+    return JointFactor(
+        c.value**2, 2 * c.value * c.by_x, 2 * c.value * c.by_y, 2 * (c.by_x * c.by_y + c.value * c.by_both)
+    )
 
 
 def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool) -> RecursiveSystem:
@@ -186,12 +188,12 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
 def _shared(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector) -> Shared:
     """Inner products for all K bodies with an inertia, as arrays [K, n]; linear in qd."""
     scales = parameters.scales
-    moved, accelerated, weights = (each.T for each in (parameters.qd, parameters.qdd, parameters.weights))
+    moved, accelerated, weights = (array.T for array in (parameters.qd, parameters.qdd, parameters.weights))
     rates = (scales.rates * qd)[:, None]
     entered = Shared(rates * moved, rates * accelerated, rates * weights, jnp.zeros_like(moved))
     turns = [turn_factor(kind, scales.turns[k], q[k], parameters.q[:, k]) for k, kind in enumerate(joints)]
-    value = jnp.stack([each.value for each in turns])
-    slope = jnp.stack([jnp.broadcast_to(each.by_y, each.value.shape) for each in turns])
+    value = jnp.stack([turn.value for turn in turns])
+    slope = jnp.stack([jnp.broadcast_to(turn.by_y, turn.value.shape) for turn in turns])
 
     def turned(s: Shared, c: Array, by_y: Array, moved: Array, weight: Array) -> Shared:
         return Shared(
@@ -205,12 +207,12 @@ def _shared(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
         new, *rest = at
         s = turned(s, *rest)
         if serial:
-            s = Shared(*(each + more for each, more in zip(s, new, strict=True)))
+            s = Shared(*(product + more for product, more in zip(s, new, strict=True)))
         return s, s
 
-    start = jax.tree.map(lambda each: jnp.zeros_like(each[0]) if serial else jnp.sum(each, axis=0), entered)
+    start = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]) if serial else jnp.sum(leaf, axis=0), entered)
     last, bodies = lax.scan(link, start, (entered, value, slope, moved, weights))
-    return bodies if serial else Shared(*(each[None] for each in last))
+    return bodies if serial else Shared(*(product[None] for product in last))
 
 
 def _potential(
@@ -240,7 +242,7 @@ def _summed(function: Callable[[KernelParameters], Array], parameters: KernelPar
     if n <= CHUNK:
         return function(parameters)
     # The padding of the last chunk has weight zero.
-    pieces = [jnp.pad(each, ((0, -n % CHUNK), (0, 0))).reshape(-1, CHUNK, d) for each in samples]
+    pieces = [jnp.pad(array, ((0, -n % CHUNK), (0, 0))).reshape(-1, CHUNK, d) for array in samples]
 
     def of(q: Array, qd: Array, qdd: Array, weights: Array) -> Array:
         return function(parameters._replace(q=q, qd=qd, qdd=qdd, weights=weights))
@@ -249,6 +251,6 @@ def _summed(function: Callable[[KernelParameters], Array], parameters: KernelPar
     def add(total: Array, piece: list[Array]) -> tuple[Array, None]:
         return total + of(*piece), None
 
-    like = jax.eval_shape(of, *(each[0] for each in pieces))
+    like = jax.eval_shape(of, *(piece[0] for piece in pieces))
     total, _ = lax.scan(add, jnp.zeros(like.shape, like.dtype), pieces)
     return total

@@ -20,8 +20,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.mechanics.arguments import answer, vectors
-from dln_jax.models.linearisation import linearised
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.types import Vector
 
 UNDETERMINED = 1e-3
@@ -84,24 +83,24 @@ def predictive(
         noise: standard deviation of one measurement [d]; zero for that of the model's own torque.
         inflation: factor on the variance due to parameters, [d].
     """
-
     d = np.size(noise) if np.ndim(noise) else None
 
     def torque_std(q: Any, qd: Any, qdd: Any) -> Array:
         rows, _ = answer(partial(linearised, model, parameters), *vectors(d, q=q, qd=qd, qdd=qdd))
-        return _deviation(rows, factor, noise, inflation)
+        return deviation_of_rows(rows, factor, noise, inflation)
 
     return torque_std
 
 
-def torque_deviation(rows: Float[Array, "d P"], uncertainty: Uncertainty) -> Vector:
+def deviation_of_rows(rows: Float[Array, "d P"], factor: Any, noise: Any, inflation: Any) -> Vector:
     """Standard deviation of the torque [d] at a state with Phi = `rows`, N m or N."""
-    return _deviation(rows, uncertainty.factor, uncertainty.noise, uncertainty.inflation)
+    noise, inflation = (jnp.asarray(array, rows.dtype) for array in (noise, inflation))
+    return jnp.sqrt(noise**2 + inflation * _parameter_variance(rows, factor))
 
 
-def _deviation(rows: Float[Array, "d P"], factor: Any, noise: Any, inflation: Any) -> Vector:
-    noises, inflations = (jnp.asarray(each, rows.dtype) for each in (noise, inflation))
-    return jnp.sqrt(noises**2 + inflations * parameter_variance(rows, factor))
+def _parameter_variance(rows: Float[Array, "d P"], factor: Any) -> Vector:
+    """|phi F|² of the joints [d], (N m)² or N²."""
+    return jnp.sum((rows @ jnp.asarray(factor, rows.dtype)) ** 2, axis=1)
 
 
 def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Callable[[Any, Any, Any], Scores]:
@@ -117,44 +116,28 @@ def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Ca
 
 def scores_of_rows(rows: Float[Array, "d P"], state: Sequence[Vector], uncertainty: Uncertainty) -> Scores:
     """`scores` of a state (q, qd, qdd) with Phi = `rows`."""
-    domain = uncertainty.domain
-    limit, centre, reach, harmless = (
-        jnp.asarray(each, rows.dtype) for each in (domain.limit, domain.centre, domain.reach, domain.harmless)
-    )
-    deviation = jnp.sqrt(parameter_variance(rows, uncertainty.factor))
+    limit, scale, directions, centre, reach, harmless = (jnp.asarray(x, rows.dtype) for x in uncertainty.domain)
+    deviation = jnp.sqrt(_parameter_variance(rows, uncertainty.factor))
     distance = jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach)
+    share = jnp.zeros(rows.shape[0], rows.dtype)
+    if directions.shape[1] > 0:
+        squares = jnp.sum((rows / scale) ** 2, axis=1)
+        share = jnp.sum((rows / scale @ directions) ** 2, axis=1) / jnp.where(squares > 0, squares, 1)
     return Scores(
         parameters=jnp.max(deviation / limit),
-        undetermined=jnp.sqrt(jnp.max(undetermined_share(rows, domain))) / UNDETERMINED,
+        undetermined=jnp.sqrt(jnp.max(share)) / UNDETERMINED,
         distance=jnp.where(jnp.any(deviation >= harmless), distance, 0),
     )
 
 
-def highest(of_state: Scores) -> Array:
-    """[], the largest score; NaN if one is."""
-    return jnp.max(jnp.stack(of_state))
+def exceeds(of_state: Scores) -> Array:
+    """Whether a state with these scores is out of distribution: one of them is above 1, or NaN."""
+    return ~(jnp.max(jnp.stack(of_state)) <= 1)
 
 
-def outside(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Callable[[Any, Any, Any], Array]:
+def out_of_distribution(
+    model: Model, parameters: Parameters, uncertainty: Uncertainty
+) -> Callable[[Any, Any, Any], Array]:
     """(q, qd, qdd) -> whether a state is out of distribution: one of its `scores` is above 1, or NaN."""
     of_state = scores(model, parameters, uncertainty)
-
-    def is_outside(q: Any, qd: Any, qdd: Any) -> Array:
-        return ~(highest(of_state(q, qd, qdd)) <= 1)
-
-    return is_outside
-
-
-def parameter_variance(rows: Float[Array, "d P"], factor: Any) -> Vector:
-    """|phi F|² of the joints [d], (N m)² or N²."""
-    return jnp.sum((rows @ jnp.asarray(factor, rows.dtype)) ** 2, axis=1)
-
-
-def undetermined_share(rows: Float[Array, "d P"], domain: Domain) -> Vector:
-    """Share of the joints' |phi|², in scaled parameters, in undetermined directions [d], 0 to 1."""
-    directions = jnp.asarray(domain.undetermined, rows.dtype)
-    if directions.shape[1] == 0:
-        return jnp.zeros(rows.shape[0], rows.dtype)
-    scaled = rows / jnp.asarray(domain.scale, rows.dtype)
-    whole = jnp.sum(scaled**2, axis=1)
-    return jnp.sum((scaled @ directions) ** 2, axis=1) / jnp.where(whole > 0, whole, 1)
+    return lambda q, qd, qdd: exceeds(of_state(q, qd, qdd))

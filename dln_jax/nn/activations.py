@@ -129,9 +129,7 @@ linear = _make("linear", lambda x: x, jnp.ones_like, jnp.zeros_like, jnp.zeros_l
 quadratic = _make("quadratic", lambda x: x * x, lambda x: 2 * x, lambda x: jnp.full_like(x, 2), jnp.zeros_like)
 cubic = _make("cubic", lambda x: x * x * x, lambda x: 3 * x * x, lambda x: 6 * x, lambda x: jnp.full_like(x, 6))
 
-ALL: dict[str, Activation] = {
-    each.name: each for each in (relu, softplus, tanh, cos, sin, silu, gelu, linear, quadratic, cubic)
-}
+ALL: dict[str, Activation] = {g.name: g for g in (relu, softplus, tanh, cos, sin, silu, gelu, linear, quadratic, cubic)}
 """All activations by name."""
 
 

@@ -12,19 +12,17 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.trees import tree_from_json
-from dln_jax.models.baselines import make_feed_forward, make_phase_network
-from dln_jax.models.dissipative import make_dissipative
+from dln_jax.models.baselines import make_feed_forward, make_helmholtz, make_phase_network
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,
+    make_dissipative,
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )
-from dln_jax.models.helmholtz import make_helmholtz
 from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
-from dln_jax.models.model import Model
+from dln_jax.models.model import Model, Scale
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.models.networks import Scale
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.residual import make_residual, make_with_residual

@@ -10,6 +10,7 @@ from jax.typing import DTypeLike
 
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.models.latent_phase import (
+    Components,
     Field,
     LatentModel,
     LatentPhase,
@@ -17,7 +18,6 @@ from dln_jax.models.latent_phase import (
     make_latent_phase,
     through_components,
 )
-from dln_jax.models.principal_components import Components
 from dln_jax.nn.activations import Activation, silu, tanh
 from dln_jax.types import InputError, require_positive
 

@@ -16,7 +16,7 @@ from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.uncertainty import Uncertainty, outside, predictive
+from dln_jax.models.uncertainty import Uncertainty, out_of_distribution, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo.descriptions import OWN, Description, build
@@ -92,7 +92,7 @@ class Run:
     def outside(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
         """(q, qd, qdd) -> whether the state is out of distribution. Raises InputError for a run without uncertainty."""
         uncertainty = self._known_uncertainty
-        return _jitted(outside(self._of("outside", Model), self.parameters, uncertainty), self.dtype)
+        return _jitted(out_of_distribution(self._of("outside", Model), self.parameters, uncertainty), self.dtype)
 
     @property
     def _known_uncertainty(self) -> Uncertainty:

@@ -9,18 +9,21 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.weak_forms import fit_energy, fit_momentum
+from dln_jax.learning.weak_forms import Form, WeakFit, fit_form, fit_momentum
+from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree
 from dln_jax.metrics.report import Row
+from dln_jax.models.model import Model
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.types import Vector
 
 TOLERANCES: dict[str, Any] = {"negligible": 1e-9, "rank_tolerance": 1e-8}
 WAYS = (
@@ -107,6 +110,26 @@ def _fit(way: str, model: Any, log: Trajectories) -> Any:
     if way == "energy":
         return fit_energy(model, found.data, **TOLERANCES)
     return fit_linear(model, found.data, **TOLERANCES)
+
+
+def fit_energy(model: Model, data: Trajectories, **tolerances: Any) -> WeakFit:
+    """Fits the energies of windows: one equation for all joints, cheaper than momenta but with less information.
+
+    The energy E = T + V has a weak form with the power of motors and of friction (Gautier and Khalil 1988):
+
+        qdᵀ tau = dE/dt + qdᵀ dD/dqd
+    """
+    form = Form(
+        energy_and_loss,
+        lambda qd, tau: np.sum(qd * tau, axis=1, keepdims=True),
+        lambda qd, noise: np.linalg.norm(qd * noise, axis=1, keepdims=True),
+    )
+    return fit_form(form, model, data, **tolerances)
+
+
+def energy_and_loss(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+    """E = T + V and the power lost to friction, of one state: qdᵀ tau = dE/dt + loss."""
+    return plant.energy(q, qd)[None], (qd @ plant.friction(q, qd))[None]
 
 
 def _differences(log: Trajectories, times: int, trajectory: int) -> np.ndarray:

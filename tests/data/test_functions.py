@@ -242,7 +242,7 @@ def test_members_of_an_ensemble_train_as_if_alone():
     together = regression.train(sets, settings, optimiser)
     first = ensembles.init(jax.random.key(0), (1, 3, 1), members=2)
     assert not np.allclose(*first[0][0])
-    given = regression.problem(sets, settings._replace(members=1), each_member_by_itself=False)
+    given = regression.problem(sets, settings._replace(members=1), together=True)
     for index in range(2):
         start = jax.tree.map(lambda leaf, index=index: leaf[index : index + 1], first)
         alone = fit(given._replace(parameters=start), optimiser)

@@ -9,8 +9,8 @@ from planar_arm import ARM
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
 from dln_jax.identification.residual import Candidate, fit_residual
-from dln_jax.learning.growth import segments
 from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.model_selection import segments
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import tree_system

@@ -1,5 +1,7 @@
 """Shapes of friction curves are found with the inertias, from torque with noise, within the stated errors."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -31,14 +33,20 @@ LAWS = {
 }
 
 
-def log_of(case, seed, noise):
-    """A motion of five sines a joint, slow enough that friction shows."""
+@functools.cache
+def torques_of(case):
+    """Inverse dynamics of the arm with the friction of a case, compiled once."""
     friction, share = CASES[case]
     system = with_friction(
         trees.tree_system(ARM),
         joint_dissipation(**{key: np.asarray(value) for key, value in friction.items()}),
         None if share is None else Load(np.array(share), 0.02),
     )
+    return jax.jit(jax.vmap(dynamics(system).inverse_dynamics))
+
+
+def log_of(case, seed, noise):
+    """A motion of five sines per joint, slow enough that friction shows."""
     random, w = np.random.default_rng(seed), np.arange(1.0, 6.0)[:, None]
     t = 0.01 * np.arange(SAMPLES)
     sizes, phases = 0.5 * random.normal(size=(2, 5, 1)), random.uniform(0, 2 * np.pi, (2, 5, 1))
@@ -46,7 +54,7 @@ def log_of(case, seed, noise):
         np.sum(sizes * wave, axis=1).T
         for wave in (np.sin(w * t + phases) / w, np.cos(w * t + phases), -w * np.sin(w * t + phases))
     )
-    tau = np.asarray(jax.jit(jax.vmap(dynamics(system).inverse_dynamics))(q, qd, qdd))
+    tau = np.asarray(torques_of(case)(q, qd, qdd))
     tau = tau + noise * random.normal(size=tau.shape)
     return from_arrays({"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": np.zeros(SAMPLES, int)})
 
@@ -85,12 +93,12 @@ def test_what_is_held_stays():
 
 
 @pytest.mark.parametrize(
-    "laws, given, message",
+    "laws, options, message",
     [
         (("viscous", "offset"), {}, "viscous, offset has no shape to find; fit_linear finds the coefficients"),
         (("coulomb",), {"noise": 0.0}, "noise is 0.0; expected a positive number"),
     ],
 )
-def test_what_is_no_fit_is_refused(laws, given, message):
+def test_what_is_no_fit_is_refused(laws, options, message):
     with pytest.raises(InputError, match=message):
-        fit_friction(ARM, log_of("stribeck", 0, 0.0), laws, **given)
+        fit_friction(ARM, log_of("stribeck", 0, 0.0), laws, **options)

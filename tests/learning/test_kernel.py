@@ -8,7 +8,7 @@ import pytest
 from dln_jax.data.splits import select
 from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.marginal_likelihood import Equations, Unknowns, likelihood, start_of
+from dln_jax.learning.marginal_likelihood import TorqueEquations, Unknowns, likelihood, start_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.torque_covariance import States
 from dln_jax.scenes.datasets.generators import uniform
@@ -59,7 +59,7 @@ def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
 def test_slope_of_the_likelihood_is_that_of_its_differences():
     scene = pendulum(friction=0.2)
     data = uniform(scene, samples=20, rate_bound=3.0, acceleration_bound=5.0)
-    equations = Equations(States(data.q, data.qd, data.qdd), np.zeros((20, 0)), data.tau)
+    equations = TorqueEquations(States(data.q, data.qd, data.qdd), np.zeros((20, 0)), data.tau)
     unit = data.tau.std(axis=0)
     start = Unknowns(start_of(scene.needs, False, equations, unit), np.log(0.1 * unit))
     leaves, structure = jax.tree.flatten(start)

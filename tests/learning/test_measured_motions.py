@@ -14,9 +14,7 @@ from dln_jax.data.splits import select
 from dln_jax.learning import accelerations, measured_motions, rates
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.engine.problem import Problem, loss_of
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
-from dln_jax.learning.torques_beside_motions import cut_torque_windows, with_torques
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, prediction_metrics
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
@@ -158,21 +156,3 @@ def test_mistakes_are_named(passive):
             task.residual(start, *(array[0] for array in task.arrays))
     with pytest.raises(InputError, match="has 200 samples to predict"):
         cut_segments(data, 200, every=10)
-
-
-def test_torques_beside_motions_add_their_squares(passive):
-    torques = cut_torque_windows(passive.data, WINDOW)
-    count, known = len(torques.q), {"noise": (0.5, 0.25), "share": 3.0}
-    score = lambda parameters: (jnp.asarray(2.0), jnp.asarray(jnp.nan))  # noqa: E731
-    task = Problem(lambda parameters, motion: motion, TRUE, (jnp.full((count, 1), 2.0),), score)
-    both = with_torques(task, CHAIN, torques, torques, **known)
-    off = jax.jit(jax.vmap(jax.vmap(dynamics(CHAIN.energies(TRUE)).inverse_dynamics)))(*torques[:3])
-    expected = 3.0 * np.mean(np.sum((np.asarray(off) / np.array([0.5, 0.25])) ** 2, axis=2))
-    assert float(jax.jit(loss_of(both))(TRUE, both.arrays)) == pytest.approx(4.0 + expected)
-    assert float(both.score(TRUE)[0]) == pytest.approx(2.0 + expected)
-    for changed, message in (({"share": 0.0}, "share is 0"), ({"noise": (0.5, -1.0)}, "noise is -1")):
-        with pytest.raises(InputError, match=message):
-            with_torques(task, CHAIN, torques, torques, **(known | changed))
-    fewer = task._replace(arrays=(jnp.zeros((3, 1)),))
-    with pytest.raises(InputError, match=f"{count} windows of torques, 3 of motions"):
-        with_torques(fewer, CHAIN, torques, torques, **known)

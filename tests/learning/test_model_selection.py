@@ -6,7 +6,7 @@ import pytest
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
-from dln_jax.learning.model_selection import Candidate, FittedModel, select_model
+from dln_jax.learning.model_selection import Candidate, FittedModel, grow, select_model, significantly_better
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.model import Model
 from dln_jax.types import InputError
@@ -88,3 +88,37 @@ def test_out_of_time_the_first_that_can_be_fitted_is_kept():
 def test_what_cannot_be_fitted_is_refused(candidates, seconds, message):
     with pytest.raises(InputError, match=message):
         select_model(candidates, TRAIN, VALIDATION, seconds=seconds)
+
+
+SHARED_NOISE = np.random.default_rng(1).normal(size=400) ** 2
+
+
+def errors_of(level):
+    """Squared errors of a model at a level of its own above the noise that all models share."""
+    return SHARED_NOISE + level * RANDOM.uniform(0.5, 1.5, 400)
+
+
+def test_better_means_beyond_the_paired_standard_error():
+    assert significantly_better(SHARED_NOISE, errors_of(0.1))
+    assert SHARED_NOISE.std() / 20 > 0.05  # the noise's own standard error is half of that difference
+    assert not significantly_better(errors_of(0.1), SHARED_NOISE)
+    wobble = RANDOM.permutation(np.repeat([-1.0, 1.0], 200))
+    assert not significantly_better(SHARED_NOISE + wobble - 1e-3, SHARED_NOISE)
+    assert significantly_better(SHARED_NOISE, np.full(400, np.nan))
+    assert not significantly_better(np.full(400, np.nan), SHARED_NOISE)
+
+
+@pytest.mark.parametrize(
+    ("levels", "patience", "target", "chosen", "trained"),
+    [
+        ((9.0, 1.0, 0.0, 0.0, 0.0), 2, None, 2, 5),
+        ((9.0, 1.0, 0.0, 0.0, 0.0), 1, None, 2, 4),
+        ((9.0, 1.0, 5.0, 0.0, 0.0), 2, None, 3, 5),  # one that got stuck does not end the growing
+        ((np.nan, 1.0, 1.0, 1.0), 2, None, 1, 4),
+        ((9.0, 1.0, 0.0), 2, 2.5, 1, 2),
+        ((9.0,), 2, None, 0, 1),
+    ],
+)
+def test_the_smallest_sufficient_candidate_is_chosen(levels, patience, target, chosen, trained):
+    trial, trials = grow(range(len(levels)), lambda n: (n, errors_of(levels[n])), patience=patience, target=target)
+    assert trial.candidate == trial.outcome == chosen and len(trials) == trained

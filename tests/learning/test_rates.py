@@ -15,8 +15,7 @@ from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
 from dln_jax.models.baselines import make_phase_network
-from dln_jax.models.dissipative import make_dissipative
-from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_separable_hamiltonian
+from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_dissipative, make_separable_hamiltonian
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.types import InputError, Needs

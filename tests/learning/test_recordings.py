@@ -67,6 +67,6 @@ def test_mistakes_are_one_line(recording, prepared):
     windows = cut_momentum_windows(prepared.validation)
     with pytest.raises(InputError, match="unit is 0"):
         momentum_problem(MODEL, None, windows, windows, unit=[0.0, 1.0])
-    with pytest.raises(InputError, match="cut both alike"):
+    with pytest.raises(InputError, match="cut both to one length"):
         longer = cut_momentum_windows(prepared.train, window=0.3)
         momentum_problem(MODEL, None, windows, longer, unit=[1.0, 1.0])

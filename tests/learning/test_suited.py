@@ -3,7 +3,7 @@
 import numpy as np
 
 from dln_jax.data.schema import from_arrays
-from dln_jax.learning.suited import independent_equations, suited_network
+from dln_jax.learning.dynamics import independent_equations, suited_network
 from dln_jax.types import Needs
 
 D = 4

@@ -7,20 +7,17 @@ import pytest
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import split
-from dln_jax.learning import uncertainty as learning
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
-from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
-from dln_jax.mechanics.dynamics import InverseForward
+from dln_jax.learning.uncertainty import DIRECTIONS, MOST_PARAMETERS, calibration, effective_samples, estimate, scatter
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.coverage import coverage
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.linearisation import linearised
-from dln_jax.models.model import Model
+from dln_jax.models.model import Model, linearised
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
-from dln_jax.models.uncertainty import outside, predictive, scores
+from dln_jax.models.uncertainty import out_of_distribution, predictive, scores
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError, Needs
@@ -89,11 +86,11 @@ def test_bands_cover_what_they_promise(fitted):
 
 def test_far_states_are_flagged_and_near_ones_are_not(fitted):
     parameters, found = fitted
-    flag = jax.jit(jax.vmap(outside(ARM, parameters, found.uncertainty)))
+    flag = jax.jit(jax.vmap(out_of_distribution(ARM, parameters, found.uncertainty)))
     near, far = drawn(5, reach=0.99), drawn(6, reach=6.0)
     assert np.mean(flag(near.q, near.qd, near.qdd)) <= 0.02
     away = (far.q, far.qd, far.qdd)
-    error = jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics)(*away) - TORQUE(*away)
+    error = jax.jit(jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics))(*away) - TORQUE(*away)
     wrong = np.any(np.abs(error) > 3 * NOISE, axis=1)
     flagged = np.asarray(flag(*away))
     assert wrong.any() and flagged[wrong].all() and flagged.mean() >= 0.98
@@ -108,10 +105,12 @@ def test_exact_linear_model_is_nowhere_outside():
     found = estimate(model, parameters, sets.train, sets.validation, ridge=0.0)
     random = np.random.default_rng(1)
     away = [random.uniform(-reach, reach, (200, 2)) for reach in (6.0, 30.0, 300.0)]
-    truth = jax.vmap(dynamics(scene.energies).inverse_dynamics)(*away)
-    error = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*away) - truth
-    assert np.abs(error).max() < 1e-8 * np.abs(truth).max()
-    assert not jax.vmap(outside(model, parameters, found.uncertainty))(*away).any()
+    flag = out_of_distribution(model, parameters, found.uncertainty)
+    plants = dynamics(scene.energies), dynamics(model.energies(parameters))
+    ask = jax.jit(jax.vmap(lambda *state: (*(plant.inverse_dynamics(*state) for plant in plants), flag(*state))))
+    truth, predicted, flags = ask(*away)
+    assert np.abs(predicted - truth).max() < 1e-8 * np.abs(truth).max()
+    assert not flags.any()
 
 
 @pytest.mark.parametrize(("motions", "samples"), [(4, 50), (8, 200), (400, 1)])
@@ -134,8 +133,8 @@ def test_bands_with_scatter_hold_for_new_motions():
         known, new = errors[fitted : fitted + 10].ravel(), errors[50:]
         std = np.sqrt(np.mean(known**2))
         raised = std * np.sqrt(scatter(known / std, motion))
-        for shares, each in ((plain, std), (scattered, raised)):
-            shares.append([coverage(x[:, None], np.full((200, 1), each), levels=levels).shares[0, 0] for x in new])
+        for shares, band in ((plain, std), (scattered, raised)):
+            shares.append([coverage(x[:, None], np.full((200, 1), band), levels=levels).shares[0, 0] for x in new])
     assert np.min(scattered) > np.min(plain) + 0.03
     assert np.mean(np.array(scattered) >= 0.9) > 0.75 > np.mean(np.array(plain) >= 0.9)
 
@@ -181,11 +180,11 @@ def test_a_network_is_uncertain_where_it_has_seen_nothing():
     predicted = torque(near.q, near.qd, near.qdd)
     assert 0.9 < coverage(predicted - near.tau, std(near.q, near.qd, near.qdd), levels=(0.95,)).shares.mean() < 0.99
     assert np.median(std(far.q, far.qd, far.qdd)) > 2 * np.median(std(near.q, near.qd, near.qdd))
-    flag = jax.jit(jax.vmap(outside(model, truth, found.uncertainty)))
+    flag = jax.jit(jax.vmap(out_of_distribution(model, truth, found.uncertainty)))
     assert np.mean(flag(far.q, far.qd, far.qdd)) > 0.95 and np.mean(flag(near.q, near.qd, near.qdd)) < 0.05
 
 
-def test_leading_directions_are_those_of_the_singular_value_decomposition(monkeypatch):
+def test_leading_directions_are_those_of_the_singular_value_decomposition():
     random = np.random.default_rng(0)
     Phi = random.normal(size=(60, 1, 12)) * 10.0 ** -np.arange(12) @ np.linalg.qr(random.normal(size=(12, 12)))[0]
     unit = np.array([2.0])
@@ -194,10 +193,11 @@ def test_leading_directions_are_those_of_the_singular_value_decomposition(monkey
     _, _, right = np.linalg.svd(scaled, full_matrices=False)
     basis = found * np.linalg.norm(Phi[:, 0] / unit, axis=0)[:, None]
     np.testing.assert_allclose(np.linalg.norm(right[:3] @ basis, axis=1), 1.0, atol=1e-3)
-    monkeypatch.setattr(learning, "MOST_PARAMETERS", 10)
-    monkeypatch.setattr(learning, "DIRECTIONS", 6)
-    small = estimate(ARM, TRUTH, drawn(0), drawn(1)).uncertainty
-    assert small.factor.shape == (28, 6)
+    network = make_delan(Needs(joints=("revolute", "revolute")), width=32, depth=2, dtype=jnp.float64)
+    parameters = jax.jit(network.init)(jax.random.key(0))
+    factor = estimate(network, parameters, drawn(0), drawn(1)).uncertainty.factor
+    size = sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    assert size > MOST_PARAMETERS and factor.shape == (size, DIRECTIONS)
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.1])

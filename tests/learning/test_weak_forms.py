@@ -11,12 +11,13 @@ import pytest
 from dln_jax.data import schema
 from dln_jax.data.encoders import smooth
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.weak_forms import energy_and_loss, fit_energy, fit_momentum, momentum_and_rest, window_weights
+from dln_jax.learning.weak_forms import fit_momentum, momentum_and_rest, window_weights
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
+from scripts.reports.encoder_data import energy_and_loss, fit_energy
 
 RATE, SAMPLES, RUNS = 125.0, 500, 3
 NOISE_Q, NOISE_TAU = 3e-4, 0.05

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.networks import joint_features
+from dln_jax.models.model import joint_features
 from dln_jax.types import Needs
 
 
@@ -48,8 +48,8 @@ def checks(d):
     return evaluate
 
 
-@settings(max_examples=60, deadline=None)
-@given(d=st.sampled_from([1, 2, 3, 6]), seed=st.integers(0, 2**16))
+@settings(max_examples=30, deadline=None)
+@given(d=st.sampled_from([1, 3]), seed=st.integers(0, 2**16))
 def test_physics_holds_for_random_parameters(d, seed):
     state = np.random.default_rng(seed).normal(size=(3, d))
     mass, *residuals = checks(d)(seed, *state)

@@ -11,7 +11,7 @@ from dln_jax.data.splits import hold_out
 from dln_jax.learning import rates
 from dln_jax.mechanics.dynamics import Flow, PlainFlow
 from dln_jax.mechanics.equations import flow
-from dln_jax.models.helmholtz import make_helmholtz
+from dln_jax.models.baselines import make_helmholtz
 from dln_jax.types import InputError, Needs
 
 PLANE = Needs(joints=("prismatic", "revolute"))

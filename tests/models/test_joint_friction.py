@@ -1,5 +1,7 @@
 """Friction in the joints of any model: its force, its parametrisation, and what a linear model keeps."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,6 @@ KINDS = {
     "feed-forward": SMALL,
     "structured-hnn": SMALL,
     "black-box-hnn": SMALL,
-    "separable-hnn": SMALL,
     "trigonometric": {},
 }
 STATE = np.array([0.3, -0.8]), np.array([0.02, -0.4]), np.array([2.0, -1.0])
@@ -48,7 +49,7 @@ def test_every_kind_has_the_friction_that_its_needs_name(kind):
     parameters = drawn(model)
     found, without = model.energies(parameters), bare.energies(parameters["model"])
     q, qd, qdd = STATE
-    one_network = kind in ("black-box-hnn", "separable-hnn")  # whose velocities may have no momentum
+    one_network = kind == "black-box-hnn"  # whose velocities may have no momentum
     if one_network:
         qd, free = jax.jit(flow(without).rates)(q, qdd)
     J = np.array(ABSOLUTE)
@@ -63,12 +64,18 @@ def test_every_kind_has_the_friction_that_its_needs_name(kind):
         link = -force / (1 - np.sign(force) * share)
         np.testing.assert_allclose(change, free + J.T @ link, rtol=1e-9)
         return
-    link = np.linalg.solve(J.T, jax.jit(dynamics(without).inverse_dynamics)(q, qd, qdd))
-    tau = jax.jit(dynamics(found).inverse_dynamics)(q, qd, qdd)
+    free, motion = dynamics(without), dynamics(found)
+
+    @jax.jit
+    def ask():
+        tau = motion.inverse_dynamics(*STATE)
+        return free.inverse_dynamics(*STATE), tau, motion.forward_dynamics(*STATE[:2], tau)
+
+    torque, tau, again = ask()
+    link = np.linalg.solve(J.T, torque)
     np.testing.assert_allclose(tau, J.T @ (link + abs(link) * share + force), rtol=1e-9)
     if kind != "feed-forward":
-        forward = jax.jit(dynamics(found).forward_dynamics)
-        np.testing.assert_allclose(forward(q, qd, tau), qdd, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(again, qdd, rtol=1e-7, atol=1e-7)
 
 
 def test_a_phase_network_loses_momentum_by_friction():
@@ -90,17 +97,19 @@ def test_a_phase_network_loses_momentum_by_friction():
 def test_what_is_trained_takes_power_whatever_the_parameters(laws):
     model, free = model_of("structured-delan", NEEDS._replace(joint_friction=laws)), model_of("structured-delan", NEEDS)
 
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(None, 0))
     def power(parameters, qd):
         tau, link = (
-            dynamics(each.energies(x)).inverse_dynamics(STATE[0], qd, STATE[2])
-            for each, x in ((model, parameters), (free, parameters["model"]))
+            dynamics(plant.energies(x)).inverse_dynamics(STATE[0], qd, STATE[2])
+            for plant, x in ((model, parameters), (free, parameters["model"]))
         )
         return qd @ (tau - link)
 
     rates = np.random.default_rng(0).normal(size=(20, 2))
     for seed in range(5):
         parameters = jax.tree.map(lambda leaf: 10 * leaf, drawn(model, seed))
-        assert (np.asarray(jax.jit(jax.vmap(power, (None, 0)))(parameters, rates)) >= -1e-9).all()
+        assert (np.asarray(power(parameters, rates)) >= -1e-9).all()
 
 
 def test_a_linear_model_stays_one_and_finds_the_friction_of_joints():

@@ -58,12 +58,8 @@ def assert_close(got, expected, tolerance=1e-12):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * scale)
 
 
-# (activation, n, m, depth): all pairs (n, depth), (n, m) and (m, depth), and each activation three times or more.
-CASES = [
-    (list(PLAIN)[(7 * depth + inputs) % 9], inputs, 1 + (inputs + depth) % 3, depth)
-    for depth in range(1, 5)
-    for inputs in range(1, 8)
-]
+# (activation, n, m, depth): every activation once, and all pairs (n, depth), (n, m) and (m, depth) of the extremes.
+CASES = [(name, (1, 2, 7)[k % 3], (1, 3)[k % 2], (1, 2, 4)[k // 3]) for k, name in enumerate(PLAIN)]
 
 
 @pytest.mark.parametrize(("name", "inputs", "outputs", "depth"), CASES)
@@ -87,8 +83,9 @@ def test_equals_autodiff_of_a_plain_network(name, inputs, outputs, depth):
 def test_cases_cover_every_value_and_both_sweeps():
     names, inputs, outputs, depths = (set(column) for column in zip(*CASES, strict=True))
     assert names == set(PLAIN) == set(activations.ALL) - {"relu"}
-    assert (inputs, outputs, depths) == (set(range(1, 8)), {1, 2, 3}, {1, 2, 3, 4})
-    assert len({(n, m) for _, n, m, _ in CASES}) == 21 and len({(m, depth) for _, _, m, depth in CASES}) == 12
+    assert (inputs, outputs, depths) == ({1, 2, 7}, {1, 3}, {1, 2, 4})
+    assert len({(n, m) for _, n, m, _ in CASES}) == len({(m, depth) for _, _, m, depth in CASES}) == 6
+    assert len({(n, depth) for _, n, _, depth in CASES}) == 9
     for rule in (differential_mlp.cheaper_jacobian, differential_mlp.cheaper_hessian):
         assert {rule((n, *(5, 4, 6, 3)[:depth], m)) for _, n, m, depth in CASES} == {"forward", "backward"}
 
@@ -113,11 +110,9 @@ def test_either_sweep_is_exact_in_a_batch(sweep, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "sizes"),
     [
-        ("tanh", (2, 5, 4, 1)),
         ("silu", (3, 5, 4, 2)),
         ("gelu", (1, 5, 4, 3)),  # second derivatives go forward
         ("cos", (7, 6, 1)),
-        ("softplus", (2, 5, 4, 3)),
     ],
 )
 def test_parameter_gradients_equal_those_through_autodiff(name, sizes):
@@ -126,7 +121,7 @@ def test_parameter_gradients_equal_those_through_autodiff(name, sizes):
     direction = jax.tree.map(lambda leaf: jnp.asarray(np.cos(leaf)), layers)
 
     def loss(layers, derivatives):
-        return sum(jnp.sum(jnp.sin(each)) + jnp.sum(each**2) for each in derivatives(layers))
+        return sum(jnp.sum(jnp.sin(array)) + jnp.sum(array**2) for array in derivatives(layers))
 
     ours = lambda layers: value_jacobian_and_hessian(layers, x, activation=activations.ALL[name])  # noqa: E731
     theirs = lambda layers: plain_derivatives(layers, x, PLAIN[name])  # noqa: E731
@@ -167,7 +162,7 @@ def test_dtype_is_that_of_the_parameters():
 
     for dtype, expected in ((jnp.float32, jnp.float32), (float, jnp.float64)):  # float: JAX's default, 64 bits here
         results = jax.eval_shape(partial(network, dtype=dtype), jax.random.key(0))
-        assert {each.dtype for each in jax.tree.leaves(results)} == {jnp.dtype(expected)}
+        assert {leaf.dtype for leaf in jax.tree.leaves(results)} == {jnp.dtype(expected)}
 
 
 def flops(function, *arguments) -> float:
@@ -176,7 +171,7 @@ def flops(function, *arguments) -> float:
 
 def training_loss(derivatives, layers, xs):
     results = jax.vmap(lambda x: derivatives(layers, x))(xs)
-    return sum(jnp.mean(each**2) for each in results)
+    return sum(jnp.mean(array**2) for array in results)
 
 
 @pytest.mark.parametrize("inputs", [2, 7])
@@ -258,11 +253,11 @@ def test_initial_weights_follow_glorot():
 
 
 @pytest.mark.parametrize("function", [value, value_and_jacobian, value_jacobian_and_hessian])
-@pytest.mark.parametrize("shape", [(), (3,), (5, 2), (2, 1)])
-def test_x_of_wrong_shape(function, shape):
+def test_x_of_wrong_shape(function):
     layers, _ = random_network((2, 4, 1))
-    with pytest.raises(InputError, match=r"x has shape .*expected \(2,\), one state"):
-        function(layers, jnp.zeros(shape), activation=TANH)
+    for shape in ((), (3,), (5, 2), (2, 1)):
+        with pytest.raises(InputError, match=r"x has shape .*expected \(2,\), one state"):
+            function(layers, jnp.zeros(shape), activation=TANH)
 
 
 def test_wrong_layers_and_sizes():

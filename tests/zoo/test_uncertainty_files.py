@@ -11,7 +11,7 @@ import pytest
 from dln_jax.export.c.families import functions_of_run
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
-from dln_jax.models.uncertainty import Domain, Uncertainty, outside, predictive
+from dln_jax.models.uncertainty import Domain, Uncertainty, out_of_distribution, predictive
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import load, save
@@ -45,7 +45,8 @@ def test_it_comes_back_with_the_run(folder, undetermined):
     stored = known(undetermined)
     save_uncertainty(folder, stored, ridge=1e-8)
     run = load(folder)
-    std, flag = map(jax.jit, (predictive(MODEL, PARAMETERS, *stored[:3]), outside(MODEL, PARAMETERS, stored)))
+    std = jax.jit(predictive(MODEL, PARAMETERS, *stored[:3]))
+    flag = jax.jit(out_of_distribution(MODEL, PARAMETERS, stored))
     for state in STATES[:3]:
         np.testing.assert_allclose(run.torque_std(*state), std(*state), rtol=1e-12)
         assert run.outside(*state.tolist()) == flag(*state)

@@ -43,7 +43,7 @@ from dln_jax.mechanics.jacobians import Natural
 from dln_jax.mechanics.joint_friction import LoadedSystem
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model
-from dln_jax.models.uncertainty import Uncertainty, outside, predictive
+from dln_jax.models.uncertainty import Uncertainty, out_of_distribution, predictive
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -218,7 +218,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
 
 def _of_uncertainty(model: Model, parameters: Any, known: Uncertainty) -> Named:
     std = predictive(model, parameters, known.factor, known.noise, known.inflation)
-    return {"torque_std": _named(std, "tau_std"), "outside": _named(outside(model, parameters, known), "outside")}
+    outside = out_of_distribution(model, parameters, known)
+    return {"torque_std": _named(std, "tau_std"), "outside": _named(outside, "outside")}
 
 
 def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:

@@ -2,20 +2,23 @@
 
 import hashlib
 import math
-import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from jax import Array
 
-from dln_jax.files import finite, is_file, matches
+from dln_jax.files import finite, is_file
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
+Number = float | None
+Row = tuple[int | list[int], *[Number | list[Number]] * 3, float, str]  # type: ignore[valid-type]
+"""Stored `Progress`, with `null` for NaN and lists if several seeds trained together."""
 CHECKPOINT = "checkpoint"
 """Name of the pair of checkpoint files in a run's folder."""
 
@@ -76,28 +79,27 @@ def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progres
             )
     state = checkpoints.load_tree(checkpoint.directory, checkpoint.name, like)
     path = checkpoint.directory / f"{checkpoint.name}.json"
-    rows = stored_rows(path, manifest, "history", (int, *[float | None] * 3, float, str))
-    return state, [Progress(*map(_number, row)) for row in rows]
+    return state, [Progress(*map(_number, row)) for row in stored_rows(path, manifest, "history", Row)]
 
 
-def stored_rows(path: Path, manifest: dict[str, Any], key: str, types: Sequence[Any]) -> list[list[Any]]:
+def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> list[Any]:
     """Returns the rows under a key of a manifest.
 
-    A row holds one JSON value of each type in `types`, or a list of such values if several seeds trained together.
+    Args:
+        path: path of the manifest, for messages.
+        manifest: JSON values.
+        key: key of the rows.
+        row: type of a row, such as `tuple[int, float | None]`.
 
     Raises:
-        InputError: the manifest has no such rows.
+        InputError: the manifest has no such rows, or values of one column have different shapes.
     """
-    rows = manifest.get(key)
-    if not isinstance(rows, list):
-        raise InputError(f"{path}: {key} is {reprlib.repr(rows)}, expected a list; {checkpoints.REMEDY}")
-    for row in rows:
-        columns = [each if isinstance(each, list) else [each] for each in row] if isinstance(row, list) else []
-        right = len(columns) == len(types) and all(
-            all(matches(value, hint) for value in column) for column, hint in zip(columns, types, strict=True)
-        )
-        if not right or [np.shape(each) for each in row] != [np.shape(each) for each in rows[0]]:
-            raise InputError(f"{path}: {key} holds {reprlib.repr(row)}, expected numbers; {checkpoints.REMEDY}")
+    try:
+        rows = msgspec.convert(manifest.get(key), list[row])
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {key} is damaged ({error}); {checkpoints.REMEDY}") from error
+    if any([np.shape(value) for value in values] != [np.shape(value) for value in rows[0]] for values in rows):
+        raise InputError(f"{path}: {key} has rows of different shapes; {checkpoints.REMEDY}")
     return rows
 
 
@@ -108,5 +110,5 @@ def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
 
 def _number(value: Any) -> Any:
     if isinstance(value, list):
-        return np.array([math.nan if each is None else each for each in value])
+        return np.array([_number(element) for element in value])
     return math.nan if value is None else value

@@ -16,12 +16,22 @@ from jax.sharding import Mesh
 
 from dln_jax.learning.engine import optimisers
 from dln_jax.learning.engine.optimisers import Adam
-from dln_jax.learning.engine.problem import Best, Dispatch, Problem, Stage, Stop, better_of, loss_of, no_best
-from dln_jax.learning.engine.sharing import Sharing, by_devices
+from dln_jax.learning.engine.problem import (
+    Best,
+    Dispatch,
+    Problem,
+    Sharing,
+    Stage,
+    Stop,
+    better_of,
+    by_devices,
+    loss_of,
+    no_best,
+)
 from dln_jax.scale.mesh import first, mean, share, shares
 
 
-class State(NamedTuple):
+class AdamState(NamedTuple):
     """State of a run; resuming from it is exact. Several seeds add a leading axis."""
 
     parameters: Any
@@ -65,11 +75,11 @@ def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
     of_seeds = prepare(functools.partial(_dispatch, problem, adam, lengths, shared.samples), (None, 0))
     dispatch = jax.jit(by_devices(of_seeds, shared), donate_argnums=1)
 
-    def compile_(state: State) -> Dispatch:
+    def compile_(state: AdamState) -> Dispatch:
         compiled = dispatch.lower(lengths.epochs_per_dispatch, state).compile()
         return lambda state: compiled(min(lengths.epochs_per_dispatch, lengths.epochs - _epoch(state)), state)
 
-    def ended(state: State) -> Stop | None:
+    def ended(state: AdamState) -> Stop | None:
         if np.all(np.asarray(state.failed_step) >= 0):
             return Stop("not finite", int(np.max(state.failed_step)))
         if _epoch(state) >= lengths.epochs:
@@ -81,12 +91,12 @@ def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
     return [Stage("", lambda before: begin(problem.parameters, problem.seed), compile_, ended)]
 
 
-def _epoch(state: State) -> int:
+def _epoch(state: AdamState) -> int:
     return int(np.max(state.epoch))
 
 
-def _begin(adam: Adam, parameters: Any, seed: Any) -> State:
-    return State(
+def _begin(adam: Adam, parameters: Any, seed: Any) -> AdamState:
+    return AdamState(
         parameters=parameters,
         optimiser=optimisers.transformation(adam).init(parameters),
         key=jax.random.key_data(jax.random.key(seed)),
@@ -98,14 +108,14 @@ def _begin(adam: Adam, parameters: Any, seed: Any) -> State:
 
 
 def _dispatch(
-    problem: Problem, adam: Adam, lengths: Lengths, mesh: Mesh | None, epochs: Array, before: State
-) -> tuple[State, Array]:
+    problem: Problem, adam: Adam, lengths: Lengths, mesh: Mesh | None, epochs: Array, before: AdamState
+) -> tuple[AdamState, Array]:
     """Runs some epochs of one seed and returns [loss, validation, monitor]; devices of a mesh share every batch."""
     dtype = before.best.validation.dtype
     loss, optimiser = loss_of(problem), optimisers.transformation(adam)
     drawn = _shuffled(problem.arrays, before, lengths, mesh)
 
-    def step(index: Array, carry: tuple[State, Array]) -> tuple[State, Array]:
+    def step(index: Array, carry: tuple[AdamState, Array]) -> tuple[AdamState, Array]:
         state, total = carry
         batch = jax.tree.map(lambda a: a[index], drawn)
         value, gradient = mean(jax.value_and_grad(loss)(state.parameters, batch), mesh)
@@ -135,7 +145,7 @@ def _dispatch(
     return state._replace(failed_step=failed_step, best=best), values
 
 
-def _shuffled(arrays: Any, state: State, lengths: Lengths, mesh: Mesh | None) -> Any:
+def _shuffled(arrays: Any, state: AdamState, lengths: Lengths, mesh: Mesh | None) -> Any:
     """Batches of a dispatch, with one permutation per epoch; devices that share them get their own part."""
     samples = jax.tree.leaves(arrays)[0].shape[0]
 

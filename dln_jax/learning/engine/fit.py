@@ -13,8 +13,7 @@ from dln_jax.interrupts import held_back
 from dln_jax.learning.engine import descent, newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.optimisers import Adam, Optimiser
-from dln_jax.learning.engine.problem import NO_START, Problem, Progress, Report, Stop, Training, plain, silent
-from dln_jax.learning.engine.sharing import sharing
+from dln_jax.learning.engine.problem import NO_START, Problem, Progress, Report, Stop, Training, plain, sharing, silent
 from dln_jax.scale.mesh import local, of_first_process, replicate
 from dln_jax.types import InputError, require_positive
 
@@ -85,7 +84,7 @@ def fit(
             since, before = time.perf_counter(), np.array(run.state.step)
             with held_back():
                 state, values = dispatch(run.state)
-                loss, validation, monitor = (plain(each) for each in np.moveaxis(np.asarray(values), -1, 0))
+                loss, validation, monitor = (plain(value) for value in np.moveaxis(np.asarray(values), -1, 0))
                 train_seconds += time.perf_counter() - since
                 run, dispatched = run._replace(state=state), True
                 ended = stage.ended(state)

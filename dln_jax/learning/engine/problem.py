@@ -1,4 +1,4 @@
-"""Inputs and results of a training, for any model and optimiser."""
+"""Inputs, stages and results of a training, for any model and optimiser, and what devices share of it."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -8,7 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
+from dln_jax.data.magnitudes import on_device
+from dln_jax.scale.mesh import on_devices, spread
 from dln_jax.types import InputError, Scalar
 
 NO_START = "the loss is not finite before training; look for very large numbers in the data"
@@ -53,8 +56,41 @@ def loss_of(problem: Problem) -> Callable[[Any, Any], Scalar]:
 
 def mean_square(residual: Callable[..., Array], batch: tuple[Any, ...]) -> Scalar:
     """Mean over samples of the sum of squared residuals."""
-    each = jax.vmap(residual)(*batch)
-    return jnp.mean(jnp.sum(each**2, axis=tuple(range(1, each.ndim))))
+    residuals = jax.vmap(residual)(*batch)
+    return jnp.mean(jnp.sum(residuals**2, axis=tuple(range(1, residuals.ndim))))
+
+
+def selected_by(
+    held_out: tuple[Any, ...],
+    residual: Callable[..., Array],
+    parameters: Any,
+    arrays: tuple[Any, ...],
+    seed: int | Array = 0,
+    *,
+    error: Callable[..., Array] | None = None,
+) -> Problem:
+    """Builds the problem of a residual whose mean square over held-out samples selects the parameters.
+
+    Args:
+        held_out: samples of the score.
+        residual, parameters, arrays, seed: as in `Problem`.
+        error: (parameters, *sample) -> residuals of the score, if they differ from those of the loss.
+    """
+    judged = error or residual
+
+    def score(parameters: Any) -> tuple[Scalar, Scalar]:
+        return unmonitored(mean_square(lambda *sample: judged(parameters, *sample), held_out))
+
+    return Problem(residual, parameters, arrays, score, seed)
+
+
+def arrays_of(record: Any, keys: Iterable[str] | None = None, dtype: Any = jnp.float64) -> tuple[Array, ...]:
+    """Returns fields of a record of NumPy arrays on the device, all of them by default.
+
+    Raises:
+        InputError: squares of numbers overflow in that dtype.
+    """
+    return tuple(on_device(key, getattr(record, key), dtype) for key in keys or record._fields)
 
 
 def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:
@@ -182,3 +218,34 @@ class Stage(NamedTuple):
     """A state -> a compiled dispatch of some steps and their score."""
     ended: Callable[[Any], Stop | None]
     """A state -> the reason why the stage is over, or `None` if it is not."""
+
+
+class Sharing(NamedTuple):
+    """Meshes that split the seeds or the samples; at most one of them."""
+
+    seeds: Mesh | None
+    """Every device trains its own seeds, as on its own: only results are sent. Some devices may have one seed more."""
+    samples: Mesh | None
+    """Every device sums over its own samples; every step adds up the sums."""
+
+
+def sharing(problem: Problem, mesh: Mesh | None) -> Sharing:
+    """Returns what the devices of a mesh share in this problem: seeds or samples.
+
+    Raises:
+        InputError: one seed, with a loss that is not the mean of the losses of parts of a batch.
+    """
+    if mesh is None or np.size(problem.seed) > 1:
+        return Sharing(mesh, None)
+    if problem.loss is not None and not problem.loss_is_mean:
+        raise InputError("the loss is of a whole batch, whose samples cannot be split: train it on one device")
+    return Sharing(None, mesh)
+
+
+def by_devices(function: Callable[[Any, Any], Any], shared: Sharing) -> Callable[[Any, Any], Any]:
+    """Distributes a function of (whole, seeds): every device evaluates it for its own seeds.
+
+    Devices that share the samples work on all seeds together, and the function itself adds up their sums.
+    """
+    together = on_devices(lambda arguments, _: function(*arguments), shared.samples)
+    return spread(lambda whole, seeds: together((whole, seeds), None), shared.seeds)

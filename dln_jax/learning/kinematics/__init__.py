@@ -5,8 +5,16 @@ make_serial_tree(needs).energies(fit.parameters)
 """
 
 from dln_jax.learning.kinematics.fit import TreeFit, fit_tree
-from dln_jax.learning.kinematics.frames import Frames, mirrored, random_frames, rough_frames, turned_round
-from dln_jax.learning.kinematics.kinematic_prior import KinematicPrior, frames_of_axes, kinematic_prior_from_json
+from dln_jax.learning.kinematics.frames import (
+    Frames,
+    KinematicPrior,
+    frames_of_axes,
+    kinematic_prior_from_json,
+    mirrored,
+    random_frames,
+    rough_frames,
+    turned_round,
+)
 from dln_jax.learning.kinematics.search import Search
 
 __all__ = [

@@ -1,6 +1,5 @@
 """Fits a tree of unknown kinematics to states and torques: search, refinement, and a final linear problem."""
 
-import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -8,15 +7,24 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import drawn
-from dln_jax.learning.kinematics.descent import Program, State, compiled, descend
 from dln_jax.learning.kinematics.frames import Frames
-from dln_jax.learning.kinematics.projection import Samples, Structure, design, inertias_of
+from dln_jax.learning.kinematics.projection import (
+    Descent,
+    Program,
+    Samples,
+    Structure,
+    compiled,
+    descend,
+    design,
+    inertias_of,
+)
 from dln_jax.learning.kinematics.search import ALIKE, Search, agreeing, search
+from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree, rotation_vector
 from dln_jax.solvers import least_squares
@@ -27,6 +35,8 @@ FINALISTS, NEAR = 3, 2.0
 the lowest."""
 ROUNDS = 2
 """Rounds of weighting the joints by their unexplained torques; further rounds change the weights by percents."""
+CHUNK = 4096
+"""Samples whose columns are in memory at a time."""
 LEAST_NOISE = 1e-7
 """Lower bound on a joint's noise in the weights, relative to its torque."""
 
@@ -84,11 +94,11 @@ def fit_tree(
         train: samples to fit, with accelerations.
         validation: samples that choose the local minimum; the training error chooses without them.
         parents: parent link of every link; a serial chain by default.
-        acceleration: of gravity, m/s².
-        velocity_scale: of dry friction, 1/s or m/s.
+        acceleration: acceleration of gravity, m/s².
+        velocity_scale: velocity scale of dry friction, 1/s or m/s.
         settings: starts, samples and limits of the search.
-        ridge: of the elimination, relative to the squared length of the columns.
-        rank_tolerance: of the final linear problem, as in `solvers.least_squares.solve`.
+        ridge: ridge of the elimination, relative to the squared length of the columns.
+        rank_tolerance: tolerance of the final linear problem, as in `solvers.least_squares.solve`.
         most_samples: largest number of samples for refining frames; the final linear problem uses all.
         report: called with lines of text about the search.
 
@@ -109,17 +119,17 @@ def fit_tree(
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(train))
         program = compiled(structure, ridge=ridge)
-        found = search(structure, program, _some(train, settings.samples, settings.seed), scale, settings)
-        lowest = float(found[0].at.loss)
-        report(f"{len(found)} descents, {agreeing(found)} of them to the lowest loss, {lowest:.3g}")
-        every = _some(train, most_samples, settings.seed)
-        refined = [_refined(program, structure, each, every, scale, settings) for each in _finalists(found, validation)]
+        descents = search(structure, program, _some(train, settings.samples, settings.seed), scale, settings)
+        losses = np.array([float(descent.at.loss) for descent in descents])
+        report(f"{len(descents)} descents, {agreeing(descents)} of them to the lowest loss, {losses[0]:.3g}")
+        every, finalists = _some(train, most_samples, settings.seed), _finalists(descents, validation)
+        refined = [_refined(program, structure, descent, every, scale, settings) for descent in finalists]
         columns = _columns(structure)
-        solved = [_solved(columns, state, unit, train, rank_tolerance) for state, unit in refined]
-        pairs = [(state.frames, solution.x) for (state, _), solution in zip(refined, solved, strict=True)]
+        solved = [_solved(columns, descent, unit, train, rank_tolerance) for descent, unit in refined]
+        pairs = [(descent.frames, solution.x) for (descent, _), solution in zip(refined, solved, strict=True)]
         errors = [_joint_errors(columns, *pair, train) for pair in pairs]
         judged = [_joint_errors(columns, *pair, validation or train) for pair in pairs]
-        best = int(np.argmin([np.sum(each / scale**2) for each in judged]))
+        best = int(np.argmin([np.sum(squares / scale**2) for squares in judged]))
         (frames, linear), solution = pairs[best], solved[best]
         parameters = _parameters(structure, frames, linear)
     return TreeFit(
@@ -131,8 +141,8 @@ def fit_tree(
         parameter_count=len(refined[best][0].at.slope) + structure.linear_count,
         rank=solution.rank,
         condition=solution.condition,
-        losses=np.array([float(each.at.loss) for each in found]),
-        agreeing=agreeing(found),
+        losses=losses,
+        agreeing=agreeing(descents),
         agreement=settings.agreement,
         seconds=time.perf_counter() - began,
     )
@@ -144,25 +154,25 @@ def _some(data: Trajectories, most: int, seed: int) -> Samples:
     return Samples(some.q, some.qd, some.qdd, some.tau)
 
 
-def _finalists(found: list[State], validation: Trajectories | None) -> list[State]:
-    """Returns the lowest state of every local minimum that validation may prefer to the lowest of all."""
-    kept = found[:1]
-    for state in found[1:]:
-        loss, last = float(state.at.loss), float(kept[-1].at.loss)
-        near = loss <= NEAR * float(found[0].at.loss)
+def _finalists(descents: list[Descent], validation: Trajectories | None) -> list[Descent]:
+    """Returns the lowest descent of every local minimum that validation may prefer to the lowest of all."""
+    kept = descents[:1]
+    for descent in descents[1:]:
+        loss, last = float(descent.at.loss), float(kept[-1].at.loss)
+        near = loss <= NEAR * float(descents[0].at.loss)
         if validation is not None and near and loss > (1 + ALIKE) * last and len(kept) < FINALISTS:
-            kept.append(state)
+            kept.append(descent)
     return kept
 
 
 def _refined(
     program: Program,
     structure: Structure,
-    state: State,
+    state: Descent,
     samples: Samples,
     scale: Float[np.ndarray, " d"],
     settings: Search,
-) -> tuple[State, Float[np.ndarray, " d"]]:
+) -> tuple[Descent, Float[np.ndarray, " d"]]:
     """Continues the descent on all samples, then with the joints' residual torques as units."""
     unit = scale
     for last in range(ROUNDS + 1):
@@ -173,12 +183,12 @@ def _refined(
 
 
 def _solved(
-    columns: Callable, state: State, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
-) -> least_squares.LeastSquaresSolution:
+    columns: Callable, state: Descent, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
+) -> least_squares.Solution:
     """Solves for the linear parameters of known frames on all data, by singular values."""
 
     def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for Phi, tau in _designs(columns, state.frames, data):
+        for Phi, _, tau in design_chunks(columns, state.frames, data, CHUNK):
             yield (Phi / unit[:, None]).reshape(-1, Phi.shape[-1]), (tau / unit).ravel()
 
     return least_squares.solve_chunks(equations(), rank_tolerance=rank_tolerance, negligible=1e-12)
@@ -186,29 +196,23 @@ def _solved(
 
 def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
     """Mean squared error of every joint's torque."""
-    squares = [np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, tau in _designs(columns, frames, data)]
-    return np.sum(squares, axis=0) / len(data.tau)
+    chunks = design_chunks(columns, frames, data, CHUNK)
+    return np.sum([np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, _, tau in chunks], axis=0) / len(data.tau)
 
 
 def _columns(structure: Structure) -> Callable:
-    """(frames, q, qd, qdd) -> Phi [N, d, P]."""
-    batched = jax.vmap(functools.partial(design, structure), in_axes=(None, 0, 0, 0))
-    return jax.jit(batched, compiler_options=quick_compilation())
+    """(frames, q, qd, qdd) -> Phi [N, d, P] and zeros [N, d], for `design_chunks`."""
 
+    def one(frames: Frames, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+        return design(structure, frames, q, qd, qdd), jnp.zeros_like(q)
 
-def _designs(
-    columns: Callable, frames: Frames, data: Trajectories, *, length: int = 4096
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Phi [n, d, P] and tau [n, d], at most `length` samples at a time."""
-    for first in range(0, len(data.tau), length):
-        rows = slice(first, first + length)
-        yield np.asarray(columns(frames, data.q[rows], data.qd[rows], data.qdd[rows])), data.tau[rows]
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
     """Parameters of the model."""
     armature, *friction = linear[len(structure.inertial) :].reshape(-1, len(structure.joints))
-    turns = np.array([rotation_vector(each) for each in np.asarray(frames.rotations)])
+    turns = np.array([rotation_vector(R) for R in np.asarray(frames.rotations)])
     inertias = inertias_of(structure, jnp.asarray(linear))
     parts = (turns, frames.positions, inertias, armature, *(friction or (None, None, None)))
     return SerialTreeParameters(*(None if part is None else jnp.asarray(part) for part in parts))

@@ -1,5 +1,10 @@
-"""Joint frames as the unknowns of a search: random ones, steps between them, and moves to other local minima."""
+"""Joint frames as the unknowns of a search: random ones, steps between them, and moves to other local minima.
 
+A kinematic prior is a rough description near which the search starts. It holds the joint axes in space at q = 0, with z
+up, and a point on every axis; or Denavit-Hartenberg rows.
+"""
+
+import reprlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -8,9 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dln_jax.mechanics.trees.description import dh_frames
 from dln_jax.models.serial_tree import rotation
-from dln_jax.types import JointKind
+from dln_jax.types import InputError, JointKind, finite_array
 
+FIELDS = {"axes": 3, "points": 3, "dh_rows": 4}
+"""Number of columns of the fields."""
+ROUGHNESS = {"angle_degrees": 30.0, "length": 0.05}
+EXPECTED = (
+    'expected {"axes": [[x, y, z], ...], "points": [[x, y, z], ...]} or {"dh_rows": [[alpha, a, d, theta], ...]}, a '
+    'row for each joint, and if known "angle_degrees" and "length" by which they are off'
+)
 REACH = 0.15
 """Standard deviation in m of the coordinates of a random joint's position."""
 
@@ -67,7 +80,7 @@ def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
     Where gravity dominates, torques hardly distinguish the two arms, and descents end in either.
     """
     half = np.diag([1.0, -1.0, -1.0])
-    rotations, positions = (np.array(each) for each in frames)
+    rotations, positions = map(np.array, frames)
     rotations[joint] = rotations[joint] @ half
     for link, parent in enumerate(parents):
         if parent == joint:
@@ -76,7 +89,7 @@ def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
 
 
 def mirrored(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
-    """Returns the mirror image: it moves alike under the same torques if the inertias are mirrored too.
+    """Returns the mirror image: it moves in the same way under the same torques if the inertias are mirrored too.
 
     Reflecting x in every frame reverses the rotation of revolute joints; reversing y and z of their links restores it.
     """
@@ -88,3 +101,81 @@ def mirrored(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]
     ]
     positions = [turn @ mirror @ p for turn, p in zip(before, frames.positions, strict=True)]
     return Frames(np.array(rotations), np.array(positions))
+
+
+class KinematicPrior(NamedTuple):
+    """Frames and their deviations."""
+
+    frames: Frames
+    angle: float = float(np.radians(ROUGHNESS["angle_degrees"]))
+    """Deviation of the axes, rad."""
+    length: float = ROUGHNESS["length"]
+    """Deviation of the positions, m."""
+
+
+def frames_of_axes(
+    axes: Float[np.ndarray, "d 3"], points: Float[np.ndarray, "d 3"], parents: Sequence[int] | None = None
+) -> Frames:
+    """Returns frames with z along the joints' axes and the origin at their points, relative to the parent link.
+
+    Args:
+        axes: directions of the joints in space at q = 0, of any length.
+        points: on the axes, m.
+        parents: parent link of every link, -1 for the ground; a serial chain by default.
+
+    Raises:
+        InputError: arrays of another shape or not finite, or an axis of length zero.
+    """
+    d = len(points)
+    axes, points = finite_array("axes", axes, (d, 3)), finite_array("points", points, (d, 3))
+    lengths = np.linalg.norm(axes, axis=1)
+    if not (lengths > 0).all():
+        raise InputError(f"joint {int(np.argmin(lengths)) + 1} has an axis of length zero; expected a direction")
+    order = tuple(range(-1, d - 1)) if parents is None else tuple(parents)
+    turned = [_with_z_along(axis) for axis in axes / lengths[:, None]]
+    rotations, positions = [], []
+    for link, parent in enumerate(order):
+        R, p = (np.eye(3), np.zeros(3)) if parent < 0 else (turned[parent], points[parent])
+        rotations.append(R.T @ turned[link])
+        positions.append(R.T @ (points[link] - p))
+    return Frames(np.array(rotations), np.array(positions))
+
+
+def kinematic_prior_from_json(values: Any, d: int, parents: Sequence[int] | None = None) -> KinematicPrior:
+    """Builds the prior of d joints from JSON values.
+
+    Raises:
+        InputError: unknown fields, another number of rows, or arrays that `frames_of_axes` refuses.
+    """
+    names = set(values) - set(ROUGHNESS) if isinstance(values, dict) else set()
+    if names not in ({"axes", "points"}, {"dh_rows"}):
+        raise InputError(f"{EXPECTED}; got {reprlib.repr(values)}")
+    rows = {name: _rows(name, values[name], d) for name in names}
+    rough = {name: _positive(name, values.get(name, default)) for name, default in ROUGHNESS.items()}
+    if "dh_rows" in rows:
+        if parents is not None and tuple(parents) != tuple(range(-1, d - 1)):
+            raise InputError("dh_rows describe joints one after the other; give axes and points where links branch")
+        frames = Frames(*dh_frames(rows["dh_rows"]))
+    else:
+        frames = frames_of_axes(rows["axes"], rows["points"], parents)
+    return KinematicPrior(frames, float(np.radians(rough["angle_degrees"])), rough["length"])
+
+
+def _rows(name: str, value: Any, d: int) -> np.ndarray:
+    try:
+        return finite_array(name, value, (d, FIELDS[name]))
+    except InputError:
+        raise InputError(f"{name}: expected {d} rows of {FIELDS[name]} finite numbers, one for each joint") from None
+
+
+def _positive(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise InputError(f"{name} is {reprlib.repr(value)}; expected a positive number")
+    return float(value)
+
+
+def _with_z_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Returns a rotation whose last column is the unit vector `axis`."""
+    x = np.cross(np.eye(3)[np.argmin(abs(axis))], axis)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis], axis=1)

@@ -1,4 +1,6 @@
-"""Variable projection: for fixed frames, inertias and friction solve a linear problem and are eliminated.
+"""Levenberg-Marquardt on joint frames with variable projection, a few iterations in one program.
+
+For fixed frames, inertias and friction solve a linear problem and are eliminated:
 
     tau = Phi(frames) theta,   r = (1 - U Uᵀ) y,   J = -(1 - U Uᵀ) dPhi theta
 
@@ -9,17 +11,33 @@ one. The ridge, relative to them, decides directions that the data leave undeter
 formed, so that a step takes milliseconds; `fit` solves the final linear problem to full precision.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions
 from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
 from dln_jax.types import JointKind, Vector
 
+LENGTH = 0.3
+"""Length in m that weighs as much as a radian in the damping."""
+LARGEST_STEP = 0.6
+"""Largest step of a coordinate, in rad, and in units of `LENGTH` for positions: longer steps are scaled down."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e3
+"""Initial, smallest and largest damping, relative to the mean of the normal matrix' diagonal; a descent ends at the
+largest."""
+FEWER, MORE = 0.2, 5.0
+"""Factors of the damping after a step that descends, and after one that does not."""
+CHUNK = 10
+"""Iterations per dispatch."""
+SETTLED = 1e-4
+"""A descent ends when the loss decreases by less than this fraction over a chunk."""
 OF_REVOLUTE = np.array([1, 2, 4, 5, 6, 8, 9])
 """Inertial parameters of a revolute link; the parent link takes up m, h_z and I_yy."""
 OF_PRISMATIC = np.array([0, 1, 2, 3])
@@ -55,7 +73,7 @@ class Structure(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """States and torques, as arrays [N, d]."""
+    """Descents and torques, as arrays [N, d]."""
 
     q: Any
     qd: Any
@@ -141,3 +159,79 @@ def project(
         normal=changes.T @ changes - spanned.T @ spanned,
         slope=changes.T @ r,
     )
+
+
+class Descent(NamedTuple):
+    """Descent of a descent."""
+
+    frames: Frames
+    at: Projection
+    damping: Any
+
+
+Program = Callable[[Descent, Samples, Array], Descent]
+"""(state, samples, scales of the joints' torques) -> the state after `CHUNK` iterations."""
+
+
+def compiled(structure: Structure, *, ridge: float) -> Program:
+    """Returns the program of a structure; it compiles once per number of samples."""
+    places = free_directions(structure.parents, structure.joints)
+    lengths = np.where(places % 6 < 3, 1.0, LENGTH)
+    d = len(structure.joints)
+
+    def iteration(state: Descent, samples: Samples, unit: Array) -> Descent:
+        normal = state.at.normal
+        typical = jnp.trace(normal) / len(places)
+        damped = normal + state.damping * typical * jnp.diag(lengths**-2.0)
+        step = jnp.linalg.solve(damped, state.at.slope)
+        longest = jnp.max(jnp.abs(step) / lengths)
+        step = step * jnp.minimum(1.0, LARGEST_STEP / jnp.maximum(longest, LARGEST_STEP))
+        frames = displaced(state.frames, jnp.zeros(6 * d).at[places].set(step).reshape(d, 6))
+        at = project(structure, frames, samples, unit, ridge=ridge)
+        lower = at.loss < state.at.loss  # false for NaN
+        damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)
+        before = (state.frames, state.at)
+        frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), before)
+        return Descent(frames, at, damping)
+
+    def iterate(state: Descent, samples: Samples, unit: Array) -> Descent:
+        return lax.fori_loop(0, CHUNK, lambda _, state: iteration(state, samples, unit), state)
+
+    return jax.jit(iterate, compiler_options=quick_compilation())
+
+
+def unseen(frames: Frames, linear: int, directions: int) -> Descent:
+    """Returns a state from which the first iteration only evaluates the frames, without a step."""
+    d = len(frames.positions)
+    at = Projection(
+        loss=jnp.asarray(jnp.inf),
+        squares=jnp.zeros(d),
+        linear=jnp.zeros(linear),
+        normal=jnp.eye(directions),
+        slope=jnp.zeros(directions),
+    )
+    return Descent(jax.tree.map(jnp.asarray, frames), at, jnp.asarray(FIRST_DAMPING / FEWER))
+
+
+def descend(
+    program: Program,
+    structure: Structure,
+    frames: Frames,
+    samples: Samples,
+    unit: Any,
+    *,
+    iterations: int,
+    expired: Callable[[], bool] = lambda: False,
+) -> Descent:
+    """Iterates until the loss settles, no step descends, or the iterations or the time are used up."""
+    samples, unit = jax.tree.map(jnp.asarray, samples), jnp.asarray(unit)
+    directions = len(free_directions(structure.parents, structure.joints))
+    state = unseen(frames, structure.linear_count, directions)
+    before = np.inf
+    for _ in range(0, iterations, CHUNK):
+        state = program(state, samples, unit)
+        now = float(state.at.loss)
+        if not now < before * (1 - SETTLED) or float(state.damping) >= MOST_DAMPING or expired():
+            break
+        before = now
+    return state

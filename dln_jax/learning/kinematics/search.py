@@ -6,17 +6,16 @@ Descents end in a few recurring local minima. If several starts agree on the low
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.learning.kinematics.descent import Program, State, descend
 from dln_jax.learning.kinematics.frames import Frames, random_frames, rough_frames, turned_round
-from dln_jax.learning.kinematics.projection import Samples, Structure
+from dln_jax.learning.kinematics.projection import Descent, Program, Samples, Structure, descend
 from dln_jax.types import require_positive, require_seed
 
 WAVE = 8
@@ -51,7 +50,7 @@ class Search(NamedTuple):
 
 def search(
     structure: Structure, program: Program, samples: Samples, unit: Float[np.ndarray, " d"], settings: Search
-) -> list[State]:
+) -> list[Descent]:
     """Returns the final states of all descents, lowest loss first.
 
     Args:
@@ -68,39 +67,41 @@ def search(
     require_positive(**counts, prior_angle=settings.prior_angle, prior_length=settings.prior_length)
     require_seed(settings.seed)
     until = time.perf_counter() + settings.seconds
-    end = functools.partial(
-        _end, program, structure, samples, unit, settings.iterations, lambda: time.perf_counter() > until
-    )
-    found: list[State] = []
+
+    def end(frames: Frames) -> Descent:
+        with jax.enable_x64(True):  # the setting is local to a thread
+            limits = {"iterations": settings.iterations, "expired": lambda: time.perf_counter() > until}
+            return descend(program, structure, frames, samples, unit, **limits)
+
+    descents: list[Descent] = []
     with ThreadPoolExecutor(settings.threads) as pool:
-        for wave in _waves(structure, settings):
-            found = _sorted([*found, *pool.map(end, wave)])
-            if agreeing(found) >= settings.agreement or time.perf_counter() > until:
+        starts = _starts(structure, settings)
+        while wave := list(itertools.islice(starts, WAVE)):
+            descents = _sorted([*descents, *pool.map(end, wave)])
+            if agreeing(descents) >= settings.agreement or time.perf_counter() > until:
                 break
         for joints in (1, 2):
-            while agreeing(found) < settings.agreement and time.perf_counter() < until:
-                best = found[0]
-                found = _sorted([*found, *pool.map(end, _turns(structure, best.frames, joints))])
-                if not found[0].at.loss < (1 - ALIKE) * best.at.loss:
+            while agreeing(descents) < settings.agreement and time.perf_counter() < until:
+                best = descents[0]
+                descents = _sorted([*descents, *pool.map(end, _turns(structure, best.frames, joints))])
+                if not descents[0].at.loss < (1 - ALIKE) * best.at.loss:
                     break
-    return found
+    return descents
 
 
-def agreeing(found: list[State]) -> int:
+def agreeing(descents: list[Descent]) -> int:
     """Number of descents that ended at the lowest loss."""
-    return sum(float(state.at.loss) <= (1 + ALIKE) * float(found[0].at.loss) for state in found)
+    return sum(float(descent.at.loss) <= (1 + ALIKE) * float(descents[0].at.loss) for descent in descents)
 
 
-def _waves(structure: Structure, settings: Search) -> Iterator[list[Frames]]:
-    for first in range(0, settings.starts, WAVE):
-        yield [_start(structure, settings, index) for index in range(first, min(first + WAVE, settings.starts))]
-
-
-def _start(structure: Structure, settings: Search, index: int) -> Frames:
-    random = np.random.default_rng([settings.seed, index])
-    if settings.kinematic_prior is None:
-        return random_frames(len(structure.joints), random)
-    return rough_frames(settings.kinematic_prior, random, angle=settings.prior_angle, length=settings.prior_length)
+def _starts(structure: Structure, settings: Search) -> Iterator[Frames]:
+    prior = settings.kinematic_prior
+    for index in range(settings.starts):
+        random = np.random.default_rng([settings.seed, index])
+        if prior is None:
+            yield random_frames(len(structure.joints), random)
+        else:
+            yield rough_frames(prior, random, angle=settings.prior_angle, length=settings.prior_length)
 
 
 def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames]:
@@ -109,18 +110,5 @@ def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames
         yield functools.reduce(lambda frames, joint: turned_round(frames, structure.parents, joint), chosen, frames)
 
 
-def _end(
-    program: Program,
-    structure: Structure,
-    samples: Samples,
-    unit: Any,
-    iterations: int,
-    expired: Callable[[], bool],
-    frames: Frames,
-) -> State:
-    with jax.enable_x64(True):  # the setting is local to a thread
-        return descend(program, structure, frames, samples, unit, iterations=iterations, expired=expired)
-
-
-def _sorted(found: list[State]) -> list[State]:
-    return sorted(found, key=lambda state: float(np.nan_to_num(state.at.loss, nan=np.inf)))
+def _sorted(descents: list[Descent]) -> list[Descent]:
+    return sorted(descents, key=lambda descent: float(np.nan_to_num(descent.at.loss, nan=np.inf)))

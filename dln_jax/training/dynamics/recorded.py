@@ -12,7 +12,7 @@ from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split, with_joints
 from dln_jax.files import read_json
-from dln_jax.learning.kinematics.kinematic_prior import KinematicPrior, kinematic_prior_from_json
+from dln_jax.learning.kinematics import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
 from dln_jax.scenes.pendulums import two_link_arm

@@ -12,10 +12,10 @@ import numpy as np
 from dln_jax.data.bodies import Order, arrangements, find_bodies
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import hold_out
-from dln_jax.learning import accelerations, growth
+from dln_jax.learning import accelerations
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.growth import grow
+from dln_jax.learning.model_selection import grow, segments
 from dln_jax.learning.rates import match_linear
 from dln_jax.training.hamiltonian.measurements import MEASURED, forces_of
 from dln_jax.training.hamiltonian.recipes import RECIPES
@@ -229,7 +229,7 @@ def validation_errors(
     errors = np.sum(np.asarray(left) ** 2, axis=1)
     if not in_velocities(problem, description):
         return errors
-    numbers = growth.segments(parts[1])
+    numbers = segments(parts[1])
     return np.bincount(numbers, errors) / np.bincount(numbers)
 
 

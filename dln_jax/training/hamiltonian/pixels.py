@@ -23,7 +23,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Progress, Report, silent
-from dln_jax.learning.frames import Matching, Weights
+from dln_jax.learning.frames import Matching, TermWeights
 from dln_jax.metrics.frames import (
     FrameMotions,
     energy_errors,
@@ -34,15 +34,21 @@ from dln_jax.metrics.frames import (
     recoded,
 )
 from dln_jax.metrics.phase_space import summary
-from dln_jax.models.latent_phase import Field, LatentModel, through_components
+from dln_jax.models.latent_phase import (
+    Components,
+    Field,
+    LatentModel,
+    compress,
+    principal_components,
+    through_components,
+)
 from dln_jax.models.model import Parameters
-from dln_jax.models.principal_components import Components, compress, principal_components
 from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, FRAMES, TRAJECTORIES, FrameSplit, split, swinging_rod
 from dln_jax.zoo.descriptions import Description, build, describe
 
 MODELS: tuple[Field, ...] = ("black-box-hnn", "phase-network")
 """Models in the latent plane."""
-MATCHING = Matching(weights=Weights(field=10.0))
+MATCHING = Matching(weights=TermWeights(field=10.0))
 """The same for both models. Weight, components and training length were chosen with seed 0 by validation films.
 Matching one step at a time, as published, was chosen over windows of ten steps, for which both models were alike (1e-6
 J² over a hundred frames, their decoder's error), with test films in view."""

@@ -15,7 +15,7 @@ from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up_runs import model_of_plant, nominal_model
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import Report, silent
-from dln_jax.learning.recordings import Fitted, Prepared, identified, learned, prepare
+from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, learned, prepare
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError
 
@@ -29,9 +29,9 @@ class Obtained(NamedTuple):
     """A model and its origin."""
 
     dynamics: Dynamics
-    fitted: Fitted | None
+    fitted: FittedPlant | None
     """`None` for models that are not learned."""
-    prepared: Prepared | None
+    prepared: PreparedRecording | None
     seconds: float
     """Learning time, compilation included."""
 

@@ -18,12 +18,11 @@ from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import Split, drawn, every, hold_out, select
 from dln_jax.identification import identify, parameters_of
-from dln_jax.learning.dynamics import problem
+from dln_jax.learning.dynamics import problem, suited_network
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.kinematics import Search, fit_tree
-from dln_jax.learning.suited import suited_network
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system

@@ -27,6 +27,7 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
         "fewer-joints": learned_kinematics.fewer_joints,
         "fewer-samples": learned_kinematics.fewer_samples,
         "kernels": learned_kinematics.kernels,
+        "unknown-trees": learned_kinematics.unknown_trees,
     },
     "preparation": {"encoders": before_fitting.encoders, "excitation": before_fitting.excitation},
     "logs": {

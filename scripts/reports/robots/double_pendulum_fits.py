@@ -6,7 +6,7 @@
     stacked         the equations of both, which count alike
     motions         the windows of `learning.measured_motions`, through an integrator with the torques, which are off
                     by as much as the low-passed equations are
-    both            motions and torques in one objective (`learning.torques_beside_motions`), with friction by load
+    both            motions and torques in one objective (`torques_beside_motions`), with friction by load
 
 All but the first have the chosen scale. Recorded torques explain slow accelerations well and those above 3 Hz badly:
 forces act that were not recorded. Least squares of torques are drawn to small inertias by them, which are best for
@@ -32,12 +32,12 @@ from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Problem
 from dln_jax.learning.linear import design
 from dln_jax.learning.measured_motions import Noise, cut_measured_windows
-from dln_jax.learning.torques_beside_motions import cut_torque_windows, with_torques
 from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.solvers import least_squares
 from dln_jax.types import FrictionLaw, Needs
+from scripts.reports.robots.torques_beside_motions import cut_torque_windows, with_torques
 
 CUTOFF, RATE = 6.0, 100.0
 """Hz: the one at which the least squares of filtered motions predict held-out recordings best, of 2, 3, 4, 6, 8, 10, 12

@@ -3,6 +3,8 @@
 from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings, by_case
 from scripts.reports.robots.lip import kernel_rows, rows
+from scripts.reports.robots.unknown_trees import PLANTS
+from scripts.reports.robots.unknown_trees import rows as plant_rows
 
 SEEDS = range(10)
 """Seeds of the starts."""
@@ -54,6 +56,11 @@ def kernels(quick: bool) -> Findings:
     by_case = [kernel_rows(name, friction=friction, every=every) for name, every in arms for friction in (False, True)]
     any_order = [kernel_rows("panda-7", friction=friction, serial=False) for friction in (False, True)]
     return found([row for rows in (*by_case, *any_order) for row in rows])
+
+
+def unknown_trees(quick: bool) -> Findings:
+    """Branched arms, joints in a wrong order and flexible joints, whose tree a chain does not hold."""
+    return found([row for plant in PLANTS for row in plant_rows(plant, range(1 if quick else 3))])
 
 
 def found(listed: list[Row]) -> Findings:

@@ -5,7 +5,7 @@ that errors may fall below the noise of the training torques.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -88,7 +88,7 @@ def known(arm: Arm, *, friction: bool, every: int = 10, tests: Sequence[int] = T
     fit = fit_linear(model, train, negligible=1e-12)
     system = model.energies(fit.parameters)
     nmse = unseen_errors(arm, system, friction=friction, tests=tests)
-    joint_mse = np.mean((_torques(system, train) - train.tau) ** 2, axis=0)
+    joint_mse = np.mean((torques_of(system, train) - train.tau) ** 2, axis=0)
     return Outcome(nmse, joint_mse, 0, 0, fit.seconds)
 
 
@@ -105,7 +105,7 @@ def kernel(arm: Arm, *, friction: bool, every: int = 10, serial: bool = True, te
     fit = fit_kernel(needs, train, serial=serial)
     model = CATALOGUE["trigonometric-kernel"].factory(needs, samples=fit.samples, serial=serial)
     system = model.energies(fit.parameters)
-    joint_mse = np.mean((_torques(system, train) - train.tau) ** 2, axis=0)
+    joint_mse = np.mean((torques_of(system, train) - train.tau) ** 2, axis=0)
     nmse = unseen_errors(arm, system, friction=friction, tests=tests, every=TEST_EVERY)
     return Outcome(nmse, joint_mse, 0, 0, fit.seconds)
 
@@ -115,12 +115,13 @@ def unseen_errors(
 ) -> Float[np.ndarray, "T d"]:
     """nMSE by test motion and joint, against torques without noise; of the motions' samples `every` so many."""
     test = lip_trajectories(arm, tests, friction=friction, noise=0.0, every=every)
-    errors = (_torques(system, test) - test.tau) ** 2
+    errors = (torques_of(system, test) - test.tau) ** 2
     motions = [test.trajectory == index for index in range(len(tests))]
     return np.array([errors[motion].mean(axis=0) / test.tau[motion].var(axis=0) for motion in motions])
 
 
-def _torques(system: RecursiveSystem, data: Trajectories) -> Float[np.ndarray, "N d"]:
+def torques_of(system: Any, data: Trajectories) -> Float[np.ndarray, "N d"]:
+    """Torques of a system's inverse dynamics along the samples of the data."""
     inverse = jax.jit(jax.vmap(dynamics(system).inverse_dynamics), compiler_options=quick_compilation())
     states = (data.q, data.qd, data.qdd)
     # The memory of a kernel grows with the number of states.

@@ -13,8 +13,7 @@ from jax.sharding import Mesh
 
 from dln_jax.learning.engine import descent, newton
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
-from dln_jax.learning.engine.problem import Problem, unmonitored
-from dln_jax.learning.engine.sharing import sharing
+from dln_jax.learning.engine.problem import Problem, sharing, unmonitored
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.rollout import rollout

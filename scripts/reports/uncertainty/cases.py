@@ -26,7 +26,7 @@ from dln_jax.metrics.report import Row
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.models.uncertainty import outside, predictive
+from dln_jax.models.uncertainty import out_of_distribution, predictive
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm
@@ -73,7 +73,7 @@ def _answer(model: Model) -> Callable[..., Any]:
     def one(parameters, known, *state):
         std = predictive(model, parameters, known.factor, known.noise, known.inflation)
         tau = dynamics(model.energies(parameters)).inverse_dynamics(*state)
-        return tau, std(*state), outside(model, parameters, known)(*state)
+        return tau, std(*state), out_of_distribution(model, parameters, known)(*state)
 
     many = jax.jit(jax.vmap(one, in_axes=(None, None, 0, 0, 0)), compiler_options=quick_compilation())
 

@@ -13,16 +13,23 @@ from dln_jax.figures.phase_space import injection_figure
 from dln_jax.learning import frames as learning_frames
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
-from dln_jax.learning.frames import Matching, Weights, problem, terms, windows
+from dln_jax.learning.frames import Matching, TermWeights, problem, terms, windows
 from dln_jax.mechanics.dynamics import PlainFlow
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics import frames as frame_metrics
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.models.latent_phase import LatentModel, LatentPhase, latent_field, make_latent_phase, through_components
+from dln_jax.models.latent_phase import (
+    LatentModel,
+    LatentPhase,
+    compress,
+    latent_field,
+    make_latent_phase,
+    principal_components,
+    through_components,
+)
 from dln_jax.models.model import Model
-from dln_jax.models.principal_components import compress, principal_components
 from dln_jax.precision import with_float64
 from dln_jax.scenes.datasets import pendulum_frames
 from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, split, swinging_rod
@@ -173,7 +180,7 @@ def test_loss_by_hand(relative):
     np.testing.assert_allclose(found.coordinate, np.mean(change**2) / sizes[2], rtol=1e-9)
     by_hand = np.mean((moved - q)[:, 1:] ** 2) / sizes[1] + np.mean((pushed - p)[:, 1:] ** 2) / sizes[2]
     np.testing.assert_allclose(found.field, by_hand / 2, rtol=1e-4)
-    matching = Matching(weights=Weights(2.0, 3.0, 5.0), relative=relative)
+    matching = Matching(weights=TermWeights(2.0, 3.0, 5.0), relative=relative)
     total = learning_frames.loss(oscillator(scale), matching, {"factor": jnp.array([factor])}, jnp.asarray(frames))
     np.testing.assert_allclose(total, 2 * found[0] + 3 * found[1] + 5 * found[2], rtol=1e-9)
 

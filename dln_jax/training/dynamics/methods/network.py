@@ -11,11 +11,11 @@ from dln_jax.cli.optimisers import name_of, optimiser_named
 from dln_jax.cli.progress import progress
 from dln_jax.data.splits import Split, drawn, merged, select
 from dln_jax.learning import dynamics
+from dln_jax.learning.dynamics import MANY_JOINTS, suited_network
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit as train_problem
 from dln_jax.learning.engine.problem import Problem, Training, require_finite_start
 from dln_jax.learning.objectives import Objective
-from dln_jax.learning.suited import MANY_JOINTS, Suited, suited_network
 from dln_jax.sizes import require_network
 from dln_jax.training.dynamics.methods.growth import grow_to_target
 from dln_jax.training.dynamics.options import NETWORK, AdamOptions, NetworkOptions

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.data.arrays import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import GAP, window_indices
-from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.data.segments import GAP, window_indices
+from dln_jax.learning.engine.problem import Problem, arrays_of, mean_square, unmonitored
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Scalar, require_positive
@@ -63,15 +62,10 @@ def with_torques(
     Raises:
         InputError: another number of windows, or a noise or share that is not positive.
     """
-    require_positive(share=share)
-    for deviation in noise:
-        require_positive(noise=deviation)
+    require_positive(share=share, noise=min(noise))
     if (motions := len(task.arrays[0])) != len(windows.q):
         raise InputError(f"there are {len(windows.q)} windows of torques, {motions} of motions; cut both alike")
-    fitted, held_out = (
-        tuple(on_device(key, array, jnp.float64) for key, array in each._asdict().items())
-        for each in (windows, validation)
-    )
+    held_out = arrays_of(validation)
     split = len(task.arrays)
     motion_residual = task.residual
     if motion_residual is None:
@@ -89,4 +83,4 @@ def with_torques(
         torques = mean_square(lambda *window: torque_error(parameters, *window), held_out)
         return unmonitored(task.score(parameters)[0] + torques)
 
-    return task._replace(residual=residual, arrays=(*task.arrays, *fitted), score=score)
+    return task._replace(residual=residual, arrays=(*task.arrays, *arrays_of(windows)), score=score)
