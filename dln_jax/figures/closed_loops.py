@@ -1,11 +1,10 @@
-"""Figures of closed loops: traces with limits, the phase plane with a regulator's region, and success over starts."""
+"""Figures of closed loops: traces with limits, and the phase plane with a regulator's region."""
 
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter
 
@@ -56,7 +55,8 @@ def closed_loop_traces(
         values = x[:MOST_SHOWN, :, joint]
         if kind == "revolute":
             values = _short_way(values - goal[joint])
-            _angles(axis)
+            angle_ticks(axis.yaxis)
+            axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
         _curves(axis, t, values, turning=kind == "revolute")
         axis.axhline(0.0 if kind == "revolute" else goal[joint], color="0.3", linestyle="--", linewidth=0.9)
         name = names[joint] if names else f"q{joint + 1}"
@@ -117,38 +117,10 @@ def phase_portrait(
             ha="center", va="top", fontsize=style.SMALL, color="#00563f",
             arrowprops={"arrowstyle": "-", "color": style.GREEN, "linewidth": 0.8},
         )  # fmt: skip
-    _angles(axis, axis.xaxis)
+    angle_ticks(axis.xaxis)
     room = 1.12 * float(np.nanmax(np.abs(rate)))
     axis.set(xlim=(-np.pi, np.pi), ylim=(-room, room), xlabel="angle from upright, rad", ylabel="rate, rad/s")
     axis.grid(False)
-    return figure
-
-
-def success_over_starts(
-    starts: Any,
-    seconds: Any,
-    *,
-    labels: tuple[str, str] = ("angle from upright, rad", "rate, rad/s"),
-) -> Figure:
-    """Starts [K, 2] in the plane of two coordinates, coloured by the time to the goal; crosses failed.
-
-    `seconds` [K] are infinite or NaN if the goal was not reached.
-    """
-    starts, seconds = np.asarray(starts), np.asarray(seconds)
-    good = np.isfinite(seconds)
-    figure, [[axis]] = style.figure(height=4.0)
-    worst = float(seconds[good].max()) if good.any() else 1.0
-    scale = Normalize(0.0, worst)
-    axis.scatter(*starts[good].T, c=seconds[good], norm=scale, cmap="viridis_r", s=22, linewidths=0)
-    axis.scatter(*starts[~good].T, marker="x", color=style.VERMILLION, s=40, linewidths=1.6, zorder=3)
-    bar = figure.colorbar(ScalarMappable(scale, "viridis_r"), ax=axis, pad=0.02)
-    bar.set_label("up after, s", fontsize=style.TEXT)
-    bar.ax.tick_params(labelsize=style.SMALL)
-    if labels[0].startswith("angle"):
-        _angles(axis, axis.xaxis)
-    axis.set(xlabel=labels[0], ylabel=labels[1])
-    failed = f", {(~good).sum()} failed (crosses)" if not good.all() else ""
-    style.title(axis, f"{good.sum()} of {len(good)} starts are up{failed}", loc="left")
     return figure
 
 
@@ -165,14 +137,11 @@ def _short_way(angle: np.ndarray) -> np.ndarray:
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
-def _angles(axis: Axes, side: Any = None) -> None:
-    """Ticks at multiples of pi / 2 over the full circle."""
-    side = axis.yaxis if side is None else side
+def angle_ticks(side: Axis) -> None:
+    """Puts ticks at multiples of pi / 2 over the full circle."""
     side.set_major_locator(FixedLocator([-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]))
     names = {-2: "-π", -1: "-π/2", 0: "0", 1: "π/2", 2: "π"}
     side.set_major_formatter(FuncFormatter(lambda value, _: names[round(2 * value / np.pi)]))
-    if side is axis.yaxis:
-        axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
 
 
 def _ellipse(S: Any, level: float) -> np.ndarray:

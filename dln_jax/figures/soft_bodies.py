@@ -10,11 +10,11 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.labels import label_ends, label_points
 from dln_jax.figures.soft_body_drawing import EDGE, GROUND, GROUND_LINE, SKIN, drawn, flattened, floor
 from dln_jax.metrics.soft_body_energies import KINETIC, TOTAL
 from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.types import InputError
+from scripts.reports.figures.labels import label_ends, label_points
 
 COLOURS = {
     KINETIC: style.VERMILLION,

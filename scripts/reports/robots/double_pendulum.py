@@ -16,7 +16,6 @@ from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, load
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
-from dln_jax.metrics.report import Row
 from scripts.reports.robots.double_pendulum_fits import (
     CUTOFF,
     RATE,
@@ -31,6 +30,7 @@ from scripts.reports.robots.double_pendulum_fits import (
     fit_torques,
     low_passed,
 )
+from scripts.reports.rows import Row
 
 FINE, BASE = 30.0, 500.0
 """Cut-off that keeps the motion, and approximate rate of the recordings, Hz."""
