@@ -3,8 +3,8 @@
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
 from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
 from dln_jax.figures.closed_loops import closed_loop_traces, phase_portrait
-from dln_jax.figures.friction import friction_curves
 from dln_jax.figures.functions import ensemble, function_curves, heat_maps, parity, surfaces
+from dln_jax.figures.joints import friction_curves
 from dln_jax.figures.phase_space import injection_figure, motion_figure
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif

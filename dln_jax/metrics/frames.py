@@ -149,8 +149,8 @@ def late_energy_errors(model: LatentModel, parameters: Parameters, test: Frames)
     frames = np.concatenate([[0.0], LATE])
     latent = predict(model.field, parameters["field"], *encoded(model, parameters, test.pairs[:, 0]), frames)
     late = Motions(frames[1:], latent.q[:, 1:], latent.p[:, 1:])
-    found = physical_energy(*physical_states(decoded(model, parameters, late)))
-    return finite_or_infinite(np.mean((found - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1))
+    predicted = physical_energy(*physical_states(decoded(model, parameters, late)))
+    return finite_or_infinite(np.mean((predicted - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1))
 
 
 def energy_floor(test: Frames) -> float:

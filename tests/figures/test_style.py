@@ -61,9 +61,11 @@ def test_logarithms_are_for_a_decade_or_more_and_prefixes_for_small_numbers():
 
 
 def test_heights_are_moved_apart_in_order():
-    found = spread({"b": 0.5, "a": 0.5, "c": 0.9, "d": 2.0}, gap=0.1)
-    assert found["c"] == pytest.approx(0.9) and found["d"] == pytest.approx(1.0)
-    assert abs(found["a"] - found["b"]) == pytest.approx(0.1) and (found["a"] + found["b"]) / 2 == pytest.approx(0.5)
+    heights = spread({"b": 0.5, "a": 0.5, "c": 0.9, "d": 2.0}, gap=0.1)
+    assert heights["c"] == pytest.approx(0.9) and heights["d"] == pytest.approx(1.0)
+    assert abs(heights["a"] - heights["b"]) == pytest.approx(0.1) and (
+        heights["a"] + heights["b"]
+    ) / 2 == pytest.approx(0.5)
     assert sorted(spread(dict.fromkeys("abcd", 0.0), gap=0.9).values()) == pytest.approx([0, 1 / 3, 2 / 3, 1])
 
 

@@ -1,4 +1,4 @@
-"""The figure of a value closes the circle and is drawn from what it is given."""
+"""The figure of a value closes the circle and shows its arguments."""
 
 import numpy as np
 

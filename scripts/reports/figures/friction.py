@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from matplotlib.figure import Figure
 
-from dln_jax.figures.friction import friction_curves
+from dln_jax.figures.joints import friction_curves
 from dln_jax.mechanics.friction import FrictionShape, unit_force
 from dln_jax.mechanics.loaded import Load, carrying
 
@@ -26,8 +26,8 @@ def friction_laws() -> Figure:
         "offset": {"offset": 0.05},
     }
     forces = {
-        name: jnp.sum(jnp.stack([size * unit_force(law, rates, shape) for law, size in each.items()]), axis=0)
-        for name, each in sums.items()
+        name: jnp.sum(jnp.stack([size * unit_force(law, rates, shape) for law, size in parts.items()]), axis=0)
+        for name, parts in sums.items()
     }
     link = jnp.ones_like(rates)
     forces["load, 1 N m carried"] = carrying(Load(0.25, shape.velocity_scale), rates, link) - link

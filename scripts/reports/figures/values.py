@@ -36,7 +36,7 @@ def value_figure(
     """
     # The angle is periodic: repeat the first nodes at the end.
     nodes = np.concatenate([nodes, nodes[:1] + np.array([2 * np.pi, 0])])
-    fitted, true, u, best = (np.concatenate([each, each[:1]]) for each in (*values, *controls))
+    fitted, true, u, best = (np.concatenate([array, array[:1]]) for array in (*values, *controls))
     figure, axes = style.figure(2, 3, height=4.9, width=9.6)
     highest = float(np.max(true))
     heights, torques = Normalize(0, highest), Normalize(-limit, limit)
