@@ -200,7 +200,7 @@ def tip_paths(
         axis.axis("off")
     for number, (axis, index) in enumerate(zip(axes.flat, shown, strict=False)):
         chosen = data.trajectory == index
-        axis.add_collection(LineCollection(training[:MOST_PATHS], colors="0.88", linewidths=0.7))
+        axis.add_collection(LineCollection(training[:MOST_PATHS], colors="0.94", linewidths=6, capstyle="round"))
         axis.plot(*positions[chosen].T, color="black", linewidth=2.2)
         title = f"{data.label[index]} (test)"
         if number < len(times):
