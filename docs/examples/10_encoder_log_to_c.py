@@ -119,7 +119,7 @@ assert np.abs(in_c.inverse_dynamics(*state) - inverse(*state)).max() < 1e-10
 assert np.abs(in_c.torque_std(*state) - std(*state)).max() < 1e-10
 
 # %%
-# The arm on its unseen motion: the colour of the path is the standard deviation of the second joint's torque.
+# The arm on its unseen motion: the colour of the path is the torque that the model predicts for the second joint.
 
 REACH = np.array([0.3, 0.0, 0.0])  # from the third joint to the tip, m
 
@@ -131,11 +131,12 @@ def joints(q):
 
 places = np.asarray(jax.jit(jax.vmap(joints))(test.q))
 figure, axes = plt.subplots(figsize=(6.5, 5), subplot_kw={"projection": "3d"}, layout="constrained")
-path = axes.scatter(*places[:, -1].T, c=band[:, 1], cmap="viridis", s=6, depthshade=False)
+path = axes.scatter(*places[:, -1].T, c=predicted[:, 1], cmap="plasma", s=8, depthshade=False)
 for index, alpha in ((0, 0.2), (250, 0.4), (500, 1.0)):
     look = {"color": "#3b4252", "linewidth": 6, "markersize": 9, "solid_capstyle": "round", "alpha": alpha}
     axes.plot(*places[index].T, "o-", **look)
-figure.colorbar(path, label="standard deviation of torque 2, N m", shrink=0.6)
+figure.colorbar(path, label="torque of joint 2, N m", shrink=0.6)
+axes.locator_params(nbins=4)
 axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", zlabel="z, m")
 
 # %%
