@@ -11,7 +11,9 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 from docutils import nodes
+from matplotlib.figure import Figure
 from sphinx.ext.napoleon import Config, GoogleDocstring
+from sphinx_gallery.scrapers import figure_rst
 
 import dln_jax
 
@@ -52,7 +54,21 @@ html_static_path = ["_static"]
 html_css_files = ["style.css"]
 html_show_sphinx = False
 
+
+def library_figures(block, block_vars, gallery_conf):
+    """Saves the figures that a block of an example has made without pyplot, as those of `dln_jax.figures`."""
+    shown = block_vars.setdefault("library_figures", [])
+    paths = []
+    for value in block_vars["example_globals"].values():
+        if isinstance(value, Figure) and not hasattr(value, "number") and not any(value is known for known in shown):
+            shown.append(value)
+            paths.append(next(block_vars["image_path_iterator"]))
+            value.savefig(paths[-1])
+    return figure_rst(paths, gallery_conf["src_dir"])
+
+
 sphinx_gallery_conf = {
+    "image_scrapers": ("matplotlib", library_figures),
     "examples_dirs": "examples",
     "gallery_dirs": "gallery",
     "filename_pattern": r"\.py$",
@@ -145,9 +161,9 @@ def modules(package):
     """A package's modules, itself first, without those that need an extra which is not installed."""
     package = importlib.import_module(f"dln_jax.{package}")
     yield package
-    for found in pkgutil.walk_packages(getattr(package, "__path__", []), package.__name__ + "."):
+    for module in pkgutil.walk_packages(getattr(package, "__path__", []), package.__name__ + "."):
         try:
-            yield importlib.import_module(found.name)
+            yield importlib.import_module(module.name)
         except ModuleNotFoundError as error:
             if (error.name or "").startswith("dln_jax"):
                 raise

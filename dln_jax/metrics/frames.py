@@ -32,7 +32,7 @@ GRID = 180
 ITERATIONS = 20
 LATE = 1000 + np.arange(32.0)
 """Frame numbers of late predictions."""
-_BATCH, _CLIMB, _CORRECTIONS = 256, 20, 3
+_BATCH, _ASCENT, _CORRECTIONS = 256, 20, 3
 
 
 class FrameMotions(NamedTuple):
@@ -87,7 +87,8 @@ def physical_energy(q: Float[np.ndarray, "*shape"], qd: Float[np.ndarray, "*shap
 def physical_states(pairs: Float[np.ndarray, "*shape input"]) -> tuple[np.ndarray, np.ndarray]:
     """(q, qd) at the first of two frames, in rad and rad/s, without the pixel axis."""
     q, qd = _states(jnp.asarray(pairs, float).reshape(-1, 2, PIXELS))
-    return np.asarray(q).reshape(pairs.shape[:-1]), np.asarray(qd).reshape(pairs.shape[:-1])
+    shape = pairs.shape[:-1]
+    return np.asarray(q).reshape(shape), np.asarray(qd).reshape(shape)
 
 
 @in_float64
@@ -114,8 +115,8 @@ def encoded(
 @in_float64
 def decoded(model: LatentModel, parameters: Parameters, latent: Motions) -> Float[np.ndarray, "K T input"]:
     """Pairs of frames of latent motions."""
-    flat = (jnp.asarray(state, float).reshape(-1, 1) for state in (latent.q, latent.p))
-    pairs = _applied("decode", model, with_float64(parameters), *flat)
+    states = (jnp.asarray(state, float).reshape(-1, 1) for state in (latent.q, latent.p))
+    pairs = _applied("decode", model, with_float64(parameters), *states)
     return np.asarray(pairs).reshape(*latent.q.shape[:2], -1)
 
 
@@ -149,8 +150,8 @@ def late_energy_errors(model: LatentModel, parameters: Parameters, test: RodFram
     frames = np.concatenate([[0.0], LATE])
     latent = predict(model.field, parameters["field"], *encoded(model, parameters, test.pairs[:, 0]), frames)
     late = Motions(frames[1:], latent.q[:, 1:], latent.p[:, 1:])
-    found = physical_energy(*physical_states(decoded(model, parameters, late)))
-    return finite_or_infinite(np.mean((found - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1))
+    predicted = physical_energy(*physical_states(decoded(model, parameters, late)))
+    return finite_or_infinite(np.mean((predicted - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1))
 
 
 def energy_floor(test: RodFrames) -> float:
@@ -182,9 +183,9 @@ def raise_energy(H: Hamiltonian, q: Vector, p: Vector, wanted: Scalar) -> tuple[
         square = sum(jnp.sum(slope**2) for slope in slopes)
         return slopes[0] / square, slopes[1] / square
 
-    levels = jnp.linspace(0.0, 1.0, _CLIMB + 1) * (wanted - H(q, p))
-    climbed = rollout(rk4(lambda s, state: direction(state)), (q, p), levels)
-    state = climbed[0][-1], climbed[1][-1]
+    levels = jnp.linspace(0.0, 1.0, _ASCENT + 1) * (wanted - H(q, p))
+    ascent = rollout(rk4(lambda s, state: direction(state)), (q, p), levels)
+    state = ascent[0][-1], ascent[1][-1]
     for _ in range(_CORRECTIONS):
         slopes, missing = direction(state), wanted - H(*state)
         state = state[0] + missing * slopes[0], state[1] + missing * slopes[1]
@@ -215,17 +216,12 @@ def inject_energy(
     H = field.energy
     still = np.tile(images(np.zeros(1))[0], 2)
     q, p = encoded(model, parameters, np.stack([pair, still]))
-    ground = H(jnp.asarray(q[1]), jnp.asarray(p[1]))
-    start = H(jnp.asarray(q[0]), jnp.asarray(p[0])) - ground
-    t = np.arange(float(times))
-
-    def move(q: np.ndarray, p: np.ndarray) -> Motions:
-        return predict(model.field, parameters["field"], q[None], p[None], t)
-
-    before = move(q[0], p[0])
-    climb = jax.jit(functools.partial(raise_energy, H))
-    kicked = climb(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), ground + factor * start)
-    after = move(*map(np.asarray, kicked))
+    start, ground = (H(jnp.asarray(state), jnp.asarray(momentum)) for state, momentum in zip(q, p, strict=True))
+    start, t = start - ground, np.arange(float(times))
+    before = predict(model.field, parameters["field"], q[:1], p[:1], t)
+    ascend = jax.jit(functools.partial(raise_energy, H))
+    raised = ascend(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), ground + factor * start)
+    after = predict(model.field, parameters["field"], *(np.asarray(state)[None] for state in raised), t)
     q, p = (np.concatenate(halves, axis=1) for halves in ((before.q, after.q), (before.p, after.p)))
     latent = Motions(np.concatenate([t, t[-1] + t]), q, p)
     pairs = decoded(model, parameters, latent)[0]

@@ -116,13 +116,13 @@ def motion_errors(
     All are reported by `summary`, over all motions of all entries, whose times may differ.
     """
 
-    def over_all(name: str, errors: Callable[[Motions, Motions], np.ndarray]) -> dict[str, float]:
-        return summary(name, np.concatenate([errors(*pair) for pair in zip(predicted, truth, strict=True)]))
+    def over_all(name: str, error: Callable[[Motions, Motions], np.ndarray]) -> dict[str, float]:
+        return summary(name, np.concatenate(list(map(error, predicted, truth))))
 
-    found = {} if H is None else over_all("energy_mse", functools.partial(energy_errors, H))
+    errors = {} if H is None else over_all("energy_mse", functools.partial(energy_errors, H))
     if published_energy is not None and published_energy is not H:
-        found |= over_all("published_energy_mse", functools.partial(energy_errors, published_energy))
-    return found | over_all("rollout_mse", state_errors)
+        errors |= over_all("published_energy_mse", functools.partial(energy_errors, published_energy))
+    return errors | over_all("rollout_mse", state_errors)
 
 
 # Compiled once per model, for all parameters.

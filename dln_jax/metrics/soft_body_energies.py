@@ -30,11 +30,12 @@ def motion_energies(
         x, v, control = moment
         data = prepare(scene, params, x, control=control)
         stored = {
-            term.name: value([energy], x, [of]) for term, energy, of in zip(scene.terms, energies, data, strict=True)
+            term.name: value([energy], x, [of_term])
+            for term, energy, of_term in zip(scene.terms, energies, data, strict=True)
         }
         return {KINETIC: 0.5 * jnp.sum(params.masses[:, None] * v**2), **stored}
 
     moments = (jnp.asarray(x), jnp.asarray(v), control)
-    found = jax.jit(lambda moments: jax.lax.map(of_moment, moments, batch_size=_BATCH))(moments)
-    by_name = {name: np.asarray(found[name]) for name in (KINETIC, *(term.name for term in scene.terms))}
+    arrays = jax.jit(lambda moments: jax.lax.map(of_moment, moments, batch_size=_BATCH))(moments)
+    by_name = {name: np.asarray(arrays[name]) for name in (KINETIC, *(term.name for term in scene.terms))}
     return {**by_name, TOTAL: np.sum(list(by_name.values()), axis=0)}

@@ -6,11 +6,15 @@ Nothing is learned here: write a Lagrangian as a function of one state, and get 
 A mass hangs on a rod and swings in all directions; q = (polar angle from the downward vertical, azimuth).
 """
 
+# sphinx_gallery_thumbnail_number = 1
+
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import numpy as np
 
 from dln_jax import LagrangianSystem, dynamics
+from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout
 
 jax.config.update("jax_enable_x64", True)
@@ -61,7 +65,7 @@ def rate(t, state):
 q, qd = jax.jit(lambda state: rollout(rk4(rate), state, times, substeps=4))(start)
 
 # %%
-# Two quantities stay what they are: the energy, and the angular momentum about the vertical.
+# Energy and angular momentum about the vertical are conserved.
 
 energy = jax.vmap(pendulum.energy)(q, qd)
 momentum = MASS * (LENGTH * jnp.sin(q[:, 0])) ** 2 * qd[:, 1]
@@ -70,10 +74,16 @@ print(f"largest relative change: energy {drift[0]:.1e}, angular momentum {drift[
 assert max(drift) < 1e-7
 
 # %%
-# Seen from above, the mass draws a rosette between two circles.
+# The mass moves between two circles of latitude; its shadow on the floor is a rosette.
 
 x, y = LENGTH * jnp.sin(q[:, 0]) * jnp.stack([jnp.cos(q[:, 1]), jnp.sin(q[:, 1])])
-figure, axes = plt.subplots(figsize=(4, 4))
-axes.plot(x, y, linewidth=1)
-axes.set(aspect="equal", xlabel="x, m", ylabel="y, m")
-figure.tight_layout()
+path = np.stack([x, y, -LENGTH * jnp.cos(q[:, 0])])
+figure, axes = plt.subplots(figsize=(6, 5), subplot_kw={"projection": "3d"}, layout="constrained")
+axes.plot(*path[:2], -1.1 * LENGTH, color="0.8", linewidth=1.2)
+axes.plot(*path, color=style.BLUE, linewidth=1.6)
+axes.plot(*np.stack([np.zeros(3), path[:, -1]], axis=1), color="#3b4252", linewidth=4)
+axes.plot(*path[:, -1:], "o", color=style.VERMILLION, markersize=16)
+axes.set(xlabel="x, m", ylabel="y, m", zlabel="z, m", zlim=(-1.1 * LENGTH, 0))
+axes.locator_params(nbins=4)
+axes.view_init(elev=22)
+axes.set_box_aspect((1, 1, 0.7))

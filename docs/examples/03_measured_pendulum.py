@@ -2,9 +2,12 @@
 A measured pendulum with friction
 =================================
 
-What a camera gives: times and noisy angles of a swinging pendulum, no rates, no torques. The command `train_hnn_task`
-matches motions through an integrator, so that no noise is differentiated, and finds energy and friction apart.
+A camera measures times and noisy angles of a swinging pendulum, but no rates and no torques. The command
+`train_hnn_task` matches motions through an integrator, so that no noise is differentiated, and separates energy from
+friction.
 """
+
+# sphinx_gallery_thumbnail_number = 1
 
 import tempfile
 from pathlib import Path
@@ -16,6 +19,7 @@ import numpy as np
 
 import dln_jax
 from dln_jax.cli.commands import train_hnn_task
+from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout
 
 jax.config.update("jax_enable_x64", True)
@@ -57,7 +61,7 @@ np.savez(
 #
 # `dln-jax train_hnn_task --task measured --data pendulum.npz --needs '{"joints": ["revolute"], "friction": true}'`
 #
-# A revolute joint enters as cosine and sine; friction is asked for, so that there is a dissipation to learn.
+# A revolute joint enters as cosine and sine. `"friction": true` adds a dissipation to the model.
 
 train_hnn_task.main(
     train_hnn_task.Arguments(
@@ -73,9 +77,9 @@ train_hnn_task.main(
 flow = dln_jax.load(folder / "run").flow
 
 # %%
-# Energy falls as friction takes it
-# ---------------------------------
-# dH/dt = -2 D, where D is the Rayleigh function: what the model loses along its own motion is what it says it loses.
+# Friction takes the energy
+# -------------------------
+# dH/dt = -2 D, where D is the Rayleigh function. Here the learned model swings from a start that was not measured.
 
 start = jnp.array([1.5]), jnp.array([0.0])
 q, p = jax.jit(lambda start: rollout(rk4(lambda t, state: flow.rates(*state)), start, times, substeps=4))(start)
@@ -87,11 +91,29 @@ error = float(np.sqrt(np.mean((q[:, 0] - true_q[0]) ** 2)))
 print(f"a new swing of 6 s: root mean square error {error:.4f} rad; the noise of the data was {NOISE} rad")
 assert error < 5 * NOISE
 
-figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True)
+# %%
+# The first swing as the camera would see it: learned rods from pale to dark, and the true positions as rings.
+
+swing_back = slice(0, int(np.argmin(true_q[0][:40])) + 1)
+figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+seen, exact = np.asarray(q[swing_back, 0]), np.asarray(true_q[0][swing_back])
+for angle, alpha in zip(seen, np.linspace(0.15, 1, len(seen)), strict=True):
+    axes.plot([0, np.sin(angle)], [0, -np.cos(angle)], color="#3b4252", linewidth=3, alpha=alpha)
+    axes.plot(np.sin(angle), -np.cos(angle), "o", color=style.VERMILLION, markersize=15, alpha=alpha)
+axes.plot(np.sin(exact), -np.cos(exact), "o", color="black", fillstyle="none", markersize=17, label="truth")
+axes.plot(0, 0, "o", color="#3b4252", markersize=9)
+axes.set(aspect="equal", xlim=(-1.25, 1.25), ylim=(-1.25, 0.15))
+axes.set_axis_off()
+style.legend(axes, loc="lower right")
+
+# %%
+# The whole motion, and the learned energy along it.
+
+figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
+style.prepare(above, below)
 above.plot(times, true_q[0], "k", linewidth=3, label="truth")
-above.plot(times, q[:, 0], "--", color="tab:red", label="learned")
+above.plot(times, q[:, 0], "--", color=style.VERMILLION, label="learned")
 above.set(ylabel="angle, rad")
-above.legend(frameon=False, ncols=2)
-below.plot(times, energy - energy.min(), color="tab:red")
+style.legend(above, ncols=2)
+below.plot(times, energy - energy.min(), color=style.VERMILLION)
 below.set(ylabel="learned energy", xlabel="time, s")
-figure.tight_layout()

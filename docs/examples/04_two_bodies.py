@@ -2,8 +2,9 @@
 Two bodies that attract each other
 ==================================
 
-A Hamiltonian network learns gravity between two bodies from samples of a few motions. To know that bodies act in pairs,
-by their distance alone, is worth more than any number of units: the energy is then kept to ten digits.
+A Hamiltonian network learns gravity between two bodies from samples of a few motions. Knowing that bodies interact in
+pairs, by their distance alone, is worth more than any number of units: the network then keeps the energy of an orbit
+that it has not seen.
 """
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 
 from dln_jax import GaussNewton, fit
 from dln_jax.data.splits import hold_out
+from dln_jax.figures import style
 from dln_jax.learning.rates import problem
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.integrators import gauss_legendre4, rollout
@@ -44,9 +46,9 @@ training = fit(problem(model, train, validation), GaussNewton(steps=ITERATIONS))
 flow = equations.flow(model.energies(training.parameters))
 
 # %%
-# An orbit that it has not seen
-# -----------------------------
-# A symplectic method keeps what energy there is; that of the true Hamiltonian shows what was learned.
+# An unseen orbit
+# ---------------
+# A symplectic method conserves the learned energy. The change of the true energy therefore shows the model's error.
 
 start = jnp.asarray(task.test.clean.q[0]), jnp.asarray(task.test.clean.p[0])
 times = jnp.linspace(0, SECONDS, 20 * SECONDS + 1)
@@ -58,9 +60,12 @@ momentum = np.asarray(p.reshape(-1, 2, 2).sum(axis=1))
 print(f"largest change of the true energy {change:.1e}, of the total momentum {np.ptp(momentum, axis=0).max():.1e}")
 assert change < 1e-4 and np.ptp(momentum, axis=0).max() < 1e-10
 
-figure, axes = plt.subplots(figsize=(4.5, 4.5))
-for body, colour in enumerate(("tab:blue", "tab:orange")):
-    axes.plot(q[:, 2 * body], q[:, 2 * body + 1], color=colour, linewidth=0.8)
-    axes.plot(q[-1, 2 * body], q[-1, 2 * body + 1], "o", color=colour)
-axes.set(aspect="equal", xlabel="x", ylabel="y")
-figure.tight_layout()
+figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
+for body, colour in enumerate((style.BLUE, style.VERMILLION)):
+    x, y = q[:, 2 * body], q[:, 2 * body + 1]
+    axes.plot(x, y, color=colour, linewidth=0.6, alpha=0.35)
+    for alpha, index in zip(np.linspace(0.1, 1, 60), range(-61, -1), strict=True):  # the last three seconds
+        axes.plot(x[index:][:2], y[index:][:2], color=colour, linewidth=4, alpha=alpha)
+    axes.plot(x[-1], y[-1], "o", color=colour, markersize=20)
+axes.set(aspect="equal")
+axes.set_axis_off()

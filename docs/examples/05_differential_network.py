@@ -3,8 +3,10 @@ A function, its gradient and its Hessian
 ========================================
 
 A differential network gives value, Jacobian and Hessian in one pass, by exact layer rules. Here it learns a landscape
-of your own from values and gradients, and its Hessian, which nobody showed it, is right as well.
+of your own from values and gradients. Its Hessian is right as well, although the data contain none.
 """
+
+# sphinx_gallery_thumbnail_number = 1
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ import numpy as np
 
 from dln_jax import GaussNewton
 from dln_jax.data.functions import from_arrays, split
+from dln_jax.figures import style
 from dln_jax.learning.functions import Network, train
 from dln_jax.nn.activations import activation
 from dln_jax.nn.differential_mlp import value_jacobian_and_hessian
@@ -43,7 +46,7 @@ data = from_arrays({"x": x, "y": np.asarray(values)[:, None], "dy": np.asarray(g
 
 network = Network(loss="type1", width=16, activation="tanh", precision="f64")
 training = train(split(data), network, GaussNewton(steps=ITERATIONS))
-layers = jax.tree.map(lambda leaf: leaf[0], training.parameters)  # of the one member of the ensemble
+layers = jax.tree.map(lambda leaf: leaf[0], training.parameters)  # of the only member of the ensemble
 
 # %%
 # Three answers in one pass
@@ -62,15 +65,34 @@ for name, error in errors.items():
 assert jnp.abs(errors["value"]).max() < 0.01 and jnp.abs(errors["Hessian"]).max() < 0.5
 
 # %%
-# The slope along a line, and its curvature.
+# The learned landscape with its gradients on the ground. The colour is the learned curvature (trace of the Hessian).
+
+side = np.linspace(-2, 2, 60)
+places = np.stack(np.meshgrid(side, side), axis=-1)
+y, dy, d2y = answers(places.reshape(-1, 2))
+curvature = np.trace(d2y[:, 0], axis1=1, axis2=2).reshape(60, 60)
+colours = plt.get_cmap("RdBu_r")(0.5 + 0.5 * curvature / np.abs(curvature).max())
+figure, axes = plt.subplots(figsize=(6.5, 5), subplot_kw={"projection": "3d"}, layout="constrained")
+axes.plot_surface(
+    *places.T, np.asarray(y).reshape(60, 60).T, facecolors=colours.transpose(1, 0, 2), rcount=60, ccount=60
+)
+few = places[3::6, 3::6].reshape(-1, 2)
+slopes = np.asarray(dy).reshape(60, 60, 2)[3::6, 3::6].reshape(-1, 2)
+ground = np.full(len(few), -1.8)
+axes.quiver(*few.T, ground, *slopes.T, 0 * ground, length=0.25, color="0.4", linewidth=0.8)
+axes.set(xlabel="$x_1$", ylabel="$x_2$", zlim=(-1.8, 1.2), zticks=[])
+axes.view_init(elev=30, azim=-60)
+
+# %%
+# Slope and curvature along a line.
 
 line = np.stack([np.linspace(-2, 2, 200), np.zeros(200)], axis=1)
 _, dy, d2y = answers(line)
-figure, axes = plt.subplots(figsize=(6, 3.5))
+figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
+style.prepare(axes)
 axes.plot(line[:, 0], jax.vmap(jax.grad(landscape))(line)[:, 0], "k", linewidth=3, label="slope")
-axes.plot(line[:, 0], dy[:, 0, 0], "--", color="tab:red", label="learned")
-axes.plot(line[:, 0], jax.vmap(jax.hessian(landscape))(line)[:, 0, 0], color="gray", linewidth=3, label="curvature")
-axes.plot(line[:, 0], d2y[:, 0, 0, 0], "--", color="tab:orange", label="learned, never shown")
-axes.set(xlabel="x_1 at x_2 = 0")
-axes.legend(frameon=False)
-figure.tight_layout()
+axes.plot(line[:, 0], dy[:, 0, 0], "--", color=style.ORANGE, label="learned")
+axes.plot(line[:, 0], jax.vmap(jax.hessian(landscape))(line)[:, 0, 0], color="0.6", linewidth=3, label="curvature")
+axes.plot(line[:, 0], d2y[:, 0, 0, 0], "--", color=style.BLUE, label="learned, not in the data")
+axes.set(xlabel="$x_1$ at $x_2$ = 0")
+style.legend(axes)

@@ -2,14 +2,17 @@
 A gait in a minute
 ==================
 
-A soft creature with 24 muscles learns to crawl. Gradients go back through the simulator, friction and contact included;
-two thousand environment steps are enough for a body length, and most of the time is compilation.
+A soft creature with 24 muscles learns to crawl. Gradients go back through the simulator, including friction and
+contact. Two thousand environment steps are enough for a body length, and most of the time is compilation.
 """
+
+# sphinx_gallery_thumbnail_number = 1
 
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
 
+from dln_jax.figures import soft_body_frame, style
 from dln_jax.locomotion.learning import Goal
 from dln_jax.locomotion.methods import shown_walk, train
 from dln_jax.locomotion.task import creature_named, make_task
@@ -30,7 +33,7 @@ print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles
 # %%
 # Learning
 # --------
-# A policy of one hidden layer, from what it sees of its body to the actuation of its muscles.
+# The policy is a network with one hidden layer, from observations of the body to the actuation of the muscles.
 
 records = []
 trained = train(
@@ -47,13 +50,21 @@ assert trained.best.distance > min(GOAL, 0.2)
 # %%
 # The gait
 # --------
-# Where its middle is, and how much its first muscles pull.
+# The creature in the middle of its walk; contracted muscles are red.
 
 seen = shown_walk(task, trained.policy, trained.best.parameters, task.episode)
 assert seen.converged.all()
-figure, (above, below) = plt.subplots(2, 1, figsize=(7, 5), sharex=True)
-above.plot(seen.x[:, :, 0].mean(axis=1) / task.length)
+moment = int(np.asarray(seen.actuation).std(axis=1).argmax())
+frame = soft_body_frame(
+    task.creature.mesh, np.asarray(seen.x[moment]), muscles=task.creature.muscles, actuation=seen.actuation[moment]
+)
+
+# %%
+# Its mean position, and the lengths of all muscles over time.
+
+figure, (above, below) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
+style.prepare(above)
+above.plot(seen.x[:, :, 0].mean(axis=1) / task.length, color=style.BLUE)
 above.set(ylabel="mean x, body lengths")
 below.imshow(np.asarray(seen.actuation).T, aspect="auto", cmap="magma")
 below.set(xlabel="step", ylabel="muscle")
-figure.tight_layout()

@@ -2,8 +2,8 @@
 Fine-tune a loaded run
 ======================
 
-The arm of yesterday's training was changed overnight. Its parameters are public: load the run, start from them, and a
-few samples of the new arm are enough.
+The arm that yesterday's model was trained on was changed overnight. Load the run and start from its parameters: a few
+samples of the new arm are enough.
 """
 
 import tempfile
@@ -18,8 +18,10 @@ import optax
 import dln_jax
 from dln_jax import dynamics
 from dln_jax.cli.commands import train_delan
-from dln_jax.scenes import two_link_arm
-from dln_jax.scenes.datasets.generators import default_data
+from dln_jax.figures import style
+from dln_jax.mechanics.integrators import rk4, rollout, second_order
+from dln_jax.scenes.datasets.default_data import default_data
+from dln_jax.scenes.two_link_arm import LINK_LENGTH, two_link_arm
 
 jax.config.update("jax_enable_x64", True)
 
@@ -39,10 +41,11 @@ print(f"{run.description['name']} with {count} parameters")
 # %%
 # Today
 # -----
-# Heavier links make all torques greater by a fifth, and a flywheel at the shoulder adds inertia: three letters of the
+# Heavier links increase all torques by a fifth, and a flywheel at the shoulder adds inertia. Three letters of the
 # changed arm were recorded, and one more for a test.
 
-letters = default_data(two_link_arm())
+scene = two_link_arm()
+letters = default_data(scene)
 names = [str(label) for label in letters.label]
 
 
@@ -64,7 +67,7 @@ def loss(parameters, data):
 # %%
 # Training goes on
 # ----------------
-# The model is a pure function of its parameters: any optimiser will do. All of it compiles into one program.
+# The model is a pure function of its parameters, so any optimiser works. The training compiles into one program.
 
 optimiser = optax.adam(optax.cosine_decay_schedule(3e-3, FINE_STEPS))
 
@@ -87,7 +90,43 @@ before, after = (float(loss(of, test)) for of in (run.parameters, parameters))
 print(f"torque MSE of the new arm's test letter: {before:.2e} before, {after:.2e} after, in (N m)²")
 assert after < 0.1 * before
 
-figure, axes = plt.subplots(figsize=(6, 3))
-axes.semilogy(values)
-axes.set(xlabel="step", ylabel="torque MSE, (N m)²")
-figure.tight_layout()
+# %%
+# Writing, before and after
+# -------------------------
+# The new arm writes the test letter with the torques of each model and weak feedback.
+
+plant = dynamics(scene.energies)
+letter = letters.trajectory == names.index("e")
+t, *reference = (np.asarray(array[letter]) for array in (letters.t, letters.q, letters.qd, letters.qdd))
+
+
+def tips(parameters):
+    model = dynamics(run.model.energies(parameters))
+
+    def accelerate(time, q, qd):
+        wanted = [jnp.stack([jnp.interp(time, t, column) for column in array.T]) for array in reference]
+        tau = model.inverse_dynamics(*wanted) + 5.0 * (wanted[0] - q) + 1.0 * (wanted[1] - qd)
+        mass = 1.2 * plant.mass_matrix(q) + jnp.diag(jnp.array([0.3, 0.0]))
+        return jnp.linalg.solve(mass, tau - 1.2 * plant.inverse_dynamics(q, qd, 0 * q))
+
+    start = jnp.asarray(reference[0][0]), jnp.asarray(reference[1][0])
+    q, _ = rollout(rk4(second_order(accelerate)), start, t)
+    return q, jax.vmap(scene.tip)(q)
+
+
+written, wanted = jax.jit(tips), np.asarray(jax.vmap(scene.tip)(jnp.asarray(reference[0])))
+figure, axes = plt.subplots(1, 2, figsize=(8, 3.6), layout="constrained", sharex=True, sharey=True)
+worst = []
+for axis, title, weights in zip(axes, ("yesterday's model", "fine-tuned"), (run.parameters, parameters), strict=True):
+    q, tip = map(np.asarray, written(weights))
+    worst.append(np.abs(tip - wanted).max())
+    elbow = LINK_LENGTH * np.array([np.cos(q[-1, 0]), np.sin(q[-1, 0])])
+    axis.plot(*wanted.T, color="0.85", linewidth=8, solid_capstyle="round")
+    axis.plot(*tip.T, color=style.BLUE, linewidth=2)
+    links = np.stack([np.zeros(2), elbow, tip[-1]])
+    axis.plot(*links.T, "o-", color="#3b4252", linewidth=7, markersize=10, solid_capstyle="round")
+    axis.plot(0, 0, "o", color=style.VERMILLION, markersize=28, zorder=0)  # the flywheel
+    axis.set(aspect="equal")
+    axis.set_axis_off()
+    style.title(axis, f"{title}: within {1e3 * worst[-1]:.0f} mm")
+assert worst[1] < 0.5 * worst[0]

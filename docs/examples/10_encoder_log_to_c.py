@@ -2,9 +2,11 @@
 From an encoder log to C
 ========================
 
-A three-axis arm whose frames are known is logged: noisy encoders, noisy torques, dry friction, no rates. Filtering,
-identification with friction, how sure the torques are, and C for the control loop.
+The log of a three-axis arm with known frames has noisy encoders, noisy torques, dry friction and no rates. The steps:
+filtering, identification with friction, uncertainty of the torques, and C for the control loop.
 """
+
+# sphinx_gallery_thumbnail_number = 1
 
 import tempfile
 from pathlib import Path
@@ -18,6 +20,7 @@ import dln_jax
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
+from dln_jax.figures import style
 from dln_jax.identification import identify, parameters_of
 from dln_jax.learning import uncertainty
 from dln_jax.learning.friction import fit_friction
@@ -31,7 +34,7 @@ random = np.random.default_rng(0)
 # %%
 # The arm
 # -------
-# Denavit-Hartenberg rows are the drawing; what the links weigh nobody knows. The true arm has motors and friction.
+# Denavit-Hartenberg rows describe the frames; the links have unknown masses. The true arm has motors and friction.
 
 rows = [[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0], [0, 0.4, 0, 0]]  # alpha, a, d, theta
 guess = trees.serial(*trees.dh_frames(rows), [trees.inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))] * 3)
@@ -57,9 +60,9 @@ t, logs = np.arange(0, 6, 0.008), []
 for _ in range(5):
     path = jax.tree_util.Partial(motion, random.uniform(0.1, 0.5, (3, 3)), random.uniform(0, 6, (3, 3)))
     speed = jax.jacfwd(path)
-    q, qd, qdd = (np.asarray(jax.jit(jax.vmap(each))(t)) for each in (path, speed, jax.jacfwd(speed)))
+    q, qd, qdd = (np.asarray(jax.jit(jax.vmap(function))(t)) for function in (path, speed, jax.jacfwd(speed)))
     logs.append((q, np.asarray(jax.jit(jax.vmap(plant.inverse_dynamics))(q, qd, qdd))))
-q, tau = (np.concatenate(each) for each in zip(*logs, strict=True))
+q, tau = map(np.concatenate, zip(*logs, strict=True))
 log = from_arrays(
     {
         "t": np.tile(t, 5),
@@ -76,30 +79,31 @@ train, validation, test = (select(data, which) for which in ([0, 1, 2], [3], [4]
 # %%
 # Identification
 # --------------
-# The velocity to which dry friction is resolved is found first; then inertias, armature and friction, weighted by the
-# joints' noise, with links that are bodies.
+# First the velocity scale of dry friction; then inertias, armature and friction, weighted by the joints' noise, with
+# physically consistent links.
 
 laws = ("viscous", "coulomb", "offset")
 scales = fit_friction(guess, train, laws).shape["velocity_scale"]
 model = make_rigid_tree(guess, friction=laws, velocity_scale=tuple(scales.tolist()))
 known = model.init(jax.random.key(0))._replace(viscous=jnp.full(3, 0.1), coulomb=jnp.full(3, 0.1))
-found = identify(model, known, train)
-arm = parameters_of(found.theta, known)
+identified = identify(model, known, train)
+arm = parameters_of(identified.theta, known)
 print(f"dry friction {np.round(arm.coulomb, 2)} N m, resolved to {np.round(scales, 3)} rad/s")
-print(f"{len(found.base.words)} base parameters, for example {found.base.words[2]}")
+print(f"{len(identified.base.words)} base parameters, for example {identified.base.words[2]}")
 assert np.abs(arm.coulomb - np.array([0.8, 1.0, 0.4])).max() < 0.1
 
 # %%
-# How sure it is
-# --------------
-# A standard deviation for the torque of any state, calibrated on motions that were left out.
+# Uncertainty
+# -----------
+# A standard deviation for the torque of any state, calibrated on held-out motions.
 
-sure = uncertainty.estimate(model, arm, train, validation, ridge=0.0, unit=found.fit.noise, negligible=1e-12)
-std = predictive(model, arm, sure.uncertainty.factor, sure.uncertainty.noise, sure.uncertainty.inflation)
+estimate = uncertainty.estimate(model, arm, train, validation, ridge=0.0, unit=identified.fit.noise, negligible=1e-12)
+bands = estimate.uncertainty
+std = predictive(model, arm, bands.factor, bands.noise, bands.inflation)
 inverse = dln_jax.dynamics(model.energies(arm)).inverse_dynamics
-predicted, band = (np.asarray(jax.jit(jax.vmap(each))(test.q, test.qd, test.qdd)) for each in (inverse, std))
+predicted, band = (np.asarray(jax.jit(jax.vmap(f))(test.q, test.qd, test.qdd)) for f in (inverse, std))
 covered = np.mean(np.abs(predicted - test.tau) < 1.96 * band)
-print(f"{covered:.1%} of the torques of an unseen motion are in the band of 95 %")
+print(f"{covered:.1%} of the torques of an unseen motion are within the 95 % band")
 assert covered > 0.9
 
 # %%
@@ -115,15 +119,36 @@ assert np.abs(in_c.inverse_dynamics(*state) - inverse(*state)).max() < 1e-10
 assert np.abs(in_c.torque_std(*state) - std(*state)).max() < 1e-10
 
 # %%
-# An unseen motion, with bands of 95 %:
+# The arm on its unseen motion: the colour of the path is the torque that the model predicts for the second joint.
+
+REACH = np.array([0.3, 0.0, 0.0])  # from the third joint to the tip, m
+
+
+def joints(q):
+    rotations, positions = trees.world_frames(true, q)
+    return jnp.stack([jnp.zeros(3), *positions, positions[-1] + rotations[-1] @ REACH])
+
+
+places = np.asarray(jax.jit(jax.vmap(joints))(test.q))
+figure, axes = plt.subplots(figsize=(6.5, 5), subplot_kw={"projection": "3d"}, layout="constrained")
+path = axes.scatter(*places[:, -1].T, c=predicted[:, 1], cmap="plasma", s=8, depthshade=False)
+for index, alpha in ((0, 0.2), (250, 0.4), (500, 1.0)):
+    look = {"color": "#3b4252", "linewidth": 6, "markersize": 9, "solid_capstyle": "round", "alpha": alpha}
+    axes.plot(*places[index].T, "o-", **look)
+figure.colorbar(path, label="torque of joint 2, N m", shrink=0.6)
+axes.locator_params(nbins=4)
+axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", zlabel="z, m")
+
+# %%
+# Its torques with 95 % bands.
 
 figure, axes = plt.subplots(3, 1, figsize=(7, 6), sharex=True, layout="constrained")
+style.prepare(*axes)
 for joint, axis in enumerate(axes):
     axis.plot(test.t, test.tau[:, joint], ".", markersize=2, color="0.6", label="measured")
-    axis.plot(test.t, predicted[:, joint], label="identified")
+    axis.plot(test.t, predicted[:, joint], color=style.BLUE, label="identified")
     low, high = (predicted[:, joint] + sign * 1.96 * band[:, joint] for sign in (-1, 1))
-    axis.fill_between(test.t, low, high, alpha=0.25, label="95 %")
+    axis.fill_between(test.t, low, high, color=style.BLUE, alpha=0.25, label="95 %")
     axis.set_ylabel(f"torque {joint + 1}, N m")
-axes[0].legend(ncols=3, loc="upper right", fontsize="small")
+style.legend(axes[0], ncols=3, loc="upper right")
 axes[-1].set_xlabel("t, s")
-plt.show()

@@ -2,9 +2,11 @@
 A swing-up in a minute
 ======================
 
-A motor turns an arm, and a free pole hangs at its end. From the energy of the machine alone follow a law that pumps the
-pole up, a regulator that holds it there, and the set of states from which it may take over.
+A motor turns an arm, and a free pole hangs at its end. The energy of the machine alone yields a law that swings the
+pole up, a regulator that holds it there, and the set of states from which the regulator may take over.
 """
+
+# sphinx_gallery_thumbnail_number = 1
 
 import tempfile
 from pathlib import Path
@@ -16,7 +18,7 @@ import numpy as np
 
 import dln_jax
 from dln_jax import control
-from dln_jax.figures import phase_portrait, rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.figures import phase_portrait, rotary_pendulum_drawing, style, write_closed_loop_gif
 from dln_jax.scenes import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
@@ -27,7 +29,7 @@ LIMIT = 0.05  # N m
 # %%
 # The machine
 # -----------
-# Coordinates are the arm's angle and the pole's, from upright; only the arm is driven.
+# The coordinates are the angles of the arm and of the pole, the latter from upright; only the arm is driven.
 
 scene = rotary_pendulum(friction=1e-5)
 plant, B, joints = dln_jax.dynamics(scene.energies), np.array(scene.needs.actuation), scene.needs.joints
@@ -36,7 +38,7 @@ field, goal = control.field_of(plant, B), jnp.zeros(4)
 # %%
 # Holding it up
 # -------------
-# A linear-quadratic regulator, and by simulation with the motor's limit the largest ellipsoid that it brings home.
+# A linear-quadratic regulator, and by simulation with the motor's limit the largest ellipsoid that it stabilises.
 
 at = control.linearise(jax.jit(field), goal, control.holding_controls(plant, goal[:2], B))
 regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
@@ -45,12 +47,12 @@ levels = 10.0 ** np.arange(-2, 1.01, 0.1)
 region = control.region_of_attraction(
     field, near, regulator, goal, joints, least=-LIMIT, most=LIMIT, rate=500.0, levels=levels, starts=32
 )
-print(f"the regulator holds what is below {region.level:.3g} of its value")
+print(f"the regulator stabilises states whose value is below {region.level:.3g}")
 
 # %%
 # Swinging it up
 # --------------
-# The energy of the pole is driven to that of the upright posture; the regulator takes over where its region begins.
+# The law drives the energy of the pole to that of the upright posture; the regulator takes over within its region.
 
 swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
 law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, joints), region.level)
@@ -71,12 +73,17 @@ assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
 # %%
 # The film and the phase plane
 # ----------------------------
-# Grey levels are the pole's energy with the arm at rest; on the dashed one it comes up by itself.
+# The first run at four moments, with the trace of its tip.
 
 folder, t, torque = Path(tempfile.mkdtemp()), np.asarray(runs.t[0, :-1]), np.asarray(runs.u[:, :, 0])
+drawing = rotary_pendulum_drawing(0.085, 0.129)
+figure, axes = plt.subplots(1, 4, figsize=(9, 3), layout="constrained")
+for axis, moment in zip(axes, (0.05, 0.6, 1.2, 3.0), strict=True):
+    drawing(axis, np.asarray(runs.x[0, :-1, :2]), 150)(int(500 * moment))
+    style.title(axis, f"{moment:.2f} s")
 write_closed_loop_gif(
     folder / "rotary-pendulum.gif",
-    rotary_pendulum_drawing(0.085, 0.129),
+    drawing,
     t,
     runs.x[0, :-1, :2],
     torque[0],
@@ -84,26 +91,31 @@ write_closed_loop_gif(
     unit="N m",
     frames_per_second=FRAMES_PER_SECOND,
 )
+print(f"the film is in {folder}")
+
+# %%
+# Grey levels are the pole's energy with the arm at rest; on the dashed level the pole comes up by itself.
+
 angles, rates = np.linspace(-np.pi, np.pi, 121), np.linspace(-30, 30, 101)
 resting = jax.vmap(lambda angle, rate: plant.energy(jnp.array([0.0, angle]), jnp.array([0.0, rate])))
-each = [grid.ravel() for grid in np.meshgrid(angles, rates)]
-levels = np.asarray(jax.jit(resting)(*each)).reshape(len(rates), len(angles))
-phase_portrait(
+states = [grid.ravel() for grid in np.meshgrid(angles, rates)]
+levels = np.asarray(jax.jit(resting)(*states)).reshape(len(rates), len(angles))
+portrait = phase_portrait(
     runs.x[:, :, 1],
     runs.x[:, :, 3],
     energy=(angles, rates, levels),
     goal_energy=float(plant.energy(goal[:2], goal[2:])),
     caught=(regulator.S[1::2, 1::2], region.level),
-).savefig(folder / "phase-portrait.png")
-print(f"a film and the phase plane are in {folder}")
+)
 
 # %%
 # Angles and torques over time, of all starts.
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4), sharex=True, layout="constrained")
-above.plot(t, runs.x[:, :-1, 1].T / (2 * np.pi), color="tab:blue", linewidth=0.6)
+style.prepare(above, below)
+above.plot(t, runs.x[:, :-1, 1].T / (2 * np.pi), color=style.BLUE, linewidth=0.6)
 above.set(ylabel="pole, turns from upright")
-below.plot(t, torque.T, color="tab:blue", linewidth=0.4)
+below.plot(t, torque.T, color=style.BLUE, linewidth=0.4)
 for limit in (-LIMIT, LIMIT):
-    below.axhline(limit, color="tab:red")
+    below.axhline(limit, color=style.VERMILLION)
 below.set(xlabel="t, s", ylabel="torque, N m")

@@ -2,10 +2,12 @@
 A plan through a stiff plant
 ============================
 
-A driven cart pulls a second one, which carries a free pole, by a spring that is nearly rigid. Its motion is slow, but
-an explicit integrator has to follow the spring: here 200 steps or more where 40 are planned. Multiple shooting plans
-through an implicit one, from a guess that is no motion at all.
+A driven cart pulls a second one, which carries a free pole, by a nearly rigid spring. The motion is slow, but an
+explicit integrator has to follow the spring: it needs 200 steps or more where the plan has 40. Multiple shooting plans
+through an implicit integrator, from a guess that is not a motion.
 """
+
+# sphinx_gallery_thumbnail_number = 1
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ import numpy as np
 
 import dln_jax
 from dln_jax import control
+from dln_jax.figures import style
 from dln_jax.mechanics.integrators import CLASSICAL, RADAU_3
 from dln_jax.scenes import flexible_cart_pole
 
@@ -26,7 +29,7 @@ STIFFNESS = 2e4  # N/m
 # %%
 # The plant
 # ---------
-# The fastest motion is that of the spring; a classical Runge-Kutta step is stable up to 2.8 of its radians.
+# The spring has the fastest motion; a classical Runge-Kutta step is stable up to 2.8 of its radians.
 
 scene = flexible_cart_pole(stiffness=STIFFNESS)
 plant, B = dln_jax.dynamics(scene.energies), np.array(scene.needs.actuation)
@@ -39,8 +42,8 @@ assert abs(modes).max() * DT > 2.8
 # %%
 # The plan
 # --------
-# Swing up within 1.6 s. The guess is a straight line from hanging to upright with no force at all; its defects are what
-# the steps miss of it. Of the costs, angles are off the goal as 2 (1 - cos).
+# Swing up within 1.6 s. The guess is a straight line from hanging to upright without a force. Its defects are the
+# differences between its states and the steps from the states before. The cost of the angle is 2 (1 - cos).
 
 
 def off(x):
@@ -55,37 +58,60 @@ problem = control.Problem(
     most=LIMIT,
 )
 guess, still = np.linspace(start, goal, STEPS + 1), np.zeros((STEPS, 1))
-found = jax.jit(lambda: control.shoot(problem, start, guess, still))()
-plan = found.plan
-print(f"{found.iterations} iterations, largest defect {found.defect:.1e}, cost {plan.cost:.3f}")
-assert found.converged
+solution = jax.jit(lambda: control.shoot(problem, start, guess, still))()
+plan = solution.plan
+print(f"{solution.iterations} iterations, largest defect {solution.defect:.1e}, cost {plan.cost:.3f}")
+assert solution.converged
 
 # %%
 # The truth
 # ---------
-# By 2000 classical steps a second, with the plan's own feedback u + K (x - plan) at its samples, within the limits.
-# Classical steps as long as the plan's explode.
+# 2000 classical steps a second, with the plan's own feedback u + K (x - plan) at its samples, within the limits.
+# Classical steps as long as the plan's diverge.
 
 many = jax.jit(control.integrated(field, DT, method=CLASSICAL, substeps=int(2000 * DT)))
 few = jax.jit(control.integrated(field, DT, method=CLASSICAL))
-true, forces, exploded = [jnp.asarray(start)], [], jnp.asarray(start)
+true, forces, diverged = [jnp.asarray(start)], [], jnp.asarray(start)
 for x, u, K in zip(plan.x, plan.u, plan.K, strict=False):
     forces.append(jnp.clip(u + K @ (true[-1] - x), -LIMIT, LIMIT))
     true.append(many(true[-1], forces[-1]))
-    exploded = few(exploded, u)
+    diverged = few(diverged, u)
 apart = np.abs(np.stack(true) - plan.x)[:, [0, 2]].max()
-print(f"cart and pole stay within {apart:.3f} of the plan; explicit steps of {DT} s explode")
-assert apart < 0.2 and not np.abs(exploded).max() < 1e3
+print(f"cart and pole stay within {apart:.3f} of the plan; explicit steps of {DT} s diverge")
+assert apart < 0.2 and not np.abs(diverged).max() < 1e3
+
+# %%
+# The true motion, from top to bottom: the driven cart, the spring, the carried cart and its pole.
+
+motion = np.asarray(jnp.stack(true))
+figure, axes = plt.subplots(figsize=(6, 6), layout="constrained")
+for row, index in enumerate((0, 4, 7, 9, 12, 40)):
+    x, y, angle = motion[index, 0], -0.5 * row, motion[index, 2]
+    carried, zigzag = x + 0.45 + motion[index, 1], np.tile([0, 0.04, 0, -0.04], 6)
+    axes.plot([-1.2, 1.2], [y - 0.09] * 2, color="0.75", linewidth=1.5, zorder=0)
+    axes.plot(np.linspace(x + 0.1, carried - 0.1, 24), y + zigzag, color=style.ORANGE, linewidth=1.5)
+    for cart, colour in ((x, "#3b4252"), (carried, style.BLUE)):
+        axes.add_patch(plt.Rectangle((cart - 0.1, y - 0.06), 0.2, 0.12, color=colour))
+        axes.plot([cart - 0.06, cart + 0.06], [y - 0.07] * 2, "o", color="0.4", markersize=6)
+    axes.plot([carried, carried + 0.178 * np.sin(angle)], [y, y + 0.178 * np.cos(angle)], color="#2e6fa7", linewidth=4)
+    axes.plot(carried + 0.178 * np.sin(angle), y + 0.178 * np.cos(angle), "o", color=style.VERMILLION, markersize=10)
+    axes.text(-1.2, y, f"{DT * index:.2f} s", va="center", ha="right", fontsize=style.TEXT)
+axes.set(aspect="equal", xlim=(-1.2, 1.2))
+axes.set_axis_off()
+
+# %%
+# Plan, truth and guess over time.
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
+style.prepare(above, below)
 t = DT * np.arange(STEPS + 1)
-for index, name, colour in ((0, "cart, m", "tab:blue"), (2, "pole, rad", "tab:orange")):
-    above.plot(t, np.stack(true)[:, index], color=colour, label=name)
+for index, name, colour in ((0, "cart, m", style.BLUE), (2, "pole, rad", style.ORANGE)):
+    above.plot(t, motion[:, index], color=colour, label=name)
     above.plot(t, plan.x[:, index], "o", color=colour, markersize=3)
     above.plot(t, guess[:, index], ":", color=colour)
-above.legend(title="line: truth, dots: plan,\ndotted: guess")
-below.step(t[:-1], np.stack(forces)[:, 0], where="post", color="tab:blue")
-below.plot(t[:-1], plan.u[:, 0], "o", color="tab:blue", markersize=3)
+style.legend(above, title="line: truth, dots: plan,\ndotted: guess")
+below.step(t[:-1], np.stack(forces)[:, 0], where="post", color=style.BLUE)
+below.plot(t[:-1], plan.u[:, 0], "o", color=style.BLUE, markersize=3)
 for limit in (-LIMIT, LIMIT):
-    below.axhline(limit, color="tab:red")
+    below.axhline(limit, color=style.VERMILLION)
 below.set(xlabel="t, s", ylabel="force, N")

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, TypeGuard
 from matplotlib.figure import Figure
 
 from dln_jax.files import is_file, matches, read_json, write_figure, write_json
-from dln_jax.metrics.report import Row, conditions, publish
 from dln_jax.types import InputError
+from scripts.reports.rows import Row, conditions, publish
 
 JOBS = "jobs.json"
 REMEDY = "restore the file, or delete it to measure everything again"

@@ -20,10 +20,8 @@ from dln_jax.learning.weak_forms import Form, WeakFit, fit_form, fit_momentum
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree
-from dln_jax.metrics.report import Row
-from dln_jax.models.model import Model
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.types import Vector
+from scripts.reports.rows import Row
 
 TOLERANCES: dict[str, Any] = {"negligible": 1e-9, "rank_tolerance": 1e-8}
 WAYS = (

@@ -1,4 +1,4 @@
-"""The figure of a value closes the circle and is drawn from what it is given."""
+"""The figure of a value closes the circle and shows its arguments."""
 
 import numpy as np
 
@@ -13,5 +13,5 @@ def test_panels_of_a_value():
     figure = value_figure(nodes, (1.01 * V, V), (nodes[..., 1] / 4, nodes[..., 1] / 4), paths, limit=2.5, seconds=5.0)
     panels = [axis for axis in figure.axes if axis.get_title()]
     assert [axis.get_title() for axis in panels][:2] == ["fitted value", "value on a grid"]
-    assert "1.0e-02" in panels[2].get_title() and panels[0].get_xlim()[1] == np.pi
+    assert "1.0e-02" in panels[4].get_title() and panels[0].get_xlim()[1] == np.pi
     figure.draw_without_rendering()

@@ -10,8 +10,8 @@ from dln_jax.types import InputError
 def test_bands_of_a_normal_variable_hold_what_they_say():
     random = np.random.default_rng(0)
     std = random.uniform(0.5, 2.0, (20_000, 2))
-    found = coverage(std * random.normal(size=std.shape), std)
-    np.testing.assert_allclose(found.shares, np.tile(LEVELS, (2, 1)).T, atol=0.015)
+    covered = coverage(std * random.normal(size=std.shape), std)
+    np.testing.assert_allclose(covered.shares, np.tile(LEVELS, (2, 1)).T, atol=0.015)
     assert half_width(0.95) == pytest.approx(1.959964, abs=1e-6)
 
 

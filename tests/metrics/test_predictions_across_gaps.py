@@ -55,22 +55,22 @@ def test_an_exact_model_is_right_to_the_end_of_a_recording_with_gaps():
     """The part after a gap is as short as one sample more than a window; predictions go on by time stamps."""
     for data in (with_gaps(), swings(np.ones(81, bool))):
         recordings = cut_recordings(data, 200, fitted=FITTED)
-        found = predict_measured(
+        predicted = predict_measured(
             oscillator(FREQUENCY), jnp.zeros(1), recordings, fitted=FITTED, substeps=4, momenta=True
         )
-        times = valid_times(recordings, found, fitted=FITTED, variance=data.q.var(axis=0))
+        times = valid_times(recordings, predicted, fitted=FITTED, variance=data.q.var(axis=0))
         assert times == pytest.approx([4 - (FITTED - 1) * STEP])
 
 
 def test_a_wrong_model_fails_at_the_same_time_with_gaps_and_without():
     """cos(w t) and cos(w' t) part at one time, whether samples before it were measured or not."""
     wrong = oscillator(1.03 * FREQUENCY)
-    found = []
+    times = []
     for data in (with_gaps(), swings(np.ones(81, bool))):
         recordings = cut_recordings(data, 200, fitted=FITTED)
         predicted = predict_measured(wrong, jnp.zeros(1), recordings, fitted=FITTED, substeps=4, momenta=True)
-        found.append(valid_times(recordings, predicted, fitted=FITTED, variance=np.array([0.5]))[0])
-    late, exact = found
+        times.append(valid_times(recordings, predicted, fitted=FITTED, variance=np.array([0.5]))[0])
+    late, exact = times
     assert FITTED * STEP < exact <= late < 3.0 and late - exact <= 14 * STEP
 
 

@@ -24,7 +24,7 @@ def with_joint(joint, values, base=TRUTH):
 
 
 @pytest.mark.parametrize(
-    ("predicted", "level", "said"),
+    ("predicted", "level", "words"),
     [
         (TRUTH, "good", "held-out nMSE 0.002"),
         (TRUTH + 0.15 * SCALE, "good", "worst"),
@@ -38,9 +38,9 @@ def with_joint(joint, values, base=TRUTH):
         (with_joint(0, np.nan), "refused", "hip is not finite"),
     ],
 )
-def test_level_and_reason(predicted, level, said):
+def test_level_and_reason(predicted, level, words):
     verdict = verdict_of(predicted, noise=NOISE)
-    assert verdict.level == level and said in verdict.line
+    assert verdict.level == level and words in verdict.line
     assert bool(verdict.remedy) == (level != "good")
     assert "\n" not in verdict.line
 
@@ -99,12 +99,12 @@ def test_worst_of_several():
 
 
 def test_metrics_are_numbers():
-    found = held_out(TRUTH, MEASURED, noise=NOISE, file=TRUTH)
-    metrics = verdict_metrics(found, judge(found))
+    errors = held_out(TRUTH, MEASURED, noise=NOISE, file=TRUTH)
+    metrics = verdict_metrics(errors, judge(errors))
     assert metrics["verdict"] == LEVELS.index("good") == 0
     assert metrics["noise_nmse"] == pytest.approx(0.0025, rel=0.05) and metrics["zero_nmse"] > 1
     assert all(isinstance(value, int | float) for value in metrics.values())
-    assert "file_nmse" not in verdict_metrics(HeldOut(*found[:3]), judge(found))
+    assert "file_nmse" not in verdict_metrics(HeldOut(*errors[:3]), judge(errors))
 
 
 def test_verdict_needs_samples():

@@ -17,10 +17,10 @@ import tyro
 from dln_jax.cli.arguments import Unstated
 from dln_jax.cli.options import Folder
 from dln_jax.files import write_bytes
-from dln_jax.metrics.report import Row, conditions, markdown, publish
 from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import Done, draw, measure
+from scripts.reports.rows import Row, conditions, markdown, publish
 from scripts.reports.speed.subjects import cases
 
 

@@ -18,13 +18,13 @@ from dln_jax.cli.arguments import Unstated, choice, names_in, refuse_given, requ
 from dln_jax.cli.options import Drawn, Resumable
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import write_bytes
-from dln_jax.metrics.report import conditions, publish
 from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
 from scripts.reports.case import measure, rows_in, say_numbers
 from scripts.reports.hamiltonian.own_files import compared, own_cases, own_markdown
 from scripts.reports.hamiltonian.table import SHOWN, TASKS, cases, markdown, table_rows
+from scripts.reports.rows import conditions, publish
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Annotated
 
 from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Folder
-from dln_jax.metrics.report import conditions, publish
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import Done, measure, rows_in
+from scripts.reports.rows import conditions, publish
 from scripts.reports.stability.interruptions import RUNS, cases
 
 

@@ -21,14 +21,13 @@ from dln_jax.cli.options import Folder
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data.mjcf import mjcf
 from dln_jax.files import read_json
-from dln_jax.metrics.report import Row, expect
 from dln_jax.metrics.verdict import LEVELS, FitRefused
 from dln_jax.training.identification.run import run
 from dln_jax.training.identification.task import Options
 from dln_jax.types import InputError, require_positive, require_seed
 from scripts.reports.case import Case, Findings, measure_and_publish
 from scripts.reports.robots.faulty_logs import FAULTS, Arrays, Fault, random_arm, rough_file, sound_log
-from scripts.reports.robots.simulated_arms import Arm
+from scripts.reports.rows import Row, expect
 
 JOINTS = (2, 3, 4, 6)
 """Numbers of joints of successive arms."""

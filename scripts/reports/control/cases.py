@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from dln_jax.control import EnergyGains
-from dln_jax.metrics.report import Row
 from dln_jax.precision import in_float64
 from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from scripts.reports.case import Case, Findings
@@ -16,6 +15,7 @@ from scripts.reports.control.board import Motor, criteria, plant, play
 from scripts.reports.control.energy_laws import SwingUp, rows_of_criteria, rows_of_outcomes, success
 from scripts.reports.control.planned import Weights, follower, search
 from scripts.reports.control.values import equation, fits
+from scripts.reports.rows import Row
 
 TURN = 2 * np.pi / 2048
 """Resolution of an encoder, rad."""

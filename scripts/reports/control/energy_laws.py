@@ -37,10 +37,10 @@ from dln_jax.control import (
 )
 from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import Row
 from dln_jax.scenes.scene import Scene
 from scripts.reports.case import Findings
 from scripts.reports.control.board import GOAL, LIMIT, RATE, SECONDS, Criteria, Motor, criteria, plant, score
+from scripts.reports.rows import Row
 
 STATE_COST, CONTROL_COST = np.diag([0.97, 0.93, 0.39, 0.26]), np.array([[0.11]])
 """Cost matrices of the regulator, from the board's own controller."""

@@ -33,14 +33,14 @@ from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.metrics.report import Row, expect
-from dln_jax.scenes.pendulums import chain
-from dln_jax.scenes.poles import rotary_pendulum
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
 from scripts.reports.control.mpc_calls import STACK, first_state, one_call
 from scripts.reports.control.values.laws import drawn_law
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
+from scripts.reports.rows import Row, expect
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
 
 AGREEMENT = 1e-10

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from dln_jax.metrics.report import Row, expect
 from scripts.reports.case import Findings
 from scripts.reports.control.mpc import HORIZONS, RATE, swing_ups
 from scripts.reports.control.mpc_calls import calls_in_a_process
+from scripts.reports.rows import Row, expect
 
 STARTS, LOOPS = 30, 10
 """Number of swing-ups, and number of loops with timed calls."""

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from matplotlib.figure import Figure
 
 from dln_jax.control import Controller
-from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
 from scripts.reports.control.board import Motor, criteria, plant, play, score
 from scripts.reports.control.disturbed_board import CRITERIA, robustness
@@ -14,6 +13,7 @@ from scripts.reports.control.energy_laws import Law, best_law, controllers_by_en
 from scripts.reports.control.planned import Weights, follower, search
 from scripts.reports.control.recovering import Recovery, by_angles, recovering
 from scripts.reports.figures.robustness import shares
+from scripts.reports.rows import Row
 
 PUBLISHED = {
     "acrobot": {

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 
 from dln_jax.control import Run
 from dln_jax.control.outcomes import hanging_starts
-from dln_jax.figures.closed_loops import closed_loop_traces, success_over_starts
+from dln_jax.figures.closed_loops import closed_loop_traces
 from dln_jax.mechanics.equations import dynamics
 from scripts.reports.case import Findings
 from scripts.reports.control.energy_laws import SwingUp, closed_loop, rows_of_outcomes, tried
+from scripts.reports.figures.starts import success_over_starts
 
 SHOWN, SECONDS, EVERY = 6, 3.0, 4
 """Runs in a figure, their length, s, and the stride of the drawn samples."""

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.benchmarks import EXACT, exact_band, exact_ground
-from dln_jax.figures.labels import label_ends
+from scripts.reports.figures.costs import EXACT, exact_band, exact_ground
+from scripts.reports.figures.labels import label_ends
 
 
 def error_lines(curves: Mapping[str, Any], *, x: str, zero: str) -> Figure:
@@ -36,9 +36,9 @@ def error_lines(curves: Mapping[str, Any], *, x: str, zero: str) -> Figure:
     top.plot(places, np.median(mean_squares, axis=1), "--", color=colours[zero], linewidth=1.2)
     top.set(yscale="log", ylabel="test torque MSE, (N m)²")
     exact_band(top, ground)
-    outside = 100 * np.median(share, axis=1)
-    bottom.fill_between(places, outside, color="0.85", linewidth=0)
-    bottom.plot(places, outside, color="0.4", linewidth=1.2)
+    percent = 100 * np.median(share, axis=1)
+    bottom.fill_between(places, percent, color="0.85", linewidth=0)
+    bottom.plot(places, percent, color="0.4", linewidth=1.2)
     bottom.set(xlabel=x, ylabel="outside the\ntraining, %", ylim=(0, 100), xscale=style.scale_of(places))
     bottom.set_xticks(places, [f"{place:g}" for place in places])
     bottom.minorticks_off()
@@ -97,16 +97,16 @@ def _errors(axis: Axes, errors: Mapping[str, Sequence[Sequence[float]]]) -> None
     """Draws all errors and their median over runs, in the order of writing; hollow marks on top are lost letters."""
     style.prepare(axis)
     values = {model: 1e3 * np.asarray(runs, float) for model, runs in errors.items()}
-    every = np.concatenate([each.ravel() for each in values.values()])
+    every = np.concatenate([runs.ravel() for runs in values.values()])
     top = 4 * every[np.isfinite(every)].max(initial=1.0)
     axis.set(yscale="log", xlabel="letter, in the order of writing", ylabel="tip error, mm (rms)")
     places = 1 + np.arange(next(iter(values.values())).shape[1])
-    for number, (model, each) in enumerate(values.items()):
+    for number, (model, runs) in enumerate(values.items()):
         look: dict[str, Any] = {"color": style.colour(model), "markersize": 4}
         beside = places + 0.06 * (number - (len(values) - 1) / 2)
-        median, lost = np.median(each, axis=0), np.isinf(each)
+        median, lost = np.median(runs, axis=0), np.isinf(runs)
         axis.plot(beside, np.where(np.isfinite(median), median, np.nan), color=look["color"], linewidth=1.2)
-        for run in np.where(lost, np.nan, each):
+        for run in np.where(lost, np.nan, runs):
             axis.plot(beside, run, style.marker(model), **look)
         hollow = beside[lost.any(axis=0)]
         axis.plot(hollow, np.full(len(hollow), top), style.marker(model), markerfacecolor="white", **look)

@@ -48,13 +48,13 @@ def speed_ups(
 
 def _draw_bars(axis: Axes, measured: Mapping[str, Mapping[str, float]]) -> None:
     places = np.arange(len(measured))
-    names = list(dict.fromkeys(name for each in measured.values() for name in each))
+    names = list(dict.fromkeys(name for layouts in measured.values() for name in layouts))
     colours, width = style.colours_of(names), 0.8 / max(len(names), 1)
     for number, name in enumerate(names):
-        heights = [each.get(name, np.nan) for each in measured.values()]
+        heights = [layouts.get(name, np.nan) for layouts in measured.values()]
         at = places + (number - (len(names) - 1) / 2) * width
         axis.bar(at, heights, 0.9 * width, color=colours[name], label=name.replace("-", " "))
     axis.axhline(1.0, color="0.6", linewidth=0.8, linestyle="--")
     axis.set_xticks(places, list(measured))
-    axis.set_ylim(top=1.35 * max([1.0, *(value for each in measured.values() for value in each.values())]))
+    axis.set_ylim(top=1.35 * max([1.0, *(value for layouts in measured.values() for value in layouts.values())]))
     style.legend(axis, loc="upper center", ncols=2)

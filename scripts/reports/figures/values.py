@@ -8,11 +8,11 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
+from dln_jax.figures.closed_loops import angle_ticks
 
 LEVELS = 16
 LEAST_ERROR, MOST_ERROR = 1e-4, 1.0
 """Range of the colour scale of relative errors."""
-TICKS = {-np.pi: "-π", -np.pi / 2: "-π/2", 0.0: "0", np.pi / 2: "π/2", np.pi: "π"}
 
 
 def value_figure(
@@ -36,33 +36,33 @@ def value_figure(
     """
     # The angle is periodic: repeat the first nodes at the end.
     nodes = np.concatenate([nodes, nodes[:1] + np.array([2 * np.pi, 0])])
-    fitted, true, u, best = (np.concatenate([each, each[:1]]) for each in (*values, *controls))
-    figure, axes = style.figure(2, 3, height=4.9, width=9.6)
+    fitted, true, u, best = (np.concatenate([array, array[:1]]) for array in (*values, *controls))
+    figure, axes = style.figure(3, 2, height=7.4)
     highest = float(np.max(true))
     heights, torques = Normalize(0, highest), Normalize(-limit, limit)
-    for axis, V, name in zip(axes[0], (fitted, true), ("fitted value", "value on a grid"), strict=False):
+    for axis, V, name in zip(axes[0], (fitted, true), ("fitted value", "value on a grid"), strict=True):
         _surface(axis, nodes, V, heights, "YlGnBu")
         axis.contour(*_sides(nodes), V.T, np.linspace(0, highest, LEVELS), colors="0.25", linewidths=0.35)
         _paths(axis, paths)
         style.title(axis, name)
     _bar(figure, ScalarMappable(heights, "YlGnBu"), axes[0, 1], "V")
-    off = np.clip(np.abs(fitted - true) / np.maximum(true, 0.01 * highest), LEAST_ERROR, MOST_ERROR)
-    shown = _surface(axes[0, 2], nodes, off, LogNorm(LEAST_ERROR, MOST_ERROR), "inferno")
-    style.title(axes[0, 2], f"relative error, median {np.median(off):.1e}")
-    _bar(figure, shown, axes[0, 2], "|V - V*| / V*")
-    for axis, torque, name in zip(axes[1], (u, best), ("fitted policy", "policy on a grid"), strict=False):
+    for axis, torque, name in zip(axes[1], (u, best), ("fitted policy", "policy on a grid"), strict=True):
         _surface(axis, nodes, torque, torques, "RdBu_r")
         _paths(axis, paths)
         style.title(axis, name)
     _bar(figure, ScalarMappable(torques, "RdBu_r"), axes[1, 1], "u, N m")
-    for axis in (*axes[0], *axes[1, :2]):
-        axis.set(xticks=list(TICKS), xticklabels=list(TICKS.values()), xlim=(-np.pi, np.pi))
-        axis.set_ylim(nodes[0, 0, 1], nodes[0, -1, 1])
+    off = np.clip(np.abs(fitted - true) / np.maximum(true, 0.01 * highest), LEAST_ERROR, MOST_ERROR)
+    shown = _surface(axes[2, 0], nodes, off, LogNorm(LEAST_ERROR, MOST_ERROR), "inferno")
+    style.title(axes[2, 0], f"relative error, median {np.median(off):.1e}")
+    _bar(figure, shown, axes[2, 0], "|V - V*| / V*")
+    for axis in (*axes[:2].flat, axes[2, 0]):
+        axis.set(xlim=(-np.pi, np.pi), ylim=(nodes[0, 0, 1], nodes[0, -1, 1]))
+        angle_ticks(axis.xaxis)
     for axis in axes[:, 0]:
         axis.set_ylabel("rate, rad/s")
-    for axis in (axes[0, 2], *axes[1, :2]):
+    for axis in (*axes[1], axes[2, 0]):
         axis.set_xlabel("angle from upright, rad")
-    _over_time(axes[1, 2], paths, seconds)
+    _over_time(axes[2, 1], paths, seconds)
     return figure
 
 

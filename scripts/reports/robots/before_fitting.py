@@ -7,14 +7,13 @@ from dln_jax.identification.excitation.candidates import Design, random_designs
 from dln_jax.identification.excitation.design import CRITERIA, best_design, make_optimiser
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import Task, make_task
-from dln_jax.metrics.report import Row, expect
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.case import Findings
 from scripts.reports.encoder_data import encoder_rows
 from scripts.reports.excitation import compare
 from scripts.reports.robots.arm import ENCODER_NOISE, TORQUE_NOISE, arm
 from scripts.reports.robots.known_kinematics import FULL, QUICK, logs
-from scripts.reports.robots.simulated_arms import panda
+from scripts.reports.rows import Row, expect
 
 PARTS = 3
 """Number of logs with equal numbers of motions and independent noise."""

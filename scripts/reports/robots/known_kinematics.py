@@ -20,11 +20,11 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import Tree, tree_system
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.metrics.report import Row, expect
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.case import Findings
 from scripts.reports.robots.arm import D, Log, Motion, arm, exact_torque, follow, measured, motion, trajectories
 from scripts.reports.robots.rivals import regression
+from scripts.reports.rows import Row, expect
 
 LAWS = ("viscous", "coulomb", "offset")
 USUAL_SCALE = 0.01

@@ -1,10 +1,8 @@
 """Cases of the report on arms with unknown kinematics, by the LIP protocol."""
 
-from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings, by_case
 from scripts.reports.robots.lip import kernel_rows, rows
-from scripts.reports.robots.unknown_trees import PLANTS
-from scripts.reports.robots.unknown_trees import rows as plant_rows
+from scripts.reports.rows import Row
 
 SEEDS = range(10)
 """Seeds of the starts."""

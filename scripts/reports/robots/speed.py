@@ -14,10 +14,10 @@ from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.metrics.report import Row, expect
 from scripts.reports.case import Findings
 from scripts.reports.robots.arm import D, arm
 from scripts.reports.robots.rivals import pinocchio, pinocchio_model
+from scripts.reports.rows import Row, expect
 from scripts.reports.speed.calls_from_python import Timed, call_all, seconds_of_calls
 
 CASE = "seven-axis-tree"

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from rich.table import Table
 
-from dln_jax.metrics.report import Row
 from scripts.reports.case import by_case
+from scripts.reports.rows import Row
 
 CASES = "hosts/"
 """Prefix of the cases of modelled rows."""

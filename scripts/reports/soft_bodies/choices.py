@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.metrics.report import expect
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.softbody.mesh.simplices import regularity
@@ -23,6 +22,7 @@ from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.energies import ElementEnergy
 from dln_jax.solvers.elements.selection import least_work, search_takes_at_most
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect
 
 WAYS = {"blocks": linear_solvers.block_tridiagonal, "matrix-free": linear_solvers.matrix_free}
 MODULI, RATIOS, TIME_STEPS = (1e5, 1e7, 1e9), (0.3, 0.49), (1e-3, 1 / 60)

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.benchmarks import cost_curves
-from dln_jax.figures.labels import label_ends
 from dln_jax.figures.soft_bodies import Moments, moments_figure
+from scripts.reports.figures.costs import cost_curves
+from scripts.reports.figures.labels import label_ends
 from scripts.reports.soft_bodies.motions import DT
 from scripts.reports.soft_bodies.statics import ELASTICA
 

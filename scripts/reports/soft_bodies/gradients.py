@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dln_jax.metrics.report import expect
 from dln_jax.rollout import rollout
 from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh import shapes
@@ -30,6 +29,7 @@ from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect
 from scripts.reports.soft_bodies.common import GRAVITY, solid
 
 BOUND = 1e-7

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.metrics.report import expect, largest
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, potential, with_parameters
@@ -22,6 +21,7 @@ from dln_jax.softbody.step import BACKWARD_EULER, INTEGRATORS, Integrator, make_
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.soft_bodies.common import GRAVITY, Seen, converges, motion, solid
 
 DT = 0.01

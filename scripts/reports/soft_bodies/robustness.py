@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.metrics.report import Row, expect, largest
 from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.mesh.simplices import simplex_volumes
@@ -23,6 +22,7 @@ from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.softbody.verdict import Info
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row, expect, largest
 from scripts.reports.soft_bodies.common import GRAVITY, Seen, cantilever_of, converges, motion
 
 DT = 1 / 30

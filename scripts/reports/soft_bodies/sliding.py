@@ -7,13 +7,13 @@ friction is smooth, and slides with g (sin - mu cos) for less.
 
 import numpy as np
 
-from dln_jax.metrics.report import expect, largest
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.scene import SoftScene, make_scene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.gravity import gravity
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.soft_bodies.common import GRAVITY, converges, motion
 
 STIFFNESS = 1e6

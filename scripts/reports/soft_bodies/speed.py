@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.metrics.report import expect, largest
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.scene import Params, State, element_energies, make_scene, prepare
@@ -21,6 +20,7 @@ from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.soft_bodies.common import cantilever_of, converges
 from scripts.reports.soft_bodies.gradients import crawling, crawling_scene, gait
 

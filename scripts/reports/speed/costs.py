@@ -13,15 +13,15 @@ import optax
 from jax import Array
 from matplotlib.figure import Figure
 
-from dln_jax.figures.benchmarks import cost_curves, cost_panels
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
-from dln_jax.metrics.report import Row
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.pendulums import chain
 from dln_jax.types import Lagrangian
 from scripts.reports.case import Findings
+from scripts.reports.figures.costs import cost_curves, cost_panels
+from scripts.reports.rows import Row
 
 BATCHES = (1, 10, 100, 1_000, 10_000, 100_000)
 QUICK = (1, 1_000)

@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.figures.benchmarks import cost_points
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.metrics.report import Row
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import compiled
 from scripts.reports.arm.models import TRIGONOMETRIC, described
 from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
+from scripts.reports.figures.costs import cost_points
+from scripts.reports.rows import Row
 
 BATCH = 1_000
 INPUTS = {"inverse": ("q", "qd", "qdd"), "forward": ("q", "qd", "tau")}

@@ -6,9 +6,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from dln_jax.figures.benchmarks import cost_curves, error_against_time
 from scripts.reports import soft_bodies
 from scripts.reports.case import Case, Findings, named
+from scripts.reports.figures.costs import cost_curves, error_against_time
 from scripts.reports.soft_bodies.figures import speed_against_error
 from scripts.reports.soft_bodies.speed import LANES
 from scripts.reports.speed import costs, exported_c, integrators, one_step, precision, training

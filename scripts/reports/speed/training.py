@@ -7,7 +7,6 @@ from dln_jax.data.splits import Split
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import Row
 from scripts.reports.arm.models import (
     WIDTHS,
     Measured,
@@ -22,6 +21,7 @@ from scripts.reports.arm.models import (
 )
 from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row
 
 ADAM_STEPS = 20_000
 QUICK = "structured-delan"

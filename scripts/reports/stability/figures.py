@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.labels import label_ends
+from scripts.reports.figures.labels import label_ends
 
 
 def curvature(curves: dict) -> Figure:

@@ -17,13 +17,13 @@ import numpy as np
 
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import expect, largest
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.nn.activations import activation
 from dln_jax.scenes.pendulums import double_pendulum
 from dln_jax.types import Needs
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.stability.random_models import random_parameters, random_states, untrained
 
 DTYPES = (np.float32, np.float64)

@@ -13,8 +13,8 @@ from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.residual import fit_residual
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
-from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row
 
 SHARE = 0.15
 """Relative range of mass and length that the worst disturbance may use."""

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dln_jax.figures import style
-from dln_jax.figures.labels import label_ends
+from scripts.reports.figures.labels import label_ends
 
 Numbers = Sequence[float | int] | np.ndarray
 Line = tuple[Numbers, Numbers]
@@ -37,20 +37,20 @@ def cost_curves(lines: Mapping[str, Line], *, x: str, y: str, title: str) -> Fig
 def cost_panels(lines: Mapping[str, Mapping[str, Line]], *, x: str, y: str | Sequence[str], columns: int = 2) -> Figure:
     """One panel of lines per title, with one legend; a line "NAME, learned" has the colour of NAME and is dashed.
 
-    `y` labels the axis of all panels, or of each.
+    `y` labels the axes of all panels, or lists one label per panel.
     """
     columns = min(columns, len(lines))
     rows = -(-len(lines) // columns)
     figure, axes = style.figure(rows, columns, height=2.3 * rows + 0.8)
-    every = list(dict.fromkeys(name for each in lines.values() for name in each))
+    every = list(dict.fromkeys(name for panel in lines.values() for name in panel))
     names = list(dict.fromkeys(name.split(", ")[0] for name in every))
     looks = {name: _look(name, names) for name in names}
-    for number, (axis, (title, each)) in enumerate(zip(axes.flat, lines.items(), strict=False)):
-        for name, line in each.items():
+    for number, (axis, (title, panel)) in enumerate(zip(axes.flat, lines.items(), strict=False)):
+        for name, line in panel.items():
             colour, marker = looks[name.split(", ")[0]]
             dash = "--" if ", " in name else "-"
             axis.plot(*line, dash, color=colour, marker=marker, markersize=3.5, linewidth=1.2)
-        _scale(axis, each.values())
+        _scale(axis, panel.values())
         style.title(axis, title)
         if number >= len(lines) - columns:
             axis.set_xlabel(x)
@@ -121,14 +121,14 @@ def call_times(panels: Mapping[str, Mapping[str, Mapping[str, Mapping[str, float
     sizes = [len(models) for models in panels.values()]
     height = 0.42 * sum(sizes) + 0.55 * len(sizes) + 0.9
     figure, axes = style.figure(len(sizes), 1, height=height, sharex=True, gridspec_kw={"height_ratios": sizes})
-    each = [
+    pairs = [
         (owner, way)
         for models in panels.values()
         for model in models.values()
         for owner in model
         for way in model[owner]
     ]
-    owners, ways = (list(dict.fromkeys(pair[part] for pair in each)) for part in range(2))
+    owners, ways = (list(dict.fromkeys(pair[part] for pair in pairs)) for part in range(2))
     colours, markers = style.colours_of(owners), dict(zip(ways, style.MARKERS, strict=False))
     for axis, (title, models) in zip(axes[:, 0], panels.items(), strict=True):
         for line, model in enumerate(models.values()):
