@@ -15,15 +15,12 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.balance import Law
-from dln_jax.control.optimal.evaluation import evaluate, starts
-from dln_jax.control.optimal.fitted import Iteration, Progress, fit_values
-from dln_jax.control.optimal.plant_fits import FITS, Fit
-from dln_jax.control.optimal.plants import PLANTS, ValuePlant
-from dln_jax.control.optimal.policy import hjb_policy
-from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal
-from dln_jax.control.optimal.residual import Stage, discounts_down_to, fit_residual
+from dln_jax.control.optimal.fitted import Iteration, ValueProgress, fit_values
+from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant, ValueSettings, evaluate, starts
+from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal, hjb_policy
+from dln_jax.control.optimal.residual import ResidualStage, discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.control.state_space import Law
 from dln_jax.files import matches
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
@@ -109,12 +106,12 @@ def family_of(plant: ValuePlant, family: Family) -> ValueNetwork:
     return value_network(plant.problem, **{**family._asdict(), "activation": activation(family.activation)})
 
 
-def usual(name: str, method: str) -> Fit:
+def usual(name: str, method: str) -> ValueSettings:
     """Default network and training settings of a plant."""
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
     if method == "residual":
-        return Fit((24, 24), Iteration(), 30.0)
+        return ValueSettings((24, 24), Iteration(), 30.0)
     return FITS.get(OTHER_NAMES.get(name, name), FITS["cart-pole"])
 
 
@@ -129,7 +126,7 @@ def by_iteration(
     """Fits value functions by fitted value iteration, one per seed; devices share the states."""
     done, total = itertools.count(1), len(seeds) * numbers.iterations
 
-    def told(at: Progress) -> None:
+    def told(at: ValueProgress) -> None:
         report(next(done), total, f"cost and misfit {at.validation:.4g}")
 
     fits = fit_values(plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, report=told)
@@ -158,11 +155,11 @@ def by_equation(
         of_parameters, of_samples = jax.random.split(jax.random.key(seed))
         done, began = itertools.count(1 + place * each), time.perf_counter()
 
-        def told(stage: Stage, done: Iterator[int] = done) -> None:
+        def told(stage: ResidualStage, done: Iterator[int] = done) -> None:
             text = f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}"
             report(next(done), len(seeds) * each, text)
 
-        found = fit_residual(
+        found = fit_hjb(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
             discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=told,
         )  # fmt: skip
@@ -181,7 +178,7 @@ def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) ->
             f"{where}_return_worst": float(np.min(found.returns)),
             f"{where}_up_share": float(np.mean(np.isfinite(found.settled))),
             f"{where}_settled_median_seconds": float(np.median(found.settled)),
-            f"{where}_control_most": found.most,
+            f"{where}_control_most": found.largest,
         }
     return numbers
 

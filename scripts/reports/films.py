@@ -121,7 +121,7 @@ def swing_up(frames: int) -> Film:
     swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
     levels = 10.0 ** np.arange(-2, 1.01, 0.1)
     region = control.region_of_attraction(
-        field, near, regulator, goal, kinds, least=-limit, most=limit, rate=500.0, levels=levels, starts=32
+        field, near, regulator, goal, kinds, lower=-limit, upper=limit, rate=500.0, levels=levels, starts=32
     )
     law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, kinds), region.level)
     start = jnp.array([0.0, np.pi + 0.1, 0.0, 0.0])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Problem, field_of, first_plan, improve, mpc, optimise, time_varying_lqr
+from dln_jax.control import TrajectoryProblem, field_of, first_plan, improve, mpc, optimise, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from dln_jax.scenes.cart_pole import cart_pole
@@ -17,7 +17,7 @@ from dln_jax.types import InputError
 RANDOM = np.random.default_rng(0)
 F, G = np.eye(3) + 0.2 * RANDOM.normal(size=(3, 3)), RANDOM.normal(size=(3, 2))
 START = np.array([1.0, -2.0, 0.5])
-LINEAR = Problem(
+LINEAR = TrajectoryProblem(
     lambda x, u: jnp.asarray(F) @ x + jnp.asarray(G) @ u, lambda x, u: x @ x + 0.5 * u @ u, lambda x: 2 * x @ x
 )
 N = 8
@@ -39,15 +39,15 @@ def total(problem, x, u):
     return cost + problem.final_cost(x)
 
 
-@pytest.mark.parametrize("most", [0.3, 0.8])
-def test_limits_hold_and_the_rest_is_stationary(most):
-    problem = LINEAR._replace(least=-most, most=most)
+@pytest.mark.parametrize("limit", [0.3, 0.8])
+def test_limits_hold_and_the_rest_is_stationary(limit):
+    problem = LINEAR._replace(lower=-limit, upper=limit)
     plan = optimise(problem, START, np.zeros((N, 2)), tolerance=1e-14)
     slope = np.asarray(jax.grad(functools.partial(total, problem, START))(plan.u))
     u = np.asarray(plan.u)
-    assert np.abs(u).max() <= most and (np.abs(u) == most).any() and (np.abs(u) < most).any()
-    np.testing.assert_allclose(slope[np.abs(u) < most], 0.0, atol=1e-6)
-    assert (slope[u == most] < 0).all() and (slope[u == -most] > 0).all()
+    assert np.abs(u).max() <= limit and (np.abs(u) == limit).any() and (np.abs(u) < limit).any()
+    np.testing.assert_allclose(slope[np.abs(u) < limit], 0.0, atol=1e-6)
+    assert (slope[u == limit] < 0).all() and (slope[u == -limit] > 0).all()
 
 
 def test_a_plan_says_why_it_ended():
@@ -69,7 +69,7 @@ def test_a_plan_says_why_it_ended():
 def cart_pole_problem(dt):
     scene = cart_pole()
     field = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
-    return Problem(
+    return TrajectoryProblem(
         lambda x, u: runge_kutta(CLASSICAL, lambda t, state: field(state, u))(0.0, x, dt),
         lambda x, u: dt * (x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * (x[2] ** 2 + x[3] ** 2) + 0.01 * u[0] ** 2),
         lambda x: 50 * (x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * (x[2] ** 2 + x[3] ** 2)),

@@ -14,7 +14,7 @@ from sharing import begun
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration, fit_value
 from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.learning.soft_body_identification import ObservedMotions, identify
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
@@ -77,7 +77,7 @@ def equation(mesh):
     network = value_network(LINE, widths=())
     start, given = network.init(jax.random.key(2)), {"samples": 9, "validation": 4, "iterations": 3, "rounds": 1}
     start = jax.tree.map(lambda leaf: leaf.astype(float), start)
-    found = fit_residual(LINE, network.value_and_gradient, start, jax.random.key(3), mesh=mesh, **given)
+    found = fit_hjb(LINE, network.value_and_gradient, start, jax.random.key(3), mesh=mesh, **given)
     return found.parameters, len(found.stages)
 
 
