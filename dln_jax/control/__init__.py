@@ -1,37 +1,67 @@
 """Controllers from known or learned energies: tracking, regulators, swing-up, and the closed loop around them."""
 
-from dln_jax.control.balance import Region, error, region_of_attraction, regulated, switched, value
-from dln_jax.control.closed_loop import Controller, Hardware, Run, following, simulate, stateless, with_differences
-from dln_jax.control.delays import with_prediction
-from dln_jax.control.energy_shaping import (
+from dln_jax.control.closed_loop import (
+    ClosedLoopRun,
+    Controller,
+    Hardware,
+    Outcomes,
+    following,
+    outcomes,
+    simulate,
+    stateless,
+)
+from dln_jax.control.observers import with_differences, with_prediction
+from dln_jax.control.regulators import (
+    Region,
+    Regulator,
+    SampledRegulators,
+    lqr,
+    region_of_attraction,
+    regulated,
+    sampled_lqr,
+    switched,
+    time_varying_lqr,
+    value,
+)
+from dln_jax.control.shooting import Shooting, shoot
+from dln_jax.control.state_space import (
+    Linearisation,
+    error,
+    field_of,
+    holding_controls,
+    integrated,
+    linearise,
+    saturated,
+    where_finite,
+)
+from dln_jax.control.swing_up import (
     EnergyGains,
     Parts,
+    SwingUp,
+    SwingUpNumbers,
     energy_shaping,
     partial_linearisation,
     parts_of,
     passive_energy,
+    swing_up,
 )
-from dln_jax.control.finite import where_finite
-from dln_jax.control.friction_compensation import friction_compensation, without_friction
-from dln_jax.control.judgement import Judgement, judged
-from dln_jax.control.outcomes import Outcomes, outcomes
-from dln_jax.control.quadratic import Regulator, SampledRegulators, lqr, sampled_lqr, time_varying_lqr
-from dln_jax.control.shooting import Shooting, shoot
-from dln_jax.control.state_space import Linearisation, field_of, holding_controls, integrated, linearise
-from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, swing_up
 from dln_jax.control.tracking import (
     Gains,
+    Judgement,
     Reference,
     Tracker,
     computed_torque,
     feed_forward,
+    friction_compensation,
     gravity_compensation,
-    limited,
+    judged,
     trusted,
+    without_friction,
 )
-from dln_jax.control.trajectories import Plan, Problem, first_plan, improve, mpc, optimise
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan, improve, mpc, optimise
 
 __all__ = [
+    "ClosedLoopRun",
     "Controller",
     "EnergyGains",
     "Gains",
@@ -41,16 +71,15 @@ __all__ = [
     "Outcomes",
     "Parts",
     "Plan",
-    "Problem",
     "Reference",
     "Region",
     "Regulator",
-    "Run",
     "SampledRegulators",
     "Shooting",
     "SwingUp",
     "SwingUpNumbers",
     "Tracker",
+    "TrajectoryProblem",
     "computed_torque",
     "energy_shaping",
     "error",
@@ -64,7 +93,6 @@ __all__ = [
     "improve",
     "integrated",
     "judged",
-    "limited",
     "linearise",
     "lqr",
     "mpc",
@@ -76,6 +104,7 @@ __all__ = [
     "region_of_attraction",
     "regulated",
     "sampled_lqr",
+    "saturated",
     "shoot",
     "simulate",
     "stateless",

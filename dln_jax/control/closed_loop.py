@@ -2,7 +2,7 @@
 
 At every sample the controller receives the measured coordinates and returns controls. They are limited, delayed by
 whole samples and noisy, and held until the next sample while the classical Runge-Kutta method integrates the plant.
-`vmap` over starts and keys simulates many runs in one program.
+`vmap` over starts and keys simulates many runs in one program; `outcomes` evaluates those of a pole.
 
 If a control or a measurement is not finite, the controls are NaN, and so is everything after them: a failure is never
 hidden.
@@ -13,14 +13,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from dln_jax.control.finite import where_finite
-from dln_jax.control.state_space import Field
-from dln_jax.control.tracking import Reference, Tracker, limited
-from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
+from dln_jax.control.state_space import Field, Law, integrated, saturated, where_finite
+from dln_jax.control.tracking import Reference, Tracker
 from dln_jax.types import InputError, require_positive
+
+UP = 0.1
+"""Angle in rad below which a pole counts as upright."""
 
 
 class Controller(NamedTuple):
@@ -35,9 +37,9 @@ class Controller(NamedTuple):
 class Hardware(NamedTuple):
     """Limits, sensors, noise and delay between a controller and a plant; by default none."""
 
-    least: Any = -jnp.inf
+    lower: Any = -jnp.inf
     """Lower limits of the controls [m], or one for all."""
-    most: Any = jnp.inf
+    upper: Any = jnp.inf
     encoder_step: Any = 0.0
     """Resolution to which the coordinates q are rounded, rad or m; 0 for none."""
     encoder_noise: Any = 0.0
@@ -50,7 +52,7 @@ class Hardware(NamedTuple):
     """Whether the controller also receives qd, free of noise; otherwise y = q."""
 
 
-class Run(NamedTuple):
+class ClosedLoopRun(NamedTuple):
     """A run of N samples."""
 
     t: Float[Array, "N+1"]
@@ -62,7 +64,7 @@ class Run(NamedTuple):
     """Measurements that the controller received."""
 
 
-def stateless(law: Callable[[Array], Array]) -> Controller:
+def stateless(law: Law) -> Controller:
     """Returns a controller without memory: y -> u."""
     return Controller((), lambda memory, t, y: (memory, law(y)))
 
@@ -84,44 +86,9 @@ def following(law: Tracker, reference: Reference, *, rate: float) -> Controller:
 
     def act(reference: Reference, t: Array, y: Array) -> tuple[Reference, Array]:
         number = jnp.clip(jnp.round(t * rate).astype(int), 0, len(reference.q) - 1)
-        q, qd = jnp.split(y, 2)
-        return reference, law(q, qd, Reference(*(jnp.asarray(each)[number] for each in reference)))
+        return reference, law(*jnp.split(y, 2), Reference(*(jnp.asarray(column)[number] for column in reference)))
 
     return Controller(reference, act)
-
-
-def with_differences(
-    law: Callable[[Array], Array] | Controller, d: int, *, rate: float, cutoff: float, order: int = 1
-) -> Controller:
-    """Estimates the rates for a law of (q, qd) from measurements of q: differences and a first-order low-pass.
-
-    Args:
-        law: (q, qd) in one vector [2 d] -> u, or a controller with such measurements.
-        d: number of coordinates.
-        rate: of the samples, Hz.
-        cutoff: of the low-pass, Hz.
-        order: of the differences; order 1 is late by half a sample, order 2 is not but amplifies the encoders' noise
-            more.
-
-    Raises:
-        InputError: a rate or a cut-off that is not positive, or another order.
-    """
-    require_positive(rate=rate, cutoff=cutoff)
-    if order not in (1, 2):
-        raise InputError(f"order is {order}; expected 1 or 2")
-    share = -jnp.expm1(-2 * jnp.pi * cutoff / rate)
-    controller = law if isinstance(law, Controller) else stateless(law)
-
-    def act(memory: tuple, t: Array, y: Array) -> tuple[tuple, Array]:
-        (before, slope, qd, seen), inner = memory
-        newest = y - before
-        # The first sample has no difference, and the second no earlier one.
-        rates = rate * (1.5 * newest - 0.5 * jnp.where(seen > 1, slope, newest) if order == 2 else newest)
-        qd = jnp.where(seen > 0, qd + share * (rates - qd), 0.0)
-        inner, u = controller.act(inner, t, jnp.concatenate([y, qd]))
-        return ((y, newest, qd, jnp.minimum(seen + 1, 2)), inner), u
-
-    return Controller(((jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(0)), controller.start), act)
 
 
 def simulate(
@@ -135,7 +102,7 @@ def simulate(
     hardware: Hardware = Hardware(),  # noqa: B008
     key: Array | None = None,
     substeps: int = 1,
-) -> Run:
+) -> ClosedLoopRun:
     """Simulates the closed loop from a state; traceable and differentiable.
 
     Args:
@@ -152,25 +119,41 @@ def simulate(
     Raises:
         InputError: settings out of range, or noise without a key.
     """
-    require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
-    lab = hardware
-    key = noise_of(lab, key)
-    samples, dt = round(seconds * rate), 1.0 / rate
+    require_positive(seconds=seconds, rate=rate, controls=controls)
+    step, dt = integrated(field, 1.0 / rate, substeps=substeps), 1.0 / rate
+    start, act = sampled(controller, hardware, controls=controls, rate=rate, key=key)
     x = jnp.asarray(x, float)
 
-    def sample(carry: tuple, number: Array) -> tuple[tuple, tuple[Array, Array, Array]]:
-        x, memory, waiting = carry
-        of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
-        y = measured(lab, x, of_encoder)
-        memory, wanted = controller.act(memory, number * dt, y)
-        u, waiting = delivered(lab, waiting, where_finite(wanted, y), of_control)
-        step = runge_kutta(CLASSICAL, lambda t, state: field(state, u))
-        x = advance(step, 0.0, x, dt, substeps=substeps)
-        return (x, memory, waiting), (x, u, y)
+    def sample(carry: tuple[Array, Any], number: Array) -> tuple[tuple[Array, Any], tuple[Array, Array, Array]]:
+        x, loop = carry
+        loop, u, y = act(loop, x, number)
+        x = step(x, u)
+        return (x, loop), (x, u, y)
 
-    start = (x, controller.start, jnp.zeros((lab.delay, controls), x.dtype))
-    _, (later, u, y) = jax.lax.scan(sample, start, jnp.arange(samples))
-    return Run(dt * jnp.arange(samples + 1), jnp.concatenate([x[None], later]), u, y)
+    samples = round(seconds * rate)
+    _, (later, u, y) = jax.lax.scan(sample, (x, start), jnp.arange(samples))
+    return ClosedLoopRun(dt * jnp.arange(samples + 1), jnp.concatenate([x[None], later]), u, y)
+
+
+def sampled(
+    controller: Controller, hardware: Hardware, *, controls: int, rate: float, key: Array | None
+) -> tuple[Any, Callable[[Any, Array, Array], tuple[Any, Array, Array]]]:
+    """What happens at a sample between a plant and its controller, for any simulator of the plant.
+
+    Returns the initial memory, with the queue of delayed controls, and (memory, x, number of the sample) -> memory, the
+    acting controls and the measurement. Raises `InputError` as `noise_of`.
+    """
+    key = noise_of(hardware, key)
+
+    def act(carry: tuple[Any, Array], x: Array, number: Array) -> tuple[tuple[Any, Array], Array, Array]:
+        memory, queue = carry
+        of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
+        y = measured(hardware, x, of_encoder)
+        memory, command = controller.act(memory, number / rate, y)
+        u, queue = delivered(hardware, queue, where_finite(command, y), of_control)
+        return (memory, queue), u, y
+
+    return (controller.start, jnp.zeros((hardware.delay, controls))), act
 
 
 def noise_of(hardware: Hardware, key: Array | None) -> Array:
@@ -188,13 +171,14 @@ def measured(hardware: Hardware, x: Array, key: Array) -> Array:
     q, qd = jnp.split(x, 2)
     if _noisy(hardware):
         q = q + hardware.encoder_noise * jax.random.normal(key, q.shape, x.dtype)
-    y = rounded(q, hardware.encoder_step)
+    step = jnp.asarray(hardware.encoder_step)
+    y = jnp.where(step > 0, step * jnp.round(q / jnp.where(step > 0, step, 1.0)), q)
     return jnp.concatenate([y, qd]) if hardware.sees_rates else y
 
 
-def delivered(hardware: Hardware, waiting: Array, wanted: Array, key: Array) -> tuple[Array, Array]:
-    """Returns the controls that act now, and the queue [delay, m] of delayed controls after adding the wanted ones."""
-    queue = jnp.concatenate([waiting, limited(wanted, hardware.least, hardware.most)[None]])
+def delivered(hardware: Hardware, queue: Array, command: Array, key: Array) -> tuple[Array, Array]:
+    """Returns the controls that act now, and the queue [delay, m] of delayed controls after adding the command."""
+    queue = jnp.concatenate([queue, saturated(command, hardware.lower, hardware.upper)[None]])
     u = queue[0]
     if _noisy(hardware):
         u = u + hardware.control_noise * jax.random.normal(key, u.shape, u.dtype)
@@ -202,11 +186,57 @@ def delivered(hardware: Hardware, waiting: Array, wanted: Array, key: Array) -> 
 
 
 def _noisy(hardware: Hardware) -> bool:
-    stated = hardware.encoder_noise, hardware.control_noise
-    return any(not isinstance(each, int | float) or each != 0 for each in stated)
+    deviations = hardware.encoder_noise, hardware.control_noise
+    return any(not isinstance(deviation, int | float) or deviation != 0 for deviation in deviations)
 
 
-def rounded(q: Array, step: Any) -> Array:
-    """Reading of an encoder with this resolution."""
-    step = jnp.asarray(step)
-    return jnp.where(step > 0, step * jnp.round(q / jnp.where(step > 0, step, 1.0)), q)
+class Outcomes(NamedTuple):
+    """Outcomes of n runs."""
+
+    seconds: Float[np.ndarray, " n"]
+    """Time in s after which the pole stays upright until the end; infinite if it does not."""
+    failed: Bool[np.ndarray, " n"]
+    """Whether a run contains values that are not finite; such values do not count as upright."""
+
+    @property
+    def share(self) -> float:
+        """Share of the runs that end upright."""
+        return float(np.mean(np.isfinite(self.seconds)))
+
+    @property
+    def median(self) -> float:
+        """Median time of the runs that end upright, s; infinite if none does."""
+        return float(np.median(self.seconds[np.isfinite(self.seconds)])) if self.share else np.inf
+
+    @property
+    def worst(self) -> float:
+        """Longest time of the runs that end upright, s; infinite if none does."""
+        return float(np.max(self.seconds[np.isfinite(self.seconds)])) if self.share else np.inf
+
+
+def outcomes(angle: Any, *, rate: float, up: float = UP) -> Outcomes:
+    """Evaluates a pole's angles from upright [n, N+1], rad, at the samples of the runs.
+
+    An angle that is not finite does not count as upright.
+    """
+    angle = np.asarray(angle)
+    near = np.cos(angle) > np.cos(up)  # NaN is not
+    stays = near.shape[1] - np.argmin(near[:, ::-1], axis=1)
+    stays = np.where(near.all(axis=1), 0, stays)
+    return Outcomes(np.where(near[:, -1], stays / rate, np.inf), ~np.isfinite(angle).all(axis=1))
+
+
+def hanging_starts(count: int, seed: int, *, position: float, angle: float = 0.1) -> Float[np.ndarray, "n 4"]:
+    """Random states (position, angle from upright, rates) near a pole hanging at rest, with normal deviations.
+
+    Args:
+        count: n.
+        seed: of the draw.
+        position: standard deviation of the driven coordinate, m or rad.
+        angle: standard deviation of the pole from hanging, rad.
+    """
+    random = np.random.default_rng(seed)
+    x = np.zeros((count, 4))
+    x[:, 0] = position * random.normal(size=count)
+    x[:, 1] = np.pi + angle * random.normal(size=count)
+    return x

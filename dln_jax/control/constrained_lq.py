@@ -40,7 +40,7 @@ class Horizon(NamedTuple):
     high: Float[Array, "N m"]
 
 
-class Solution(NamedTuple):
+class HorizonSolution(NamedTuple):
     """Minimiser; not finite if there is no minimum."""
 
     dx: Float[Array, "N+1 n"]
@@ -52,14 +52,14 @@ class Solution(NamedTuple):
 
 
 class _Point(NamedTuple):
-    solution: Solution
+    solution: HorizonSolution
     below: Array
     above: Array
     product: Array
     steps: Array
 
 
-def least_cost(horizon: Horizon) -> Solution:
+def least_cost(horizon: Horizon) -> HorizonSolution:
     """Returns the solution; traceable."""
     low, high = horizon.low, horizon.high
     finite = jnp.isfinite(low), jnp.isfinite(high)
@@ -67,7 +67,7 @@ def least_cost(horizon: Horizon) -> Solution:
     width = jnp.where(finite[0] & finite[1], high - low, 1.0)
     du = jnp.clip(jnp.zeros_like(low), low + 0.1 * width, high - 0.1 * width)
     size = jnp.max(jnp.abs(horizon.gradients)) + jnp.max(jnp.abs(horizon.end_gradient))
-    below, above = (jnp.where(each, size / width, 0.0) for each in finite)
+    below, above = (jnp.where(limited, size / width, 0.0) for limited in finite)
 
     def complementarity(du: Array, below: Array, above: Array) -> Array:
         products = jnp.where(finite[0], below * (du - low), 0.0) + jnp.where(finite[1], above * (high - du), 0.0)
@@ -77,14 +77,14 @@ def least_cost(horizon: Horizon) -> Solution:
         dx, du, below, above = *point.solution[:2], point.below, point.above
         under, over, aim = du - low, high - du, CENTRING * point.product
         # About the present point, because the weights of controls at their limits exceed all else by ten orders.
-        found = _recursion(_about(horizon, dx, du), aim / over - aim / under, below / under + above / over)
-        change = found.du
+        solution = _recursion(_about(horizon, dx, du), aim / over - aim / under, below / under + above / over)
+        change = solution.du
         of_below, of_above = (aim - below * change) / under - below, (aim + above * change) / over - above
         fastest = [-change / under, change / over]
         fastest += [jnp.where(z > 0, -dz / z, 0.0) for z, dz in ((below, of_below), (above, of_above))]
         length = jnp.minimum(1.0, SHORT_OF_LIMITS / jnp.maximum(jnp.max(jnp.stack(fastest)), 1e-30))
         du, below, above = du + length * change, below + length * of_below, above + length * of_above
-        solution = found._replace(dx=dx + length * found.dx, du=du)
+        solution = solution._replace(dx=dx + length * solution.dx, du=du)
         return _Point(solution, below, above, complementarity(du, below, above), point.steps + 1)
 
     first = complementarity(du, below, above)
@@ -93,7 +93,7 @@ def least_cost(horizon: Horizon) -> Solution:
         return (point.product > SMALL * first) & (point.steps < MOST_STEPS)
 
     K = jnp.zeros((*du.shape, horizon.missed.shape[1]), du.dtype)
-    start = Solution(_followed(horizon, du), du, K, jnp.zeros_like(horizon.missed))
+    start = HorizonSolution(_forward(horizon, du, K)[0], du, K, jnp.zeros_like(horizon.missed))
     return jax.lax.while_loop(going, step, step(_Point(start, below, above, first, jnp.asarray(0)))).solution
 
 
@@ -107,13 +107,13 @@ def _about(horizon: Horizon, dx: Array, du: Array) -> Horizon:
     )
 
 
-def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:
+def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> HorizonSolution:
     """Returns the minimum without limits of the program plus ½ weight du² + gradient du."""
     n = horizon.missed.shape[1]
 
-    def back(value: tuple[Array, Array], now: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+    def back(value: tuple[Array, Array], stage: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
         g, S = value
-        F, missed, of_cost, curvature, beside, weight = now
+        F, missed, of_cost, curvature, beside, weight = stage
         q, Q = of_cost + F.T @ (g + S @ missed), curvature + F.T @ S @ F
         qu, Quu, Qux = q[n:] + beside, Q[n:, n:] + jnp.diag(weight), Q[n:, :n]
         both = -solve(Quu, jnp.concatenate([qu[:, None], Qux], axis=1))
@@ -126,25 +126,19 @@ def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:
     stages = horizon.slopes, horizon.missed, horizon.gradients, horizon.curvatures, gradient, weight
     end = horizon.end_gradient, horizon.end_curvature
     _, (k, K, g, S) = jax.lax.scan(back, end, stages, reverse=True)
+    dx, du = _forward(horizon, k, K)
+    return HorizonSolution(dx, du, K, g + jnp.einsum("kij,kj->ki", S, dx[1:]))
 
-    def forth(dx: Array, now: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array, Array]]:
-        F, missed, k, K, g, S = now
+
+def _forward(horizon: Horizon, k: Array, K: Array) -> tuple[Array, Array]:
+    """States and controls du = k + K dx from the start on."""
+
+    def forth(dx: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+        F, missed, k, K = stage
         du = k + K @ dx
         after = F @ jnp.concatenate([dx, du]) + missed
-        return after, (after, du, g + S @ after)
+        return after, (after, du)
 
-    first = jnp.zeros(n, k.dtype)
-    _, (dx, du, prices) = jax.lax.scan(forth, first, (horizon.slopes, horizon.missed, k, K, g, S))
-    return Solution(jnp.concatenate([first[None], dx]), du, K, prices)
-
-
-def _followed(horizon: Horizon, du: Array) -> Array:
-    """States that follow from the controls."""
-
-    def forth(dx: Array, now: tuple[Array, ...]) -> tuple[Array, Array]:
-        F, missed, du = now
-        after = F @ jnp.concatenate([dx, du]) + missed
-        return after, after
-
-    first = jnp.zeros_like(horizon.end_gradient)
-    return jnp.concatenate([first[None], jax.lax.scan(forth, first, (horizon.slopes, horizon.missed, du))[1]])
+    start = jnp.zeros_like(horizon.end_gradient)
+    _, (dx, du) = jax.lax.scan(forth, start, (horizon.slopes, horizon.missed, k, K))
+    return jnp.concatenate([start[None], dx]), du

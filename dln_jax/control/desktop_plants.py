@@ -1,4 +1,4 @@
-"""Two desktop plants: friction, limits, encoders, noise and delay, defined in one place.
+"""Two desktop plants with friction, limits, encoders, noise and delay, and swing-ups on them by any model.
 
 | | cart-pole | rotary pendulum |
 |---|---|---|
@@ -17,11 +17,18 @@ Both run at 500 Hz, with forces delayed by one sample. Stiction is dry friction 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
-from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.energy_shaping import EnergyGains
-from dln_jax.control.swing_up import SwingUpNumbers
+from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, hanging_starts, outcomes, simulate
+from dln_jax.control.observers import with_differences
+from dln_jax.control.state_space import field_of
+from dln_jax.control.swing_up import EnergyGains, SwingUp, SwingUpNumbers, swing_up
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from dln_jax.scenes.scene import Scene, with_friction
@@ -29,6 +36,12 @@ from dln_jax.types import InputError
 
 TURN = 2 * np.pi / 2048
 """Resolution of an encoder, rad."""
+SECONDS = 10.0
+"""Duration of a swing-up's simulation, s."""
+CUTOFF = 50.0
+"""Cut-off frequency of the rates, which are differences of encoder readings, Hz."""
+POSTURES = 65
+"""Number of pole angles around the circle at which a model has to be usable."""
 
 
 class DesktopPlant(NamedTuple):
@@ -51,12 +64,22 @@ class DesktopPlant(NamedTuple):
     """Standard deviation of the driven coordinate's initial value, m or rad."""
 
 
+class Tried(NamedTuple):
+    """Swing-ups from n initial states."""
+
+    outcomes: Outcomes
+    farthest: Float[np.ndarray, " n"]
+    """Largest displacement of the driven coordinate, m or rad."""
+
+
 def desktop_cart_pole() -> DesktopPlant:
     """Returns a cart on a rail."""
     sizes = {"cart_mass": 0.57, "pole_mass": 0.127, "length": 0.16825}
     friction = FrictionCoefficients(viscous=(0.1, 1e-3), coulomb=(0.3, 5e-4), stribeck=(0.1, 2e-4))
     shape = FrictionShape(velocity_scale=(0.005, 0.01), stribeck_velocity=(0.05, 0.1))
-    lab = Hardware(-10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False)
+    hardware = Hardware(
+        -10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False
+    )
     numbers = SwingUpNumbers(
         EnergyGains(1100.0, 21.0, 4.7),
         np.diag([10.0, 10.0, 1.0, 0.1]),
@@ -66,7 +89,7 @@ def desktop_cart_pole() -> DesktopPlant:
         kick=5.0,
     )
     scene = with_friction(cart_pole(**sizes), friction, shape)
-    return DesktopPlant(scene, cart_pole, sizes, lab, 500.0, 2, numbers, 0.02)
+    return DesktopPlant(scene, cart_pole, sizes, hardware, 500.0, 2, numbers, 0.02)
 
 
 def desktop_rotary_pendulum() -> DesktopPlant:
@@ -74,7 +97,9 @@ def desktop_rotary_pendulum() -> DesktopPlant:
     sizes = {"arm_mass": 0.095, "arm_length": 0.085, "pole_mass": 0.024, "pole_length": 0.129}
     friction = FrictionCoefficients(viscous=(1e-4, 1e-5), coulomb=(1.5e-3, 5e-5), stribeck=(5e-4, 2e-5))
     shape = FrictionShape(velocity_scale=(0.01, 0.01), stribeck_velocity=(0.1, 0.1))
-    lab = Hardware(-0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False)
+    hardware = Hardware(
+        -0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False
+    )
     numbers = SwingUpNumbers(
         EnergyGains(4.3e7, 32.0, 11.0),
         np.diag([1.0, 1.0, 0.01, 0.01]),
@@ -84,7 +109,7 @@ def desktop_rotary_pendulum() -> DesktopPlant:
         kick=0.025,
     )
     scene = with_friction(rotary_pendulum(**sizes), friction, shape)
-    return DesktopPlant(scene, rotary_pendulum, sizes, lab, 500.0, 2, numbers, 0.1)
+    return DesktopPlant(scene, rotary_pendulum, sizes, hardware, 500.0, 2, numbers, 0.1)
 
 
 PLANTS: Mapping[str, Callable[[], DesktopPlant]] = {
@@ -100,3 +125,66 @@ def desktop_plant(name: str) -> DesktopPlant:
     if name not in NAMES:
         raise InputError(f"plant is {name!r:.40}; choose from {', '.join(NAMES)}")
     return PLANTS[NAMES[name]]()
+
+
+def model_of_plant(plant: DesktopPlant) -> Dynamics:
+    """The true plant with its friction, which is unknown in practice."""
+    return dynamics(plant.scene.closed_form)
+
+
+def nominal_model(plant: DesktopPlant) -> Dynamics:
+    """Model with the manufacturer's sizes, without friction."""
+    return dynamics(plant.nominal(**plant.sizes).closed_form)
+
+
+def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, numbers: SwingUpNumbers | None = None) -> SwingUp:
+    """Returns the plant's swing-up by a model, with the plant's own numbers by default. Raises as `swing_up`."""
+    angle = np.linspace(-np.pi, np.pi, POSTURES)
+    needs, hardware = plant.scene.needs, plant.hardware
+    return swing_up(
+        model, needs.actuation, needs.joints, np.zeros(2), plant.numbers if numbers is None else numbers,
+        postures=np.stack([np.zeros(POSTURES), angle], axis=1), lower=hardware.lower, upper=hardware.upper,
+    )  # fmt: skip
+
+
+def motion_of(
+    plant: DesktopPlant,
+    model: Dynamics | PlainDynamics,
+    numbers: SwingUpNumbers | None = None,
+    *,
+    seconds: float = SECONDS,
+) -> Callable[[Array, Array], ClosedLoopRun]:
+    """(initial state [4], key of the noise) -> a run of the true plant with the model's law."""
+    law = law_of(plant, model, numbers).law
+    controller = with_differences(law, 2, rate=plant.rate, cutoff=CUTOFF)
+    B = np.asarray(plant.scene.needs.actuation)
+    field = field_of(model_of_plant(plant), B)
+
+    def run(x: Array, key: Array) -> ClosedLoopRun:
+        return simulate(
+            field, controller, x, seconds=seconds, rate=plant.rate, controls=B.shape[1],
+            hardware=plant.hardware, key=key, substeps=plant.substeps,
+        )  # fmt: skip
+
+    return run
+
+
+def try_starts(
+    plant: DesktopPlant,
+    model: Dynamics | PlainDynamics,
+    numbers: SwingUpNumbers | None = None,
+    *,
+    starts: int = 1000,
+    seed: int = 0,
+    seconds: float = SECONDS,
+) -> Tried:
+    """Runs swing-ups from random states near hanging, with independent noise."""
+    run = motion_of(plant, model, numbers, seconds=seconds)
+
+    def extremes(x: Array, key: Array) -> tuple[Array, Array]:
+        states = run(x, key).x
+        return states[:, 1], jnp.max(jnp.abs(states[:, 0]))
+
+    x = hanging_starts(starts, seed, position=plant.position)
+    angle, far = jax.jit(jax.vmap(extremes))(x, jax.random.split(jax.random.key(seed), starts))
+    return Tried(outcomes(angle, rate=plant.rate), np.asarray(far))

@@ -20,7 +20,7 @@ from dln_jax.types import InputError, JointKind, Scalar, require_positive
 
 class _Place(NamedTuple):
     x: Array
-    waiting: Array
+    queue: Array
     """[delay, m], delayed controls."""
     number: Array
 
@@ -64,7 +64,7 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         failure_cost: float = 1e3,
     ):
         require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
-        low, high = (np.broadcast_to(np.asarray(each, float), controls) for each in hardware[:2])
+        low, high = (np.broadcast_to(np.asarray(limit, float), controls) for limit in hardware[:2])
         if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
             raise InputError(f"limits are {low} and {high}; expected finite ones, which actions in [-1, 1] span")
         noise_of(hardware, jax.random.key(0))
@@ -89,9 +89,8 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         @jax.jit
         def advance(key: Array, place: _Place, action: Array) -> tuple[_Place, Array, Array, Array]:
             of_control, of_encoder = jax.random.split(jax.random.fold_in(key, place.number))
-            wanted = middle + half * action
-            u, waiting = delivered(hardware, place.waiting, wanted, of_control)
-            after = _Place(step(place.x, u), waiting, place.number + 1)
+            u, queue = delivered(hardware, place.queue, middle + half * action, of_control)
+            after = _Place(step(place.x, u), queue, place.number + 1)
             return after, observe(after.x, of_encoder), cost(place.x, u) / rate, u
 
         self._begin, self._advance = begin, advance

@@ -12,12 +12,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.balance import Law
-from dln_jax.control.closed_loop import Controller, Hardware, Run, simulate, with_differences
-from dln_jax.control.desktop_plants import DesktopPlant
-from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, parts_of, passive_energy
-from dln_jax.control.outcomes import hanging_starts
-from dln_jax.control.state_space import field_of
+from dln_jax.control.closed_loop import ClosedLoopRun, Controller, hanging_starts, simulate
+from dln_jax.control.desktop_plants import CUTOFF, DesktopPlant, model_of_plant
+from dln_jax.control.observers import with_differences
+from dln_jax.control.state_space import Law, field_of, saturated
+from dln_jax.control.swing_up import EnergyGains, energy_shaping, parts_of, passive_energy
 from dln_jax.data.encoders import low_pass
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.equations import dynamics
@@ -41,7 +40,7 @@ class Excitation(NamedTuple):
     """Bandwidth of the noise, Hz."""
     share: float = 0.8
     """Largest share of the limits that is used."""
-    cutoff: float = 50.0
+    cutoff: float = CUTOFF
     """Cut-off frequency of the law's rates, Hz."""
 
 
@@ -66,23 +65,13 @@ def with_noise(law: Law, noise: Any, *, rate: float, cutoff: float) -> Controlle
     return Controller((inner.start, noise), act)
 
 
-def commands(controller: Controller, run: Run, hardware: Hardware) -> Float[Array, "N m"]:
-    """Commands of the controller in a run, within the limits, recomputed from its measurements."""
-
-    def ask(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
-        memory, wanted = controller.act(memory, *now)
-        return memory, jnp.clip(wanted, hardware.least, hardware.most)
-
-    return jax.lax.scan(ask, controller.start, (run.t[:-1], run.y))[1]
-
-
 def explore(
     plant: DesktopPlant,
     gains: EnergyGains,
     excitation: Excitation = Excitation(),  # noqa: B008
     *,
     seed: int = 0,
-) -> tuple[Trajectories, Run]:
+) -> tuple[Trajectories, ClosedLoopRun]:
     """Returns a recording of t, q and the commanded torques, without rates, and the true runs for evaluation.
 
     Args:
@@ -99,39 +88,44 @@ def explore(
         seconds=excitation.seconds, episodes=excitation.episodes, bandwidth=excitation.bandwidth, share=excitation.share
     )
     random = np.random.default_rng([seed, 17])
-    needs, rate, lab = plant.scene.needs, plant.rate, plant.hardware
-    B = np.asarray(needs.actuation)
+    rate, B = plant.rate, np.asarray(plant.scene.needs.actuation)
     sizes = {name: size * (1 + excitation.wrong * random.choice([-1.0, 1.0])) for name, size in plant.sizes.items()}
     rough = dynamics(plant.nominal(**sizes).closed_form)
     parts = parts_of(B)
     lift = passive_energy(rough, parts, jnp.zeros(2))(jnp.array([0.0, np.pi]), jnp.zeros(2))
     surplus = -lift * jnp.linspace(*excitation.surplus, excitation.episodes)
-    most = excitation.share * np.broadcast_to(lab.most, B.shape[1])
-    inside = lab._replace(least=-most, most=most)
+    limit = excitation.share * np.broadcast_to(plant.hardware.upper, B.shape[1])
+    hardware = plant.hardware._replace(lower=-limit, upper=limit)
     episodes, samples = excitation.episodes, round(excitation.seconds / excitation.episodes * rate)
     noise = smooth_noise((samples, episodes), rate=rate, bandwidth=excitation.bandwidth, random=random)
-    field = field_of(dynamics(plant.scene.closed_form), B)
+    field = field_of(model_of_plant(plant), B)
 
     @jax.jit
     @jax.vmap
-    def episode(x: Array, surplus: Array, noise: Array, key: Array) -> tuple[Run, Array]:
+    def episode(x: Array, surplus: Array, noise: Array, key: Array) -> tuple[ClosedLoopRun, Array]:
         law = energy_shaping(rough, parts, jnp.zeros(2), gains, surplus=surplus)
         controller = with_noise(
-            lambda x: law(x[:2], x[2:]), excitation.noise * most * noise[:, None], rate=rate, cutoff=excitation.cutoff
+            lambda x: law(x[:2], x[2:]), excitation.noise * limit * noise[:, None], rate=rate, cutoff=excitation.cutoff
         )
         run = simulate(
-            field, controller, x, seconds=samples / rate, rate=rate, controls=B.shape[1], hardware=inside, key=key,
+            field, controller, x, seconds=samples / rate, rate=rate, controls=B.shape[1], hardware=hardware, key=key,
             substeps=plant.substeps,
         )  # fmt: skip
-        return run, commands(controller, run, inside)
+
+        def command(memory: Any, sample: tuple[Array, Array]) -> tuple[Any, Array]:
+            memory, u = controller.act(memory, *sample)
+            return memory, saturated(u, -limit, limit)
+
+        # The controls that acted are late and noisy: those that were commanded follow from the measurements.
+        return run, jax.lax.scan(command, controller.start, (run.t[:-1], run.y))[1]
 
     starts = hanging_starts(episodes, int(random.integers(2**31)), position=plant.position)
     keys = jax.random.split(jax.random.key(int(random.integers(2**31))), episodes)
-    runs, asked = jax.tree.map(np.asarray, episode(starts, surplus, noise.T, keys))
-    return recording(runs, asked @ B.T, plant), runs
+    runs, commands = jax.tree.map(np.asarray, episode(starts, surplus, noise.T, keys))
+    return recording(runs, commands @ B.T, plant), runs
 
 
-def recording(runs: Run, tau: Float[np.ndarray, "E N d"], plant: DesktopPlant) -> Trajectories:
+def recording(runs: ClosedLoopRun, tau: Float[np.ndarray, "E N d"], plant: DesktopPlant) -> Trajectories:
     """Joins episodes into one log of q and torques, with the needs of the manufacturer's model: without friction."""
     episodes, samples, d = runs.y.shape
     q = np.asarray(runs.y).reshape(-1, d)

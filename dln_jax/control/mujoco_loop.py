@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.closed_loop import Controller, Hardware, Run, delivered, measured, noise_of
-from dln_jax.control.finite import where_finite
+from dln_jax.control.closed_loop import ClosedLoopRun, Controller, Hardware, sampled
 from dln_jax.data.robots import quiet
 from dln_jax.types import InputError, require_positive
 
@@ -26,7 +25,7 @@ def simulate_in_mujoco(
     actuation: Any = None,
     hardware: Hardware = Hardware(),  # noqa: B008
     key: Array | None = None,
-) -> Run:
+) -> ClosedLoopRun:
     """Simulates one run as `simulate` does, sample by sample, with MuJoCo's integrator and time step.
 
     After a control that is not finite, or MuJoCo's warning of divergence, all is NaN.
@@ -46,7 +45,6 @@ def simulate_in_mujoco(
             another size; a sample that is not a whole number of steps; settings as for `simulate`.
     """
     require_positive(seconds=seconds, rate=rate)
-    key = noise_of(hardware, key)
     mujoco, model = _compiled(model)
     data, x = mujoco.MjData(model), np.asarray(x, float)
     if model.nq != model.nv or x.shape != (2 * model.nv,):
@@ -56,24 +54,16 @@ def simulate_in_mujoco(
         raise InputError(f"a sample has {steps:.4g} steps of {model.opt.timestep:g} s; expected a whole number")
     B = np.eye(model.nu) if actuation is None else np.asarray(actuation, float)
     data.qpos[:], data.qvel[:] = np.split(x, 2)
-
-    @jax.jit
-    def sample(memory: Any, waiting: Array, x: Array, number: Array) -> tuple[Any, Array, Array, Array]:
-        of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
-        y = measured(hardware, x, of_encoder)
-        memory, wanted = controller.act(memory, number / rate, y)
-        u, waiting = delivered(hardware, waiting, where_finite(wanted, y), of_control)
-        return memory, waiting, u, y
-
-    memory, waiting = controller.start, jnp.zeros((hardware.delay, B.shape[1]))
-    states, controls, seen = [x], [], []
+    memory, act = sampled(controller, hardware, controls=B.shape[1], rate=rate, key=key)
+    act = jax.jit(act)
+    states, controls, measurements = [x], [], []
     for number in range(round(seconds * rate)):
-        memory, waiting, u, y = sample(memory, waiting, jnp.asarray(states[-1]), jnp.asarray(number))
+        memory, u, y = act(memory, jnp.asarray(states[-1]), jnp.asarray(number))
         controls.append(u)
-        seen.append(y)
+        measurements.append(y)
         states.append(_advanced(mujoco, model, data, B @ np.asarray(u), round(steps)))
     t = jnp.arange(len(states)) / rate
-    return Run(t, jnp.asarray(np.stack(states)), jnp.stack(controls), jnp.stack(seen))
+    return ClosedLoopRun(t, jnp.asarray(np.stack(states)), jnp.stack(controls), jnp.stack(measurements))
 
 
 def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: int) -> np.ndarray:
@@ -86,7 +76,7 @@ def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: in
     else:
         data.qpos[:] = np.nan
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-    if any(data.warning[each].number for each in bad):
+    if any(data.warning[kind].number for kind in bad):
         data.qpos[:] = np.nan
     x = np.concatenate([data.qpos, data.qvel])
     return x if np.isfinite(x).all() else np.full_like(x, np.nan)

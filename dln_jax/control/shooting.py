@@ -1,6 +1,6 @@
 """Optimal trajectories by multiple shooting: the states at all knots are unknowns, and steps may be implicit.
 
-    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   least <= u_k <= most
+    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   lower <= u_k <= upper
 
 The defect of a step, d_k = f(x_k, u_k) - x_{k+1}, vanishes only at the solution. A guess need not be a motion, and an
 unstable system does not multiply its errors over the horizon (Bock and Plitt 1984).
@@ -20,7 +20,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.constrained_lq import Horizon, least_cost
-from dln_jax.control.trajectories import FIRST_DAMPING, Plan, Problem
+from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, expand
 from dln_jax.solvers.ending import Ending
 from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, require_positive
@@ -73,7 +73,7 @@ class _Knots(NamedTuple):
 
 
 def shoot(
-    problem: Problem,
+    problem: TrajectoryProblem,
     x: Any,
     states: Any,
     u: Any,
@@ -98,12 +98,12 @@ def shoot(
         InputError: shapes that do not agree, or settings that are not positive.
     """
     require_positive(iterations=iterations, tolerance=tolerance)
-    x, states, u = (jnp.asarray(each, float) for each in (x, states, u))
+    x, states, u = (jnp.asarray(array, float) for array in (x, states, u))
     if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
         raise InputError(
             f"x has shape {x.shape}, states {states.shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]"
         )
-    states, u = states.at[0].set(x), jnp.clip(u, problem.least, problem.most)
+    states, u = states.at[0].set(x), jnp.clip(u, problem.lower, problem.upper)
     cost, missed = _judge(problem, states, u)
     no = jnp.asarray(False)
     knots = _Knots(
@@ -115,20 +115,14 @@ def shoot(
         return (knots.iterations < iterations) & ~knots.done & knots.better & jnp.isfinite(knots.cost)
 
     last = jax.lax.while_loop(going, lambda knots: _iterate(problem, knots, tolerance, exact), knots)
-    outcomes = (
-        (last.done, Ending.CONVERGED),
-        (~jnp.isfinite(last.cost), Ending.NOT_FINITE),
-        (~last.better, Ending.NO_DESCENT),
-    )
-    ending = jnp.select(
-        [is_so for is_so, _ in outcomes], [int(each) for _, each in outcomes], int(Ending.OUT_OF_ITERATIONS)
-    )
+    outcomes = [Ending.CONVERGED, Ending.NOT_FINITE, Ending.NO_DESCENT]
+    ending = jnp.select([last.done, ~jnp.isfinite(last.cost), ~last.better], outcomes, Ending.OUT_OF_ITERATIONS)
     plan = Plan(last.u, last.x, last.K, last.cost, jnp.asarray(FIRST_DAMPING, u.dtype), ~no, ending)
     defect = jnp.max(jnp.abs(last.missed))
     return Shooting(plan, last.multipliers, defect, last.promised, last.iterations, ending)
 
 
-def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> _Knots:
+def _iterate(problem: TrajectoryProblem, knots: _Knots, tolerance: float, exact: bool) -> _Knots:
     """Evaluates the knots and improves them."""
     n = knots.x.shape[1]
     horizon = _expand(problem, knots, exact)
@@ -171,44 +165,34 @@ def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> 
     )  # fmt: skip
 
 
-def _judge(problem: Problem, x: Array, u: Array) -> tuple[Array, Array]:
+def _judge(problem: TrajectoryProblem, x: Array, u: Array) -> tuple[Array, Array]:
     """Returns the cost, and the defects [N, n]."""
     missed = jax.vmap(problem.step)(x[:-1], u) - x[1:]
     return jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1]), missed
 
 
-def _expand(problem: Problem, knots: _Knots, exact: bool) -> Horizon:
+def _expand(problem: TrajectoryProblem, knots: _Knots, exact: bool) -> Horizon:
     """Returns the quadratic program at the knots."""
     n = knots.x.shape[1]
-    both = jnp.concatenate([knots.x[:-1], knots.u], axis=1)
-
-    def step(xu: Array) -> Array:
-        return problem.step(xu[:n], xu[n:])
-
-    def cost(xu: Array) -> Array:
-        return problem.cost(xu[:n], xu[n:])
-
-    gradients, slopes = jax.vmap(jax.grad(cost))(both), jax.vmap(jax.jacfwd(step))(both)
-    of_costs, end_gradient = jax.vmap(jax.hessian(cost))(both), jax.grad(problem.final_cost)(knots.x[-1])
-    of_end = jax.hessian(problem.final_cost)(knots.x[-1])
-    curvatures, end_curvature = _not_negative(of_costs, of_end)
+    horizon = expand(problem, knots.x, knots.u, knots.missed)
+    curvatures = _not_negative(horizon.curvatures, horizon.end_curvature)
     if exact:
 
         def of_lagrangian() -> tuple[Array, Array]:
-            prices = _adjoint(slopes[:, :, :n], gradients[:, :n], end_gradient)
-            bent = jax.vmap(lambda xu, price: jax.hessian(lambda each: price @ step(each))(xu))(both, prices)
-            return of_costs + bent, of_end
+            both = jnp.concatenate([knots.x[:-1], knots.u], axis=1)
+            prices = _adjoint(horizon.slopes[:, :, :n], horizon.gradients[:, :n], horizon.end_gradient)
+            bent = jax.vmap(jax.hessian(lambda xu, price: price @ problem.step(xu[:n], xu[n:])))(both, prices)
+            return horizon.curvatures + bent, horizon.end_curvature
 
-        curvatures, end_curvature = jax.lax.cond(knots.close, of_lagrangian, lambda: (curvatures, end_curvature))
-    low, high = (jnp.broadcast_to(jnp.asarray(each, knots.u.dtype), knots.u.shape) - knots.u for each in problem[3:])
-    return Horizon(slopes, knots.missed, gradients, curvatures, end_gradient, end_curvature, low, high)
+        curvatures = jax.lax.cond(knots.close, of_lagrangian, lambda: curvatures)
+    return horizon._replace(curvatures=curvatures[0], end_curvature=curvatures[1])
 
 
 def _adjoint(slopes: Array, gradients: Array, end: Array) -> Array:
     """Multipliers [N, n] from the derivatives of the steps and of the costs by the states."""
 
-    def back(after: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-        slope, gradient = now
+    def back(after: Array, stage: tuple[Array, Array]) -> tuple[Array, Array]:
+        slope, gradient = stage
         return gradient + slope.T @ after, after
 
     return jax.lax.scan(back, end, (slopes, gradients), reverse=True)[1]

@@ -1,19 +1,25 @@
-"""Mechanical systems in state space, x = (q, qd): their field, and its linearisation at a state."""
+"""Mechanical systems in state space, x = (q, qd): field, steps, linearisation, and errors of angles.
+
+A control law returns NaN for a state that is not finite (`where_finite`), also behind limits (`saturated`).
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.integrators import CLASSICAL, Tableau, advance, runge_kutta
-from dln_jax.types import InputError, Vector, require_positive
+from dln_jax.types import InputError, JointKind, Vector, require_positive
 
 Field = Callable[[Array, Array], Array]
 """(x [n], u [m]) -> dx/dt [n]."""
+Law = Callable[[Array], Array]
+"""x [n] -> u [m]."""
 
 
 class Linearisation(NamedTuple):
@@ -114,3 +120,32 @@ def holding_controls(plant: Dynamics, q: Any, actuation: Any = None, *, toleranc
             "give an equilibrium"
         )
     return u
+
+
+def where_finite(u: Array, *state: Any) -> Array:
+    """Returns the controls [m] for a finite state, and NaN in every motor otherwise, for whoever handles the failure.
+
+    Without it, a law of some coordinates only would return numbers while others are NaN.
+    """
+    finite = jnp.asarray(True)
+    for part in state:
+        finite &= jnp.isfinite(jnp.asarray(part)).all()
+    return jnp.where(finite, u, jnp.nan)
+
+
+def saturated(u: Any, lower: Any, upper: Any) -> Array:
+    """Clips controls to their limits; one that is not finite becomes NaN, for whoever handles the failure."""
+    u = jnp.asarray(u)
+    return jnp.where(jnp.isfinite(u), jnp.clip(u, lower, upper), jnp.nan)
+
+
+def circular(joints: tuple[JointKind, ...], n: int) -> Bool[np.ndarray, " n"]:
+    """Mask of the angles on a circle among n states, of which the first have these kinds."""
+    return np.array([number < len(joints) and joints[number] == "revolute" for number in range(n)])
+
+
+def error(x: Array, goal: Any, joints: tuple[JointKind, ...]) -> Array:
+    """Returns x - goal [n], with angles wrapped to the shorter way round."""
+    difference = x - jnp.asarray(goal)
+    wrapped = jnp.arctan2(jnp.sin(difference), jnp.cos(difference))
+    return jnp.where(circular(joints, len(difference)), wrapped, difference)

@@ -1,13 +1,24 @@
-"""Swing-up of a plant with passive joints by a known or learned model: the same functions for all models.
+"""Swing-up of plants with passive joints by energy, with a known or learned model: the same functions for all models.
 
-1. The model's friction is removed (`friction_compensation`): the rest has energies, and a smooth linearisation.
+Collocated partial feedback linearisation gives the active joints any acceleration a (Spong 1995, "The swing up control
+problem for the acrobot"). The passive rows of the equations of motion, without motors, determine the other
+accelerations. With h = c + g + friction,
+
+    qdd_p = -M_pp⁻¹ (M_pa a + h_p),   tau_a = M_aa a + M_ap qdd_p + h_a
+
+The passive part, with the active joints locked, has the energy E = ½ qd_pᵀ M_pp qd_p + V. Accelerating the active
+joints does work on it at the rate -qd_pᵀ M_pa a, so that a = k (E - E*) M_ap qd_p drives E to that of the goal.
+
+`swing_up` makes a whole law from a model:
+
+1. The model's friction is removed: the rest has energies, and a smooth linearisation.
 2. The model's own equilibrium near the goal is computed, because a learned potential is not level exactly at the goal.
 3. Far from it the energy law acts, near it the regulator of the model's linearisation; the regulator's value decides.
 4. A share of the friction of the active joints is compensated, at the measured rates.
 5. At rest the energy law returns zero, and dry friction would hold the plant: a kick starts it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,18 +27,110 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.balance import Law, regulated, switched, value
-from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, parts_of
-from dln_jax.control.friction_compensation import GAIN, friction_compensation, without_friction
-from dln_jax.control.quadratic import Regulator, lqr
-from dln_jax.control.state_space import field_of, holding_controls, linearise
-from dln_jax.control.tracking import definite
+from dln_jax.control.regulators import Regulator, lqr, regulated, switched, value
+from dln_jax.control.state_space import Law, field_of, holding_controls, linearise, where_finite
+from dln_jax.control.tracking import GAIN, definite, friction_compensation, without_friction
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.types import InputError, JointKind, Vector
+from dln_jax.solvers.elimination import solve
+from dln_jax.types import InputError, JointKind, Scalar, Vector
 
 NEWTON_STEPS = 20
 FARTHEST = 0.1
 """Largest distance of a model's equilibrium from the goal, rad or m."""
+
+
+class EnergyGains(NamedTuple):
+    """Gains of the accelerations of the active joints."""
+
+    energy: float
+    """1/(kg m² J s) for revolute joints; maps M_ap qd_p times the energy's error to an acceleration."""
+    proportional: float
+    """1/s²."""
+    derivative: float
+    """1/s."""
+
+
+class Parts(NamedTuple):
+    """Indices of the driven and of the passive coordinates."""
+
+    active: tuple[int, ...]
+    passive: tuple[int, ...]
+
+
+def parts_of(actuation: Any) -> Parts:
+    """Derives the parts from the matrix [d, u] in tau = B u, if every motor drives one coordinate.
+
+    Raises:
+        InputError: motors that drive several coordinates, or no passive one.
+    """
+    B = np.asarray(actuation, float)
+    driven = (B != 0).sum(axis=1)
+    active = tuple(np.flatnonzero(driven).tolist())
+    if B.ndim != 2 or (driven > 1).any() or ((B != 0).sum(axis=0) != 1).any() or len(active) == len(B):
+        raise InputError(
+            f"actuation is {B.tolist()}; expected motors that drive one coordinate each, and some coordinate without"
+        )
+    return Parts(active, tuple(np.setdiff1d(np.arange(len(B)), active).tolist()))
+
+
+def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Vector, Array], Array]:
+    """(q, qd, accelerations of the active joints) -> their forces, exact where M_pp is regular."""
+    active, passive = map(np.array, parts)
+
+    def forces(q: Vector, qd: Vector, a: Array) -> Array:
+        M = plant.mass_matrix(q)
+        h = plant.inverse_dynamics(q, qd, jnp.zeros_like(qd))
+        coupling = M[np.ix_(active, passive)]
+        others = -solve(M[np.ix_(passive, passive)], coupling.T @ a + h[passive])
+        return where_finite(M[np.ix_(active, active)] @ a + coupling @ others + h[active], q, qd)
+
+    return forces
+
+
+def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector, Vector], Scalar]:
+    """(q, qd) -> energy of the passive part in J, with the active joints locked at the goal, relative to the goal."""
+    active, passive = map(np.array, parts)
+    goal = jnp.asarray(goal, float)
+
+    def energy(q: Vector, qd: Vector) -> Scalar:
+        held = q.at[active].set(goal[active])
+        moving = jnp.zeros_like(qd).at[passive].set(qd[passive])
+        return plant.energy(held, moving) - plant.energy(goal, jnp.zeros_like(qd))
+
+    return energy
+
+
+def energy_shaping(
+    plant: Dynamics | PlainDynamics,
+    parts: Parts,
+    goal: Sequence[float] | Array,
+    gains: EnergyGains,
+    *,
+    surplus: Any = 0.0,
+) -> Callable[[Vector, Vector], Array]:
+    """(q, qd) -> forces that bring the passive joints to the goal's energy, and the active joints to the goal.
+
+    Args:
+        plant: a known or learned model with energies; its friction is compensated at the active joints.
+        parts: driven and passive joints.
+        goal: posture [d].
+        gains: of the accelerations.
+        surplus: target energy of the passive joints above that of the goal, J, which compensates their losses.
+
+    Raises:
+        InputError: a model without energies.
+    """
+    plant, (active, passive) = _with_energy(plant), map(np.array, parts)
+    forces, energy = partial_linearisation(plant, parts), passive_energy(plant, parts, goal)
+    home = jnp.asarray(goal, float)[active]
+
+    def law(q: Vector, qd: Vector) -> Array:
+        coupling = plant.mass_matrix(q)[np.ix_(active, passive)]
+        pumping = gains.energy * (energy(q, qd) - surplus) * (coupling @ qd[passive])
+        a = pumping - gains.proportional * (q[active] - home) - gains.derivative * qd[active]
+        return forces(q, qd, a)
+
+    return law
 
 
 class SwingUpNumbers(NamedTuple):
@@ -91,23 +194,6 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
     return goal.at[free].set(angles)
 
 
-def usable(plant: Dynamics | PlainDynamics, postures: Any) -> Dynamics:
-    """Returns the model if it is usable.
-
-    Raises:
-        InputError: a model without energies, or with a mass matrix that is not definite in some posture [n, d].
-    """
-    if not isinstance(plant, Dynamics):
-        raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
-    fine = np.asarray(jax.jit(jax.vmap(lambda q: definite(plant, q)))(jnp.asarray(postures, float)))
-    if not fine.all():
-        raise InputError(
-            f"the model's mass matrix is not positive definite in {np.mean(~fine):.1%} of the postures that a swing-up "
-            "goes through; learn one that is by construction, such as a structured DeLaN, or from more motions"
-        )
-    return plant
-
-
 def swing_up(
     model: Dynamics | PlainDynamics,
     actuation: Any,
@@ -116,8 +202,8 @@ def swing_up(
     numbers: SwingUpNumbers,
     *,
     postures: Any,
-    least: Any = -jnp.inf,
-    most: Any = jnp.inf,
+    lower: Any = -jnp.inf,
+    upper: Any = jnp.inf,
     tolerance: float = 1e-6,
 ) -> SwingUp:
     """Returns the law x -> u of a swing-up by a model.
@@ -129,8 +215,8 @@ def swing_up(
         goal: posture [d].
         numbers: gains and costs.
         postures: [n, d], postures of a swing-up, in which the model has to be usable.
-        least: lower limits of the controls.
-        most: upper limits of the controls.
+        lower: lower limits of the controls.
+        upper: upper limits of the controls.
         tolerance: of the equilibrium, in N m or N.
 
     Raises:
@@ -140,16 +226,23 @@ def swing_up(
     parts, B = parts_of(actuation), np.asarray(actuation, float)
     # Values that depend on the model only are computed now, even if gains or the level are being traced.
     with jax.ensure_compile_time_eval():
-        model = usable(model, postures)
+        model = _with_energy(model)
+        sound = np.asarray(jax.jit(jax.vmap(lambda q: definite(model, q)))(jnp.asarray(postures, float)))
+        if not sound.all():
+            raise InputError(
+                f"the model's mass matrix is not positive definite in {np.mean(~sound):.1%} of the postures that a "
+                "swing-up goes through; learn a model that is by construction, such as a structured DeLaN, or use more "
+                "motions"
+            )
         conservative = without_friction(model)
         # Compiled, because operation by operation they take longer.
         inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
         whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
         home = nearest_equilibrium(whole, goal, parts.passive)
         controls = holding_controls(whole, home, B, tolerance=tolerance)
-        if not bool(jnp.all((controls > least) & (controls < most))):
+        if not bool(jnp.all((controls > lower) & (controls < upper))):
             raise InputError(
-                f"the limits {least} to {most} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
+                f"the limits {lower} to {upper} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
                 "choose another goal, or a stronger motor"
             )
         x = jnp.concatenate([home, jnp.zeros_like(home)])
@@ -173,3 +266,9 @@ def swing_up(
         return SwingUp(law, x, controls, regulator)
     friction = friction_compensation(model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation)
     return SwingUp(lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2)), x, controls, regulator)
+
+
+def _with_energy(model: Dynamics | PlainDynamics) -> Dynamics:
+    if not isinstance(model, Dynamics):
+        raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
+    return model

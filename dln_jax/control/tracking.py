@@ -1,4 +1,6 @@
-"""Tracking laws for mechanical systems, of one state; gains and torques are differentiable.
+"""Tracking laws for mechanical systems, compensation of friction, and the check of a model before it is used.
+
+Laws are functions of one state; gains and torques are differentiable.
 
     gravity compensation    tau = g(q) + feedback
     feed-forward            tau = f(q*, qd*, qdd*) + feedback
@@ -7,19 +9,36 @@
 with f the inverse dynamics of a known or learned model, and feedback = P (q* - q) + D (qd* - qd). Computed torque
 evaluates the model at any measured state: with a bad model it is worse than feedback alone (`trusted`). If a state is
 not finite, all torques are NaN.
+
+Dry friction jumps when a joint reverses, where a measured rate is mostly noise. With r = √(u² + s²) > |u|, the
+compensation of a joint at rate u is
+
+    gain (w F(r) + (1 - w) F(-r)),   w = (1 + u / r) / 2
+
+This equals F(u) at rates well above the smoothing rate s. Below, it is a straight line through rest with the magnitude
+of friction at s: no jump, and no work at rest. A gain below 1 never compensates all friction, so that it cannot drive a
+joint.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from dln_jax.control.finite import where_finite
+from dln_jax.control.state_space import where_finite
+from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.solvers.lapack import cholesky
-from dln_jax.types import Vector
+from dln_jax.types import InputError, Vector, require_positive
+
+GAIN = 0.9
+"""Share of the friction that is compensated."""
+TOLERANCE = 0.1
+"""Largest nMSE of a joint's torques: the share of their variance that a usable model may leave unexplained."""
 
 
 class Reference(NamedTuple):
@@ -81,18 +100,12 @@ def computed_torque(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
     return law
 
 
-def limited(tau: Any, least: Any, most: Any) -> Array:
-    """Clips a torque to the motors' limits; one that is not finite becomes NaN, for whoever handles the failure."""
-    tau = jnp.asarray(tau)
-    return jnp.where(jnp.isfinite(tau), jnp.clip(tau, least, most), jnp.nan)
-
-
 def trusted(
     plant: Dynamics,
     first: Tracker,
     otherwise: Tracker,
     *,
-    outside: Callable[[Vector, Vector, Vector], Any] | None = None,
+    out_of_distribution: Callable[[Vector, Vector, Vector], Any] | None = None,
     usable: bool = True,
 ) -> Callable[[Vector, Vector, Reference], tuple[Array, Array]]:
     """Returns a law that takes `first` where the model is usable and `otherwise` elsewhere, with a flag for the first.
@@ -104,16 +117,15 @@ def trusted(
         plant: the model.
         first: a law such as `computed_torque`.
         otherwise: a law such as `feed_forward`.
-        outside: (q, qd, qdd) -> whether the state is out of distribution, for example from a run with uncertainty.
-        usable: whether the model may be used at all, for example by `judgement.judged` on held-out motions.
+        out_of_distribution: (q, qd, qdd) -> whether the state is, for example from a run with uncertainty.
+        usable: whether the model may be used at all, for example by `judged` on held-out motions.
     """
-    credible = usable
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> tuple[Array, Array]:
-        usable = definite(plant, q) & credible
-        if outside is not None:
-            usable &= jnp.logical_not(outside(q, qd, wanted.qdd))
-        return jnp.where(usable, first(q, qd, wanted), otherwise(q, qd, wanted)), usable
+        trust = definite(plant, q) & usable
+        if out_of_distribution is not None:
+            trust &= jnp.logical_not(out_of_distribution(q, qd, wanted.qdd))
+        return jnp.where(trust, first(q, qd, wanted), otherwise(q, qd, wanted)), trust
 
     return law
 
@@ -126,3 +138,85 @@ def definite(plant: Dynamics, q: Vector) -> Bool[Array, ""]:
 def _times(gain: Any, error: Any) -> Array:
     gain = jnp.asarray(gain)
     return gain @ error if gain.ndim == 2 else gain * error
+
+
+class Judgement(NamedTuple):
+    """Verdict on a model."""
+
+    usable: bool
+    line: str
+    """The reason, in a sentence."""
+    nmse: Float[np.ndarray, " d"]
+    """Mean squared errors of the joints' torques over their variances."""
+    definite: float
+    """Share of the states in which the mass matrix is positive definite."""
+
+
+def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERANCE) -> Judgement:
+    """Decides whether a model explains held-out torques, with a positive definite mass matrix in all states.
+
+    Args:
+        plant: the model.
+        held_out: motions like those to follow, not used in the fit; joints with constant torques do not count.
+        tolerance: largest nMSE of the worst joint.
+    """
+    require_positive(tolerance=tolerance)
+    q, qd, qdd = (jnp.asarray(column) for column in (held_out.q, held_out.qd, held_out.qdd))
+    tau = np.asarray(jax.jit(jax.vmap(plant.inverse_dynamics))(q, qd, qdd))
+    share = float(np.mean(np.asarray(jax.jit(jax.vmap(lambda q: definite(plant, q)))(q))))
+    variance = np.var(held_out.tau, axis=0)
+    moved = variance > 0
+    nmse = np.mean((tau - held_out.tau) ** 2, axis=0) / np.where(moved, variance, np.nan)
+    # An error that is not finite is the worst.
+    worst = int(np.argmax(np.where(moved, np.where(np.isfinite(nmse), nmse, np.inf), -1.0)))
+    usable = bool(nmse[worst] <= tolerance) and share == 1.0
+    if share < 1:
+        line = f"the mass matrix is not positive definite in {1 - share:.1%} of the held-out states"
+    else:
+        line = (
+            f"{nmse[worst]:.2%} of joint {worst + 1}'s held-out torque variance is unexplained (limit {tolerance:.0%})"
+        )
+    verdict = "the model is used" if usable else "the model is not evaluated at the measured state"
+    return Judgement(usable, f"{line}: {verdict}", nmse, share)
+
+
+def without_friction(plant: Dynamics) -> Dynamics:
+    """Removes the friction, whose slope at rest a linearisation should not contain; the energies stay.
+
+    It requires friction that adds to the other forces, which holds for all systems without load in their transmissions.
+    """
+    return plant._replace(
+        inverse_dynamics=lambda q, qd, qdd: plant.inverse_dynamics(q, qd, qdd) - plant.friction(q, qd),
+        forward_dynamics=lambda q, qd, tau: plant.forward_dynamics(q, qd, tau + plant.friction(q, qd)),
+        friction=lambda q, qd: jnp.zeros_like(qd),
+    )
+
+
+def friction_compensation(
+    plant: Dynamics, active: Sequence[int], *, smoothing: Any, gain: float = GAIN
+) -> Callable[[Vector, Vector], Array]:
+    """(q, qd) -> forces of the active joints that compensate a share of their friction; qd measured or wanted.
+
+    Args:
+        plant: with friction, known or learned.
+        active: joints with a motor.
+        smoothing: s, rad/s or m/s, one per active joint or one for all: some times the noise of a measured rate.
+        gain: share of the friction, above 0 and at most 1.
+
+    Raises:
+        InputError: a smoothing that is not positive, or a gain out of range.
+    """
+    for rate in np.ravel(smoothing):
+        require_positive(smoothing=float(rate))
+    if not 0 < gain <= 1:
+        raise InputError(f"gain is {gain}; expected a share of the friction, above 0 and at most 1")
+    driven = np.array(active)
+
+    def forces(q: Vector, qd: Vector) -> Array:
+        rate = qd[driven]
+        size = jnp.sqrt(rate**2 + jnp.asarray(smoothing) ** 2)
+        forwards = (1 + rate / size) / 2
+        positive, negative = (plant.friction(q, qd.at[driven].set(side * size))[driven] for side in (1, -1))
+        return gain * (forwards * positive + (1 - forwards) * negative)
+
+    return forces

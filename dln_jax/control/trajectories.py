@@ -1,6 +1,6 @@
 """Optimal trajectories with limited controls, by iterative linear-quadratic regulators, and their use as MPC.
 
-    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   least <= u_k <= most
+    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   lower <= u_k <= upper
 
 An iteration expands f to first and the costs to second order about the plan (Gauss-Newton: Li and Todorov 2004). It
 solves for u_k = ū_k + k_k + K_k (x_k - x̄_k) backwards, with a small quadratic program for the limits in every step
@@ -17,19 +17,20 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.control.finite import where_finite
+from dln_jax.control.constrained_lq import Horizon
+from dln_jax.control.state_space import where_finite
 from dln_jax.solvers.elimination import solve
 from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, Scalar, require_positive
 
 STEP_LENGTHS = 0.5 ** np.arange(10)
-LEAST_DAMPING, MOST_DAMPING, FIRST_DAMPING = 1e-9, 1e9, 1e-3
+MIN_DAMPING, MAX_DAMPING, FIRST_DAMPING = 1e-9, 1e9, 1e-3
 """Damping of the controls' Hessian, relative to the mean of its diagonal."""
 PROJECTED_STEPS = 8
 """Newton iterations of the quadratic program of a step."""
 
 
-class Problem(NamedTuple):
+class TrajectoryProblem(NamedTuple):
     """Dynamics, costs and limits of a trajectory."""
 
     step: Callable[[Array, Array], Array]
@@ -38,9 +39,9 @@ class Problem(NamedTuple):
     """(x, u) -> cost of one step."""
     final_cost: Callable[[Array], Scalar]
     """x -> cost of the last state."""
-    least: Any = -jnp.inf
+    lower: Any = -jnp.inf
     """Lower limits of the controls, [m] or one for all."""
-    most: Any = jnp.inf
+    upper: Any = jnp.inf
 
 
 class Plan(NamedTuple):
@@ -63,7 +64,7 @@ class Plan(NamedTuple):
         return self.ending == Ending.CONVERGED
 
 
-def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
+def first_plan(problem: TrajectoryProblem, x: Any, u: Any) -> Plan:
     """Returns the plan of controls [N, m] from a state [n]; raises `InputError` for other shapes."""
     x, u = jnp.asarray(x, float), jnp.asarray(u, float)
     if x.ndim != 1 or u.ndim != 2 or not len(u):
@@ -76,12 +77,12 @@ def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
     return plan._replace(u=u, x=states, cost=cost)
 
 
-def improve(problem: Problem, plan: Plan, *, step_lengths: Any = STEP_LENGTHS) -> Plan:
+def improve(problem: TrajectoryProblem, plan: Plan, *, step_lengths: Any = STEP_LENGTHS) -> Plan:
     """Runs one iteration and takes the best of some step lengths [L]; the cost never rises."""
     return _improved(problem, plan, step_lengths)[0]
 
 
-def _improved(problem: Problem, plan: Plan, step_lengths: Any) -> tuple[Plan, Array]:
+def _improved(problem: TrajectoryProblem, plan: Plan, step_lengths: Any) -> tuple[Plan, Array]:
     """Returns the plan after an iteration, and the decrease of the cost at the first step length."""
     k, K = _backward(problem, plan)
     lengths = jnp.asarray(step_lengths, plan.u.dtype)
@@ -92,13 +93,13 @@ def _improved(problem: Problem, plan: Plan, step_lengths: Any) -> tuple[Plan, Ar
     best = jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))
     better = costs[best] < plan.cost
     undecided = jnp.asarray(Ending.UNDECIDED)
-    less_damping, more_damping = jnp.maximum(plan.damping / 10, LEAST_DAMPING), plan.damping * 10
-    found = Plan(u[best], x[best], K, costs[best], less_damping, better, undecided)
-    kept = plan._replace(K=K, damping=jnp.minimum(more_damping, MOST_DAMPING), better=better, ending=undecided)
-    return jax.tree.map(lambda new, old: jnp.where(better, new, old), found, kept), plan.cost - costs[0]
+    less_damping, more_damping = jnp.maximum(plan.damping / 10, MIN_DAMPING), plan.damping * 10
+    new = Plan(u[best], x[best], K, costs[best], less_damping, better, undecided)
+    kept = plan._replace(K=K, damping=jnp.minimum(more_damping, MAX_DAMPING), better=better, ending=undecided)
+    return jax.tree.map(lambda new, old: jnp.where(better, new, old), new, kept), plan.cost - costs[0]
 
 
-def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, tolerance: float = 1e-9) -> Plan:
+def optimise(problem: TrajectoryProblem, x: Any, u: Any, *, iterations: int = 200, tolerance: float = 1e-9) -> Plan:
     """Iterates from initial controls until the relative decrease of the cost is small, or no step is better.
 
     The plan's `ending` states which. Without a lower cost it has converged only if a full step changes nothing either.
@@ -114,21 +115,19 @@ def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, toleran
     plan = first_plan(problem, x, u)
 
     def ending(number: Array, plan: Plan, fell: Array) -> Array:
-        flat = (jnp.abs(fell) <= tolerance * jnp.abs(plan.cost)) & (number > 0)
-        hopeless = jnp.logical_not(plan.better) & (plan.damping >= MOST_DAMPING)
-        outcomes = (
-            (~jnp.isfinite(plan.cost) & (number > 0), Ending.NOT_FINITE),
-            (flat, Ending.CONVERGED),
-            (hopeless, Ending.NO_DESCENT),
-            (number >= iterations, Ending.OUT_OF_ITERATIONS),
-        )
-        return jnp.select([is_so for is_so, _ in outcomes], [int(each) for _, each in outcomes], int(Ending.UNDECIDED))
+        conditions = [
+            ~jnp.isfinite(plan.cost) & (number > 0),
+            (jnp.abs(fell) <= tolerance * jnp.abs(plan.cost)) & (number > 0),
+            ~plan.better & (plan.damping >= MAX_DAMPING),
+            number >= iterations,
+        ]
+        outcomes = [Ending.NOT_FINITE, Ending.CONVERGED, Ending.NO_DESCENT, Ending.OUT_OF_ITERATIONS]
+        return jnp.select(conditions, outcomes, Ending.UNDECIDED)
 
     def iterate(carry: tuple[Array, Plan, Array]) -> tuple[Array, Plan, Array]:
         number, plan, _ = carry
-        found, by_whole_step = _improved(problem, plan, STEP_LENGTHS)
-        fell = jnp.where(found.better, plan.cost - found.cost, by_whole_step)
-        return number + 1, found, fell
+        new, by_whole_step = _improved(problem, plan, STEP_LENGTHS)
+        return number + 1, new, jnp.where(new.better, plan.cost - new.cost, by_whole_step)
 
     start = (jnp.asarray(0), plan, jnp.asarray(jnp.inf, plan.u.dtype))
     last = jax.lax.while_loop(lambda carry: ending(*carry) == Ending.UNDECIDED, iterate, start)
@@ -136,7 +135,7 @@ def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, toleran
 
 
 def mpc(
-    problem: Problem, *, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
+    problem: TrajectoryProblem, *, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
 ) -> Callable[[Array, Plan], tuple[Array, Plan]]:
     """Model predictive control: (state, plan) -> (control, plan), with the plan shifted by one step and improved.
 
@@ -163,34 +162,44 @@ def mpc(
     return act
 
 
-def _follow(problem: Problem, x: Array, plan: Plan) -> tuple[Array, Array, Array]:
+def _follow(problem: TrajectoryProblem, x: Array, plan: Plan) -> tuple[Array, Array, Array]:
     """Returns states, controls and cost from a state under the plan and its gains."""
 
-    def step(x: Array, now: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array, Array]]:
-        planned, u, K = now
-        u = jnp.clip(u + K @ (x - planned), problem.least, problem.most)
+    def step(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array, Array]]:
+        planned, u, K = stage
+        u = jnp.clip(u + K @ (x - planned), problem.lower, problem.upper)
         return problem.step(x, u), (x, u, problem.cost(x, u))
 
     last, (states, u, costs) = jax.lax.scan(step, x, (plan.x[:-1], plan.u, plan.K))
     return jnp.concatenate([states, last[None]]), u, jnp.sum(costs) + problem.final_cost(last)
 
 
-def _backward(problem: Problem, plan: Plan) -> tuple[Array, Array]:
-    """Returns k [N, m] and K [N, m, n]."""
-    n = plan.x.shape[1]
+def expand(problem: TrajectoryProblem, x: Array, u: Array, missed: Array) -> Horizon:
+    """Expands the steps to first and the costs to second order at states [N+1, n] and controls [N, m].
+
+    `missed` [N, n] are the defects of the steps. The result's limits are those of the change of the controls.
+    """
+    n, both = x.shape[1], jnp.concatenate([x[:-1], u], axis=1)
 
     def of_both(function: Callable[..., Any]) -> Callable[[Array], Any]:
         return lambda xu: function(xu[:n], xu[n:])
 
-    both = jnp.concatenate([plan.x[:-1], plan.u], axis=1)
-    slopes = jax.vmap(jax.jacfwd(of_both(problem.step)))(both)
-    gradients = jax.vmap(jax.grad(of_both(problem.cost)))(both)
-    curvatures = jax.vmap(jax.hessian(of_both(problem.cost)))(both)
-    low, high = (jnp.broadcast_to(jnp.asarray(each, plan.u.dtype), plan.u.shape) - plan.u for each in problem[3:])
+    cost, limits = of_both(problem.cost), (problem.lower, problem.upper)
+    low, high = (jnp.broadcast_to(jnp.asarray(limit, u.dtype), u.shape) - u for limit in limits)
+    return Horizon(
+        jax.vmap(jax.jacfwd(of_both(problem.step)))(both), missed, jax.vmap(jax.grad(cost))(both),
+        jax.vmap(jax.hessian(cost))(both), jax.grad(problem.final_cost)(x[-1]), jax.hessian(problem.final_cost)(x[-1]),
+        low, high,
+    )  # fmt: skip
 
-    def back(value: tuple[Array, Array], now: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+
+def _backward(problem: TrajectoryProblem, plan: Plan) -> tuple[Array, Array]:
+    """Returns k [N, m] and K [N, m, n]."""
+    n, horizon = plan.x.shape[1], expand(problem, plan.x, plan.u, jnp.zeros_like(plan.x[1:]))
+
+    def back(value: tuple[Array, Array], stage: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         g, H = value
-        slope, gradient, curvature, low, high = now
+        slope, gradient, curvature, low, high = stage
         q, Q = gradient + slope.T @ g, curvature + slope.T @ H @ slope
         qx, qu, Qxx, Qux, Quu = q[:n], q[n:], Q[:n, :n], Q[n:, :n], Q[n:, n:]
         size = jnp.mean(jnp.abs(jnp.diagonal(Quu)))
@@ -199,8 +208,8 @@ def _backward(problem: Problem, plan: Plan) -> tuple[Array, Array]:
         H = Qxx + K.T @ Quu @ K + K.T @ Qux + Qux.T @ K
         return (g, (H + H.T) / 2), (k, K)
 
-    end = jax.grad(problem.final_cost)(plan.x[-1]), jax.hessian(problem.final_cost)(plan.x[-1])
-    _, (k, K) = jax.lax.scan(back, end, (slopes, gradients, curvatures, low, high), reverse=True)
+    stages = horizon.slopes, horizon.gradients, horizon.curvatures, horizon.low, horizon.high
+    _, (k, K) = jax.lax.scan(back, (horizon.end_gradient, horizon.end_curvature), stages, reverse=True)
     return k, K
 
 

@@ -8,7 +8,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter
 
-from dln_jax.control.closed_loop import Run
+from dln_jax.control.closed_loop import ClosedLoopRun
 from dln_jax.figures import style
 from dln_jax.types import InputError, JointKind
 
@@ -18,7 +18,7 @@ MOST_SHOWN = 30
 
 
 def closed_loop_traces(
-    runs: Run,
+    runs: ClosedLoopRun,
     joints: tuple[JointKind, ...],
     *,
     names: tuple[str, ...] | None = None,

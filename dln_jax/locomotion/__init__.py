@@ -1,7 +1,17 @@
-"""Locomotion of soft creatures: policies learned by gradients through the simulator, or by evolution."""
+"""Locomotion of soft creatures: policies learned by gradients through the simulator."""
 
+from dln_jax.locomotion.gradient import TrainedPolicies, shown_walk, train
 from dln_jax.locomotion.learning import Goal, Learned, Record
-from dln_jax.locomotion.methods import Trained, shown_walk, train
-from dln_jax.locomotion.task import Task, creature_named, make_task
+from dln_jax.locomotion.task import LocomotionTask, creature_named, make_task
 
-__all__ = ["Goal", "Learned", "Record", "Task", "Trained", "creature_named", "make_task", "shown_walk", "train"]
+__all__ = [
+    "Goal",
+    "Learned",
+    "LocomotionTask",
+    "Record",
+    "TrainedPolicies",
+    "creature_named",
+    "make_task",
+    "shown_walk",
+    "train",
+]

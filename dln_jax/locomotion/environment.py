@@ -7,10 +7,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.locomotion.task import FALLEN, Task, actuation_of, advance, beginning, observe
+from dln_jax.locomotion.task import FALLEN, LocomotionTask, actuation_of, advance, beginning, observe
 
 
-def spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Spaces of observations and of actions."""
     seen = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
     return seen, gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
@@ -23,7 +23,7 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     that does not converge; `info["converged"]` distinguishes the two.
     """
 
-    def __init__(self, task: Task):
+    def __init__(self, task: LocomotionTask):
         self.task = task
         self.observation_space, self.action_space = spaces(task)
         self._place = self._start = beginning(task)

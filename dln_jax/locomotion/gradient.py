@@ -1,4 +1,4 @@
-"""Short-horizon gradients through the simulator, of a smoothed objective.
+"""Learns to move by short-horizon gradients through the simulator, of a smoothed objective.
 
     J(theta) = E[ reward of a window of H steps under theta + sigma eps ],    eps ~ N(0, I)
 
@@ -9,19 +9,40 @@ include the effect of a step on the next stride, and no value function is needed
 The gradient is the mean over lanes in their order, so that it does not depend on their assignment to devices.
 """
 
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh
 from jaxtyping import Array, Int
 
-from dln_jax.locomotion.learning import LANES, Learner, chosen, finite
-from dln_jax.locomotion.policy import Parameters, Policy
-from dln_jax.locomotion.task import FALLEN, Place, Task, beginning, walk
+from dln_jax.locomotion.learning import (
+    LANES,
+    WIDTH,
+    CompiledLearner,
+    Goal,
+    Learned,
+    Learner,
+    Parameters,
+    Policy,
+    Record,
+    compile_learner,
+    learn,
+    make_policy,
+)
+from dln_jax.locomotion.task import FALLEN, EpisodeState, LocomotionTask, Walk, beginning, chosen, walk
 from dln_jax.scale.mesh import shares, spread
 from dln_jax.types import InputError, require_positive
+
+BALANCING = {"biped": 80}
+"""Windows of creatures that need one longer than the default: balance on two legs needs the whole episode."""
+
+Report = Callable[[int, Record], None]
 
 
 class GradientSettings(NamedTuple):
@@ -49,33 +70,96 @@ class GradientState(NamedTuple):
 
     parameters: Parameters
     optimiser: Any
-    lanes: Place
-    """Places of the lanes."""
+    lanes: EpisodeState
+    """States of the lanes."""
     seed: Int[Array, ""]
     updates: Int[Array, ""]
     skipped: Int[Array, ""]
 
 
-def check(settings: GradientSettings, episode: int) -> None:
-    """Raises `InputError` for a window that does not divide the episode, or a number that is not positive."""
-    require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
-    if episode % settings.window:
-        raise InputError(f"a window has {settings.window} steps; expected a divisor of the episode's {episode}")
+class TrainedPolicies(NamedTuple):
+    """Policies of several seeds."""
+
+    policy: Policy
+    learned: list[Learned]
+
+    @property
+    def best(self) -> Learned:
+        """The seed with the longest distance."""
+        return max(self.learned, key=lambda seed: seed.distance if np.isfinite(seed.distance) else -np.inf)
+
+
+def settings_of(task: LocomotionTask, window: int | None = None, lanes: int | None = None) -> GradientSettings:
+    """Returns the settings for a creature; only the window depends on it.
+
+    Raises:
+        InputError: a window that does not divide the episode, or an odd number of lanes.
+    """
+    settings = GradientSettings()
+    window = window or BALANCING.get(task.creature.name, settings.window)
+    lanes = settings.lanes if lanes is None else lanes
+    if lanes % 2:
+        raise InputError(f"{lanes} creatures are no pairs, in which the gradient takes them; give an even number")
+    if task.episode % window:
+        raise InputError(f"a window has {window} steps; expected a divisor of the episode's {task.episode}")
+    return settings._replace(window=window, pairs=lanes // 2)
+
+
+def train(
+    task: LocomotionTask,
+    *,
+    seeds: Sequence[int],
+    goal: Goal,
+    width: int = WIDTH,
+    window: int | None = None,
+    lanes: int | None = None,
+    directory: Path | None = None,
+    resume: bool = False,
+    mesh: Mesh | None = None,
+    report: Report = lambda seed, record: None,
+) -> TrainedPolicies:
+    """Learns with several seeds; settings are the same for all seeds and, except the window, for all creatures.
+
+    Args:
+        task: to learn.
+        seeds: trained one after the other; programs are compiled once.
+        goal: conditions that end the learning of a seed.
+        width: of the hidden layer of the policy.
+        window: steps that gradients go back, a divisor of the episode (default: 40, for the biped 80).
+        lanes: creatures side by side, an even number (default: 2).
+        directory: where states are stored.
+        resume: continue the runs stored there.
+        mesh: devices that share the creatures simulated side by side.
+        report: called with seed and record after every evaluation.
+
+    Raises:
+        InputError: settings out of range, a stored run with others, or a mesh that does not divide the creatures.
+    """
+    settings = settings_of(task, window, lanes)
+    learner = make_gradient_learner(task, make_policy(task, width=width), settings, mesh=mesh)
+    facts = {"creature": task.creature.name, "width": width, "episode": task.episode}
+    facts |= {"clock_period": task.clock_period, "upright": task.upright, **settings._asdict()}
+    compiled = compile_learner(task, learner, mesh)
+    return learn_seeds(compiled, seeds, goal, report, directory=directory, settings=facts, resume=resume)
+
+
+def learn_seeds(
+    compiled: CompiledLearner, seeds: Sequence[int], goal: Goal, report: Report, **stored: Any
+) -> TrainedPolicies:
+    """Learns with several seeds by one compiled learner; `stored` are arguments of `learn` on checkpoints."""
+    one = partial(learn, compiled, goal=goal, **stored)
+    return TrainedPolicies(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
 
 def make_gradient_learner(
-    task: Task,
+    task: LocomotionTask,
     policy: Policy,
     settings: GradientSettings = GradientSettings(),  # noqa: B008
     *,
     mesh: Mesh | None = None,
 ) -> Learner:
-    """Returns the learner.
-
-    Raises:
-        InputError: raised by `check`, or a mesh that does not divide the lanes.
-    """
-    check(settings, task.episode)
+    """Returns the learner; raises `InputError` for settings out of range, or a mesh that does not divide the lanes."""
+    require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
     shares(mesh, settings.lanes, LANES)
     lanes, window = settings.lanes, settings.window
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(settings.learning_rate, b2=0.95))
@@ -88,7 +172,7 @@ def make_gradient_learner(
         zero = jnp.asarray(0)
         return GradientState(parameters, optimiser.init(parameters), places, jnp.asarray(seed), zero, zero)
 
-    def loss(parameters: Parameters, sign: Array, noise: Parameters, place: Place) -> tuple[Array, Any]:
+    def loss(parameters: Parameters, sign: Array, noise: Parameters, place: EpisodeState) -> tuple[Array, Any]:
         own = jax.tree.map(lambda p, eps: p + sign * settings.deviation * eps, parameters, noise)
         end, seen = walk(task, lambda observation: policy.apply(own, observation), place, window)
         usable = seen.converged.all() & (jnp.abs(seen.tilt[-1]) < FALLEN)
@@ -104,7 +188,7 @@ def make_gradient_learner(
         gradients, (ends, usable_ends) = descents(state.parameters, (signs, noise, state.lanes))
         gradient = jax.tree.map(lambda of_lanes: of_lanes.mean(axis=0), gradients)
         # A step that does not converge has NaN as its gradient.
-        usable = finite(gradient)
+        usable = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all()
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
         parameters, moments = chosen(usable, (moved, moments), (state.parameters, state.optimiser))
@@ -128,3 +212,9 @@ def _pairs_of_noise(key: Array, like: Parameters, pairs: int) -> Parameters:
     keys = jax.random.split(key, len(leaves))
     drawn = [jax.random.normal(k, (pairs, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
     return structure.unflatten([jnp.repeat(noise, 2, axis=0) for noise in drawn])
+
+
+def shown_walk(task: LocomotionTask, policy: Policy, parameters: Parameters, steps: int) -> Walk:
+    """Runs a policy from rest and returns its steps as NumPy arrays."""
+    program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), beginning(task), steps)[1])
+    return jax.tree.map(np.asarray, program(parameters))

@@ -1,7 +1,10 @@
-"""Loop of all learning methods: learn, evaluate, record, until a distance or a number of environment steps.
+"""A policy, and the loop that trains it: update, evaluate, record, until a distance or a number of environment steps.
 
-An environment step is one step of the simulator for one creature. Those of evaluations are counted separately. All
-methods are evaluated alike, by one episode from rest, after every call of `improve`.
+    h = tanh(W_b body + W_c clock + b),    actuation = 0.25 + 0.75 sigmoid(W_a h + b_a + 1)
+
+Layers start with variances 0.3, 1 and 1 over their fan-in: initially the clock has more influence than the body. An
+environment step is one step of the simulator for one creature. A policy is evaluated by one episode from rest after
+every call of `improve`; the steps of evaluations are counted separately.
 """
 
 import math
@@ -10,25 +13,41 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import haiku as hk
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
 from dln_jax.interrupts import held_back
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
-from dln_jax.locomotion.policy import Parameters, Policy
-from dln_jax.locomotion.task import Task, run_episode
+from dln_jax.locomotion.task import SHORTEST, LocomotionTask, beginning, observe, run_episode
 from dln_jax.scale.mesh import local, program, spread
+from dln_jax.sizes import require_network
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
+WIDTH = 32
+"""Hidden units of the policy."""
+CLOCK = 2
+"""Numbers at the end of an observation that show the clock."""
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
 LANES = "creatures side by side"
 """What devices share, for messages."""
+
+Parameters = Any
+
+
+class Policy(NamedTuple):
+    """Policy as an (init, apply) pair."""
+
+    init: Callable[[Array], Parameters]
+    """Random key -> parameters."""
+    apply: Callable[[Parameters, Float[Array, " o"]], Float[Array, " k"]]
+    """Observation -> actuation."""
 
 
 class Record(NamedTuple):
@@ -45,11 +64,11 @@ class Record(NamedTuple):
 
 
 class Learner(NamedTuple):
-    """A learning method."""
+    """A way of learning a policy."""
 
     policy: Policy
     start: Callable[[int], Any]
-    """Seed -> state, a tree of arrays; of a method that is never stored, any object."""
+    """Seed -> state, a tree of arrays; if it is never stored, any object."""
     improve: Callable[[Any], Any]
     """State -> state after some updates; traceable for trees."""
     parameters: Callable[[Any], Parameters]
@@ -60,13 +79,12 @@ class Learner(NamedTuple):
     """State -> number of skipped updates."""
 
 
-class Compiled(NamedTuple):
+class CompiledLearner(NamedTuple):
     """A learner with its compiled programs, for any number of seeds."""
 
     learner: Learner
     improve: Callable[[Any], Any]
     evaluate: Callable[[Parameters], Any]
-    episode: int
     seconds: float
     """Compilation time."""
     mesh: Mesh | None = None
@@ -74,14 +92,12 @@ class Compiled(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Result of learning."""
+    """Result of learning with one seed."""
 
     parameters: Parameters
     """Parameters with the longest distance in an evaluation."""
     records: list[Record]
     compile_seconds: float
-    evaluation_steps: int
-    """Environment steps of evaluations."""
 
     @property
     def distance(self) -> float:
@@ -98,49 +114,62 @@ class Goal(NamedTuple):
     """Body lengths."""
 
 
-Report = Callable[[Record], None]
+def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
+    """Returns the policy of a task."""
+    require_network(width=width, depth=1)
+
+    def network(observation: Float[Array, " o"]) -> Float[Array, " k"]:
+        body, clock = observation[:-CLOCK], observation[-CLOCK:]
+        scaled = hk.initializers.VarianceScaling
+        from_body = hk.Linear(width, w_init=scaled(0.3), name="body")(body)
+        from_clock = hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(clock)
+        muscles = hk.Linear(task.muscle_count, w_init=scaled(1.0), name="muscles")
+        return SHORTEST + (1.0 - SHORTEST) * jax.nn.sigmoid(muscles(jnp.tanh(from_body + from_clock)) + 1.0)
+
+    transformed = hk.without_apply_rng(hk.transform(network))
+    return Policy(lambda key: transformed.init(key, observe(task, beginning(task))), transformed.apply)
 
 
-def compile_learner(task: Task, learner: Learner, mesh: Mesh | None = None) -> Compiled:
+def compile_learner(task: LocomotionTask, learner: Learner, mesh: Mesh | None = None) -> CompiledLearner:
     """Compiles a learner's programs, for the mesh that it was built for."""
     began = time.perf_counter()
     state = jax.eval_shape(lambda: learner.start(0))
     improve = program(learner.improve, mesh).lower(state).compile(quick_compilation())
     evaluate = compile_evaluation(task, learner.policy, jax.eval_shape(learner.parameters, state), mesh)
-    return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began, mesh)
+    return CompiledLearner(learner, improve, evaluate, time.perf_counter() - began, mesh)
 
 
 def compile_evaluation(
-    task: Task, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
+    task: LocomotionTask, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
 ) -> Callable[[Parameters], Any]:
     """Parameters -> body lengths in one episode from rest; every device walks, and the first device's result counts."""
 
-    def judged(parameters: Parameters, ones: Array) -> Array:
-        return ones * run_episode(task, lambda seen: policy.apply(parameters, seen)).distance
+    def distance(parameters: Parameters, ones: Array) -> Array:
+        return ones * run_episode(task, lambda observation: policy.apply(parameters, observation)).distance
 
     # Devices of different models may round differently, and must come to the same decisions.
-    judge = program(lambda parameters: spread(judged, mesh)(parameters, jnp.ones(1))[0], mesh)
-    return judge.lower(parameters).compile(quick_compilation())
+    evaluate = program(lambda parameters: spread(distance, mesh)(parameters, jnp.ones(1))[0], mesh)
+    return evaluate.lower(parameters).compile(quick_compilation())
 
 
 def learn(
-    compiled: Compiled,
+    compiled: CompiledLearner,
     *,
     seed: int,
     goal: Goal,
     directory: Path | None = None,
     settings: dict[str, Any] | None = None,
     resume: bool = False,
-    report: Report = lambda record: None,
+    report: Callable[[Record], None] = lambda record: None,
 ) -> Learned:
     """Learns until the goal; with a directory, stores the state of every evaluation there and can resume bit for bit.
 
     Args:
         compiled: from `compile_learner`; without a directory its state may be any object.
-        seed: decides everything random.
+        seed: determines everything random.
         goal: conditions that end learning.
         directory: an existing folder for checkpoints.
-        settings: JSON values that decide the result; a stored run with others is not continued.
+        settings: JSON values that determine the result; a stored run with others is not continued.
         resume: continue the run in the directory, if it has a checkpoint.
         report: called after every evaluation.
 
@@ -157,7 +186,7 @@ def learn(
     farthest = max((record.distance for record in records), default=-math.inf)
     before = records[-1].seconds if records else compiled.seconds
     began = time.perf_counter()
-    while not reached(records, goal):
+    while not (records and (records[-1].steps >= goal.steps or records[-1].distance >= goal.distance)):
         with held_back():
             state = compiled.improve(state)
             distance = float(compiled.evaluate(learner.parameters(state)))
@@ -171,22 +200,7 @@ def learn(
                 stored = {**identity, "records": rows}
                 checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
         report(records[-1])
-    return Learned(local(best, compiled.mesh), records, compiled.seconds, len(records) * compiled.episode)
-
-
-def finite(tree: Any) -> Any:
-    """Whether all numbers of a tree are finite."""
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
-
-
-def chosen(condition: Any, new: Any, old: Any) -> Any:
-    """Selects one of two trees."""
-    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
-
-
-def reached(records: list[Record], goal: Goal) -> bool:
-    """Whether the last evaluation meets the goal."""
-    return bool(records) and (records[-1].steps >= goal.steps or records[-1].distance >= goal.distance)
+    return Learned(local(best, compiled.mesh), records, compiled.seconds)
 
 
 def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -> tuple[Any, list[Record]]:

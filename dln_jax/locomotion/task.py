@@ -12,13 +12,13 @@ bodies would go far by rolling.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.rollout import rollout
 from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh.shapes import Creature, biped, body_length, crawler, quadruped
 from dln_jax.softbody.scene import SoftScene, State
@@ -46,7 +46,7 @@ Act = Callable[[Float[Array, " o"]], Float[Array, " k"]]
 """Observation -> actuation."""
 
 
-class Task(NamedTuple):
+class LocomotionTask(NamedTuple):
     """A creature with its scene and time step."""
 
     creature: Creature
@@ -72,7 +72,7 @@ class Task(NamedTuple):
         return len(self.creature.muscles)
 
 
-class Place(NamedTuple):
+class EpisodeState(NamedTuple):
     """State of an episode."""
 
     state: State
@@ -95,11 +95,12 @@ class Walk(NamedTuple):
 
 def make_task(
     creature: Creature, *, episode: int = EPISODE, clock_period: float = CLOCK_PERIOD, upright: float = UPRIGHT
-) -> Task:
+) -> LocomotionTask:
     """Returns the task of a creature of the "creature" preset, with its published time step."""
     require_positive(episode=episode, clock_period=clock_period)
     scene = creature_scene(creature)
-    return Task(creature, scene, make_step(scene, TIME_STEP), body_length(creature), episode, clock_period, upright)
+    stepper, length = make_step(scene, TIME_STEP), body_length(creature)
+    return LocomotionTask(creature, scene, stepper, length, episode, clock_period, upright)
 
 
 def creature_named(name: str) -> Creature:
@@ -109,12 +110,12 @@ def creature_named(name: str) -> Creature:
     return CREATURES[name]()
 
 
-def beginning(task: Task) -> Place:
+def beginning(task: LocomotionTask) -> EpisodeState:
     """Returns the creature's rest shape at rest."""
-    return Place(task.stepper.init(), jnp.asarray(0))
+    return EpisodeState(task.stepper.init(), jnp.asarray(0))
 
 
-def observe(task: Task, place: Place) -> Float[Array, " o"]:
+def observe(task: LocomotionTask, place: EpisodeState) -> Float[Array, " o"]:
     """Returns the observation defined at the top of the module."""
     rest = jnp.asarray(task.creature.mesh.vertices, place.state.x.dtype)
     moved = place.state.x - rest
@@ -124,27 +125,22 @@ def observe(task: Task, place: Place) -> Float[Array, " o"]:
     return jnp.concatenate([moved.ravel(), place.state.v.ravel() / task.length, clock])
 
 
-def advance(task: Task, place: Place, actuation: Float[Array, " k"]) -> tuple[Place, Walk]:
+def advance(task: LocomotionTask, place: EpisodeState, actuation: Float[Array, " k"]) -> tuple[EpisodeState, Walk]:
     """Returns the place after one step, and the record of the step."""
     state, info = task.stepper.step(task.scene.params, place.state, actuation)
-    after = Place(state, place.steps + 1)
     cost, angle = _posture(task, state.x)
-    reward = travelled(task, place, after) - task.upright * cost / task.episode
-    return after, Walk(state.x, actuation, info.converged, reward, angle)
+    travelled = (state.x[:, 0].mean() - place.state.x[:, 0].mean()) / task.length
+    reward = travelled - task.upright * cost / task.episode
+    return EpisodeState(state, place.steps + 1), Walk(state.x, actuation, info.converged, reward, angle)
 
 
-def walk(task: Task, act: Act, start: Place, steps: int) -> tuple[Place, Walk]:
+def walk(task: LocomotionTask, act: Act, start: EpisodeState, steps: int) -> tuple[EpisodeState, Walk]:
     """Runs a policy for a number of steps from a place."""
 
-    def one(place: Place, _: None) -> tuple[Place, Walk]:
+    def one(place: EpisodeState, _: None) -> tuple[EpisodeState, Walk]:
         return advance(task, place, act(observe(task, place)))
 
-    return rollout(one, start, steps=steps, observe=lambda place, seen: seen)
-
-
-def travelled(task: Task, start: Place, end: Place) -> Float[Array, ""]:
-    """Change of the mean x, in body lengths."""
-    return (end.state.x[:, 0].mean() - start.state.x[:, 0].mean()) / task.length
+    return jax.lax.scan(one, start, length=steps)
 
 
 class Episode(NamedTuple):
@@ -156,20 +152,23 @@ class Episode(NamedTuple):
     """Reward before a fall."""
 
 
-def run_episode(task: Task, act: Act) -> Episode:
+def run_episode(task: LocomotionTask, act: Act) -> Episode:
     """Runs one episode from rest."""
-    start = beginning(task)
-    _, seen = walk(task, act, start, task.episode)
-    return judged(task, start, seen)
+    return judged(task, walk(task, act, beginning(task), task.episode)[1])
 
 
-def judged(task: Task, start: Place, seen: Walk) -> Episode:
-    """Evaluates the steps of an episode."""
+def judged(task: LocomotionTask, seen: Walk) -> Episode:
+    """Evaluates the steps of an episode from rest."""
     before_fall = jnp.cumsum(jnp.abs(seen.tilt) > FALLEN) == 0
-    means = jnp.concatenate([start.state.x[None, :, 0], seen.x[:, :, 0]]).mean(axis=1)
+    means = jnp.concatenate([beginning(task).state.x[None, :, 0], seen.x[:, :, 0]]).mean(axis=1)
     distance = (before_fall * jnp.diff(means)).sum() / task.length
     usable = jnp.where(seen.converged.all(), 1.0, jnp.nan)
     return Episode(usable * distance, usable * (before_fall * seen.reward).sum())
+
+
+def chosen(condition: Any, new: Any, old: Any) -> Any:
+    """Selects one of two trees of arrays."""
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
 
 
 def actuation_of(command: Float[Array, "*k"] | Float[np.ndarray, "*k"]) -> Float[Array, "*k"]:
@@ -177,7 +176,7 @@ def actuation_of(command: Float[Array, "*k"] | Float[np.ndarray, "*k"]) -> Float
     return SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + jnp.clip(command, -1.0, 1.0))
 
 
-def _posture(task: Task, x: Float[Array, "n 2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _posture(task: LocomotionTask, x: Float[Array, "n 2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Posture of the reward, and tilt in rad, positive to the left."""
     rest = jnp.asarray(task.creature.mesh.vertices, x.dtype)
     lowered = jnp.maximum(0.0, CROUCHED - x[:, 1].mean() / rest[:, 1].mean()) / (1.0 - CROUCHED)

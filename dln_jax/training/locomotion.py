@@ -8,17 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 from jax.sharding import Mesh
+from matplotlib.figure import Figure
 
 from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.progress import progress
+from dln_jax.figures import style
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
-from dln_jax.locomotion import gradient
-from dln_jax.locomotion.learning import LANES, Goal, Record
-from dln_jax.locomotion.methods import STEPS, Method, Report, Trained, settings_of, shown_walk, train
-from dln_jax.locomotion.policy import WIDTH
-from dln_jax.locomotion.progress import learning_figure, median_to_reach
-from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, UPRIGHT, Task, Walk, creature_named, make_task
+from dln_jax.locomotion.gradient import Report, TrainedPolicies, settings_of, shown_walk, train
+from dln_jax.locomotion.learning import LANES, WIDTH, Goal, Record
+from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, UPRIGHT, LocomotionTask, Walk, creature_named, make_task
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
@@ -27,11 +26,13 @@ from dln_jax.zoo.parameter_files import save_tree
 from dln_jax.zoo.run import MODEL
 
 GOAL = 1.0
-"""Distance in body lengths by which the methods are compared."""
+"""Distance in body lengths at which the effort of learning is measured."""
+STEPS = 40_000
+"""Default number of environment steps."""
 
 
 @dataclass(frozen=True)
-class Options:
+class LocomotionOptions:
     """What is to be learned."""
 
     creature: Literal["crawler", "biped", "quadruped"] = "crawler"
@@ -41,7 +42,7 @@ class Options:
     seeds: int = 1
     """How many seeds, one after the other."""
     steps: Unstated[int] = None
-    """Environment steps of each seed (default: 40000 by gradient, 500000 by evolution)."""
+    """Environment steps of each seed (default: 40000)."""
     until: Unstated[float] = None
     """Body lengths at which a seed ends (default: no limit)."""
     upright: float = UPRIGHT
@@ -51,30 +52,29 @@ class Options:
     episode: int = EPISODE
     """Steps of 0.033 s."""
     window: Unstated[int] = None
-    """gradient: steps that gradients go back; divides the episode (default: 40, of the biped 80)."""
-    width: Unstated[int] = None
-    """Hidden units of the policy (default: 32)."""
+    """Steps that gradients go back; divides the episode (default: 40, for the biped 80)."""
+    width: int = WIDTH
+    """Hidden units of the policy."""
     lanes: Unstated[int] = None
-    """Creatures side by side, in pairs, which devices share (default: 2 by gradient, 32 by evolution)."""
+    """Creatures side by side, in pairs, which devices share (default: 2)."""
 
 
-def prepare(given: Options, methods: Sequence[Method], mesh: Mesh | None) -> Task:
-    """Makes the task, and refuses settings that these methods and devices cannot train, before anything is written."""
-    require_positive(episode=given.episode, clock_period=given.clock_period)
-    require_positive_if_given(given, ["seeds", "steps", "until", "window", "width", "lanes"])
-    require_seed(given.seed, given.seeds)
-    for method in methods:
-        settings = settings_of(method, given.creature, given.window, given.lanes)
-        shares(mesh, settings.lanes, f"{LANES} (--lanes)")
-        if method == "gradient":
-            gradient.check(settings, given.episode)
-    if not (math.isfinite(given.upright) and given.upright >= 0):
-        raise InputError(f"--upright is {given.upright}; expected 0 or a positive number")
-    creature = creature_named(given.creature)
-    return make_task(creature, episode=given.episode, clock_period=given.clock_period, upright=given.upright)
+def prepare(options: LocomotionOptions, mesh: Mesh | None) -> LocomotionTask:
+    """Makes the task, and refuses settings that cannot be trained on these devices, before anything is written."""
+    require_positive(
+        seeds=options.seeds, width=options.width, episode=options.episode, clock_period=options.clock_period
+    )
+    require_positive_if_given(options, ["steps", "until", "window", "lanes"])
+    require_seed(options.seed, options.seeds)
+    if not (math.isfinite(options.upright) and options.upright >= 0):
+        raise InputError(f"--upright is {options.upright}; expected 0 or a positive number")
+    creature, clock, upright = creature_named(options.creature), options.clock_period, options.upright
+    task = make_task(creature, episode=options.episode, clock_period=clock, upright=upright)
+    shares(mesh, settings_of(task, options.window, options.lanes).lanes, f"{LANES} (--lanes)")
+    return task
 
 
-def announce(task: Task) -> None:
+def announce(task: LocomotionTask) -> None:
     """Prints the creature and the episode."""
     size = f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, {task.length:.3g} m long"
     print(f"{task.creature.name}: {size}; episodes of {task.episode} steps of {TIME_STEP} s; f64")
@@ -82,69 +82,67 @@ def announce(task: Task) -> None:
         print(line)
 
 
-def learned(
-    task: Task,
-    method: Method,
-    given: Options,
-    mesh: Mesh | None,
-    *,
-    directory: Path | None = None,
-    resume: bool = False,
-) -> Trained:
-    """Trains all seeds of one method, with checkpoints in `directory`, if any."""
-    return reported(
-        given,
-        method,
-        given.steps or STEPS[method],
-        lambda seeds, goal, report: train(
-            task,
-            method,
-            seeds=seeds,
-            goal=goal,
-            width=given.width or WIDTH,
-            window=given.window,
-            lanes=given.lanes,
-            mesh=mesh,
-            directory=directory,
-            resume=resume,
-            report=report,
-        ),
-    )
+def trained(task: LocomotionTask, options: LocomotionOptions, mesh: Mesh | None, **stored: Any) -> TrainedPolicies:
+    """Trains all seeds; `stored` are the arguments of `train` on checkpoints."""
+
+    def run(seeds: Sequence[int], goal: Goal, report: Report) -> TrainedPolicies:
+        sizes = {"width": options.width, "window": options.window, "lanes": options.lanes}
+        return train(task, seeds=seeds, goal=goal, mesh=mesh, report=report, **sizes, **stored)
+
+    return reported(options, "gradient", options.steps or STEPS, run)
 
 
-def reported(given: Options, method: str, steps: int, run: Callable[[Sequence[int], Goal, Report], Trained]) -> Trained:
+def reported(
+    options: LocomotionOptions,
+    method: str,
+    steps: int,
+    run: Callable[[Sequence[int], Goal, Report], TrainedPolicies],
+) -> TrainedPolicies:
     """Trains all seeds by `run(seeds, goal, report)`, `steps` environment steps each, and shows the progress."""
-    with progress(given.seeds * steps, "environment steps") as show:
+    with progress(options.seeds * steps, "environment steps") as show:
 
         def report(seed: int, at: Record) -> None:
-            done = (seed - given.seed) * steps + min(at.steps, steps)
+            done = (seed - options.seed) * steps + min(at.steps, steps)
             skipped = f", {at.skipped} skipped" if at.skipped else ""
             show(done, f"{method}, seed {seed}: {at.distance:.3f} body lengths{skipped}")
 
-        return run(range(given.seed, given.seed + given.seeds), Goal(steps, given.until or math.inf), report)
+        seeds = range(options.seed, options.seed + options.seeds)
+        return run(seeds, Goal(steps, options.until or math.inf), report)
 
 
 def write_run(
-    folder: Path, task: Task, method: str, trained: Trained, given: Options, settings: Any, *, figures: bool
+    folder: Path,
+    task: LocomotionTask,
+    policies: TrainedPolicies,
+    settings: dict[str, Any],
+    *,
+    method: str = "gradient",
+    figures: bool,
 ) -> dict[str, float]:
-    """Writes model, metrics, figure and GIF (at half speed) of the best seed; returns the metrics."""
-    best, creature = trained.best, task.creature.name
+    """Writes model, metrics, figure and GIF (at half speed) of the best seed; returns the metrics.
+
+    Args:
+        folder: where files are written.
+        task: of the policies.
+        policies: at least one of which has a finite distance.
+        settings: of the learning, stored with the model.
+        method: of the learning.
+        figures: whether to draw.
+
+    Raises:
+        InputError: no evaluation converged.
+    """
+    best, creature = policies.best, task.creature.name
     if not math.isfinite(best.distance):
         raise InputError(f"no evaluation converged; {folder} holds no model: lower the number of steps or the width")
-    description = {
-        "name": f"locomotion-{method}",
-        "creature": creature,
-        "width": given.width or WIDTH,
-        "precision": "f64",
-        "clock_period": task.clock_period,
-        "settings": settings._asdict(),
-    }
-    save_tree(folder, MODEL, best.parameters, {"model": description})
-    seen = shown_walk(task, trained.policy, best.parameters, task.episode)
-    numbers = metrics_of(task, trained, seen)
+    facts = {"name": f"locomotion-{method}", "creature": creature, "precision": "f64"}
+    facts |= {"clock_period": task.clock_period, "settings": settings}
+    save_tree(folder, MODEL, best.parameters, {"model": facts})
+    seen = shown_walk(task, policies.policy, best.parameters, task.episode)
+    numbers = metrics_of(task, policies, seen)
     write_json(folder / "metrics.json", numbers)
     if figures:
-        records = [of.records for of in trained.learned]
+        records = [seed.records for seed in policies.learned]
         write_figure(folder / "learning.png", learning_figure(records, method=method))
         x = np.concatenate([task.creature.mesh.vertices[None], seen.x])
         write_soft_body_gif(
@@ -160,16 +158,15 @@ def write_run(
     return numbers
 
 
-def metrics_of(task: Task, trained: Trained, seen: Walk) -> dict[str, float]:
+def metrics_of(task: LocomotionTask, policies: TrainedPolicies, seen: Walk) -> dict[str, float]:
     """Finite metrics of the best seed, whose episode is `seen`, and medians over all seeds."""
-    best = trained.best
-    records = [of.records for of in trained.learned]
+    best, records = policies.best, [seed.records for seed in policies.learned]
     heights = seen.x[:, :, 1].mean(axis=1) / task.creature.mesh.vertices[:, 1].mean()
     numbers = {
         "distance_body_lengths": best.distance,
-        "distance_body_lengths_median": np.median([float(of.distance) for of in trained.learned]),
+        "distance_body_lengths_median": np.median([float(seed.distance) for seed in policies.learned]),
         "environment_steps": best.records[-1].steps,
-        "evaluation_steps": best.evaluation_steps,
+        "evaluation_steps": len(best.records) * task.episode,
         "environment_steps_to_one_body_length": median_to_reach(records, GOAL, "steps"),
         "seconds_to_one_body_length": median_to_reach(records, GOAL, "seconds"),
         "compile_seconds": best.compile_seconds,
@@ -179,3 +176,26 @@ def metrics_of(task: Task, trained: Trained, seen: Walk) -> dict[str, float]:
         "least_height": heights.min(),
     }
     return {name: float(value) for name, value in numbers.items() if math.isfinite(value)}
+
+
+def first_reaching(records: Sequence[Record], distance: float) -> Record | None:
+    """First evaluation of a seed that reached the distance; `None` if none did."""
+    return next((record for record in records if record.distance >= distance), None)
+
+
+def median_to_reach(seeds: Sequence[Sequence[Record]], distance: float, field: str) -> float:
+    """Median over seeds of the "steps" or "seconds" to the distance; infinite if at least half never reached it."""
+    reached = [first_reaching(records, distance) for records in seeds]
+    return float(np.median([math.inf if record is None else getattr(record, field) for record in reached]))
+
+
+def learning_figure(seeds: Sequence[Sequence[Record]], *, method: str) -> Figure:
+    """Distance of every evaluation against environment steps, with a line per seed."""
+    figure, [[axis]] = style.figure(height=3.4)
+    for records in seeds:
+        steps, distances = [record.steps for record in records], [record.distance for record in records]
+        axis.plot(steps, distances, color=style.BLUE, linewidth=1.2, alpha=0.8)
+    axis.axhline(1.0, color="0.6", linewidth=0.8, linestyle="--")
+    axis.set(xlabel="environment steps", ylabel="distance in one episode, body lengths")
+    style.title(axis, f"{method}, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}")
+    return figure

@@ -15,16 +15,13 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.balance import Law
-from dln_jax.control.optimal.evaluation import evaluate, starts
-from dln_jax.control.optimal.fitted import Iteration, Progress, fit_values
-from dln_jax.control.optimal.plant_fits import FITS, Fit
-from dln_jax.control.optimal.plants import PLANTS, ValuePlant
-from dln_jax.control.optimal.policy import hjb_policy
-from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal
-from dln_jax.control.optimal.residual import Stage, discounts_down_to, fit_residual
+from dln_jax.control.optimal.fitted import Iteration, ValueProgress, fit_values
+from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant, ValueSettings, evaluate, starts
+from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal, hjb_policy
+from dln_jax.control.optimal.residual import ResidualStage, discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
-from dln_jax.files import as_type
+from dln_jax.control.state_space import Law
+from dln_jax.files import matches
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
@@ -120,12 +117,12 @@ def family_of(plant: ValuePlant, family: Family) -> ValueNetwork:
     return value_network(plant.problem, **{**dataclasses.asdict(family), "activation": activation(family.activation)})
 
 
-def usual(name: str, method: str) -> Fit:
+def usual(name: str, method: str) -> ValueSettings:
     """Default network and training settings of a plant."""
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
     if method == "residual":
-        return Fit((24, 24), Iteration(), 30.0)
+        return ValueSettings((24, 24), Iteration(), 30.0)
     return FITS.get(OTHER_NAMES.get(name, name), FITS["cart-pole"])
 
 
@@ -140,7 +137,7 @@ def by_iteration(
     """Fits value functions by fitted value iteration, one per seed; devices share the states."""
     done, total = itertools.count(1), len(seeds) * numbers.iterations
 
-    def report_progress(at: Progress) -> None:
+    def told(at: ValueProgress) -> None:
         report(next(done), total, f"cost and misfit {at.validation:.4g}")
 
     fits = fit_values(
@@ -171,11 +168,11 @@ def by_equation(
         of_parameters, of_samples = jax.random.split(jax.random.key(seed))
         done, began = itertools.count(1 + place * stages), time.perf_counter()
 
-        def report_progress(stage: Stage, done: Iterator[int] = done) -> None:
+        def told(stage: ResidualStage, done: Iterator[int] = done) -> None:
             text = f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}"
             report(next(done), len(seeds) * stages, text)
 
-        solution = fit_residual(
+        found = fit_hjb(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
             discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=report_progress,
         )  # fmt: skip
@@ -189,12 +186,12 @@ def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) ->
     for where in ("down", "uniform"):
         evaluation = evaluate(plant, law, starts(plant, where, count, seed))
         numbers |= {
-            f"{where}_return_mean": float(np.mean(evaluation.returns)),
-            f"{where}_return_median": float(np.median(evaluation.returns)),
-            f"{where}_return_worst": float(np.min(evaluation.returns)),
-            f"{where}_up_share": float(np.mean(np.isfinite(evaluation.settled))),
-            f"{where}_settled_median_seconds": float(np.median(evaluation.settled)),
-            f"{where}_control_most": evaluation.most,
+            f"{where}_return_mean": float(np.mean(found.returns)),
+            f"{where}_return_median": float(np.median(found.returns)),
+            f"{where}_return_worst": float(np.min(found.returns)),
+            f"{where}_up_share": float(np.mean(np.isfinite(found.settled))),
+            f"{where}_settled_median_seconds": float(np.median(found.settled)),
+            f"{where}_control_most": found.largest,
         }
     return numbers
 

@@ -12,10 +12,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dln_jax.figures import soft_body_frame, style
-from dln_jax.locomotion.learning import Goal
-from dln_jax.locomotion.methods import shown_walk, train
-from dln_jax.locomotion.task import creature_named, make_task
+from dln_jax.locomotion import Goal, creature_named, make_task, shown_walk, train
 
 jax.config.update("jax_enable_x64", True)
 
@@ -38,7 +35,6 @@ print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles
 records = []
 trained = train(
     task,
-    "gradient",
     seeds=[0],
     goal=Goal(steps=STEPS, distance=GOAL),
     report=lambda seed, record: records.append(record),

@@ -45,7 +45,7 @@ regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
 near = control.regulated(regulator, goal, at.u, joints)
 levels = 10.0 ** np.arange(-2, 1.01, 0.1)
 region = control.region_of_attraction(
-    field, near, regulator, goal, joints, least=-LIMIT, most=LIMIT, rate=500.0, levels=levels, starts=32
+    field, near, regulator, goal, joints, lower=-LIMIT, upper=LIMIT, rate=500.0, levels=levels, starts=32
 )
 print(f"the regulator stabilises states whose value is below {region.level:.3g}")
 

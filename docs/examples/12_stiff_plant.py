@@ -50,12 +50,12 @@ def off(x):
     return x[0] ** 2 + 2 * (1 - jnp.cos(x[2])) + 0.02 * (x[3] ** 2 + (0.18 * x[5]) ** 2)
 
 
-problem = control.Problem(
+problem = control.TrajectoryProblem(
     step=control.integrated(field, DT, method=RADAU_3),
     cost=lambda x, u: DT * (off(x) + 1e-3 * u @ u),
     final_cost=lambda x: 50 * off(x),
-    least=-LIMIT,
-    most=LIMIT,
+    lower=-LIMIT,
+    upper=LIMIT,
 )
 guess, still = np.linspace(start, goal, STEPS + 1), np.zeros((STEPS, 1))
 solution = jax.jit(lambda: control.shoot(problem, start, guess, still))()

@@ -17,8 +17,8 @@ from dln_jax.data.splits import hold_out, split
 from dln_jax.figures import rotary_pendulum_drawing, style
 from dln_jax.learning.dynamics import problem as torque_problem
 from dln_jax.learning.rates import problem as rate_problem
+from dln_jax.locomotion.gradient import shown_walk, train
 from dln_jax.locomotion.learning import Goal
-from dln_jax.locomotion.methods import shown_walk, train
 from dln_jax.locomotion.task import creature_named, make_task
 from dln_jax.mechanics.integrators import gauss_legendre4, rk4, rollout, second_order
 from dln_jax.models.lagrangian import make_delan
@@ -121,7 +121,7 @@ def swing_up(frames: int) -> Film:
     swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
     levels = 10.0 ** np.arange(-2, 1.01, 0.1)
     region = control.region_of_attraction(
-        field, near, regulator, goal, kinds, least=-limit, most=limit, rate=500.0, levels=levels, starts=32
+        field, near, regulator, goal, kinds, lower=-limit, upper=limit, rate=500.0, levels=levels, starts=32
     )
     law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, kinds), region.level)
     start = jnp.array([0.0, np.pi + 0.1, 0.0, 0.0])
@@ -138,7 +138,7 @@ def swing_up(frames: int) -> Film:
 def crawler(frames: int) -> Film:
     """A soft body crawls by a policy that was learned through the simulator."""
     task = make_task(creature_named("crawler"))
-    trained = train(task, "gradient", seeds=[0], goal=Goal(steps=20_000, distance=2.0))
+    trained = train(task, seeds=[0], goal=Goal(steps=20_000, distance=2.0))
     seen = shown_walk(task, trained.policy, trained.best.parameters, 2 * task.episode)
     x, pull = sampled(seen.x, frames), sampled(seen.actuation, frames)
     mesh, muscles = task.creature.mesh, np.asarray(task.creature.muscles)

@@ -97,7 +97,7 @@ def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
     ("name", "arguments", "resumes"),
     [
         ("compare_locomotion", {}, False),
-        ("train_locomotion", {"method": "evolution"}, True),
+        ("train_locomotion", {"creature": "biped"}, True),
         ("train_hnn_pixels", {}, True),
     ],
 )

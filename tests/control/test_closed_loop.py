@@ -34,7 +34,7 @@ def test_controls_are_held_and_integrated_exactly():
 
 
 def test_limits_and_delay():
-    run = simulate(FIELD, COUNTING, [0.0, 0.0], hardware=Hardware(most=5.0, delay=3), **SETTINGS)
+    run = simulate(FIELD, COUNTING, [0.0, 0.0], hardware=Hardware(upper=5.0, delay=3), **SETTINGS)
     np.testing.assert_array_equal(run.u[:, 0], np.minimum(np.maximum(np.arange(20) - 2, 0), 5))
 
 

@@ -21,7 +21,7 @@ def explored():
 def test_torques_keep_to_the_limits_and_are_those_that_arrive_late(explored):
     data, runs = explored
     asked = data.tau[:, 0].reshape(2, -1)
-    assert np.abs(asked).max() <= EXCITATION.share * PLANT.hardware.most
+    assert np.abs(asked).max() <= EXCITATION.share * PLANT.hardware.upper
     assert (data.tau[:, 1] == 0).all()
     np.testing.assert_allclose(runs.u[:, 1:, 0], asked[:, :-1], atol=1e-12)
     assert (runs.u[:, 0] == 0).all()

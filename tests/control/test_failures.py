@@ -9,20 +9,20 @@ from dln_jax.control import (
     EnergyGains,
     Gains,
     Hardware,
-    Problem,
     Reference,
+    TrajectoryProblem,
     computed_torque,
     energy_shaping,
     feed_forward,
     first_plan,
     gravity_compensation,
-    limited,
     linearise,
     lqr,
     mpc,
     partial_linearisation,
     parts_of,
     regulated,
+    saturated,
     simulate,
     stateless,
     switched,
@@ -51,7 +51,9 @@ def laws():
     # Gains of zero: a law of few coordinates.
     trackers = {make.__name__: make(PLANT, Gains(np.zeros(2), np.zeros(2))) for make in TRACKERS}
     first, otherwise = trackers["computed_torque"], trackers["feed_forward"]
-    problem = Problem(lambda x, u: x + 0.01 * FIELD(x, u), lambda x, u: x @ x + u @ u, lambda x: x @ x, -0.05, 0.05)
+    problem = TrajectoryProblem(
+        lambda x, u: x + 0.01 * FIELD(x, u), lambda x, u: x @ x + u @ u, lambda x: x @ x, -0.05, 0.05
+    )
     plan, act = first_plan(problem, GOAL, np.zeros((3, 1))), mpc(problem)
     differences = with_differences(far, 2, rate=500.0, cutoff=50.0)
 
@@ -84,7 +86,7 @@ def test_no_law_answers_where_its_state_is_no_number():
     for place, number in enumerate([np.nan, np.inf]):
         bad[4 * place : 4 * place + 4][np.diag_indices(4)] = number
     every = laws()
-    all_of = jax.jit(jax.vmap(lambda x: {name: limited(law(x), -0.05, 0.05) for name, law in every.items()}))(bad)
+    all_of = jax.jit(jax.vmap(lambda x: {name: saturated(law(x), -0.05, 0.05) for name, law in every.items()}))(bad)
     for name, answers in all_of.items():
         assert np.isnan(answers[:8]).all(), name
         assert np.isfinite(answers[8]).all(), name

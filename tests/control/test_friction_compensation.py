@@ -8,7 +8,7 @@ import pytest
 from dln_jax.control import Gains, Reference, feed_forward, field_of, simulate
 from dln_jax.control.closed_loop import Controller
 from dln_jax.control.desktop_plants import desktop_cart_pole
-from dln_jax.control.friction_compensation import friction_compensation, without_friction
+from dln_jax.control.tracking import friction_compensation, without_friction
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients
 from dln_jax.scenes.pendulums import pendulum

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Problem, field_of, integrated, mpc, shoot, time_varying_lqr
+from dln_jax.control import TrajectoryProblem, field_of, integrated, mpc, shoot, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
 from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
@@ -16,7 +16,7 @@ from dln_jax.types import InputError
 RANDOM = np.random.default_rng(0)
 F, G = np.eye(3) + 0.2 * RANDOM.normal(size=(3, 3)), RANDOM.normal(size=(3, 2))
 START = np.array([1.0, -2.0, 0.5])
-LINEAR = Problem(
+LINEAR = TrajectoryProblem(
     lambda x, u: jnp.asarray(F) @ x + jnp.asarray(G) @ u, lambda x, u: x @ x + 0.5 * u @ u, lambda x: 2 * x @ x
 )
 N = 8
@@ -43,7 +43,7 @@ def swing_up():
     scene = cart_pole()
     field = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
     off = lambda x: x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * (x[2] ** 2 + x[3] ** 2)  # noqa: E731
-    return Problem(
+    return TrajectoryProblem(
         integrated(field, DT), lambda x, u: DT * (off(x) + 0.01 * u[0] ** 2), lambda x: 50 * off(x), -10.0, 10.0
     )
 
@@ -51,7 +51,7 @@ def swing_up():
 @functools.cache
 def shooter(exact):
     def found(x, states, u, limit):
-        return shoot(swing_up()._replace(least=-limit, most=limit), x, states, u, exact=exact, tolerance=1e-12)
+        return shoot(swing_up()._replace(lower=-limit, upper=limit), x, states, u, exact=exact, tolerance=1e-12)
 
     return jax.jit(found)
 

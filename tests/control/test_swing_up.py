@@ -104,7 +104,7 @@ def test_the_region_of_attraction_is_that_of_the_unstable_mode():
     at = linearise(field, goal, jnp.zeros(1))
     regulator = lqr(at.A, at.B, np.eye(2), np.eye(1))
     law = regulated(regulator, goal, at.u, joints)
-    found = region_of_attraction(field, law, regulator, goal, joints, least=-1.0, most=1.0, rate=100.0, seconds=10.0)
+    found = region_of_attraction(field, law, regulator, goal, joints, lower=-1.0, upper=1.0, rate=100.0, seconds=10.0)
     largest = 1 / np.sum(np.linalg.inv(regulator.S))
     assert 0.5 * largest < found.level < 1.05 * largest and found.share == 1
 

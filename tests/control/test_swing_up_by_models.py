@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.desktop_plants import desktop_plant
-from dln_jax.control.outcomes import hanging_starts, outcomes
+from dln_jax.control.closed_loop import hanging_starts, outcomes
+from dln_jax.control.desktop_plants import desktop_plant, law_of, model_of_plant, nominal_model, try_starts
 from dln_jax.control.swing_up import nearest_equilibrium, swing_up
-from dln_jax.control.swing_up_runs import law_of, model_of_plant, nominal_model, try_starts
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -49,7 +48,7 @@ def test_the_model_s_own_equilibrium_is_found():
 
 def build(model, **changed):
     lab = PLANT.hardware
-    keywords = {"postures": ANGLES, "least": lab.least, "most": lab.most, **changed}
+    keywords = {"postures": ANGLES, "lower": lab.lower, "upper": lab.upper, **changed}
     needs = PLANT.scene.needs
     return swing_up(model, needs.actuation, needs.joints, np.zeros(2), PLANT.numbers, **keywords)
 

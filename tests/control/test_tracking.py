@@ -12,7 +12,7 @@ from dln_jax.control import (
     feed_forward,
     gravity_compensation,
     judged,
-    limited,
+    saturated,
     trusted,
 )
 from dln_jax.data.schema import from_arrays
@@ -64,7 +64,9 @@ def test_an_indefinite_or_unknown_state_falls_back():
     q, wanted = jnp.array([0.4, -1.1]), reference(0.3)
     first, other = computed_torque(ARM, Gains(P, D)), feed_forward(ARM, Gains(P, D))
     for plant, outside, expected in ((ARM, False, first), (ARM, True, other), (bad, False, other)):
-        law = jax.jit(trusted(plant, first, other, outside=lambda q, qd, qdd, flag=outside: jnp.asarray(flag)))
+        law = jax.jit(
+            trusted(plant, first, other, out_of_distribution=lambda q, qd, qdd, flag=outside: jnp.asarray(flag))
+        )
         tau, usable = law(q, wanted.qd, wanted)
         np.testing.assert_allclose(tau, expected(q, wanted.qd, wanted), rtol=1e-12)
         assert bool(usable) == (expected is first)
@@ -92,5 +94,5 @@ def test_a_model_is_judged_by_motions_that_it_has_not_seen():
 
 
 def test_limits_leave_what_is_no_number():
-    found = limited(jnp.array([5.0, -5.0, jnp.nan]), -1.0, 2.0)
+    found = saturated(jnp.array([5.0, -5.0, jnp.nan]), -1.0, 2.0)
     np.testing.assert_array_equal(found, [2.0, -1.0, np.nan])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dln_jax.control import Run
+from dln_jax.control import ClosedLoopRun
 from dln_jax.figures import (
     cart_pole_drawing,
     closed_loop_traces,
@@ -22,7 +22,7 @@ U = 2.0 * np.sign(np.sin(9 * T[:-1]))[None, :, None].repeat(3, axis=0)
 
 
 def test_traces_show_every_coordinate_and_the_limits():
-    runs = Run(T, X, U, X[:, :-1])
+    runs = ClosedLoopRun(T, X, U, X[:, :-1])
     joules = 10.0 * (-1.0) ** np.arange(51) * np.ones((3, 1))  # leaps are no turns
     options = {"limits": (-2.0, np.inf), "energy": joules, "goal_energy": 0.1}
     figure = closed_loop_traces(runs, ("prismatic", "revolute"), **options)

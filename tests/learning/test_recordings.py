@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.desktop_plants import desktop_plant
+from dln_jax.control.desktop_plants import desktop_plant, model_of_plant
 from dln_jax.control.exploration import Excitation, explore
-from dln_jax.control.swing_up_runs import model_of_plant
 from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
 from dln_jax.learning.recordings import identified, learned, prepare
 from dln_jax.models.trigonometric import make_trigonometric

@@ -1,4 +1,4 @@
-"""Locomotion: the task, its environment, and the ways of learning, on a body of six vertices and short episodes."""
+"""Locomotion: the task, its environment, and the learning, on a body of six vertices and short episodes."""
 
 import json
 import os
@@ -16,10 +16,8 @@ from small_creature import EPISODE, block_task
 from dln_jax.cli.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.locomotion.environment import CreatureEnvironment
-from dln_jax.locomotion.evolution import EvolutionSettings, centred_ranks, estimate, make_evolution_learner
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, compile_learner, learn
-from dln_jax.locomotion.policy import make_policy
+from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import FALLEN, Walk, actuation_of, beginning, judged, observe
 from dln_jax.scale.mesh import AXIS
 from dln_jax.softbody.mesh.mesh import make_mesh
@@ -87,14 +85,13 @@ def test_observations_know_no_place_along_the_ground(task):
 
 
 def test_what_a_fallen_body_travels_does_not_count(task):
-    start = beginning(task)
-    x = start.state.x + 0.1 * jnp.arange(1, 5)[:, None, None] * jnp.asarray([1.0, 0.0])
+    x = beginning(task).state.x + 0.1 * jnp.arange(1, 5)[:, None, None] * jnp.asarray([1.0, 0.0])
     tilt = jnp.asarray([0.0, 0.9 * FALLEN, -1.1 * FALLEN, 0.0])
     seen = Walk(x, jnp.ones((4, 2)), jnp.ones(4, bool), jnp.arange(4.0), tilt)
-    episode = judged(task, start, seen)
+    episode = judged(task, seen)
     np.testing.assert_allclose(episode.distance, 0.2 / task.length, rtol=1e-12)
     assert episode.total_reward == 1.0
-    lost = judged(task, start, seen._replace(converged=jnp.asarray([True, True, True, False])))
+    lost = judged(task, seen._replace(converged=jnp.asarray([True, True, True, False])))
     assert np.isnan(lost.distance) and np.isnan(lost.total_reward)
 
 
@@ -107,7 +104,6 @@ def test_gradients_increase_the_distance_and_the_same_seed_gives_the_same(compil
     assert first.distance > max(0.01, 4 * first.records[0].distance)
     assert [record.steps for record in first.records] == [48 * (n + 1) for n in range(20)]
     assert first.records[-1].skipped == 0
-    assert first.evaluation_steps == 20 * EPISODE
     again, other = (learn(compiled, seed=seed, goal=Goal(2 * compiled.learner.steps)) for seed in (0, 1))
     assert [r.distance for r in again.records] == [r.distance for r in first.records[:2]]
     assert [r.distance for r in other.records] != [r.distance for r in first.records[:2]]
@@ -166,52 +162,15 @@ def test_updates_without_a_gradient_are_skipped_and_counted(compiled):
     assert not same(after.parameters, state.parameters)
 
 
-def test_the_evolution_estimate_is_the_gradient_of_a_quadratic():
-    random = np.random.default_rng(0)
-    p, deviation = 5, 0.3
-    curvature = random.normal(size=(p, p))
-    curvature, slope, theta = curvature + curvature.T, random.normal(size=p), random.normal(size=p)
-
-    def fitness(x):
-        return 0.5 * x @ curvature @ x + slope @ x
-
-    def estimated(noise):
-        moves = deviation * noise
-        plus, minus = (jnp.asarray([fitness(theta + sign * move) for move in moves]) for sign in (1, -1))
-        return estimate(plus, minus, jnp.asarray(noise), deviation)
-
-    exact = curvature @ theta + slope
-    # Directions whose mean outer product is the identity leave no sampling error.
-    np.testing.assert_allclose(estimated(np.sqrt(p) * np.eye(p)), exact, rtol=1e-10)
-    sampled = estimated(random.normal(size=(20_000, p)))
-    np.testing.assert_allclose(sampled, exact, atol=0.05 * np.linalg.norm(exact))
-
-
-def test_ranks_are_centred_and_put_what_is_no_number_last():
-    ranks = centred_ranks(jnp.asarray([3.0, jnp.nan, 1e9, -2.0, 0.0]))
-    np.testing.assert_allclose(ranks, [0.25, -0.5, 0.5, -0.25, 0.0])
-
-
-def test_evolution_improves(task, policy, compiled):
-    settings = EvolutionSettings(pairs=4, deviation=0.3, learning_rate=0.1, generations=5)
-    learner = make_evolution_learner(task, policy, settings)
-    evolution = compiled._replace(learner=learner, improve=jax.jit(learner.improve))
-    learned = learn(evolution, seed=0, goal=Goal(6 * evolution.learner.steps))
-    assert evolution.learner.steps == 5 * 8 * EPISODE
-    assert learned.distance > max(0.005, 4 * learned.records[0].distance)
-    assert learned.records[-1].skipped == 0
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--steps", "0"), "steps is 0"),
         (("--upright", "-1"), "--upright is -1"),
-        (("--method", "evolution", "--resume", "--out", "run"), "holds none"),
+        (("--resume", "--out", "run"), "holds none"),
         (("--episode", "50"), "a window has 40 steps"),
         (("--window", "7"), "a window has 7 steps"),
-        (("--window", "8", "--method", "evolution"), "--window is not used by --method evolution"),
-        (("--lanes", "3"), "3 creatures are no pairs, in which gradient takes them"),
+        (("--lanes", "3"), "3 creatures are no pairs, in which the gradient takes them"),
         (("--lanes", "0"), "lanes is 0"),
         (("--seed", "-1"), "seed is -1"),
         (("--seed", "4294967295", "--seeds", "2"), "and 1 after it"),
@@ -223,13 +182,10 @@ def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(
-    ("make_learner", "settings"), [(make_gradient_learner, QUICK), (make_evolution_learner, EvolutionSettings())]
-)
-def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy, make_learner, settings):
+def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy):
     mesh = Mesh(np.array(7 * jax.devices()[:1]), (AXIS,))
     with pytest.raises(InputError, match="creatures side by side cannot be split over 7 devices"):
-        make_learner(task, policy, settings, mesh=mesh)
+        make_gradient_learner(task, policy, QUICK, mesh=mesh)
 
 
 def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):
@@ -251,10 +207,3 @@ def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_pat
         write_soft_body_gif(tmp_path / "no.gif", mesh, x, t[:4])
     with pytest.raises(InputError, match="actuation has shape"):
         write_soft_body_gif(tmp_path / "no.gif", mesh, x, t, muscles=muscles, actuation=np.ones((5, 3)))
-
-
-def test_the_settings_of_the_methods_are_json():
-    from dln_jax.locomotion.methods import METHODS, SETTINGS, STEPS
-
-    assert set(METHODS) == set(SETTINGS) == set(STEPS)
-    json.dumps({name: settings._asdict() for name, settings in SETTINGS.items()})

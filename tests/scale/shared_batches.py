@@ -14,15 +14,14 @@ from sharing import begun
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration, fit_value
 from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.learning.soft_body_identification import ObservedMotions, identify
-from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learner
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, compile_learner, learn
-from dln_jax.locomotion.policy import make_policy
+from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import make_task
-from dln_jax.scale.mesh import batch_mesh, program
+from dln_jax.scale.mesh import batch_mesh
+from dln_jax.softbody.mesh.creatures import Creature
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import Creature
 from dln_jax.softbody.scene import State
@@ -79,27 +78,18 @@ def equation(mesh):
     network = value_network(LINE, widths=())
     start, given = network.init(jax.random.key(2)), {"samples": 9, "validation": 4, "iterations": 3, "rounds": 1}
     start = jax.tree.map(lambda leaf: leaf.astype(float), start)
-    found = fit_residual(LINE, network.value_and_gradient, start, jax.random.key(3), mesh=mesh, **given)
+    found = fit_hjb(LINE, network.value_and_gradient, start, jax.random.key(3), mesh=mesh, **given)
     return found.parameters, len(found.stages)
 
 
 def main(folder, name, *, whole):
-    mesh, task = batch_mesh(), block()
-    policy = make_policy(task, width=2)
-    evolution = make_evolution_learner(task, policy, EvolutionSettings(pairs=2, generations=1), mesh=mesh)
-    by_evolution = compile_learner(task, evolution, mesh)
-    found = {
-        "evolution": walked(folder, "evolution", by_evolution),
-        "stiffness": stiffness(mesh),
-        "value": value(mesh),
-    }
+    mesh = batch_mesh()
+    found = {"stiffness": stiffness(mesh), "value": value(mesh)}
     if whole:
-        settings = GradientSettings(window=3, pairs=2, updates=1)
-        gradient = make_gradient_learner(task, policy, settings, mesh=mesh)
-        # Both have one program of evaluation.
-        improve = program(gradient.improve, mesh).lower(jax.eval_shape(lambda: gradient.start(0))).compile()
-        by_gradient = by_evolution._replace(learner=gradient, improve=improve)
-        found |= {"gradient": walked(folder, "gradient", by_gradient), "equation": equation(mesh)}
+        task, settings = block(), GradientSettings(window=3, pairs=2, updates=1)
+        gradient = make_gradient_learner(task, make_policy(task, width=2), settings, mesh=mesh)
+        found |= {"gradient": walked(folder, "gradient", compile_learner(task, gradient, mesh))}
+        found |= {"equation": equation(mesh)}
     arrays = {
         f"{subject} {number}": np.asarray(leaf)
         for subject, results in found.items()
@@ -110,5 +100,5 @@ def main(folder, name, *, whole):
 
 if __name__ == "__main__":
     own_folder, own_name, of_two = begun()
-    # Gradients of a body take long to compile, and share what evolution shares: not in two processes too.
+    # Gradients of a body take long to compile: not in two processes too.
     main(own_folder, own_name, whole=not of_two)

@@ -1,10 +1,10 @@
-"""Swing up a pole by a model that was learned from it: explore the plant, learn, make a controller, close the loop.
+"""Swing up a pole with a model that was learned from it: explore the plant, learn, design a controller, close the loop.
 
-Plants are simulated as they stand on a desk: dry friction, limits, encoders, noise, torques a sample late, at 500 Hz.
-A rough model explores; q and the torques asked for are all that is recorded. Models: delan (a structured deep
-Lagrangian network with friction), identified (linear in its parameters), analytic (the nominal sizes, no friction),
-known (the plant itself). Each gets the same energy law, regulator and friction compensation, with the same gains. A run
-folder gets data.npz, the model, metrics.json, config.json, and a figure and a film of the runs.
+The simulated plants have dry friction, limits, encoders, noise and torques that act a sample late, at 500 Hz. A rough
+model explores; only q and the commanded torques are recorded. Models: delan (a structured deep Lagrangian network with
+friction), identified (linear in its parameters), analytic (the nominal dimensions, no friction), known (the plant
+itself). All use the same energy law, regulator and friction compensation, with the same gains. A run folder gets
+data.npz, the model, metrics.json, config.json, and a figure and an animation of the runs.
 """
 
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ class Arguments(Folder, Drawn):
     """Plant, model, and where the results go."""
 
     plant: Annotated[str, choice(NAMES)] = "rotary-pendulum"
-    """The plant; furuta is the rotary pendulum by its other name."""
+    """The plant; furuta is another name of the rotary pendulum."""
     model: Annotated[str, choice(MODELS)] = "delan"
-    """What the controller is made of."""
+    """The model from which the controller is designed."""
     seconds_of_data: float = 30.0
-    """Seconds of motion to learn from, at 500 Hz; an episode of them is to select by."""
+    """Seconds of motion to learn from, at 500 Hz, including an episode for validation."""
     starts: int = 100
-    """Starts near hanging at rest."""
+    """Number of starts near hanging at rest."""
     seed: int = 0
-    """Of the exploration, the network's initial parameters, the starts and the noise."""
+    """Seed of the exploration, the network's initial parameters, the starts and the noise."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Explores the plant, learns the model, swings up and writes the run folder."""
-    checked = asked(given.plant, given.model, given.seconds_of_data, given.starts, given.seed)
-    with command_folder(given, "swing_up") as folder:
-        swing_up(checked, folder, figures=given.figures)
+    task = asked(options.plant, options.model, options.seconds_of_data, options.starts, options.seed)
+    with command_folder(options, "swing_up") as folder:
+        swing_up(task, folder, figures=options.figures)
         print(f"run folder: {folder}")

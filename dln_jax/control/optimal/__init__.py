@@ -2,10 +2,9 @@
 
 from dln_jax.control.optimal import action_costs
 from dln_jax.control.optimal.action_costs import ActionCost
-from dln_jax.control.optimal.fitted import Fitted, Iteration, fit_value, fit_values
+from dln_jax.control.optimal.fitted import FittedValue, Iteration, fit_value, fit_values
 from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import Grid, interpolated
-from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import (
     Affine,
     ControlProblem,
@@ -13,11 +12,12 @@ from dln_jax.control.optimal.problem import (
     checked,
     from_field,
     from_plant,
+    hjb_policy,
     hjb_residual,
     optimal_control,
     rates,
 )
-from dln_jax.control.optimal.residual import ResidualFit, Stage, discounts_down_to, fit_residual
+from dln_jax.control.optimal.residual import HJBFit, ResidualStage, discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 
@@ -26,19 +26,19 @@ __all__ = [
     "Affine",
     "Bounds",
     "ControlProblem",
-    "Fitted",
+    "FittedValue",
     "Grid",
     "GridValue",
+    "HJBFit",
     "Iteration",
-    "ResidualFit",
-    "Stage",
+    "ResidualStage",
     "ValueNetwork",
     "action_costs",
     "at_goal",
     "checked",
     "discounts_down_to",
     "extrapolated",
-    "fit_residual",
+    "fit_hjb",
     "fit_value",
     "fit_values",
     "from_field",

@@ -57,25 +57,16 @@ def quadratic(R: Any) -> ActionCost:
     )
 
 
-def _within(least: float, most: float, cost: Callable[[Array], Array]) -> Callable[[Array], Scalar]:
+def _within(lower: float, upper: float, cost: Callable[[Array], Array]) -> Callable[[Array], Scalar]:
     """Sum over controls, infinite if one is out of range; NaN stays NaN."""
-    return lambda u: jnp.sum(jnp.where((u < least) | (u > most), jnp.inf, cost(jnp.clip(u, least, most))))
+    return lambda u: jnp.sum(jnp.where((u < lower) | (u > upper), jnp.inf, cost(jnp.clip(u, lower, upper))))
 
 
 def _entropy(u: Array) -> Array:
     return xlogy(u, u) + xlogy(1 - u, 1 - u)
 
 
-def _sigmoid(w: Array) -> Array:
-    return softplus.first(w)
-
-
-def _huber(w: Array) -> Scalar:
-    size = jnp.abs(w)
-    return jnp.sum(jnp.where(size <= 1, 0.5 * w**2, size - 0.5))
-
-
-logistic = ActionCost(_within(0.0, 1.0, _entropy), _sigmoid, lambda w: jnp.sum(softplus.value(w)))
+logistic = ActionCost(_within(0.0, 1.0, _entropy), softplus.first, lambda w: jnp.sum(softplus.value(w)))
 """u log u + (1 - u) log(1 - u) on (0, 1)."""
 atan = ActionCost(
     _within(-np.pi / 2, np.pi / 2, lambda u: -jnp.log(jnp.cos(u))),
@@ -92,7 +83,11 @@ tanh = ActionCost(
 """The entropy of (u + 1)/2, zero at 0, on (-1, 1)."""
 bang_bang = ActionCost(_within(-1.0, 1.0, lambda u: 0 * u), jnp.sign, lambda w: jnp.sum(jnp.abs(w)))
 """Zero within [-1, 1]: the control is at a limit."""
-bang_lin = ActionCost(_within(-1.0, 1.0, lambda u: 0.5 * u**2), lambda w: jnp.clip(w, -1, 1), _huber)
+bang_lin = ActionCost(
+    _within(-1.0, 1.0, lambda u: 0.5 * u**2),
+    lambda w: jnp.clip(w, -1, 1),
+    lambda w: jnp.sum(jnp.where(jnp.abs(w) <= 1, 0.5 * w**2, jnp.abs(w) - 0.5)),
+)
 """½ u² within [-1, 1]: linear up to the limits."""
 
 

@@ -21,23 +21,53 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.optimal.boxes import drawn, widened
-from dln_jax.control.optimal.iteration import Iteration, Subject, iterate, score
+from dln_jax.control.optimal.flow import Targets, drawn, greedy, targets, widened
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.value_networks import ValueNetwork
 from dln_jax.control.optimal.worst_case import Disturbance
-from dln_jax.scale.mesh import local, program
+from dln_jax.scale.mesh import local, program, spread
 from dln_jax.types import InputError, require_positive
 
 VALIDATED = 256
 """Number of states from which the policy's cost is compared between iterations."""
 
 
-class Progress(NamedTuple):
+class Iteration(NamedTuple):
+    """Numbers of fitted value iteration."""
+
+    iterations: int = 36
+    starts: int = 1024
+    """States drawn per iteration."""
+    seconds: float = 3.0
+    """Time in s for which the policy is followed from every state."""
+    dt: float = 0.02
+    """Time step, s."""
+    memory: float = 3.0
+    """Memory in the last iteration, s; infinite for the policy's own cost."""
+    first_memory: float = 0.3
+    """Memory in the first iteration, s."""
+    kept: int = 8
+    """States per trajectory that are fitted: the first, and others with growing distance."""
+    steps: int = 200
+    """Adam steps per iteration."""
+    batch: int = 1024
+    learning_rate: float = 1e-2
+    """Peak; it decays by a cosine over all iterations."""
+    slope_weight: float = 0.05
+    """Weight of the slopes' misfit, in units of the box, relative to that of the values."""
+    floor: float = 0.02
+    """Share of the largest target added to every target in relative misfits."""
+    margin: float = 1.25
+    """Factor on the box for drawing states and clipping trajectories; 1 as published, where the edges of the box affect
+    the value inside."""
+
+
+class ValueProgress(NamedTuple):
     """Progress after an iteration."""
 
     iteration: int
@@ -48,47 +78,19 @@ class Progress(NamedTuple):
     """Time since the start, without compilation."""
 
 
-class Fitted(NamedTuple):
+class FittedValue(NamedTuple):
     """Result of the iterations."""
 
     parameters: Any
     """Parameters with the lowest validation."""
-    history: list[Progress]
+    history: list[ValueProgress]
     train_seconds: float
     compile_seconds: float
 
 
-def fit_value(
-    problem: ControlProblem,
-    network: ValueNetwork,
-    *,
-    seed: int = 0,
-    numbers: Iteration = Iteration(),  # noqa: B008
-    parameters: Any = None,
-    double: bool = False,
-    disturbance: Disturbance | None = None,
-    mesh: Mesh | None = None,
-    report: Callable[[Progress], None] = lambda progress: None,
-) -> Fitted:
-    """Runs the iterations and keeps the best parameters on separate validation states.
-
-    Args:
-        problem: the control problem.
-        network: family of value functions.
-        seed: of parameters and states.
-        numbers: of the iteration.
-        parameters: initial ones; random by default.
-        double: whether to compute in float64, which takes twice as long.
-        disturbance: of the worst case, for a robust value.
-        mesh: devices that share the states from which the policy is followed; all devices do the whole fits.
-        report: called after every iteration.
-
-    Raises:
-        InputError: numbers out of range, or a value that was never finite.
-    """
-    given = {"numbers": numbers, "parameters": parameters, "double": double, "disturbance": disturbance}
-    (found,) = fit_values(problem, network, (seed,), **given, mesh=mesh, report=report)
-    return found
+def fit_value(problem: ControlProblem, network: ValueNetwork, *, seed: int = 0, **options: Any) -> FittedValue:
+    """Runs `fit_values` for one seed; `options` are its keyword arguments."""
+    return fit_values(problem, network, (seed,), **options)[0]
 
 
 def fit_values(
@@ -101,70 +103,155 @@ def fit_values(
     double: bool = False,
     disturbance: Disturbance | None = None,
     mesh: Mesh | None = None,
-    report: Callable[[Progress], None] = lambda progress: None,
-) -> list[Fitted]:
-    """Runs `fit_value` for several seeds, one after the other, with a program that is compiled once."""
+    report: Callable[[ValueProgress], None] = lambda progress: None,
+) -> list[FittedValue]:
+    """Runs the iterations for several seeds, one after the other, with a program that is compiled once.
+
+    The parameters of a seed are the best on separate validation states.
+
+    Args:
+        problem: the control problem.
+        network: family of value functions.
+        seeds: of parameters and states.
+        numbers: of the iteration.
+        parameters: initial ones; random by default.
+        double: whether to compute in float64, which takes twice as long.
+        disturbance: of the worst case, for a robust value.
+        mesh: devices that share the states from which the policy is followed; all devices do the whole fits.
+        report: called after every iteration.
+
+    Raises:
+        InputError: numbers out of range, or a value that was never finite.
+    """
     require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
-    problem = widened(problem, numbers.margin)
-    with jax.enable_x64(double):
-        began = time.perf_counter()
-        programs = _compiled(Subject(problem, network, numbers, disturbance, mesh), parameters)
-        compile_seconds = time.perf_counter() - began
-        return [_fit(programs, seed, numbers, parameters, report, compile_seconds) for seed in seeds]
-
-
-class _Programs(NamedTuple):
-    begin: Callable[[Array, Any], tuple[Any, ...]]
-    """(key, parameters or none) -> parameters, state of the optimiser, validation states."""
-    iterate: Callable[..., tuple[Any, Any, Array]]
-    score: Callable[[Any, Array], Array]
-    local: Callable[[Any], Any]
-    """Turns the programs' results into arrays of this process."""
-
-
-def _compiled(subject: Subject, parameters: Any) -> _Programs:
-    problem, network, numbers, _, mesh = subject
+    subject = _Subject(widened(problem, numbers.margin), network, numbers, disturbance, mesh)
     rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
     adam = optax.adam(rate, b2=0.99)
 
-    def begin(key: Array, parameters: Any) -> tuple[Any, ...]:
-        if parameters is None:
-            parameters = network.init(jax.random.fold_in(key, 0))
-        parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
-        return parameters, adam.init(parameters), drawn(problem, jax.random.fold_in(key, 1), VALIDATED)
+    def begin(key: Array) -> tuple[Any, Any, Array]:
+        """Parameters, state of the optimiser, and validation states."""
+        start = network.init(jax.random.fold_in(key, 0)) if parameters is None else parameters
+        start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), start)
+        return start, adam.init(start), drawn(subject.problem, jax.random.fold_in(key, 1), VALIDATED)
 
-    key = jax.random.key(0)
-    parameters, state, validated = begin(key, parameters)
-    advance = program(functools.partial(iterate, subject, adam), mesh)
-    judge = program(functools.partial(score, subject), mesh)
-    return _Programs(
-        begin,
-        advance.lower(parameters, state, key, jnp.asarray(0.0)).compile(),
-        judge.lower(parameters, validated).compile(),
-        functools.partial(local, mesh=mesh),
-    )
+    with jax.enable_x64(double):
+        began, key = time.perf_counter(), jax.random.key(0)
+        start, state, validated = begin(key)
+        advance = program(functools.partial(_iterate, subject, adam), mesh)
+        advance = advance.lower(start, state, key, jnp.asarray(0.0)).compile()
+        judge = program(functools.partial(_score, subject), mesh).lower(start, validated).compile()
+        compile_seconds = time.perf_counter() - began
+
+        def fit(seed: int) -> FittedValue:
+            began, key = time.perf_counter(), jax.random.key(seed)
+            current, state, validated = begin(key)
+            best, lowest, history = current, math.inf, []
+            for number in range(numbers.iterations):
+                grown = number / max(numbers.iterations - 1, 1)
+                memory = jnp.asarray(numbers.first_memory ** (1 - grown) * numbers.memory**grown)
+                current, state, loss = advance(current, state, jax.random.fold_in(key, 2 + number), memory)
+                score = float(judge(current, validated))
+                if score < lowest:
+                    best, lowest = current, score
+                history.append(ValueProgress(number + 1, float(loss), score, time.perf_counter() - began))
+                report(history[-1])
+            if not math.isfinite(lowest):
+                raise InputError(
+                    "the cost of the policy was never finite; take a smaller dt, or a box that it can stay near"
+                )
+            return FittedValue(local(best, mesh), history, time.perf_counter() - began, compile_seconds)
+
+        return [fit(seed) for seed in seeds]
 
 
-def _fit(
-    programs: _Programs,
-    seed: int,
-    numbers: Iteration,
-    parameters: Any,
-    report: Callable[[Progress], None],
-    compile_seconds: float,
-) -> Fitted:
-    began, key = time.perf_counter(), jax.random.key(seed)
-    parameters, state, validated = programs.begin(key, parameters)
-    best, least, history = parameters, math.inf, []
-    for number in range(numbers.iterations):
-        grown = number / max(numbers.iterations - 1, 1)
-        memory = jnp.asarray(numbers.first_memory ** (1 - grown) * numbers.memory**grown)
-        parameters, state, loss = programs.iterate(parameters, state, jax.random.fold_in(key, 2 + number), memory)
-        now = float(programs.score(parameters, validated))
-        if now < least:
-            best, least = parameters, now
-        history.append(Progress(number + 1, float(loss), now, time.perf_counter() - began))
-        report(history[-1])
-    if not math.isfinite(least):
-        raise InputError("the cost of the policy was never finite; take a smaller dt, or a box that it can stay near")
-    return Fitted(programs.local(best), history, time.perf_counter() - began, compile_seconds)
+class _Subject(NamedTuple):
+    """Problem, network and settings of the iterations."""
+
+    problem: ControlProblem
+    network: ValueNetwork
+    numbers: Iteration
+    disturbance: Disturbance | None
+    mesh: Mesh | None
+    """Devices that share the trajectories; all devices do the whole fit."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of a trajectory."""
+        return round(self.numbers.seconds / self.numbers.dt)
+
+
+def _iterate(
+    subject: _Subject, adam: optax.GradientTransformation, parameters: Any, state: Any, key: Array, memory: Array
+) -> tuple[Any, Any, Array]:
+    """Returns parameters, state of the optimiser and mean loss after an iteration with this memory, in s."""
+    problem, network, numbers = subject.problem, subject.network, subject.numbers
+    of_starts, of_batches = jax.random.split(key)
+    data = _kept_targets(subject, parameters, drawn(problem, of_starts, numbers.starts), memory)
+    half = jnp.asarray((np.asarray(problem.high) - np.asarray(problem.low)) / 2, float)
+    largest = jnp.quantile(data.V, 0.9)
+
+    def loss(parameters: Any, batch: Targets) -> Array:
+        V, slope = jax.vmap(lambda x: network.members(parameters, x))(batch.x)
+        size = (batch.V + numbers.floor * largest)[:, None]
+        off = (V - batch.V[:, None]) / size
+        off_slope = (slope - batch.slope[:, None]) * half / size[..., None]
+        return jnp.mean(_robust(off)) + numbers.slope_weight * jnp.mean(_robust(off_slope))
+
+    def descend(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], Array]:
+        parameters, state = carry
+        batch = jax.tree.map(lambda rows: rows[jax.random.randint(key, (numbers.batch,), 0, len(data.V))], data)
+        value, gradient = jax.value_and_grad(loss)(parameters, batch)
+        updates, state = adam.update(gradient, state, parameters)
+        return (optax.apply_updates(parameters, updates), state), value
+
+    keys = jax.random.split(of_batches, numbers.steps)
+    (parameters, state), losses = jax.lax.scan(descend, (parameters, state), keys)
+    return parameters, state, jnp.mean(losses)
+
+
+def _kept_targets(subject: _Subject, parameters: Any, x: Array, memory: Array) -> Targets:
+    """Targets at some states of the trajectories from x [N, n], one row per state."""
+
+    def of_start(parameters: Any, memory: Array, x: Array) -> Targets:
+        return targets(
+            subject.problem,
+            lambda x: subject.network.value_and_gradient(parameters, x),
+            x,
+            steps=subject.steps,
+            dt=subject.numbers.dt,
+            memory=memory,
+            disturbance=subject.disturbance,
+        )
+
+    trajectories = spread(lambda shared, x: jax.vmap(functools.partial(of_start, *shared))(x), subject.mesh)
+    kept = subject.numbers.kept
+    index = np.unique((subject.steps * (np.arange(kept) / kept) ** 2).astype(int))
+    return jax.tree.map(lambda rows: rows[:, index].reshape(-1, *rows.shape[2:]), trajectories((parameters, memory), x))
+
+
+def _robust(off: Array) -> Array:
+    """Loss that is quadratic for small errors and linear for large ones, because slopes jump at a ridge of V."""
+    size = 0.1
+    return size**2 * (jnp.sqrt(1 + (off / size) ** 2) - 1)
+
+
+def _score(subject: _Subject, parameters: Any, x: Array) -> Array:
+    """Mean cost of the policy from states x [N, n], plus the mean of |V - cost|."""
+    problem, network, dt = subject.problem, subject.network, subject.numbers.dt
+
+    def one(parameters: Any, x: Array) -> tuple[Array, Array]:
+        value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
+        closed, discount = greedy(problem, value, dt, subject.disturbance), math.exp(-problem.discount * dt)
+
+        def forward(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
+            x, total, weight = carry
+            after, cost = closed(x)
+            return (after, total + weight * cost, weight * discount), None
+
+        (last, total, weight), _ = jax.lax.scan(
+            forward, (x, jnp.zeros((), x.dtype), jnp.ones((), x.dtype)), length=2 * subject.steps
+        )
+        return value(x)[0], total + weight * value(last)[0]
+
+    V, cost = spread(jax.vmap(one, (None, 0)), subject.mesh)(parameters, x)
+    return jnp.mean(cost + jnp.abs(V - cost))

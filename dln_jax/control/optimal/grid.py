@@ -25,10 +25,10 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.control.optimal.boxes import circles
 from dln_jax.control.optimal.flow import Flow, flow
 from dln_jax.control.optimal.grid_interpolation import Grid, interpolated, linear, one_sided_slopes, read
-from dln_jax.control.optimal.problem import ControlProblem, optimal_control
+from dln_jax.control.optimal.problem import ControlProblem, circles, optimal_control
+from dln_jax.control.state_space import Law
 from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, require_positive
 
@@ -51,7 +51,7 @@ class GridValue(NamedTuple):
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether `change` is within the tolerance; `solvers.ending.reason(found.ending)` says why not."""
+        """Whether `change` is within the tolerance; `solvers.ending.reason(ending)` says why not."""
         return self.ending == Ending.CONVERGED
 
 
@@ -61,7 +61,7 @@ def solve_on_grid(
     *,
     low: Any,
     high: Any,
-    most: float,
+    limit: float,
     dt: float = 0.05,
     tolerance: float = 1e-7,
     improvements: int = 100,
@@ -75,7 +75,7 @@ def solve_on_grid(
         low: corner of the rectangle [2]. Trajectories that would leave it stay on its edge: make it large enough for
             those of interest.
         high: the opposite corner.
-        most: magnitude of the largest control, where its cost is finite.
+        limit: magnitude of the largest control, where its cost is finite.
         dt: s. Controls are held for it, which costs O(dt²); interpolation costs O(h²/dt) for nodes at a distance h.
         tolerance: of V, relative to its largest.
         improvements: largest number of policy improvements per grid; the result states whether they sufficed.
@@ -87,51 +87,45 @@ def solve_on_grid(
     low, high = np.asarray(low, float), np.asarray(high, float)
     if low.shape != (2,) or high.shape != (2,) or not (low < high).all():
         raise InputError(f"the rectangle is {low} to {high}; expected two ascending numbers each, for two states")
-    if not len(points):
-        raise InputError("there are no points; expected one number for each grid")
-    require_positive(most=most, dt=dt, tolerance=tolerance, improvements=improvements, least_points=min(points) - 4)
-    circle = tuple(bool(each) for each in circles(problem))
+    if not len(points) or min(points) < 5:
+        raise InputError(f"points are {tuple(points)}; expected a number for each grid, 5 or more")
+    require_positive(limit=limit, dt=dt, tolerance=tolerance, improvements=improvements)
+    circle = tuple(circles(problem).tolist())
     step, discount = flow(problem, dt), math.exp(-problem.discount * dt)
 
     def policy(x: Array, slope: Array) -> Array:
         return optimal_control(problem, x, slope)[0]
 
-    found = start
+    solution = start
     for count in points:
-        shape = tuple(count - 1 if round_ else count for round_ in circle)
+        shape = tuple(count - closed for closed in circle)
         grid = Grid(tuple(low.tolist()), tuple(((high - low) / (count - 1)).tolist()), shape, circle)
-        V = jnp.zeros(shape) if found is None else interpolated(found.grid, found.V, grid.nodes)
-        found = GridValue(grid, *_iterate(step, policy, grid, discount, V, most, tolerance, improvements))
-    assert found is not None  # there are points
-    return found
+        V = jnp.zeros(shape) if solution is None else interpolated(solution.grid, solution.V, grid.nodes)
+        solution = GridValue(grid, *_iterate(step, policy, grid, discount, V, limit, tolerance, improvements))
+    assert solution is not None  # there are points
+    return solution
 
 
 def extrapolated(coarse: GridValue, fine: GridValue, x: Any) -> Array:
     """V at states [..., 2] by Richardson's extrapolation from two grids, whose errors are proportional to h²."""
     ratio = (coarse.grid.steps[0] / fine.grid.steps[0]) ** 2
-    of_coarse, of_fine = (interpolated(each.grid, each.V, x) for each in (coarse, fine))
+    of_coarse, of_fine = (interpolated(value.grid, value.V, x) for value in (coarse, fine))
     return of_fine + (of_fine - of_coarse) / (ratio - 1)
 
 
-def lookahead(
-    problem: ControlProblem, found: GridValue, *, most: float, dt: float = 0.05
-) -> Callable[[Array], Float[Array, " 1"]]:
+def lookahead(problem: ControlProblem, value: GridValue, *, limit: float, dt: float = 0.05) -> Law:
     """Returns the policy of a value on a grid: x [2] -> the listed control u [1] with the lowest cost over dt plus V.
 
     The cost of following it is at least the true value, so it bounds V from above.
     """
-    step, listed = flow(problem, dt), jnp.linspace(-most, most, 8 * CONTROLS + 1)
+    step, listed = flow(problem, dt), jnp.linspace(-limit, limit, 8 * CONTROLS + 1)
 
     def law(x: Array) -> Array:
         after, cost = jax.vmap(lambda u: step(x, u[None]))(listed)
-        totals = cost + math.exp(-problem.discount * dt) * read(found.V, linear(found.grid, after))
+        totals = cost + math.exp(-problem.discount * dt) * read(value.V, linear(value.grid, after))
         return listed[jnp.argmin(totals)][None]
 
     return law
-
-
-def _over(function: Callable[..., Any]) -> Callable[..., Any]:
-    return jax.vmap(jax.vmap(function))
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -141,15 +135,15 @@ def _iterate(
     grid: Grid,
     discount: Any,
     V: Array,
-    most: Any,
+    limit: Any,
     tolerance: Any,
     improvements: Any,
 ) -> tuple[Array, Array, Array, Array]:
     nodes = jnp.asarray(grid.nodes)
-    listed = jnp.linspace(-most, most, CONTROLS)
+    listed = jnp.linspace(-limit, limit, CONTROLS)
 
     def feet(u: Array) -> tuple[Array, Array]:
-        return _over(lambda x, u: step(x, u[None]))(nodes, u)
+        return jax.vmap(jax.vmap(lambda x, u: step(x, u[None])))(nodes, u)
 
     def total(V: Array, u: Array) -> Array:
         after, cost = feet(u)
@@ -160,7 +154,7 @@ def _iterate(
         sides = [one_sided_slopes(grid, V, axis) for axis in (0, 1)]
         pairs = [tuple(side[which] for side in sides) for which in (0, 1)]
         pairs.append(tuple((before + after) / 2 for before, after in sides))
-        return [jnp.clip(_over(policy)(nodes, jnp.stack(pair, axis=-1)), -most, most) for pair in pairs]
+        return [jnp.clip(jax.vmap(jax.vmap(policy))(nodes, jnp.stack(pair, axis=-1)), -limit, limit) for pair in pairs]
 
     def improved(V: Array, u: Array) -> tuple[Array, Array]:
         """Returns the best control at every node and its V; the present control stays unless another is better."""

@@ -5,6 +5,7 @@ larger values between them. Cubic interpolation is more accurate for smooth valu
 surrounding corners (Bermejo and Staniforth 1992) it does not overshoot at ridges.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -44,8 +45,7 @@ class Stencil(NamedTuple):
 
 def linear(grid: Grid, x: Array) -> Stencil:
     """Stencil of bilinear interpolation at states x [..., 2]; beyond an edge, the edge's value applies."""
-    (rows, row_weights), (columns, column_weights) = (_linear(x[..., i], *side) for i, side in enumerate(_sides(grid)))
-    return Stencil(rows, columns, row_weights, column_weights)
+    return _stencil(grid, x, (0, 1))
 
 
 def read(values: Array, at: Stencil) -> Array:
@@ -60,12 +60,9 @@ def read(values: Array, at: Stencil) -> Array:
 
 def interpolated(grid: Grid, values: Array, x: Any) -> Array:
     """Limited cubic interpolation of values at the nodes [A, B], such as V, at states [..., 2]."""
-    x = jnp.asarray(x)
-    (rows, row_weights), (columns, column_weights) = (_cubic(x[..., i], *side) for i, side in enumerate(_sides(grid)))
-    smooth = read(values, Stencil(rows, columns, row_weights, column_weights))
-    around = linear(grid, x)
+    smooth, around = (_stencil(grid, jnp.asarray(x), offsets) for offsets in ((-1, 0, 1, 2), (0, 1)))
     corners = jnp.stack([values[row, column] for row in around.rows for column in around.columns])
-    return jnp.clip(smooth, jnp.min(corners, axis=0), jnp.max(corners, axis=0))
+    return jnp.clip(read(values, smooth), jnp.min(corners, axis=0), jnp.max(corners, axis=0))
 
 
 def one_sided_slopes(grid: Grid, values: Array, axis: int) -> tuple[Array, Array]:
@@ -74,40 +71,22 @@ def one_sided_slopes(grid: Grid, values: Array, axis: int) -> tuple[Array, Array
     backward = jnp.roll(forward, 1, axis)
     if grid.circle[axis]:
         return backward, forward
-    place = jnp.arange(values.shape[axis]).reshape([-1 if each == axis else 1 for each in range(values.ndim)])
+    place = jnp.arange(values.shape[axis]).reshape([-1 if side == axis else 1 for side in range(values.ndim)])
     first, last = place == 0, place == values.shape[axis] - 1
     return jnp.where(first, forward, backward), jnp.where(last, backward, forward)
 
 
-def _sides(grid: Grid) -> list[tuple[float, float, int, bool]]:
-    return list(zip(grid.low, grid.steps, grid.shape, grid.circle, strict=True))
-
-
-def _linear(x: Array, low: float, step: float, count: int, circle: bool) -> tuple[Array, Array]:
-    """Two nodes [2, ...] around x on a side, and their weights."""
-    place = (x - low) / step
-    if not circle:
-        place = jnp.clip(place, 0.0, count - 1.0)
-    cell = jnp.floor(place) if circle else jnp.clip(jnp.floor(place), 0.0, count - 2.0)
-    nodes = cell.astype(jnp.int32) + jnp.arange(2).reshape(2, *[1] * x.ndim)
-    return (jnp.mod(nodes, count) if circle else nodes), jnp.stack([1 - (place - cell), place - cell])
-
-
-def _cubic(x: Array, low: float, step: float, count: int, circle: bool) -> tuple[Array, Array]:
-    """Four nodes [4, ...] about x on a side, and the weights of Lagrange's polynomial."""
-    place = (x - low) / step
-    if not circle:
-        place = jnp.clip(place, 0.0, count - 1.0)
-    # At an edge the four nodes lie on one side of the cell.
-    first = jnp.floor(place) if circle else jnp.clip(jnp.floor(place), 1.0, count - 3.0)
-    s = place - first
-    weights = jnp.stack(
-        [
-            -s * (s - 1) * (s - 2) / 6,
-            (s + 1) * (s - 1) * (s - 2) / 2,
-            -(s + 1) * s * (s - 2) / 2,
-            (s + 1) * s * (s - 1) / 6,
-        ]
-    )
-    nodes = first.astype(jnp.int32) + jnp.arange(-1, 3).reshape(4, *[1] * x.ndim)
-    return (jnp.mod(nodes, count) if circle else nodes), weights
+def _stencil(grid: Grid, x: Array, offsets: tuple[int, ...]) -> Stencil:
+    """Stencil of Lagrange's polynomials through the nodes at these offsets from a state's cell, on both sides."""
+    nodes, weights = [], []
+    for axis, (low, step, count, circle) in enumerate(zip(*grid, strict=True)):
+        place = (x[..., axis] - low) / step
+        place = place if circle else jnp.clip(place, 0.0, count - 1.0)
+        # At an edge all nodes lie on one side of the cell.
+        cell = jnp.floor(place) if circle else jnp.clip(jnp.floor(place), -offsets[0], count - 1.0 - offsets[-1])
+        s = place - cell
+        own = [math.prod((s - k) / (j - k) for k in offsets if k != j) for j in offsets]
+        around = cell.astype(jnp.int32) + jnp.array(offsets).reshape(-1, *[1] * place.ndim)
+        nodes.append(jnp.mod(around, count) if circle else around)
+        weights.append(jnp.stack(own))
+    return Stencil(*nodes, *weights)

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dln_jax.control.optimal.action_costs import ActionCost, centred
-from dln_jax.control.state_space import Field, field_of
+from dln_jax.control.state_space import Field, Law, circular, field_of, where_finite
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, JointKind, Scalar
 
@@ -113,7 +113,7 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
         InputError: shapes that do not agree, an empty box, a negative discount, or a goal that is not an equilibrium or
             has a cost.
     """
-    low, high, goal = (np.asarray(each, float) for each in (problem.low, problem.high, problem.goal))
+    low, high, goal = (np.asarray(point, float) for point in (problem.low, problem.high, problem.goal))
     if goal.ndim != 1 or low.shape != goal.shape or high.shape != goal.shape:
         raise InputError(f"low, high and goal have shapes {low.shape}, {high.shape}, {goal.shape}; expected [n] each")
     if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
@@ -159,9 +159,11 @@ def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> C
         raise InputError(f"the goal has shape {goal.shape}; expected {before.shape}, a state")
     drift, B = jax.jit(lambda x: (problem.drift(x), problem.actuation(x)))(goal)
     u = jnp.linalg.lstsq(B, -drift)[0]
-    left = float(jnp.max(jnp.abs(drift + B @ u)))
-    if not left <= tolerance:
-        raise InputError(f"the goal is no equilibrium: no control makes dx/dt less than {left:.3g} there; give another")
+    moving = float(jnp.max(jnp.abs(drift + B @ u)))
+    if not moving <= tolerance:
+        raise InputError(
+            f"the goal is no equilibrium: no control makes dx/dt less than {moving:.3g} there; give another"
+        )
     cost = problem.state_cost
     return checked(
         problem._replace(
@@ -172,12 +174,27 @@ def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> C
     )
 
 
+def circles(problem: ControlProblem) -> Bool[np.ndarray, " n"]:
+    """Mask of the coordinates that are angles on a circle."""
+    return circular(problem.joints, len(problem.low))
+
+
 def features(problem: ControlProblem, x: Array) -> Float[Array, " k"]:
     """z(x) - z(goal) [k]: sines, then cosines of angles, which close the circle, and the other states in box units."""
-    circular = np.zeros(len(problem.goal), bool)
-    circular[: len(problem.joints)] = np.array(problem.joints) == "revolute"
+    angles = circles(problem)
     half = (np.asarray(problem.high, float) - np.asarray(problem.low, float)) / 2
     goal = jnp.asarray(problem.goal, x.dtype)
-    straight = ((x - goal) / jnp.asarray(half, x.dtype))[~circular]
-    angle, aim = x[circular], goal[circular]
+    straight = ((x - goal) / jnp.asarray(half, x.dtype))[~angles]
+    angle, aim = x[angles], goal[angles]
     return jnp.concatenate([jnp.sin(angle) - jnp.sin(aim), jnp.cos(angle) - jnp.cos(aim), straight])
+
+
+def hjb_policy(value_and_gradient: ValueAndGradient, problem: ControlProblem) -> Law:
+    """x [n] -> u [m], within the limits of the action cost; NaN if the state is not finite.
+
+    Args:
+        value_and_gradient: x -> V and V_x, for example of a trained network.
+        problem: with B and g.
+    """
+    # A limited control is finite even if a rate is infinite.
+    return lambda x: where_finite(optimal_control(problem, x, value_and_gradient(x)[1]), x)

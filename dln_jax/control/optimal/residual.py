@@ -20,7 +20,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.control.optimal.boxes import uniform
+from dln_jax.control.optimal.flow import uniform
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
 from dln_jax.control.optimal.worst_case import Disturbance
 from dln_jax.scale.mesh import local, of_first_process, program
@@ -28,7 +28,7 @@ from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 
 
-class Stage(NamedTuple):
+class ResidualStage(NamedTuple):
     """Residuals of the equation after the fit at one discount."""
 
     discount: float
@@ -39,13 +39,13 @@ class Stage(NamedTuple):
     """The same on the validation samples, with this discount."""
 
 
-class ResidualFit(NamedTuple):
+class HJBFit(NamedTuple):
     """Result of a training."""
 
     parameters: Any
     """Parameters with the lowest validation at the problem's own discount."""
     validation: float
-    stages: list[Stage]
+    stages: list[ResidualStage]
 
 
 def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.5, last: float = 0.01) -> list[float]:
@@ -67,7 +67,7 @@ def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.
     return [*(discount + first * ratio**step for step in range(steps)), discount]
 
 
-def fit_residual(
+def fit_hjb(
     problem: ControlProblem,
     value_and_gradient: Callable[[Any, Array], tuple[Array, Array]],
     parameters: Any,
@@ -81,8 +81,8 @@ def fit_residual(
     patience: int = 2,
     disturbance: Disturbance | None = None,
     mesh: Mesh | None = None,
-    report: Callable[[Stage], None] = lambda stage: None,
-) -> ResidualFit:
+    report: Callable[[ResidualStage], None] = lambda stage: None,
+) -> HJBFit:
     """Fits the value function of a family to the equation, in float64.
 
     Args:
@@ -130,14 +130,14 @@ def fit_residual(
     def validated(parameters: Any, discount: Array) -> Array:
         return jnp.sqrt(jnp.mean(jax.vmap(residual, (None, 0, None))(parameters, unseen, discount) ** 2))
 
-    stages: list[Stage] = []
+    stages: list[ResidualStage] = []
 
     def fitted(parameters: Any, discount: float) -> Any:
         x = uniform(problem, jax.random.fold_in(of_draws, len(stages)), samples)
         parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
         # This number decides how many rounds there are, so all processes must use the same one.
         left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
-        stages.append(Stage(discount, int(done), float(loss), float(left)))
+        stages.append(ResidualStage(discount, int(done), float(loss), float(left)))
         report(stages[-1])
         return parameters
 
@@ -146,12 +146,12 @@ def fit_residual(
     best, lowest, since = parameters, np.inf, 0
     for _ in range(rounds):
         parameters = fitted(parameters, problem.discount)
-        found = stages[-1].validation
-        best, lowest, since = (parameters, found, 0) if found < lowest else (best, lowest, since + 1)
+        score = stages[-1].validation
+        best, lowest, since = (parameters, score, 0) if score < lowest else (best, lowest, since + 1)
         if since >= patience:
             break
     if not np.isfinite(lowest):
         raise InputError(
             "the equation is not finite at the samples; look for states in the box where the plant or a cost is not"
         )
-    return ResidualFit(local(best, mesh), float(lowest), stages)
+    return HJBFit(local(best, mesh), float(lowest), stages)

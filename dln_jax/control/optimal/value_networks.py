@@ -85,11 +85,11 @@ def value_network(
         (slope,) = back_to_x(2 * L @ y + back_to_z(slopes))
         return scale * (y @ y), scale * slope
 
-    def each(layers: Any, x: Array) -> tuple[Float[Array, " K"], Float[Array, "K n"]]:
+    def every(layers: Any, x: Array) -> tuple[Float[Array, " K"], Float[Array, "K n"]]:
         return jax.vmap(one, in_axes=(0, None))(layers, x)
 
     def mean(layers: Any, x: Array) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-        values, slopes = each(layers, x)
+        values, slopes = every(layers, x)
         return jnp.mean(values), jnp.mean(slopes, axis=0)
 
-    return ValueNetwork(init, mean, each)
+    return ValueNetwork(init, mean, every)

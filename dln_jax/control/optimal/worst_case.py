@@ -41,8 +41,8 @@ def worst_disturbance(
     parameters: Any,
     bounds: Bounds,
     *,
-    least: Any = None,
-    most: Any = None,
+    lower: Any = -jnp.inf,
+    upper: Any = jnp.inf,
 ) -> Disturbance:
     """Returns the worst case of all disturbances at once.
 
@@ -50,8 +50,8 @@ def worst_disturbance(
         plant: (x [n], u [m], p [k]) -> dx/dt [n], f.
         parameters: p.
         bounds: of the disturbances.
-        least: lower bound of p + xi_p [k], for example zero for masses; by default none.
-        most: upper bound of p + xi_p [k]; by default none.
+        lower: bound of p + xi_p [k], for example zero for masses; by default none.
+        upper: bound of p + xi_p [k]; by default none.
 
     Raises:
         InputError: bounds that are negative.
@@ -60,12 +60,11 @@ def worst_disturbance(
         if not bound >= 0:
             raise InputError(f"the bound of {name} is {bound}; expected 0 or more")
     p = jnp.asarray(parameters, float)
-    lowest, highest = jnp.asarray(-jnp.inf if least is None else least), jnp.asarray(jnp.inf if most is None else most)
 
     def change(x: Array, slope: Array, u: Array) -> Array:
         rate, pull_back = jax.vjp(plant, x, u, p.astype(x.dtype))
         to_x, to_u, to_p = pull_back(slope)
-        worst_p = jnp.clip(p + bounds.parameters * jnp.abs(p) * jnp.sign(to_p), lowest, highest)
+        worst_p = jnp.clip(p + bounds.parameters * jnp.abs(p) * jnp.sign(to_p), jnp.asarray(lower), jnp.asarray(upper))
         moved = plant(x + bounds.observation * unit(to_x), u + bounds.action * unit(to_u), worst_p.astype(x.dtype))
         return moved - rate + bounds.state * unit(slope)
 

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control.closed_loop import Run
-from dln_jax.control.desktop_plants import DesktopPlant
+from dln_jax.control.closed_loop import ClosedLoopRun
+from dln_jax.control.desktop_plants import DesktopPlant, model_of_plant, nominal_model
 from dln_jax.control.exploration import Excitation, explore
 from dln_jax.control.state_space import field_of
-from dln_jax.control.swing_up_runs import model_of_plant, nominal_model
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import Report, silent
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, learned, prepare
@@ -70,7 +69,7 @@ def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: in
     return Obtained(fitted.dynamics, fitted, prepared, time.perf_counter() - began)
 
 
-def errors_along(plant: DesktopPlant, model: Dynamics, runs: Run) -> Errors:
+def errors_along(plant: DesktopPlant, model: Dynamics, runs: ClosedLoopRun) -> Errors:
     """Errors of a model's inverse and forward dynamics along true runs [E, N], at the plant's own states and forces."""
     B = np.asarray(plant.scene.needs.actuation)
     x, u = (jnp.asarray(each.reshape(-1, each.shape[-1])) for each in (runs.x[:, :-1], runs.u))
@@ -86,7 +85,7 @@ def errors_along(plant: DesktopPlant, model: Dynamics, runs: Run) -> Errors:
     return Errors(float(torque / of_torque), float(acceleration / of_acceleration))
 
 
-def test_motions(plant: DesktopPlant, *, seed: int, seconds: float = 12.0) -> Run:
+def test_motions(plant: DesktopPlant, *, seed: int, seconds: float = 12.0) -> ClosedLoopRun:
     """True motions of another exploration, as test data."""
     excitation = Excitation(seconds=seconds, episodes=2, surplus=(0.0, 0.5))
     return explore(plant, plant.numbers.gains, excitation, seed=seed + TEST_SEED)[1]

@@ -9,12 +9,19 @@ import numpy as np
 
 from dln_jax.cli.progress import progress
 from dln_jax.control import parts_of, passive_energy
-from dln_jax.control.closed_loop import Run
-from dln_jax.control.desktop_plants import NAMES, DesktopPlant, desktop_plant
+from dln_jax.control.closed_loop import ClosedLoopRun, hanging_starts
+from dln_jax.control.desktop_plants import (
+    NAMES,
+    SECONDS,
+    DesktopPlant,
+    Tried,
+    desktop_plant,
+    law_of,
+    motion_of,
+    try_starts,
+)
 from dln_jax.control.exploration import Excitation, explore
-from dln_jax.control.friction_compensation import without_friction
-from dln_jax.control.outcomes import hanging_starts
-from dln_jax.control.swing_up_runs import SECONDS, Tried, law_of, motion_of, try_starts
+from dln_jax.control.tracking import without_friction
 from dln_jax.data import schema
 from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
 from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
@@ -132,7 +139,7 @@ def draw(given: Asked, model: Dynamics, folder: Path) -> None:
     """Writes a figure of some runs, and an animation of the first."""
     plant, lab = given.plant, given.plant.hardware
     runs = some_runs(plant, model, min(given.starts, MOST_SHOWN), given.seed)
-    unit, limits = UNITS[given.name], (lab.least, lab.most)
+    unit, limits = UNITS[given.name], (lab.lower, lab.upper)
     energy = passive_energy(without_friction(model), parts_of(plant.scene.needs.actuation), np.zeros(2))
     of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
     traces = closed_loop_traces(
@@ -152,7 +159,7 @@ def draw(given: Asked, model: Dynamics, folder: Path) -> None:
     )  # fmt: skip
 
 
-def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> Run:
+def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> ClosedLoopRun:
     """The first `count` of the runs that were tried, [count, N]."""
     run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0)))
     found = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))

@@ -18,10 +18,10 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control import (
+    ClosedLoopRun,
     Gains,
     Hardware,
     Reference,
-    Run,
     Tracker,
     feed_forward,
     field_of,
@@ -173,7 +173,7 @@ def rows_of(case: str, runs: Sequence[Sequence[Written]]) -> list[Row]:
 class Driven(NamedTuple):
     """A run of N samples along a reference."""
 
-    run: Run
+    run: ClosedLoopRun
     qdd: Any
     """Accelerations at the start of the samples [N, 2], rad/s²."""
     tip: Any

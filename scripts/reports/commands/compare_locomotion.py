@@ -1,11 +1,11 @@
 """Train one soft creature by gradients, by evolution and by PPO, and print what each needs for one body length.
 
 Several seeds each, until 1.2 body lengths or --steps. Writes report.json, a figure of the distance against environment
-steps and against wall time, and the model and gait of each method's best seed. ppo needs the extra [rl].
+steps and against wall time, and the model and gait of each method's best seed. Evolution needs the extra [rivals], PPO
+the extra [rl].
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -15,63 +15,76 @@ from dln_jax.cli.options import Drawn, Folder, Scaled
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.scaled import mesh_of
 from dln_jax.files import write_figure, write_json
-from dln_jax.locomotion.methods import METHODS, Trained, settings_of
-from dln_jax.locomotion.progress import median_to_reach
+from dln_jax.locomotion.gradient import settings_of
 from dln_jax.locomotion.task import FALLEN
-from dln_jax.training.locomotion import GOAL, Options, announce, learned, prepare, reported, write_run
-from scripts.reports.locomotion import comparison, ppo
+from dln_jax.metrics.report import conditions, print_report, write_report
+from dln_jax.training.locomotion import (
+    GOAL,
+    LocomotionOptions,
+    announce,
+    median_to_reach,
+    prepare,
+    reported,
+    trained,
+    write_run,
+)
+from scripts.reports.locomotion import comparison, evolution, ppo
 from scripts.reports.locomotion.rows import comparison_rows
 from scripts.reports.rows import conditions, print_report, write_report
 
 
 @dataclass(frozen=True)
-class Arguments(Options, Folder, Drawn, Scaled):
+class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     """What to compare, and where the results go."""
 
     MEASURES_COMPILATION: ClassVar = True
 
     seeds: int = 3
     """Of each method, one after the other."""
+    steps: Unstated[int] = None
+    """Environment steps of each seed (default: 40000 by gradients, 500000 by evolution, 300000 by ppo)."""
     until: Unstated[float] = 1.2
     """Body lengths at which a seed ends (default: 1.2)."""
+    lanes: Unstated[int] = None
+    """Creatures side by side, which devices share (default: 2 by gradients, 32 by evolution, 16 by ppo)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Trains by all methods, prints the comparison and writes it."""
-    mesh = mesh_of(given)
-    ppo.check(given.lanes, mesh)
-    task = prepare(given, METHODS, mesh)
-    settings: dict[str, Any] = {
-        method: settings_of(method, given.creature, given.window, given.lanes) for method in METHODS
-    }
-    settings["ppo"] = ppo.settings_of(given.lanes)
-    with command_folder(given, "compare_locomotion") as folder:
+    mesh, lanes = mesh_of(options), options.lanes
+    task = prepare(options, mesh)
+    rivals = {"ppo": (ppo, ppo.train_by_ppo), "evolution": (evolution, evolution.train_by_evolution)}
+    for rival, _ in rivals.values():
+        rival.check(lanes, mesh)
+    settings: dict[str, Any] = {"gradient": settings_of(task, options.window, lanes)}
+    settings |= {method: rival.settings_of(lanes) for method, (rival, _) in rivals.items()}
+    ways = {"gradient": partial(trained, task, options, mesh)}
+    for method, (rival, run) in rivals.items():
+        by_rival = partial(run, task, lanes=lanes, mesh=mesh)
+        ways[method] = partial(reported, options, method, options.steps or rival.STEPS, by_rival)
+    with command_folder(options, "compare_locomotion") as folder:
         announce(task)
         curves, numbers = {}, {}
-        by_ppo = partial(ppo.train_by_ppo, task, lanes=given.lanes, mesh=mesh)
-        ways: dict[str, Callable[[], Trained]] = {
-            method: partial(learned, task, method, given, mesh) for method in METHODS
-        }
-        ways["ppo"] = lambda: reported(given, "ppo", given.steps or ppo.STEPS, by_ppo)
         for method, train in ways.items():
-            trained = train()
+            policies = train()
             (folder / method).mkdir()
-            found = write_run(folder / method, task, method, trained, given, settings[method], figures=given.figures)
-            numbers |= {f"{method}_{name}": value for name, value in found.items()}
-            curves[method] = [of.records for of in trained.learned]
-        rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
+            stated = settings[method]._asdict()
+            metrics = write_run(folder / method, task, policies, stated, method=method, figures=options.figures)
+            numbers |= {f"{method}_{name}": value for name, value in metrics.items()}
+            curves[method] = [seed.records for seed in policies.learned]
+        rows = comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
         facts = conditions(
             dtype="float64; ppo's networks float32",
-            seeds=list(range(given.seed, given.seed + given.seeds)),
-            settings={method: numbers._asdict() for method, numbers in settings.items()},
+            seeds=list(range(options.seed, options.seed + options.seeds)),
+            settings={method: values._asdict() for method, values in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
             counted="environment steps of learning; one episode after each evaluation is apart",
             seconds="wall time with compilation and evaluation, which the first seed pays and every seed is charged",
         )
         write_report(folder / "report.json", rows, facts)
         write_json(folder / "metrics.json", numbers)
-        if given.figures:
-            title = f"{given.creature}: farthest so far, {given.seeds} seeds (thin) and their median (thick)"
+        if options.figures:
+            title = f"{options.creature}: farthest so far, {options.seeds} seeds (thin) and their median (thick)"
             write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
         print_report(rows, facts)
         if any(math.isinf(median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):

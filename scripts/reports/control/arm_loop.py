@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import Reference, Tracker, limited, where_finite
+from dln_jax.control import Reference, Tracker, saturated, where_finite
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
@@ -92,7 +92,7 @@ def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, sampl
     def asked(q: Any, qd: Any, now: Reference) -> Any:
         found = law(q, qd, now)
         tau, usable = found if isinstance(found, tuple) else (found, jnp.asarray(True))
-        return limited(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
+        return saturated(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
 
     q, step = plant(wanted)
     count = len(wanted.q) if samples is None else samples

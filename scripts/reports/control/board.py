@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import Controller, Hardware, Run, field_of, simulate
+from dln_jax.control import ClosedLoopRun, Controller, Hardware, field_of, simulate
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from dln_jax.scenes.scene import Scene
@@ -51,7 +51,7 @@ def plant(motor: Motor) -> tuple[Scene, Array]:
     return scene, jnp.asarray(scene.needs.actuation)
 
 
-def play(motor: Motor, controller: Controller) -> Run:
+def play(motor: Motor, controller: Controller) -> ClosedLoopRun:
     """Runs the closed loop with the board's settings."""
     scene, B = plant(motor)
     field = field_of(dynamics(scene.energies), B)
@@ -61,7 +61,7 @@ def play(motor: Motor, controller: Controller) -> Run:
     )()
 
 
-def criteria(motor: Motor, run: Run) -> Criteria:
+def criteria(motor: Motor, run: ClosedLoopRun) -> Criteria:
     """The criteria of a run."""
     driven = {"shoulder": 0, "elbow": 1}[motor]
     q, qd = np.split(np.asarray(run.x), 2, axis=1)

@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control import Controller, error, limited
+from dln_jax.control import Controller, error, saturated
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
@@ -149,7 +149,7 @@ def last_state(motor: Motor, controller: Controller, disturbance: Disturbance, k
         y = y.at[2:].add(disturbance.rate_noise * jax.random.normal(of_rates, (2,)))
         memory, wanted = controller.act(memory, number * dt, y)
         u = before + disturbance.response * (wanted - before)
-        u = limited(u + disturbance.torque_noise * jax.random.normal(of_torque, (1,)), -LIMIT, LIMIT)
+        u = saturated(u + disturbance.torque_noise * jax.random.normal(of_torque, (1,)), -LIMIT, LIMIT)
         since = (number * dt - disturbance.times) / disturbance.widths
         pushed = B.T @ jnp.sum(disturbance.pushes * jnp.exp(-(since**2) / 2), axis=1)
         tau = B @ (u + pushed)

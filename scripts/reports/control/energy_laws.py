@@ -18,10 +18,10 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control import (
+    ClosedLoopRun,
     Controller,
     EnergyGains,
     Hardware,
-    Run,
     energy_shaping,
     field_of,
     holding_controls,
@@ -35,7 +35,7 @@ from dln_jax.control import (
     value,
     with_differences,
 )
-from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
+from dln_jax.control.closed_loop import Outcomes, hanging_starts, outcomes
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.scene import Scene
 from scripts.reports.case import Findings
@@ -113,7 +113,7 @@ def controllers_by_energy(motor: Motor) -> Callable[[Law], Controller]:
     return controller
 
 
-def runs_by_energy(motor: Motor) -> Callable[[Law], Run]:
+def runs_by_energy(motor: Motor) -> Callable[[Law], ClosedLoopRun]:
     """A law's numbers -> its closed loop on the board."""
     scene, B = plant(motor)
     field, controller = field_of(dynamics(scene.energies), B), controllers_by_energy(motor)
@@ -168,7 +168,7 @@ class SwingUp(NamedTuple):
     """Standard deviation of the driven coordinate at the start, m or rad."""
 
 
-def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Run]:
+def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], ClosedLoopRun]:
     """Start [4] -> run with a model of the hardware: only encoders are read, at 500 Hz, rates are their differences,
     and torques act one sample late."""
     scene, rate = case.scene, RATE

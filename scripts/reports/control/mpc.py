@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import Controller, Hardware, Plan, Problem, error, first_plan, mpc, simulate
+from dln_jax.control import Controller, Hardware, Plan, TrajectoryProblem, error, first_plan, mpc, simulate
 from dln_jax.control.state_space import Field, field_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
@@ -54,7 +54,7 @@ def field() -> Field:
     return field_of(dynamics(known.closed_form), np.asarray(known.needs.actuation))
 
 
-def cart_pole_problem(weights: Weights = Weights()) -> Problem:  # noqa: B008
+def cart_pole_problem(weights: Weights = Weights()) -> TrajectoryProblem:  # noqa: B008
     """The optimal control problem: steps of 10 ms by the classical Runge-Kutta method, and their costs."""
     plant, dt = field(), 1.0 / RATE
 
@@ -65,7 +65,7 @@ def cart_pole_problem(weights: Weights = Weights()) -> Problem:  # noqa: B008
             weights.position * x[0] ** 2 + 2 * weights.angle * (1 - jnp.cos(x[1])) + speed + weights.beyond * beyond**2
         )
 
-    return Problem(
+    return TrajectoryProblem(
         lambda x, u: runge_kutta(CLASSICAL, lambda t, state: plant(state, u))(0.0, x, dt),
         lambda x, u: dt * (off(x) + weights.force * u[0] ** 2),
         lambda x: weights.last * off(x),
@@ -80,7 +80,7 @@ def starts(count: int, seed: int = 0) -> np.ndarray:
     return random.normal(size=(count, 4)) * np.sqrt([1e-3, 5e-2, 1e-6, 1e-6]) + HANGING
 
 
-def controller(problem: Problem, steps: int) -> Controller:
+def controller(problem: TrajectoryProblem, steps: int) -> Controller:
     """A controller of the full state; its memory is the plan, initially without force."""
     act = mpc(problem)
     waiting = first_plan(problem, HANGING, np.zeros((steps, 1)))

@@ -16,7 +16,7 @@ from jax import Array
 from dln_jax.control import (
     Controller,
     Plan,
-    Problem,
+    TrajectoryProblem,
     error,
     field_of,
     holding_controls,
@@ -45,7 +45,7 @@ class Weights(NamedTuple):
     """Weight of the torque's slope."""
 
 
-def problem(motor: Motor, weights: Weights) -> Problem:
+def problem(motor: Motor, weights: Weights) -> TrajectoryProblem:
     """The optimal control problem on (q, qd, tau), in steps of `EVERY` samples with a constant slope of the torque."""
     scene, B = plant(motor)
     field, dt = field_of(dynamics(scene.energies), B), 1.0 / RATE
@@ -67,7 +67,7 @@ def problem(motor: Motor, weights: Weights) -> Problem:
     def final_cost(state: Array) -> Array:
         return jnp.asarray(END) @ (state - jnp.append(jnp.asarray(GOAL), 0.0)) ** 2
 
-    return Problem(step, cost, final_cost)
+    return TrajectoryProblem(step, cost, final_cost)
 
 
 def planned(motor: Motor, weights: Weights, guess: Array, *, iterations: int = 300) -> Plan:

@@ -16,10 +16,10 @@ from dln_jax.control import (
     Plan,
     field_of,
     holding_controls,
-    limited,
     linearise,
     regulated,
     sampled_lqr,
+    saturated,
     value,
     with_differences,
     with_prediction,
@@ -53,7 +53,7 @@ def by_angles(motor: Motor, controller: Controller) -> Controller:
     scene, B = plant(motor)
     field = field_of(dynamics(scene.closed_form), B)
     step = lambda x, u: runge_kutta(MIDPOINT, lambda t, x: field(x, u))(0.0, x, 1 / RATE)  # noqa: E731
-    predicting = with_prediction(controller, step, states=4, controls=1, most=LONGEST)
+    predicting = with_prediction(controller, step, states=4, controls=1, max_delay=LONGEST)
     seeing = with_differences(predicting, 2, rate=RATE, cutoff=CUTOFF, order=2)
     return Controller(seeing.start, lambda memory, t, y: seeing.act(memory, t, y[:2]))
 
@@ -81,9 +81,9 @@ def recovering(motor: Motor, weights: Weights, plan: Plan, control_cost: float) 
             inner, number, tau = memory
             inner, by_plan = planned.act(inner, t, y)
             beyond = recovery.sweep * jnp.sin(2 * jnp.pi * (number - last) / (RATE * recovery.period))
-            by_energy = tau + law.share * (limited(far(y, law.gains, beyond), -law.most, law.most) - tau)
+            by_energy = tau + law.share * (saturated(far(y, law.gains, beyond), -law.most, law.most) - tau)
             u = jnp.where(number < last, by_plan, jnp.where(cost(y) <= law.level, near(y), by_energy))
-            u = limited(u, -LIMIT, LIMIT)
+            u = saturated(u, -LIMIT, LIMIT)
             return (inner, number + 1, u), u
 
         return Controller((planned.start, jnp.asarray(0), jnp.zeros(1)), act)

@@ -13,10 +13,9 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control import EnergyGains
-from dln_jax.control.desktop_plants import DesktopPlant
-from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
+from dln_jax.control.closed_loop import Outcomes, hanging_starts, outcomes
+from dln_jax.control.desktop_plants import DesktopPlant, model_of_plant, motion_of, nominal_model
 from dln_jax.control.swing_up import SwingUpNumbers
-from dln_jax.control.swing_up_runs import model_of_plant, motion_of, nominal_model
 from dln_jax.mechanics.dynamics import Dynamics
 
 SEED = 1_000_000

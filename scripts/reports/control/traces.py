@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from dln_jax.control import Run
-from dln_jax.control.outcomes import hanging_starts
-from dln_jax.figures.closed_loops import closed_loop_traces
+from dln_jax.control import ClosedLoopRun
+from dln_jax.control.closed_loop import hanging_starts
+from dln_jax.figures.closed_loops import closed_loop_traces, success_over_starts
 from dln_jax.mechanics.equations import dynamics
 from scripts.reports.case import Findings
 from scripts.reports.control.energy_laws import SwingUp, closed_loop, rows_of_outcomes, tried
@@ -42,7 +42,7 @@ def draw_traces(curves: Mapping[str, Any]) -> Figure:
     t, d = np.array(curves["t"]), len(curves["revolute"])
     x = np.reshape(curves["x"], (-1, len(t), 2 * d))
     u = np.reshape(curves["u"], (len(x), -1, 1))[:, : len(t) - 1]
-    runs = Run(jnp.asarray(t), jnp.asarray(x), jnp.asarray(u), jnp.zeros((len(x), len(t) - 1, d)))
+    runs = ClosedLoopRun(jnp.asarray(t), jnp.asarray(x), jnp.asarray(u), jnp.zeros((len(x), len(t) - 1, d)))
     limit, (goal,) = curves["limit"][0], curves["goal_energy"]
     sliding = curves["revolute"][0] == 0.0
     return closed_loop_traces(

@@ -120,9 +120,9 @@ def laws(known: dict[str, tuple[Dynamics, Any]], held_out: Trajectories) -> dict
         ahead, computed = feed_forward(model, AHEAD), computed_torque(model, COMPUTED)
         found |= {f"feed-forward/{name}": ahead, f"computed-torque/{name}": computed}
         if outside is not None:
-            found[f"trusted/{name}"] = trusted(model, computed, ahead, outside=outside)
+            found[f"trusted/{name}"] = trusted(model, computed, ahead, out_of_distribution=outside)
             usable = judged(model, held_out).usable
-            found[f"judged/{name}"] = trusted(model, computed, ahead, outside=outside, usable=usable)
+            found[f"judged/{name}"] = trusted(model, computed, ahead, out_of_distribution=outside, usable=usable)
     return found
 
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from dln_jax.figures import style
 from dln_jax.locomotion.learning import Record
-from dln_jax.locomotion.progress import median_to_reach
+from dln_jax.training.locomotion import median_to_reach
 
 Curves = Mapping[str, Sequence[Sequence[Record]]]
 """Records of the seeds, by the name of the method."""

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from dln_jax.locomotion.learning import LANES, Compiled, Goal, Learner, compile_evaluation
-from dln_jax.locomotion.methods import Report, Trained, learn_seeds
-from dln_jax.locomotion.policy import Parameters, Policy
-from dln_jax.locomotion.task import Task, actuation_of
+from dln_jax.locomotion.gradient import Report, TrainedPolicies, learn_seeds
+from dln_jax.locomotion.learning import LANES, CompiledLearner, Goal, Learner, Parameters, Policy, compile_evaluation
+from dln_jax.locomotion.task import LocomotionTask, actuation_of
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError
@@ -61,8 +60,8 @@ def check(lanes: int | None, mesh: Mesh | None) -> None:
 
 
 def train_by_ppo(
-    task: Task, seeds: Sequence[int], goal: Goal, report: Report, *, lanes: int | None, mesh: Mesh | None
-) -> Trained:
+    task: LocomotionTask, seeds: Sequence[int], goal: Goal, report: Report, *, lanes: int | None, mesh: Mesh | None
+) -> TrainedPolicies:
     """Learns with several seeds, without checkpoints; arguments as for `dln_jax.locomotion.train`."""
     return learn_seeds(compile_ppo(task, settings_of(lanes), mesh=mesh), seeds, goal, report)
 
@@ -73,7 +72,7 @@ def require_stable_baselines3() -> None:
         raise InputError("ppo needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
 
 
-def make_actor(task: Task) -> Policy:
+def make_actor(task: LocomotionTask) -> Policy:
     """Returns the actor's mean as a policy; parameters are "w" and "b" of the layers, and `init` raises."""
 
     def apply(parameters: Parameters, observation: Float[Array, " o"]) -> Float[Array, " k"]:
@@ -99,11 +98,11 @@ def actor_parameters(model: Any) -> Parameters:
 
 
 def compile_ppo(
-    task: Task,
+    task: LocomotionTask,
     settings: PPOSettings = PPOSettings(),  # noqa: B008
     *,
     mesh: Mesh | None = None,
-) -> Compiled:
+) -> CompiledLearner:
     """Returns the learner with its programs; an update takes `settings.steps` steps of every lane.
 
     Devices of a mesh share the lanes. All processes train the networks identically, because they see the same lanes and
@@ -147,4 +146,4 @@ def compile_ppo(
     steps, actor = settings.steps * settings.lanes, make_actor(task)
     learner = Learner(actor, start, improve, actor_parameters, steps, skipped=lambda model: 0)
     evaluate = compile_evaluation(task, actor, actor_parameters(start(0)), mesh)
-    return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began)
+    return CompiledLearner(learner, improve, evaluate, time.perf_counter() - began)

@@ -3,8 +3,8 @@
 import math
 
 from dln_jax.locomotion.learning import Record
-from dln_jax.locomotion.progress import first_reaching, median_to_reach
-from scripts.reports.rows import Row
+from dln_jax.metrics.report import Row
+from dln_jax.training.locomotion import first_reaching, median_to_reach
 
 
 def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goal: float, seed: int) -> list[Row]:

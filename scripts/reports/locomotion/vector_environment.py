@@ -10,8 +10,17 @@ from jax.sharding import Mesh
 from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 from dln_jax.locomotion.environment import spaces
-from dln_jax.locomotion.learning import LANES, chosen
-from dln_jax.locomotion.task import FALLEN, Place, Task, actuation_of, advance, beginning, observe
+from dln_jax.locomotion.learning import LANES
+from dln_jax.locomotion.task import (
+    FALLEN,
+    EpisodeState,
+    LocomotionTask,
+    actuation_of,
+    advance,
+    beginning,
+    chosen,
+    observe,
+)
 from dln_jax.scale.mesh import program, shares, spread
 
 
@@ -21,7 +30,7 @@ class VectorEnvironment(VecEnv):
     Raises `InputError` for a mesh that does not divide the lanes.
     """
 
-    def __init__(self, task: Task, lanes: int, *, reward_scale: float = 1.0, mesh: Mesh | None = None):
+    def __init__(self, task: LocomotionTask, lanes: int, *, reward_scale: float = 1.0, mesh: Mesh | None = None):
         shares(mesh, lanes, LANES)
         self.render_mode = None
         super().__init__(lanes, *spaces(task))
@@ -29,7 +38,7 @@ class VectorEnvironment(VecEnv):
         self._start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), beginning(task))
         self._places, self._actions = self._start, np.zeros((lanes, task.muscle_count), np.float32)
 
-        def one(place: Place, action: Any) -> tuple[Place, Any]:
+        def one(place: EpisodeState, action: Any) -> tuple[EpisodeState, Any]:
             after, seen = advance(task, place, actuation_of(action))
             terminated = (jnp.abs(seen.tilt) > FALLEN) | ~seen.converged
             truncated = (after.steps >= task.episode) & ~terminated

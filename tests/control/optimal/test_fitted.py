@@ -7,11 +7,9 @@ import pytest
 
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
-from dln_jax.control.optimal.boxes import drawn, widened
 from dln_jax.control.optimal.fitted import Iteration, fit_value, fit_values
-from dln_jax.control.optimal.flow import flow
+from dln_jax.control.optimal.flow import drawn, flow, targets, widened
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
-from dln_jax.control.optimal.targets import targets
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.types import InputError

@@ -33,7 +33,7 @@ LINEAR = ControlProblem(
 @pytest.mark.slow
 def test_the_value_of_a_linear_plant():
     S = lqr(A - 0.15 * np.eye(2), B, np.eye(2), np.eye(1)).S
-    corners = {"low": [-2, -2], "high": [2, 2], "most": 8.0}
+    corners = {"low": [-2, -2], "high": [2, 2], "limit": 8.0}
     coarse = solve_on_grid(LINEAR, (33, 65), **corners)
     found = solve_on_grid(LINEAR, (129,), **corners, start=coarse)
     assert coarse.converged
@@ -111,7 +111,7 @@ def cost_of(problem, law, x, *, dt=0.02, seconds=20.0):
 @pytest.fixture(scope="module")
 def of_weak_pendulum():
     problem = weak_pendulum()
-    return problem, solve_on_grid(problem, (51, 101), low=[-math.pi, -14], high=[math.pi, 14], most=LIMIT)
+    return problem, solve_on_grid(problem, (51, 101), low=[-math.pi, -14], high=[math.pi, 14], limit=LIMIT)
 
 
 @pytest.mark.slow
@@ -136,12 +136,12 @@ def test_policy_of_the_value_costs_what_the_value_says(of_weak_pendulum):
     problem, found = of_weak_pendulum
     x = np.random.default_rng(4).uniform([-math.pi, -8], [math.pi, 8], (60, 2))
     V = np.asarray(interpolated(found.grid, found.V, x))
-    followed = cost_of(problem, lookahead(problem, found, most=LIMIT), x)
+    followed = cost_of(problem, lookahead(problem, found, limit=LIMIT), x)
     assert np.median(np.abs(followed - V) / followed) < 1e-2
 
 
 def test_too_few_improvements_are_not_converged():
-    found = solve_on_grid(LINEAR, (17,), low=[-3, -3], high=[3, 3], most=8.0, improvements=1)
+    found = solve_on_grid(LINEAR, (17,), low=[-3, -3], high=[3, 3], limit=8.0, improvements=1)
     assert not found.converged
     assert reason(found.ending).startswith("used up its iterations")
 
@@ -159,4 +159,4 @@ def test_a_step_and_its_cost():
 
 def test_what_is_no_rectangle():
     with pytest.raises(InputError, match="two ascending numbers"):
-        solve_on_grid(LINEAR, (33,), low=[1, -3], high=[-1, 3], most=8.0)
+        solve_on_grid(LINEAR, (33,), low=[1, -3], high=[-1, 3], limit=8.0)

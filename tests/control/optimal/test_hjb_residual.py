@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import discounts_down_to, fit_residual
+from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.types import InputError
 
@@ -25,7 +25,7 @@ KEY = jax.random.key(1)
 def test_continuation_comes_to_the_cost_to_go_and_not_to_the_other_solution():
     form = lambda theta, x: (theta * x[0] ** 2, 2 * theta * x)  # noqa: E731
     fits = {
-        name: fit_residual(LINE, form, jnp.asarray(-3.0), KEY, discounts=discounts, **FEW)
+        name: fit_hjb(LINE, form, jnp.asarray(-3.0), KEY, discounts=discounts, **FEW)
         for name, discounts in (("with", discounts_down_to(0.0, first=100.0)), ("without", [0.0]))
     }
     assert fits["with"].parameters == pytest.approx((1 + np.sqrt(2)) / 2, rel=1e-12)
@@ -56,7 +56,7 @@ def test_six_states_have_the_regulators_value():
         np.zeros(6),
     )  # fmt: skip
     form = value_network(problem, widths=(), floor=0.0)
-    fit = fit_residual(problem, form.value_and_gradient, form.init(KEY), KEY, iterations=60, **FEW)
+    fit = fit_hjb(problem, form.value_and_gradient, form.init(KEY), KEY, iterations=60, **FEW)
     x = high * np.random.default_rng(0).uniform(-1, 1, (20, 6))
     value, slope = jax.vmap(lambda x: form.value_and_gradient(fit.parameters, x))(x)
     S = np.asarray(lqr(A, B, Q, R).S)
@@ -69,7 +69,7 @@ def test_a_network_has_the_value_of_limited_controls():
     limit, weight = 5.5, 2 * 5.5 / np.pi
     problem = LINE._replace(action_cost=limited_atan(limit, weight))
     network = value_network(problem, widths=(8,), scale=100.0)
-    fit = fit_residual(
+    fit = fit_hjb(
         problem,
         network.value_and_gradient,
         network.init(KEY),
@@ -104,7 +104,7 @@ def test_what_cannot_be_fitted_is_one_line(change, message):
     form = lambda theta, x: (theta * x[0] ** 2, 2 * theta * x)  # noqa: E731
     settings = {"problem": LINE, "discounts": [0.0], **FEW, **change}
     with pytest.raises(InputError, match=message):
-        fit_residual(settings.pop("problem"), form, jnp.asarray(1.0), KEY, **settings)
+        fit_hjb(settings.pop("problem"), form, jnp.asarray(1.0), KEY, **settings)
 
 
 def test_discounts_come_down():

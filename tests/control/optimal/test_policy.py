@@ -7,8 +7,7 @@ import pytest
 
 from dln_jax.control import simulate, stateless
 from dln_jax.control.optimal.action_costs import limited_atan
-from dln_jax.control.optimal.policy import hjb_policy
-from dln_jax.control.optimal.problem import ControlProblem, rates
+from dln_jax.control.optimal.problem import ControlProblem, hjb_policy, rates
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c

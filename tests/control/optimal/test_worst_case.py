@@ -7,7 +7,7 @@ import pytest
 
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.types import InputError
 
@@ -42,7 +42,7 @@ def test_without_a_slope_or_a_bound_it_does_nothing():
 
 
 def test_parameters_stay_where_they_make_sense():
-    change = worst_disturbance(plant, P, Bounds(parameters=0.5), least=[1.0, -1.0], most=[1.5, 0.0])
+    change = worst_disturbance(plant, P, Bounds(parameters=0.5), lower=[1.0, -1.0], upper=[1.5, 0.0])
     np.testing.assert_allclose(change(X, jnp.array([1.0, 1.0]), U), [(1.5 - 1.2) * 0.4, -0.2 * -1.0], rtol=1e-12)
     with pytest.raises(InputError, match="bound of action"):
         worst_disturbance(plant, P, Bounds(action=-1.0))
@@ -55,7 +55,7 @@ def test_a_robust_value_is_that_of_the_worst_plant():
     )
     worst = worst_disturbance(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=0.1))
 
-    fit = fit_residual(
+    fit = fit_hjb(
         line, lambda theta, x: (theta * x[0] ** 2, 2 * theta * x), jnp.asarray(1.0), jax.random.key(0),
         samples=64, validation=64, disturbance=worst,
     )  # fmt: skip

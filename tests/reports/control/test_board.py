@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Run
+from dln_jax.control import ClosedLoopRun
 from dln_jax.mechanics.equations import dynamics
 from scripts.reports.control import board
 from scripts.reports.control.board import Criteria, criteria, plant, play, score
@@ -23,7 +23,7 @@ def test_criteria_of_a_motion_that_is_known():
     q = np.stack([np.minimum(np.pi * t, np.pi), np.zeros_like(t)], axis=1)
     qd = np.stack([np.where(t < 1, np.pi, 0.0), np.zeros_like(t)], axis=1)
     u = np.where(t[:-1] < 1, 2.0, 0.0)[:, None]
-    found = criteria("shoulder", Run(*map(jnp.asarray, (t, np.hstack([q, qd]), u, q))))
+    found = criteria("shoulder", ClosedLoopRun(*map(jnp.asarray, (t, np.hstack([q, qd]), u, q))))
     # The stretched tip is at 0.9 of its length from the angle arccos(-0.9) on.
     assert found.time == pytest.approx(np.arccos(-0.9) / np.pi, abs=2 / board.RATE)
     assert found.energy == pytest.approx(2 * np.pi, rel=1e-12)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Gains, Problem, Reference, feed_forward, first_plan
+from dln_jax.control import Gains, Reference, TrajectoryProblem, feed_forward, first_plan
 from dln_jax.control import mpc as predicting
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
@@ -17,7 +17,9 @@ from scripts.reports.robots.arm import Motion
 def planning():
     """A pendulum's plan, moved on and improved."""
     field = lambda x, u: jnp.stack([x[1], jnp.sin(x[0]) + u[0]])  # noqa: E731
-    problem = Problem(lambda x, u: x + 0.1 * field(x, u), lambda x, u: x @ x + u @ u, lambda x: 9 * x @ x, -0.5, 0.5)
+    problem = TrajectoryProblem(
+        lambda x, u: x + 0.1 * field(x, u), lambda x, u: x @ x + u @ u, lambda x: 9 * x @ x, -0.5, 0.5
+    )
     plan, act = first_plan(problem, np.zeros(2), np.zeros((3, 1))), predicting(problem, step_lengths=(1.0, 0.3))
 
     def law(x, u, about, K):

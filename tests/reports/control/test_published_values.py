@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.optimal.evaluation import evaluate, starts
-from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.control.optimal.plants import PLANTS, evaluate, starts
 from dln_jax.control.optimal.problem import checked, rates
 from scripts.reports.control.values.truths import direct_values, followed, regulator_value
 

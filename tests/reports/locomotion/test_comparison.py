@@ -3,7 +3,7 @@
 import numpy as np
 
 from dln_jax.locomotion.learning import Record
-from dln_jax.locomotion.progress import median_to_reach
+from dln_jax.training.locomotion import median_to_reach
 from scripts.reports.locomotion import comparison
 
 

@@ -61,8 +61,7 @@ def test_vector_lanes_are_single_environments(task, environment, shared):
     np.testing.assert_array_equal(seen, lanes.reset())
 
 
-def test_missing_stable_baselines3_is_one_line(capsys, monkeypatch, tmp_path):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "stable_baselines3" else find(name))
+def test_missing_rivals_are_one_line(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert "pip install 'dln-jax[rl]'" in refused(capsys, compare_locomotion, "--out", tmp_path / "run")
     assert not (tmp_path / "run").exists()

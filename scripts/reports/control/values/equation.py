@@ -17,17 +17,15 @@ from jaxtyping import Float
 
 from dln_jax.control import field_of, linearise, lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
-from dln_jax.control.optimal.evaluation import evaluate, starts
-from dln_jax.control.optimal.plants import PLANTS
-from dln_jax.control.optimal.policy import hjb_policy
-from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import discounts_down_to, fit_residual
+from dln_jax.control.optimal.plants import PLANTS, evaluate, starts
+from dln_jax.control.optimal.problem import ControlProblem, hjb_policy
+from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from scripts.reports.case import Findings
 from scripts.reports.control.values import robust
-from scripts.reports.rows import Row, expect, largest, unit_of
+from scripts.reports.control.values.fits import PUBLISHED
 
 EXACT = 1e-8
 LIMIT, WEIGHT = 5.5, 2 * 5.5 / np.pi
@@ -48,7 +46,7 @@ def line(quick: bool) -> Findings:
         ("continued", discounts_down_to(0.0, first=100.0), THETA[0]),
         ("not_continued", [0.0], THETA[1]),
     ):
-        found = fit_residual(
+        found = fit_hjb(
             LINE, form, jnp.asarray(-3.0), jax.random.key(0), discounts=discounts, samples=64, validation=64
         )
         words = "the cost to go, from a start that is nearer to the other solution"
@@ -124,7 +122,7 @@ def by_network(
         network = value_network(problem, widths=widths, scale=float(np.max(truth)), floor=1e-3 if widths else 0.0)
         of_parameters, of_samples = jax.random.split(jax.random.key(seed))
         began = time.perf_counter()
-        fit = fit_residual(
+        fit = fit_hjb(
             problem, network.value_and_gradient, network.init(of_parameters), of_samples,
             samples=samples, validation=samples, iterations=iterations,
         )  # fmt: skip
@@ -147,7 +145,7 @@ def published(quick: bool) -> Findings:
     for seed in range(seeds):
         of_parameters, of_samples = jax.random.split(jax.random.key(seed))
         began = time.perf_counter()
-        fit = fit_residual(
+        fit = fit_hjb(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
             samples=samples, iterations=iterations,
         )  # fmt: skip
@@ -156,7 +154,7 @@ def published(quick: bool) -> Findings:
         found = evaluate(plant, _law(network.value_and_gradient, fit.parameters, plant.problem), starts(plant, "down"))
         returns.append(float(np.mean(found.returns)))
         up.append(float(np.mean(np.isfinite(found.settled))))
-    reference = plant.reference["down"]
+    reference = PUBLISHED["pendulum"]
     return Findings(
         [
             Row(case, "down_return_median", float(np.median(returns)), reference=reference),

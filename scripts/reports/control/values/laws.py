@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import jax
 
-from dln_jax.control.balance import Law
 from dln_jax.control.optimal.plants import PLANTS
-from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.state_space import Law
 
 
 def drawn_law(plant: str = "cart-pole", *, widths: Sequence[int] = (64, 64), members: int = 1, seed: int = 0) -> Law:

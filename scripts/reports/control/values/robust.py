@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.balance import Law
-from dln_jax.control.optimal.evaluation import Returns, evaluate, starts
-from dln_jax.control.optimal.plants import PLANTS
-from dln_jax.control.optimal.policy import hjb_policy
-from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.control.optimal.plants import PLANTS, Returns, evaluate, starts
+from dln_jax.control.optimal.problem import ControlProblem, hjb_policy
+from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
+from dln_jax.control.state_space import Law
+from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
 from scripts.reports.rows import Row
 
@@ -44,7 +43,7 @@ def trained(problem: ControlProblem, share: float, seed: int, quick: bool) -> La
     """Trains a value against the worst disturbance of mass and length by a share, and returns its policy."""
     network = value_network(problem, widths=(8, 8) if quick else (16, 16), scale=30.0)
     of_parameters, of_samples = jax.random.split(jax.random.key(seed))
-    fit = fit_residual(
+    fit = fit_hjb(
         problem, network.value_and_gradient, network.init(of_parameters), of_samples,
         samples=512 if quick else 2048, iterations=5 if quick else 15, rounds=6,
         disturbance=worst_disturbance(rod, [1.0, 1.0], Bounds(parameters=share)) if share else None,

@@ -15,10 +15,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control import Problem, lqr, optimise
-from dln_jax.control.optimal.boxes import circles
+from dln_jax.control import TrajectoryProblem, lqr, optimise
 from dln_jax.control.optimal.flow import flow
-from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.problem import ControlProblem, circles
 from dln_jax.types import Scalar
 
 
@@ -74,7 +73,7 @@ def direct_values(
     def final(state: Array) -> Scalar:
         return state[-1] * (tail(state[:-1]) + 0.5 * dt * problem.state_cost(state[:-1]))
 
-    planned = Problem(step, cost, final, -limit, limit)
+    planned = TrajectoryProblem(step, cost, final, -limit, limit)
 
     def best(x: Array, u: Array) -> Array:
         plan = optimise(planned, jnp.append(x, 1.0), u[:, None], iterations=iterations, tolerance=tolerance)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dln_jax.control import lqr, sampled_lqr, time_varying_lqr
-from dln_jax.control.quadratic import held
+from dln_jax.control.regulators import held
 from dln_jax.types import InputError
 
 A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])

@@ -22,7 +22,7 @@ def step(x, u):
 @pytest.mark.parametrize("delay", [0, 3])
 def test_it_is_the_loop_without_delay_that_comes_later(delay):
     prompt = simulate(FIELD, LAW, np.zeros(2), **SETTINGS)
-    predicting = with_prediction(LAW, step, states=2, controls=1, most=5)
+    predicting = with_prediction(LAW, step, states=2, controls=1, max_delay=5)
     late = simulate(FIELD, predicting, np.zeros(2), hardware=Hardware(delay=delay), **SETTINGS)
     np.testing.assert_allclose(late.x[delay:], prompt.x[: len(prompt.x) - delay], atol=1e-9)
     # Without prediction it is another motion.
