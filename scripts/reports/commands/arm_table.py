@@ -18,7 +18,7 @@ from dln_jax.files import write_bytes, write_figure
 from dln_jax.metrics.report import conditions, publish
 from dln_jax.types import InputError
 from scripts.reports.arm import table
-from scripts.reports.case import Case, measure, say_numbers
+from scripts.reports.case import Case, compared, measure, say_numbers
 
 
 @dataclass(frozen=True)
@@ -43,34 +43,34 @@ class Arguments(Resumable):
     """Structured models that are trained one by one, to time Gauss-Newton; 0 leaves them out."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures the cases that are not stored yet, prints the table and writes it."""
-    require_positive_if_given(given, ("seeds", "split_seeds", "steps"))
+    require_positive_if_given(options, ("seeds", "split_seeds", "steps"))
+    counts = {key: getattr(options, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
     for name in ("splits", "adam_steps", "timed_seeds"):
-        if getattr(given, name) < 0:
-            raise InputError(
-                f"--{name.replace('_', '-')} is {getattr(given, name)}; expected a whole number, 0 or more"
-            )
-    sets, parts = table.data_sets(given.data, given.uniform, given.splits)
-    counts = {key: getattr(given, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
+        if getattr(options, name) < 0:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} is {getattr(options, name)}; expected a whole number, 0 or more")
+    sets, parts = table.data_sets(options.data, options.uniform, options.splits)
     cases = table.cases(sets, parts, **counts)
-    with command_folder(given, "arm_table") as folder:
+    with command_folder(options, "arm_table") as folder:
         say = say_numbers("torque_mse", "vpt_seconds", "train_seconds", "seconds_to_1e-08")
-        found = measure(sorted(cases, key=_late), say, folder=folder, resume=given.resume)
-        rows = table.table_rows({case.name: found[case.name] for case in cases})
+        results = measure(sorted(cases, key=_late), say, folder=folder, resume=options.resume)
+        rows = table.table_rows({case.name: results[case.name] for case in cases})
         facts = conditions(
             dtype="float64; adam float32",
-            seeds=list(range(given.seeds)),
+            seeds=list(range(options.seeds)),
             selection="stopping by validation; sizes settled on seed 0 by validation, its test errors printed beside "
             "them",
-            data="embedded letters" if given.data is None else given.data.name,
+            data="embedded letters" if options.data is None else options.data.name,
             statistics="medians over seeds; one program for all seeds of a model",
             splits=[" ".join(part.test.label[np.unique(part.test.trajectory)]) for part in parts],
         )
-        write_bytes(folder / "table.md", table.markdown(rows).encode())
-        write_figure(folder / "pareto.png", table.figure(found))
-        compared = [row for row in rows if row.bound is not None or row.reference is not None]
-        publish(folder, rows, facts, shown=compared, tables=[table.markdown(rows)])
+        shown = compared(rows, table.SHOWN)
+        write_bytes(folder / "table.md", shown.encode())
+        write_figure(folder / "pareto.png", table.figure(results))
+        beside = [row for row in rows if row.bound is not None or row.reference is not None]
+        publish(folder, rows, facts, shown=beside, tables=[shown])
         print(f"table: {folder / 'table.md'}, figure: {folder / 'pareto.png'}")
 
 

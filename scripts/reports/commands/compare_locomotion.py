@@ -31,38 +31,40 @@ class Arguments(Options, Folder, Drawn, Scaled):
     MEASURES_COMPILATION: ClassVar = True
 
     seeds: int = 3
-    """Of each method, one after the other."""
+    """Number of seeds of each method, one after the other."""
     until: Unstated[float] = 1.2
     """Body lengths at which a seed ends (default: 1.2)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Trains by all methods, prints the comparison and writes it."""
-    mesh = mesh_of(given)
-    ppo.check(given.lanes, mesh)
-    task = prepare(given, METHODS, mesh)
+    mesh = mesh_of(options)
+    ppo.check(options.lanes, mesh)
+    task = prepare(options, METHODS, mesh)
     settings: dict[str, Any] = {
-        method: settings_of(method, given.creature, given.window, given.lanes) for method in METHODS
+        method: settings_of(method, options.creature, options.window, options.lanes) for method in METHODS
     }
-    settings["ppo"] = ppo.settings_of(given.lanes)
-    with command_folder(given, "compare_locomotion") as folder:
+    settings["ppo"] = ppo.settings_of(options.lanes)
+    with command_folder(options, "compare_locomotion") as folder:
         announce(task)
         curves, numbers = {}, {}
-        by_ppo = partial(ppo.train_by_ppo, task, lanes=given.lanes, mesh=mesh)
+        by_ppo = partial(ppo.train_by_ppo, task, lanes=options.lanes, mesh=mesh)
         ways: dict[str, Callable[[], Trained]] = {
-            method: partial(learned, task, method, given, mesh) for method in METHODS
+            method: partial(learned, task, method, options, mesh) for method in METHODS
         }
-        ways["ppo"] = lambda: reported(given, "ppo", given.steps or ppo.STEPS, by_ppo)
+        ways["ppo"] = lambda: reported(options, "ppo", options.steps or ppo.STEPS, by_ppo)
         for method, train in ways.items():
             trained = train()
             (folder / method).mkdir()
-            found = write_run(folder / method, task, method, trained, given, settings[method], figures=given.figures)
-            numbers |= {f"{method}_{name}": value for name, value in found.items()}
-            curves[method] = [of.records for of in trained.learned]
-        rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
+            metrics = write_run(
+                folder / method, task, method, trained, options, settings[method], figures=options.figures
+            )
+            numbers |= {f"{method}_{name}": value for name, value in metrics.items()}
+            curves[method] = [seed.records for seed in trained.learned]
+        rows = comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
         facts = conditions(
             dtype="float64; ppo's networks float32",
-            seeds=list(range(given.seed, given.seed + given.seeds)),
+            seeds=list(range(options.seed, options.seed + options.seeds)),
             settings={method: numbers._asdict() for method, numbers in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
             counted="environment steps of learning; one episode after each evaluation is apart",
@@ -70,8 +72,8 @@ def main(given: Arguments) -> None:
         )
         write_report(folder / "report.json", rows, facts)
         write_json(folder / "metrics.json", numbers)
-        if given.figures:
-            title = f"{given.creature}: farthest so far, {given.seeds} seeds (thin) and their median (thick)"
+        if options.figures:
+            title = f"{options.creature}: farthest so far, {options.seeds} seeds (thin) and their median (thick)"
             write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
         print_report(rows, facts)
         if any(math.isinf(median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):

@@ -90,8 +90,8 @@ def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, sampl
 
     @jax.jit
     def asked(q: Any, qd: Any, now: Reference) -> Any:
-        found = law(q, qd, now)
-        tau, usable = found if isinstance(found, tuple) else (found, jnp.asarray(True))
+        answer = law(q, qd, now)
+        tau, usable = answer if isinstance(answer, tuple) else (answer, jnp.asarray(True))
         return limited(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
 
     q, step = plant(wanted)
@@ -102,7 +102,7 @@ def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, sampl
         seen = ENCODER_STEP * np.round(q / ENCODER_STEP)
         qd = qd if before is None else qd + share * ((seen - before) / STEP - qd)
         before = seen
-        tau, usable = asked(seen, qd, Reference(*(each[number] for each in wanted)))
+        tau, usable = asked(seen, qd, Reference(*(values[number] for values in wanted)))
         off.append(q - wanted.q[number])
         used += bool(usable)
         # Torques act one sample late; the first torque holds the arm at the start.

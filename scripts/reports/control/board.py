@@ -15,6 +15,7 @@ from jax import Array
 
 from dln_jax.control import Controller, Hardware, Run, field_of, simulate
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.report import Row
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
 
@@ -43,6 +44,8 @@ class Criteria(NamedTuple):
 
 
 SIZES = Criteria(20.0, 60.0, 20.0, 0.1, 400.0)
+UNITS = ("s", "J", "N² m² s", "N m", "rad²/s")
+"""Units of the criteria."""
 
 
 def plant(motor: Motor) -> tuple[Scene, Array]:
@@ -78,8 +81,15 @@ def criteria(motor: Motor, run: Run) -> Criteria:
     )
 
 
-def score(found: Criteria) -> float:
+def score(numbers: Criteria) -> float:
     """Score of version 2, from 0 to 1; 0 without success or if a criterion is NaN."""
-    if not np.isfinite(found).all():
+    if not np.isfinite(numbers).all():
         return 0.0
-    return 1 - float(np.mean([np.tanh(np.pi * value / size) for value, size in zip(found, SIZES, strict=True)]))
+    return 1 - float(np.mean([np.tanh(np.pi * value / size) for value, size in zip(numbers, SIZES, strict=True)]))
+
+
+def rows_of_criteria(case: str, numbers: Criteria) -> list[Row]:
+    """The five criteria of the score."""
+    return [
+        Row(case, key, float(number), unit) for key, number, unit in zip(numbers._fields, numbers, UNITS, strict=True)
+    ]

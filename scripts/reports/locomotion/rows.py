@@ -24,5 +24,5 @@ def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goa
         rows += [Row(case, steps, median), Row(case, "seconds_to_one_body_length", seconds, "s", bound=bound)]
     name, bound = "environment_steps_ratio_to_gradient", 3.0 if crawls else None
     ratios = {method: needed[method] / needed["gradient"] for method in curves if method != "gradient"}
-    rows += [Row(f"{creature}/{method}", name, each, bound=bound, at_least=True) for method, each in ratios.items()]
+    rows += [Row(f"{creature}/{method}", name, ratio, bound=bound, at_least=True) for method, ratio in ratios.items()]
     return rows

@@ -9,14 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, load
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
 from dln_jax.metrics.report import Row
+from scripts.reports.robots.arm import torque_of
 from scripts.reports.robots.double_pendulum_fits import (
     CUTOFF,
     RATE,
@@ -59,12 +58,12 @@ def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
     `torque_nmse_low_passed` is the low-passed error along less filtered motions.
     """
     logs = read(path)
-    found = [split_numbers(logs, labels) for labels in held_out]
+    splits = [split_numbers(logs, labels) for labels in held_out]
     listed = []
     for way in WAYS:
         for quantity, (unit, longer) in QUANTITIES.items():
-            values, rival = ([each[name][quantity] for each in found] for name in (way, WAYS[0]))
-            of_splits = {f"_{'_'.join(labels)}": lambda each, n=n: each[n] for n, labels in enumerate(held_out)}
+            values, rival = ([numbers[name][quantity] for numbers in splits] for name in (way, WAYS[0]))
+            of_splits = {f"_{'_'.join(labels)}": lambda values, n=n: values[n] for n, labels in enumerate(held_out)}
             for suffix, of in {"": np.median, "_worst": np.min if longer else np.max, **of_splits}.items():
                 bound = float(of(rival)) if way != WAYS[0] else None
                 row = Row(f"double-pendulum/{way}", quantity + suffix, float(of(values)), unit, None, bound, longer)
@@ -76,7 +75,7 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
     """Numbers by method and quantity, with the recordings of these labels held out."""
     index = {label: place for place, label in enumerate(logs.fine.label)}
     test = [index[label] for label in held_out]
-    rest = logs.of(each for each in np.unique(logs.fine.trajectory) if each not in test)
+    rest = logs.of(index for index in np.unique(logs.fine.trajectory) if index not in test)
     scale = choose_scale(rest)
     fits = (
         fit_torques(rest),
@@ -86,21 +85,21 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
         fit_motions(rest, scale),
         fit_both(rest, scale),
     )
-    return {way: judged(found, logs.of(test), logs) for way, found in zip(WAYS, fits, strict=True)}
+    return {way: judged(fitted, logs.of(test), logs) for way, fitted in zip(WAYS, fits, strict=True)}
 
 
-def judged(found: Fitted, held: Logs, every: Logs) -> Numbers:
+def judged(fitted: Fitted, held: Logs, every: Logs) -> Numbers:
     """Torque errors relative to the variance over all recordings, averaged over joints, and valid prediction times."""
-    torque = jax.jit(jax.vmap(dynamics(found.model.energies(found.parameters)).inverse_dynamics))
+    torque = torque_of(*fitted)
     variance = every.coarse.tau.var(axis=0)
 
     def error(data: Trajectories, filtered: Any) -> float:
-        off = np.asarray(torque(data.q, data.qd, data.qdd)) - data.tau
+        off = torque(data.q, data.qd, data.qdd) - data.tau
         parts = [filtered(off[data.trajectory == index]) for index in np.unique(data.trajectory)]
         return float(np.mean(np.concatenate(parts) ** 2 / variance))
 
     segments = cut_segments(held.fine, round(HORIZON * RATE), every=round(EVERY * RATE))
-    predicted = predict_measured(*found, segments, fitted=WINDOW)
+    predicted = predict_measured(*fitted, segments, fitted=WINDOW)
     times = valid_times(segments, predicted, fitted=WINDOW, variance=every.fine.q.var(axis=0))
     numbers = (
         error(held.coarse, lambda off: off),

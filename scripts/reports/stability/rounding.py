@@ -91,7 +91,7 @@ SATURATED: dict[str, tuple[_Values, Callable, float, dict]] = {
 def activations() -> Findings:
     """Every smooth activation and its two derivatives against series near 0 and expansions in saturation."""
     near = {name: (series, np.ones_like, 1e-12, dict.fromkeys(DTYPES, 1e-4)) for name, series in NEAR_ZERO.items()}
-    cases = []
+    rows = []
     for place, regions in (("near-0", near), ("saturated", SATURATED)):
         errors = [_rounding_units(regions, dtype) for dtype in DTYPES]
         for name, (_, _, nearest, farthest) in regions.items():
@@ -100,8 +100,8 @@ def activations() -> Findings:
                 f"within {ROUNDINGS:.0f} eps (1 + kappa) of their expansions"
             )
             got = largest([error[name] for error in errors])
-            cases.append(expect(f"activations-{place}/{name}", "rounding_units", text, got, ROUNDINGS))
-    return Findings(cases, _curvature_curves())
+            rows.append(expect(f"activations-{place}/{name}", "rounding_units", text, got, ROUNDINGS))
+    return Findings(rows)
 
 
 def turned_angles() -> Findings:
@@ -119,7 +119,7 @@ def turned_angles() -> Findings:
         f"tau after {TURNS} turns differs by |dtau/dq| times the rounding of the angle, 1.25 eps 2 pi k for the sum, "
         "the product and pi itself; 2 with that of tau"
     )
-    cases = []
+    rows = []
     for name, system, dtype in systems:
         q, qd, qdd = random_states(32, 2, RANGES, dtype)
         turn = np.asarray(2 * np.pi * TURNS, dtype) * np.array([1, -1], dtype)
@@ -130,8 +130,8 @@ def turned_angles() -> Findings:
         slopes = [abs(torque(q + step, qd, qdd) - torque(q - step, qd, qdd)) / (2 * step.max()) for step in steps]
         change = abs(torque(q + turn, qd, qdd) - torque(q, qd, qdd)).max(axis=1)
         got = largest(change / (np.sum(slopes, axis=0).max(axis=1) * float(np.finfo(dtype).eps) * 2 * np.pi * TURNS))
-        cases.append(expect(f"turned-angles/{name}", "rounding_units", text, got, 2.0))
-    return Findings(cases)
+        rows.append(expect(f"turned-angles/{name}", "rounding_units", text, got, 2.0))
+    return Findings(rows)
 
 
 def float32() -> Findings:
@@ -145,21 +145,21 @@ def float32() -> Findings:
         ("double-pendulum", dynamics(double_pendulum().energies), dynamics(double_pendulum().energies)),
     ]
     roundings = LAYERS * WIDTH
-    cases = []
+    rows = []
     for name, narrow, exact in pairs:
         states = random_states(64, 2, RANGES, np.float32)
-        found = _both_ways(narrow)(*states)
-        sizes = _sizes(exact, *(each.astype(np.float64) for each in states))
-        for quantity, value, (truth, size) in zip(("inverse", "forward"), np.swapaxes(found, 0, 1), sizes, strict=True):
+        both = _both_ways(narrow)(*states)
+        sizes = _sizes(exact, *(state.astype(np.float64) for state in states))
+        for quantity, value, (truth, size) in zip(("inverse", "forward"), np.swapaxes(both, 0, 1), sizes, strict=True):
             got = largest(abs(value - truth).max(axis=1) / size) / float(np.finfo(np.float32).eps)
             text = (
                 f"{quantity} dynamics within {roundings} eps32 (layers times width: the roundings in series) of the "
                 "sum of |terms|, with what inputs rounded by as much change"
             )
-            cases.append(expect(f"float32/{name}", f"{quantity}_rounding_units", text, got, float(roundings)))
+            rows.append(expect(f"float32/{name}", f"{quantity}_rounding_units", text, got, float(roundings)))
         text = "float32 in, float32 out: nothing is widened"
-        cases.append(expect(f"float32/{name}", "widened_outputs", text, float(found.dtype != np.float32), 0.0))
-    return Findings(cases)
+        rows.append(expect(f"float32/{name}", "widened_outputs", text, float(both.dtype != np.float32), 0.0))
+    return Findings(rows)
 
 
 def _rounding_units(regions: dict, dtype) -> dict[str, float]:
@@ -174,26 +174,14 @@ def _rounding_units(regions: dict, dtype) -> dict[str, float]:
         return {name: [function(x) for function in activation(name)[1:]] for name, x in points.items()}
 
     errors = {}
-    for name, found in evaluate(points).items():
+    for name, answers in evaluate(points).items():
         tail, kappa, *_ = regions[name]
         x, worst = points[name].astype(np.float64), []
-        for value, wanted in zip(found, tail(x), strict=True):
+        for value, wanted in zip(answers, tail(x), strict=True):
             condition = np.where(abs(wanted) < 0.1, kappa(x), 1.0)
             worst.append(largest(abs(np.asarray(value, np.float64) - wanted) / ((1 + condition) * abs(wanted))))
         errors[name] = largest(worst) / float(np.finfo(dtype).eps)
     return errors
-
-
-def _curvature_curves() -> dict:
-    """Relative error of tanh'' in float32, by its formula and by differentiating tanh twice."""
-    x = np.geomspace(1e-8, 30.0, 200).astype(np.float32)
-    exact = x.astype(np.float64)
-    decay = np.exp(-2 * exact)
-    truth = 8 * decay * np.expm1(-2 * exact) / (1 + decay) ** 3
-    nested = jax.vmap(jax.grad(jax.grad(lambda x: 1 - 2 / (jnp.exp(2 * x) + 1))))
-    found = {"formula": activation("tanh").second(jnp.asarray(x)), "1 - 2/(e^2x + 1), differentiated twice": nested(x)}
-    errors = {key: abs(np.asarray(value, float) - truth) / abs(truth) for key, value in found.items()}
-    return {"x": exact, "errors": errors}
 
 
 def _both_ways(system: Dynamics) -> Callable:
