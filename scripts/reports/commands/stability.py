@@ -18,10 +18,10 @@ from scripts.reports.stability.data_faults import batches, not_finite, torque_ch
 from scripts.reports.stability.double_pendulum import lyapunov_time
 from scripts.reports.stability.encounters import close_encounters, separatrix
 from scripts.reports.stability.noise import missing_friction, noise
-from scripts.reports.stability.rounding import activations, float32, turned_angles
+from scripts.reports.stability.rounding import float32, turned_angles
 
 SHORT = (
-    *(activations, turned_angles, float32, mass_conditions, sizes, indefinite_hessians, close_encounters),
+    *(turned_angles, float32, mass_conditions, sizes, indefinite_hessians, close_encounters),
     *(torque_channels, batches, not_finite, noise, missing_friction),
 )
 LONG = (separatrix, lyapunov_time)

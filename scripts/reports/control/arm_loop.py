@@ -1,4 +1,4 @@
-"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo or our own equations, with a model of the hardware.
+"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo, with a model of the hardware.
 
 Torques are limited and one sample late. Only angles are measured, by 14-bit encoders on the motor side of a 100:1 gear;
 rates are low-passed differences of angles.
@@ -13,10 +13,7 @@ import numpy as np
 
 from dln_jax.control import Reference, Tracker, limited, where_finite
 from dln_jax.data.robots import Robot
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
-from dln_jax.mechanics.trees import tree_system
 from scripts.reports.robots.arm import STEP, D, Motion, simulator
 from scripts.reports.robots.known_kinematics import USUAL_SCALE
 
@@ -54,28 +51,6 @@ def in_mujoco(robot: Robot) -> Plant:
             return np.array(data.qpos)
 
         return np.array(data.qpos), step
-
-    return start
-
-
-def in_equations(robot: Robot) -> Plant:
-    """The same tree in our equations, with smooth dry friction, by the classical Runge-Kutta method."""
-    system = dynamics(tree_system(robot.tree, friction_of(robot)))
-
-    @jax.jit
-    def after(x: Any, tau: Any) -> Any:
-        field = lambda t, x: jnp.concatenate([x[D:], system.forward_dynamics(x[:D], x[D:], tau)])  # noqa: E731
-        return runge_kutta(CLASSICAL, field)(0.0, x, STEP)
-
-    def start(wanted: Motion) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        x = np.concatenate([wanted.q[0], wanted.qd[0]])
-
-        def step(tau: np.ndarray) -> np.ndarray:
-            nonlocal x
-            x = np.asarray(after(x, tau))
-            return x[:D]
-
-        return x[:D], step
 
     return start
 

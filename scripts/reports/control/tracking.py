@@ -1,7 +1,7 @@
 """A seven-axis arm that follows references in closed loop with known, identified and learned models.
 
-The arm is that of the robot report (`robots.arm`) with dry friction, simulated in MuJoCo. Without MuJoCo our own
-equations with a smooth law of friction replace it. The loop is in `arm_loop`.
+The arm is that of the robot report (`robots.arm`) with dry friction, simulated in MuJoCo. The loop is in
+`arm_loop`.
 """
 
 from collections.abc import Callable
@@ -29,10 +29,9 @@ from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.report import Row
 from dln_jax.models.serial_tree import make_serial_tree
-from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings, spread
-from scripts.reports.control.arm_loop import Plant, Tracked, friction_of, in_equations, in_mujoco, track
+from scripts.reports.control.arm_loop import Plant, Tracked, friction_of, in_mujoco, track
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm, logs, measured, motion
 from scripts.reports.robots.known_kinematics import DECIMATE, LAWS, identified, rough
 
@@ -124,10 +123,7 @@ def laws(known: dict[str, tuple[Dynamics, Any]], held_out: Trajectories) -> dict
 def tracking(quick: bool) -> Findings:
     """Rms errors, mrad, by law and model over seeds of the data and unseen motions; failures count separately."""
     effort, robot = QUICK if quick else FULL, arm(coulomb=True)
-    try:
-        plant = in_mujoco(robot)
-    except InputError:
-        plant = in_equations(robot)
+    plant = in_mujoco(robot)
     by_law: dict[str, list[Tracked]] = {}
     errors: dict[str, list[float]] = {}
     for seed in range(effort.seeds):
