@@ -1,32 +1,24 @@
 """Figures of data, models and motions; every function returns a Matplotlib figure or writes a GIF."""
 
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
-from dln_jax.figures.benchmarks import call_times, cost_curves, cost_panels, cost_points, error_against_time
 from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
-from dln_jax.figures.closed_loops import closed_loop_traces, phase_portrait, success_over_starts
-from dln_jax.figures.dynamics import force_decomposition, tip_paths
-from dln_jax.figures.friction import friction_curves, friction_laws
+from dln_jax.figures.closed_loops import closed_loop_traces, phase_portrait
+from dln_jax.figures.friction import friction_curves
 from dln_jax.figures.functions import ensemble, function_curves, heat_maps, parity, surfaces
 from dln_jax.figures.phase_space import injection_figure, motion_figure
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
+from dln_jax.figures.torques import force_decomposition, tip_paths, torque_bands, torque_by_joint
 from dln_jax.figures.training import training_curve
-from dln_jax.figures.uncertainty import torque_bands
 
 __all__ = [
     "Moments",
-    "call_times",
     "cart_pole_drawing",
     "closed_loop_traces",
-    "cost_curves",
-    "cost_panels",
-    "cost_points",
     "energies_against_time",
     "ensemble",
-    "error_against_time",
     "force_decomposition",
     "friction_curves",
-    "friction_laws",
     "function_curves",
     "heat_maps",
     "injection_figure",
@@ -36,10 +28,10 @@ __all__ = [
     "phase_portrait",
     "rotary_pendulum_drawing",
     "soft_body_frame",
-    "success_over_starts",
     "surfaces",
     "tip_paths",
     "torque_bands",
+    "torque_by_joint",
     "training_curve",
     "write_closed_loop_gif",
     "write_frame_gif",

@@ -1,7 +1,7 @@
 """Animated GIFs, written frame by frame: image sequences, and motions in the plane over the truth."""
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ def write_gif(
     show: Callable[[int], None],
     t: Float[np.ndarray, " times"] | None,
     *,
-    frames: range,
+    frames: Iterable[int],
     frames_per_second: float,
     title: str = "",
 ) -> None:
@@ -71,23 +71,22 @@ def write_frame_gif(
     side = round(np.sqrt(pixels))
     if side * side != pixels:
         raise InputError(f"images have {pixels} pixels; expected a square, row by row")
+    squares = {name: np.clip(images, 0.0, 1.0).reshape(-1, side, side, 1) for name, images in frames.items()}
     models = [name for name in frames if name != TRUTH] or [TRUTH]
     over = TRUTH in frames and models != [TRUTH]
     figure, axes = style.figure(1, len(models), width=2.4 * len(models), height=2.9 + 0.3 * over, dpi=DPI)
-    blank, images = np.zeros((side, side, 3)), []
-    for axis, name in zip(axes[0], models, strict=True):
+    images = {name: axis.imshow(np.zeros((side, side, 3))) for name, axis in zip(models, axes[0], strict=True)}
+    for name, axis in zip(models, axes[0], strict=True):
         style.title(axis, name, color=style.colour(name))
         axis.set(xticks=[], yticks=[])
         axis.grid(False)
-        images.append(axis.imshow(blank))
     if over:
         figure.supxlabel("white: both  blue: truth only\norange: model only", fontsize=7)
 
     def show(index: int) -> None:
-        for image, name in zip(images, models, strict=True):
-            model = np.clip(frames[name][index], 0.0, 1.0).reshape(side, side, 1)
-            truth = np.clip(frames[TRUTH][index], 0.0, 1.0).reshape(side, side, 1) if over else model
-            image.set_data(truth * ONLY_TRUTH + model * ONLY_MODEL)
+        for name, image in images.items():
+            truth = squares[TRUTH if over else name][index]
+            image.set_data(truth * ONLY_TRUTH + squares[name][index] * ONLY_MODEL)
 
     write_gif(path, figure, show, t, frames=range(len(t)), frames_per_second=frames_per_second)
 
@@ -117,10 +116,10 @@ def write_motion_gif(
     _require_common_length(t, {name: moved.q.shape[1] for name, moved in motions.items()})
     curves = {name: plane_paths(moved, shown) for name, moved in motions.items()}
     plane = next(iter(motions.values())).q.shape[2] == 1
-    framed = curves.get(TRUTH) or [curve for of_one in curves.values() for curve in of_one]
-    corners = [1.2 * max(float(np.nanmax(np.abs(curve[half]))) for curve in framed) for half in range(2)]
+    framed = curves.get(TRUTH) or [curve for paths in curves.values() for curve in paths]
+    corners = 1.2 * np.nanmax(np.abs(framed), axis=(0, 2))
     if not plane:
-        corners = [max(corners)] * 2
+        corners[:] = corners.max()
     models = [name for name in motions if name != TRUTH] or [TRUTH]
     width = min(style.WIDTH, 3.4 * len(models))
     figure, axes = style.figure(1, len(models), width=width, height=width / len(models) + 0.6, sharey=True, dpi=DPI)
@@ -130,19 +129,18 @@ def write_motion_gif(
         over = TRUTH in motions and name != TRUTH
         style.title(axis, f"{name}, over the truth" if over else name, color=style.colour(name))
         axis.set_xlabel(style.with_unit("q", units[0]) if plane else "x, m")
-        for of in (TRUTH, name) if over else (name,):
-            thick, size = (3.0, 8) if of == TRUTH else (1.4, 5)
-            for curve in curves[of]:
-                (line,) = axis.plot([], [], color=style.colour(of), linewidth=thick)
-                (body,) = axis.plot([], [], "o", color=style.colour(of), markersize=size)
+        for system in (TRUTH, name) if over else (name,):
+            width, size = (3.0, 8) if system == TRUTH else (1.4, 5)
+            for curve in curves[system]:
+                (line,) = axis.plot([], [], color=style.colour(system), linewidth=width)
+                (body,) = axis.plot([], [], "o", color=style.colour(system), markersize=size)
                 lines.append((line, body, curve))
     axes[0, 0].set_ylabel(style.with_unit("p", units[1]) if plane else "y, m")
 
     def show(index: int) -> None:
         for line, body, (x, y) in lines:
-            since = max(0, index - tail)
-            line.set(data=(x[since : index + 1], y[since : index + 1]))
-            body.set(data=(x[index : index + 1], y[index : index + 1]))
+            for artist, part in ((line, slice(max(0, index - tail), index + 1)), (body, slice(index, index + 1))):
+                artist.set(data=(x[part], y[part]))
 
     write_gif(path, figure, show, t, frames=range(0, len(t), stride), frames_per_second=frames_per_second)
 

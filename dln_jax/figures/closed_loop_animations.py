@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patches import Circle, Rectangle
 
 from dln_jax.figures import style
 from dln_jax.figures.animations import DPI, write_gif
@@ -26,23 +26,23 @@ def cart_pole_drawing(length: float) -> Drawing:
     """Drawing of a cart-pole with q = (cart, pole from upright), m and rad; `length` of the pole in m."""
 
     def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
-        wide, high = 0.55 * length, 0.28 * length
+        wide, tall = 0.55 * length, 0.28 * length
         tip = np.stack([q[:, 0] + length * np.sin(q[:, 1]), length * np.cos(q[:, 1])], axis=1)
-        low, most = q[:, 0].min() - 1.25 * length, q[:, 0].max() + 1.25 * length
-        axis.plot([low, most], [-high / 2 - 0.07 * length] * 2, color=GROUND, linewidth=2.5, zorder=0)
-        cart = Rectangle((0, 0), wide, high, facecolor=BODY, edgecolor="none", zorder=2)
+        low, high = q[:, 0].min() - 1.25 * length, q[:, 0].max() + 1.25 * length
+        axis.plot([low, high], [-tall / 2 - 0.07 * length] * 2, color=GROUND, linewidth=2.5, zorder=0)
+        cart = Rectangle((0, 0), wide, tall, facecolor=BODY, edgecolor="none", zorder=2)
         wheels = [Circle((0, 0), 0.07 * length, facecolor="0.45", zorder=3) for _ in range(2)]
         for patch in (cart, *wheels):
             axis.add_patch(patch)
         moving = _rod(axis, tip, trail)
-        axis.set(xlim=(low, most), ylim=(-1.25 * length, 1.25 * length), aspect="equal")
+        axis.set(xlim=(low, high), ylim=(-1.25 * length, 1.25 * length), aspect="equal")
         axis.set_axis_off()
 
         def show(index: int) -> None:
             x = q[index, 0]
-            cart.set_xy((x - wide / 2, -high / 2))
+            cart.set_xy((x - wide / 2, -tall / 2))
             for wheel, side in zip(wheels, (-1, 1), strict=True):
-                wheel.set_center((x + side * 0.3 * wide, -high / 2))
+                wheel.set_center((x + side * 0.3 * wide, -tall / 2))
             moving(index, np.array([x, 0.0]))
 
         return show
@@ -61,10 +61,9 @@ def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
         turn = np.linspace(0, 2 * np.pi, 120)[:, None]
         ring = np.concatenate([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
         floor, reach = np.array([0.0, 0.0, -1.1 * pole]), float(np.hypot(arm, pole))
-        disc = _seen(reach * ring + floor)
-        axis.add_patch(Polygon(disc, facecolor="0.95", edgecolor="none", zorder=0))
+        disc, post = _seen(reach * ring + floor), _seen(np.stack([floor, np.zeros(3)]))
+        axis.fill(*disc.T, facecolor="0.95", edgecolor="none", zorder=0)
         axis.plot(*_seen(arm * ring).T, color="0.85", linewidth=1.0, zorder=1)
-        post = _seen(np.stack([floor, np.zeros(3)]))
         axis.plot(*post.T, color=GROUND, linewidth=9, solid_capstyle="butt", zorder=1)
         (shadow,) = axis.plot([], [], color="0.82", linewidth=4, solid_capstyle="round", zorder=0.5)
         (beam,) = axis.plot([], [], color=BODY, linewidth=7, solid_capstyle="round", zorder=3)
@@ -115,10 +114,10 @@ def write_closed_loop_gif(
         InputError: arrays of different lengths, or coordinates that are not finite.
     """
     require_positive(frames_per_second=frames_per_second)
-    t, q, u = (np.asarray(each) for each in (t, q, u))
+    t, q, u = np.asarray(t), np.asarray(q), np.asarray(u)
     if not len(t) == len(q) == len(u) > 1 or not np.isfinite(q).all():
         raise InputError(f"there are {len(t)} times, {len(q)} states, {len(u)} controls; expected as many, all finite")
-    frames = np.searchsorted(t, np.arange(t[0], t[-1], 1 / frames_per_second) - 1e-9)
+    samples = np.searchsorted(t, np.arange(t[0], t[-1], 1 / frames_per_second) - 1e-9)
     figure, [[machine, trace]] = style.figure(1, 2, width=6.4, height=2.9, dpi=DPI, width_ratios=[1.5, 1.0])
     machine.grid(False)
     show_machine = drawing(machine, q, int(np.searchsorted(t, t[0] + TRACE)))
@@ -131,15 +130,12 @@ def write_closed_loop_gif(
     trace.set(xlabel="t, s", ylabel=f"control, {unit}", xlim=(t[0], t[-1]))
     trace.margins(y=0.12)
 
-    def show(number: int) -> None:
-        index = int(frames[number])
+    def show(index: int) -> None:
         show_machine(index)
         line.set_data(t[: index + 1], u[: index + 1])
         now.set_data([t[index]], [u[index]])
 
-    write_gif(
-        path, figure, show, t[frames], frames=range(len(frames)), frames_per_second=frames_per_second, title=title
-    )
+    write_gif(path, figure, show, t, frames=samples.tolist(), frames_per_second=frames_per_second, title=title)
 
 
 def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray], None]:

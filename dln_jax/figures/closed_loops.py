@@ -1,11 +1,10 @@
-"""Figures of closed loops: traces with limits, the phase plane with a regulator's region, and success over starts."""
+"""Figures of closed loops: traces with limits, and the phase plane with a regulator's region."""
 
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter
 
@@ -48,25 +47,24 @@ def closed_loop_traces(
     if x.ndim != 3 or x.shape[2] != 2 * d or (names is not None and len(names) != d):
         raise InputError(f"x has shape {x.shape} for {d} joints; expected [K, T, 2 d], and a name for each")
     t = np.asarray(runs.t).reshape(-1, x.shape[1])[0]
-    goal = np.zeros(2 * d) if goal is None else np.asarray(goal)
-    m = u.shape[2]
+    goal, m = np.zeros(2 * d) if goal is None else np.asarray(goal), u.shape[2]
     rows = d + m + (energy is not None)
     figure, axes = style.figure(rows, 1, height=1.25 * rows + 0.6, sharex=True)
+    dashed = {"color": "0.3", "linestyle": "--", "linewidth": 0.9}
     for joint, (axis, kind) in enumerate(zip(axes[:d, 0], joints, strict=True)):
-        values = x[:MOST_SHOWN, :, joint]
+        values, level = x[:MOST_SHOWN, :, joint], goal[joint]
         if kind == "revolute":
-            values = _short_way(values - goal[joint])
-            _angles(axis)
+            values, level = _wrapped(values - level), 0.0
+            angle_ticks(axis.yaxis)
+            axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
         _curves(axis, t, values, turning=kind == "revolute")
-        axis.axhline(0.0 if kind == "revolute" else goal[joint], color="0.3", linestyle="--", linewidth=0.9)
+        axis.axhline(level, **dashed)
         name = names[joint] if names else f"q{joint + 1}"
         axis.set_ylabel(f"{name}, {'rad' if kind == 'revolute' else 'm'}")
-    for control in range(m):
-        axis = axes[d + control, 0]
-        _curves(axis, t[:-1], u[:1, :, control], steps=True)  # many runs would hide each other
+    for control, axis in enumerate(axes[d : d + m, 0]):
+        axis.plot(t[:-1], u[0, :, control], color=style.BLUE, linewidth=1.6, drawstyle="steps-post")
         for limit in limits:
-            level = float(np.broadcast_to(limit, m)[control])
-            if np.isfinite(level):
+            if np.isfinite(level := np.broadcast_to(limit, m)[control]):
                 axis.axhline(level, color=LIMIT, linewidth=1.2)
         axis.set_ylabel(f"control, {unit}" if m == 1 else f"u{control + 1}, {unit}")
         axis.margins(y=0.15)
@@ -74,7 +72,7 @@ def closed_loop_traces(
         factor, joules = style.prefixed(float(np.nanmax(np.abs(energy))), "J")
         _curves(axes[-1, 0], t, np.asarray(energy)[:MOST_SHOWN] / factor)
         if goal_energy is not None:
-            axes[-1, 0].axhline(goal_energy / factor, color="0.3", linestyle="--", linewidth=0.9)
+            axes[-1, 0].axhline(goal_energy / factor, **dashed)
         axes[-1, 0].set_ylabel(f"energy, {joules}")
     axes[-1, 0].set(xlabel="t, s", xlim=(t[0], t[-1]))
     figure.align_ylabels()
@@ -99,17 +97,16 @@ def phase_portrait(
         caught: S [2, 2] and the level of xᵀ S x below which the regulator takes over.
     """
     figure, [[axis]] = style.figure(height=4.2)
-    angle, rate = _short_way(np.asarray(angle)), np.asarray(rate)
+    angle, rate = _wrapped(np.asarray(angle)), np.asarray(rate)
     if energy is not None:
         axis.contourf(*energy, levels=18, cmap="Greys", alpha=0.35, zorder=0)
         if goal_energy is not None:
             axis.contour(*energy, levels=[goal_energy], colors="0.25", linestyles="--", linewidths=1.2)
-    for number, (q, qd) in reversed(list(enumerate(zip(angle[:MOST_SHOWN], rate[:MOST_SHOWN], strict=True)))):
-        broken = np.concatenate([[False], np.abs(np.diff(q)) > np.pi])
-        strong = number == 0
-        colour, width = (style.BLUE, 1.8) if strong else (style.SKY, 0.7)
-        axis.plot(np.where(broken, np.nan, q), qd, color=colour, linewidth=width, alpha=1.0 if strong else 0.6)
-        axis.plot(q[0], qd[0], "o", color=colour, markersize=6 if strong else 3)
+    for number in reversed(range(len(angle[:MOST_SHOWN]))):
+        q, qd = angle[number], rate[number]
+        colour, width, alpha, size = (style.SKY, 0.7, 0.6, 3) if number else (style.BLUE, 1.8, 1.0, 6)
+        axis.plot(_with_gaps(q), qd, color=colour, linewidth=width, alpha=alpha)
+        axis.plot(q[0], qd[0], "o", color=colour, markersize=size)
     if caught is not None:
         axis.fill(*_ellipse(*caught), facecolor=style.GREEN, edgecolor=style.GREEN, alpha=0.45, zorder=4)
         axis.annotate(
@@ -117,62 +114,34 @@ def phase_portrait(
             ha="center", va="top", fontsize=style.SMALL, color="#00563f",
             arrowprops={"arrowstyle": "-", "color": style.GREEN, "linewidth": 0.8},
         )  # fmt: skip
-    _angles(axis, axis.xaxis)
+    angle_ticks(axis.xaxis)
     room = 1.12 * float(np.nanmax(np.abs(rate)))
     axis.set(xlim=(-np.pi, np.pi), ylim=(-room, room), xlabel="angle from upright, rad", ylabel="rate, rad/s")
     axis.grid(False)
     return figure
 
 
-def success_over_starts(
-    starts: Any,
-    seconds: Any,
-    *,
-    labels: tuple[str, str] = ("angle from upright, rad", "rate, rad/s"),
-) -> Figure:
-    """Starts [K, 2] in the plane of two coordinates, coloured by the time to the goal; crosses failed.
-
-    `seconds` [K] are infinite or NaN if the goal was not reached.
-    """
-    starts, seconds = np.asarray(starts), np.asarray(seconds)
-    good = np.isfinite(seconds)
-    figure, [[axis]] = style.figure(height=4.0)
-    worst = float(seconds[good].max()) if good.any() else 1.0
-    scale = Normalize(0.0, worst)
-    axis.scatter(*starts[good].T, c=seconds[good], norm=scale, cmap="viridis_r", s=22, linewidths=0)
-    axis.scatter(*starts[~good].T, marker="x", color=style.VERMILLION, s=40, linewidths=1.6, zorder=3)
-    bar = figure.colorbar(ScalarMappable(scale, "viridis_r"), ax=axis, pad=0.02)
-    bar.set_label("up after, s", fontsize=style.TEXT)
-    bar.ax.tick_params(labelsize=style.SMALL)
-    if labels[0].startswith("angle"):
-        _angles(axis, axis.xaxis)
-    axis.set(xlabel=labels[0], ylabel=labels[1])
-    failed = f", {(~good).sum()} failed (crosses)" if not good.all() else ""
-    style.title(axis, f"{good.sum()} of {len(good)} starts are up{failed}", loc="left")
-    return figure
-
-
-def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = False, steps: bool = False) -> None:
+def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = False) -> None:
     """Draws curves with the first in front; angles have gaps where they wrap."""
-    for number, each in reversed(list(enumerate(values))):
-        broken = np.concatenate([[False], np.abs(np.diff(each)) > np.pi]) & turning
-        colour, width = (style.BLUE, 1.6) if number == 0 else (style.SKY, 0.6)
-        drawn = np.where(broken, np.nan, each)
-        axis.plot(t, drawn, color=colour, linewidth=width, drawstyle="steps-post" if steps else "default")
+    for number in reversed(range(len(values))):
+        colour, width = (style.SKY, 0.6) if number else (style.BLUE, 1.6)
+        axis.plot(t, _with_gaps(values[number]) if turning else values[number], color=colour, linewidth=width)
 
 
-def _short_way(angle: np.ndarray) -> np.ndarray:
+def _wrapped(angle: np.ndarray) -> np.ndarray:
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
-def _angles(axis: Axes, side: Any = None) -> None:
-    """Ticks at multiples of pi / 2 over the full circle."""
-    side = axis.yaxis if side is None else side
+def _with_gaps(angle: np.ndarray) -> np.ndarray:
+    """NaN where a wrapped angle jumps by a turn."""
+    return np.where(np.abs(np.diff(angle, prepend=angle[0])) > np.pi, np.nan, angle)
+
+
+def angle_ticks(side: Axis) -> None:
+    """Puts ticks at multiples of pi / 2 over the full circle."""
     side.set_major_locator(FixedLocator([-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]))
     names = {-2: "-π", -1: "-π/2", 0: "0", 1: "π/2", 2: "π"}
     side.set_major_formatter(FuncFormatter(lambda value, _: names[round(2 * value / np.pi)]))
-    if side is axis.yaxis:
-        axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
 
 
 def _ellipse(S: Any, level: float) -> np.ndarray:

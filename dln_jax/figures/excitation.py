@@ -1,7 +1,8 @@
 """Figure of excitation motions: positions, velocities and forces within limits, and the resulting condition."""
 
+import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,7 +12,7 @@ from dln_jax.figures import style
 
 MOST_JOINTS = 8
 """Largest number of joints shown."""
-ROWS = {"q": "position", "qd": "velocity", "tau": "force"}
+ROWS: dict[Literal["q", "qd", "tau"], str] = {"q": "position", "qd": "velocity", "tau": "force"}
 
 
 def excitation_figure(
@@ -27,40 +28,33 @@ def excitation_figure(
     """
     joints = min(data.degrees_of_freedom, MOST_JOINTS)
     figure = style.blank(height=5.6)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(3.4, 1.2))
-    upper, lower = parts
-    axes = upper.subplots(len(ROWS), joints, squeeze=False, sharex=True)
+    upper, lower = figure.subfigures(2, 1, height_ratios=(3.4, 1.2), squeeze=False)[:, 0]
+    axes, below = upper.subplots(len(ROWS), joints, squeeze=False, sharex=True), lower.subplots()
+    style.prepare(*axes.flat, below)
     colours = style.colours_of(data.label)
-    for line, (key, word) in zip(axes, ROWS.items(), strict=True):
+    for line, (key, quantity) in zip(axes, ROWS.items(), strict=True):
         for joint, axis in enumerate(line):
-            style.prepare(axis)
             for index, name in enumerate(data.label):
                 samples = data.trajectory == index
-                axis.plot(data.t[samples], getattr(data, key)[samples, joint], color=colours[name], linewidth=0.8)
+                look = {"color": colours[name], "linewidth": 0.8, "label": str(name)}
+                axis.plot(data.t[samples], getattr(data, key)[samples, joint], **look)
             for bound in limits[key][joint]:
                 if np.isfinite(bound):
                     axis.axhline(bound, color=style.REFERENCE, linestyle="--", linewidth=0.9)
             axis.tick_params(labelsize=6.5)
-            if joint == 0:
-                axis.set_ylabel(f"{word}, {_unit(key, data, joint)}")
+        line[0].set_ylabel(f"{quantity}, {style.unit_of(data, 0, key)}")
     for joint in range(joints):
-        own = "" if _unit("q", data, joint) == _unit("q", data, 0) else f" ({_unit('q', data, joint)})"
-        style.title(axes[0, joint], f"{names[joint]:.12}{own}", fontsize=style.SMALL)
+        unit = style.unit_of(data, joint, "q")
+        differs = "" if unit == style.unit_of(data, 0, "q") else f" ({unit})"
+        style.title(axes[0, joint], f"{names[joint]:.12}{differs}", fontsize=style.SMALL)
         axes[-1, joint].set_xlabel("time, s", fontsize=style.SMALL)
-    axis = lower.subplots()
-    style.prepare(axis)
-    for place, (name, found) in enumerate(conditions.items()):
+    for place, (name, values) in enumerate(conditions.items()):
         shade = style.REFERENCE if name == "random" else style.BLUE
-        axis.plot(found, np.full(len(found), place), "o", color=shade, markersize=4, alpha=0.8)
-    axis.set_yticks(range(len(conditions)), list(conditions))
-    axis.set_ylim(len(conditions) - 0.5, -0.5)
-    axis.set_xscale(style.scale_of([each for found in conditions.values() for each in found]))
-    axis.set_xlabel("condition of the regressor, columns of unit length")
-    handles = [axes[0, 0].lines[place] for place in range(len(data.label))]
-    style.legend(figure, handles, list(data.label), loc="outside lower center", ncols=6)
+        below.plot(values, np.full(len(values), place), "o", color=shade, markersize=4, alpha=0.8)
+    below.set_yticks(range(len(conditions)), list(conditions))
+    below.set_ylim(len(conditions) - 0.5, -0.5)
+    below.set_xscale(style.scale_of(itertools.chain(*conditions.values())))
+    below.set_xlabel("condition of the regressor, columns of unit length")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    style.legend(figure, handles, labels, loc="outside lower center", ncols=6)
     return figure
-
-
-def _unit(key: str, data: Trajectories, joint: int) -> str:
-    prismatic = data.needs is not None and data.needs.joints[joint] == "prismatic"
-    return {"q": ("rad", "m"), "qd": ("rad/s", "m/s"), "tau": ("N m", "N")}[key][prismatic]

@@ -1,15 +1,13 @@
-"""Friction of joints against their rates: fitted curves over measured points, and the friction laws side by side."""
+"""Friction of joints against their rates: fitted curves over measured points."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.mechanics.friction import FrictionShape, unit_force
-from dln_jax.mechanics.loaded import Load, carrying
 
 MOST_POINTS = 4000
 """Largest number of points drawn per joint."""
@@ -34,71 +32,36 @@ def friction_curves(
         rate_unit: one unit for all joints, or one each.
         force_unit: likewise.
     """
-    arrays = {name: tuple(np.atleast_2d(np.asarray(each, float)) for each in pair) for name, pair in curves.items()}
+    arrays = {name: (np.asarray(rates), np.asarray(forces)) for name, (rates, forces) in curves.items()}
     d = next(iter(arrays.values()))[0].shape[1]
-    units = [(rate_unit, force_unit)] * d
-    if not (isinstance(rate_unit, str) and isinstance(force_unit, str)):
-        units = list(zip(np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d), strict=True))
-    alike = len(set(units)) == 1
+    rate_units, force_units = np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d)
+    alike = len({*zip(rate_units, force_units, strict=True)}) == 1
     columns = min(d, MOST_COLUMNS)
     rows = -(-d // columns)
     figure, axes = style.figure(rows, columns, height=0.6 + 2.4 * rows)
-    for joint, axis in enumerate(axes.flat):
-        if joint >= d:
-            axis.set_visible(False)
-            continue
+    for axis in axes.flat[d:]:
+        axis.set_visible(False)
+    for joint, axis in enumerate(axes.flat[:d]):
         if measured is not None:
-            rates, forces = (np.asarray(each)[:, joint] for each in measured)
+            rates, forces = (np.asarray(values)[:, joint] for values in measured)
             every = slice(None, None, -(-len(rates) // MOST_POINTS))
             points = {"color": style.REFERENCE, "markersize": 1.5, "rasterized": True, "label": "measured"}
             axis.plot(rates[every], forces[every], ".", **points)
-            seen = [np.percentile(forces, [0.5, 99.5]), *(curve[:, joint] for _, curve in arrays.values())]
-            axis.set_ylim(*_with_room(np.concatenate(seen)))
-        for place, (name, (rates, forces)) in enumerate(arrays.items()):
+            seen = [np.percentile(forces, [0.5, 99.5]), *(forces[:, joint] for _, forces in arrays.values())]
+            low, high = float(min(map(np.min, seen))), float(max(map(np.max, seen)))
+            room = 0.1 * (high - low) or 1.0
+            axis.set_ylim(low - room, high + room)
+        for colour, (name, (rates, forces)) in zip(itertools.cycle(style.CYCLE), arrays.items(), strict=False):
             order = np.argsort(rates[:, joint])
-            colour = style.CYCLE[place % len(style.CYCLE)]
             axis.plot(rates[order, joint], forces[order, joint], color=colour, linewidth=1.3, label=name)
         axis.axhline(0, color="black", linewidth=0.5)
         axis.locator_params(axis="x", nbins=5)
         if d > 1:
             style.title(axis, names[joint] if names else f"joint {joint + 1}")
-        of_rates, of_forces = units[joint]
         if joint >= d - columns or not alike:
-            axis.set_xlabel(f"rate, {of_rates}")
+            axis.set_xlabel(f"rate, {rate_units[joint]}")
         if joint % columns == 0 or not alike:
-            axis.set_ylabel(f"friction, {of_forces}")
+            axis.set_ylabel(f"friction, {force_units[joint]}")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     style.legend(figure, handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
     return figure
-
-
-def _with_room(values: np.ndarray) -> tuple[float, float]:
-    low, high = float(values.min()), float(values.max())
-    room = 0.1 * (high - low) or 1.0
-    return low - room, high + room
-
-
-def friction_laws() -> Figure:
-    """Every law with typical coefficients, over the rate of one joint: `docs/friction.png`."""
-    shape = FrictionShape(velocity_scale=0.02, stribeck_velocity=0.15, sigmoid_slope=12.0, sigmoid_shift=0.05)
-    rates = jnp.linspace(-0.6, 0.6, 1201)
-    sums: dict[str, dict[str, float]] = {
-        "viscous": {"viscous": 1.0},
-        "coulomb": {"coulomb": 0.5},
-        "coulomb + stribeck": {"coulomb": 0.5, "stribeck": 0.4},
-        "asymmetric": {
-            "viscous_forward": 0.2,
-            "viscous_backward": 0.9,
-            "coulomb_forward": 0.35,
-            "coulomb_backward": 0.15,
-        },
-        "sigmoid": {"sigmoid": 1.0},
-        "offset": {"offset": 0.05},
-    }
-    forces = {
-        name: jnp.sum(jnp.stack([size * unit_force(law, rates, shape) for law, size in each.items()]), axis=0)
-        for name, each in sums.items()
-    }
-    link = jnp.ones_like(rates)
-    forces["load, 1 N m carried"] = carrying(Load(0.25, shape.velocity_scale), rates, link) - link
-    return friction_curves({name: (rates[:, None], force[:, None]) for name, force in forces.items()})

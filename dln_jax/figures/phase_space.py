@@ -18,7 +18,7 @@ Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(q [N, 1], p [N, 1]) -> (qd, pd)."""
 ROOM = 0.15
 """Smallest margin of an axis above and below the truth, relative to the largest true value."""
-LEAST = 1e-17
+ROUNDING = 1e-17
 """Relative errors below this are drawn at this value."""
 
 
@@ -44,68 +44,64 @@ def motion_figure(
     figure = style.blank(height=2.1 + 7.0 / max(len(models), 3))
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[6.6 / max(len(models), 3), 2.1])[:, 0]
     panels = above.subplots(1, len(models), sharex=True, sharey=True, squeeze=False)[0]
+    over_time, errors = below.subplots(1, 2)
+    style.prepare(*panels, over_time, errors)
     corner = 1.25 * max(float(np.abs(path).max()) for path in truth)
     for axis, name in zip(panels, models, strict=True):
-        style.prepare(axis)
         for x, y in truth:
             axis.plot(x, y, color="black", linewidth=2.2)
         for x, y in plane_paths(motions[name], shown):
             axis.plot(x, y, color=style.colour(name), linewidth=1.2)
         if plane and fields is not None and name in fields:
-            _arrows(axis, fields[name], corner)
+            grid = np.linspace(-corner, corner, 11)
+            states = [values.reshape(-1, 1) for values in np.meshgrid(grid, grid)]
+            axis.quiver(*states, *fields[name](*states), color="0.7", zorder=0, width=4e-3)
         axis.set(xlim=(-corner, corner), ylim=(-corner, corner), aspect="equal")
         style.title(axis, name, color=style.colour(name))
         axis.set_xlabel(style.with_unit("q", units[0]) if plane else "x, m")
     panels[0].set_ylabel(style.with_unit("p", units[1]) if plane else "y, m")
-    of_shown = {name: np.where(np.isfinite(each[shown]), each[shown], np.nan) for name, each in energies.items()}
-    labels = style.with_unit(quantity, units[2]), "error / largest true value"
-    for axis, draw, label in zip(below.subplots(1, 2), (_over_time, _relative_errors), labels, strict=True):
-        style.prepare(axis)
-        draw(axis, motions[TRUTH].t, of_shown)
+    t = motions[TRUTH].t
+    values = {name: np.where(np.isfinite(energy[shown]), energy[shown], np.nan) for name, energy in energies.items()}
+    _draw_over_time(over_time, t, values)
+    _draw_errors(errors, t, values)
+    for axis, label in ((over_time, style.with_unit(quantity, units[2])), (errors, "error / largest true value")):
         axis.set(xlabel="t, s", ylabel=label)
     return figure
 
 
-def _over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+def _draw_over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
     """The truth is dashed in front of the models; a diverging model leaves the panel."""
-    for name, each in values.items():
+    for name, energy in values.items():
         dash, order = ("--", 3) if name == TRUTH else ("-", 2)
-        axis.plot(t, each, dash, color=style.colour(name), linewidth=1.4, zorder=order, label=name)
-    truth, every = values[TRUTH], np.concatenate(list(values.values()))
-    low, high = np.nanquantile(every, [0.03, 0.97])
+        axis.plot(t, energy, dash, color=style.colour(name), linewidth=1.4, zorder=order, label=name)
+    truth = values[TRUTH]
+    low, high = np.nanquantile(np.concatenate(list(values.values())), [0.03, 0.97])
     room = ROOM * float(np.abs(truth).max())
     axis.set_ylim(min(low, truth.min()) - room, max(high, truth.max()) + room)
     style.legend(axis, handles=[line for line in axis.get_lines() if line.get_label() == TRUTH], loc="best")
 
 
-def _relative_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+def _draw_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
     """Logarithmic, since errors differ by orders of magnitude; exact values are drawn at rounding level."""
-    truth = values[TRUTH]
+    truth, finite = values[TRUTH], []
     size = float(np.abs(truth).max()) or 1.0
-    relative = {name: np.maximum(abs(each - truth) / size, LEAST) for name, each in values.items() if name != TRUTH}
-    for name, each in relative.items():
-        axis.plot(t[1:], each[1:], color=style.colour(name), linewidth=1.0)
+    for name, energy in values.items():
+        if name != TRUTH:
+            error = np.maximum(abs(energy - truth) / size, ROUNDING)[1:]
+            axis.plot(t[1:], error, color=style.colour(name), linewidth=1.0)
+            finite += error[np.isfinite(error)].tolist()
     axis.set_yscale("log")
-    every = np.concatenate([each[1:][np.isfinite(each[1:])] for each in relative.values()])
-    high = np.ceil(np.log10(np.quantile(every, 0.99))) if len(every) else 0.0
-    low = np.floor(np.log10(np.quantile(every, 0.02))) if len(every) else -1.0
-    axis.set_ylim(10.0 ** min(low, high - 2), 10.0**high * 2)
+    low, high = np.log10(np.quantile(finite or [0.1, 1.0], [0.02, 0.99]))
+    axis.set_ylim(10.0 ** min(np.floor(low), np.ceil(high) - 2), 2 * 10.0 ** np.ceil(high))
 
 
 def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Curves of one motion: (q, p), or (x, y) of every body; gaps for non-finite values."""
     q, p = motions.q[shown], motions.p[shown]
-    q, p = (np.where(np.isfinite(each), each, np.nan) for each in (q, p))
+    q, p = (np.where(np.isfinite(state), state, np.nan) for state in (q, p))
     if q.shape[1] == 1:
         return [(q[:, 0], p[:, 0])]
     return [(q[:, 2 * body], q[:, 2 * body + 1]) for body in range(q.shape[1] // 2)]
-
-
-def _arrows(axis: Axes, field: Field, corner: float) -> None:
-    grid = np.linspace(-corner, corner, 11)
-    q, p = (each.reshape(-1, 1) for each in np.meshgrid(grid, grid))
-    qd, pd = field(q, p)
-    axis.quiver(q, p, qd, pd, color="0.7", zorder=0, width=4e-3)
 
 
 def injection_figure(injection: Injection, *, shown: int = 7) -> Figure:
@@ -127,8 +123,7 @@ def injection_figure(injection: Injection, *, shown: int = 7) -> Figure:
         row[0].set_ylabel(name, color=colour, fontsize=style.TEXT)
     plane, levels = lower.subplots(1, 2, width_ratios=[1.0, 1.6])
     joules = levels.twinx()
-    for axis in (plane, levels, joules):
-        style.prepare(axis)
+    style.prepare(plane, levels, joules)
     q, p = injection.latent.q[0, :, 0], injection.latent.p[0, :, 0]
     t = FRAME_TIME * injection.latent.t
     for part, colour in zip((slice(0, half), slice(half, total)), colours, strict=True):

@@ -1,6 +1,6 @@
-"""Figures of soft bodies in motion: energies against time, and snapshots."""
+"""Figures of soft bodies in motion: energies against time, and snapshots; bodies in space are seen obliquely."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +10,6 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.labels import label_ends, label_points
-from dln_jax.figures.soft_body_drawing import EDGE, GROUND, GROUND_LINE, SKIN, drawn, flattened, floor
 from dln_jax.metrics.soft_body_energies import KINETIC, TOTAL
 from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.types import InputError
@@ -24,6 +22,15 @@ COLOURS = {
     "muscles": style.PURPLE,
     TOTAL: "black",
 }
+BODY, EDGE, SKIN = np.array((0.62, 0.75, 0.87)), np.array((0.46, 0.58, 0.71)), np.array((0.16, 0.26, 0.38))
+GROUND, GROUND_LINE = "0.90", (0.35, 0.33, 0.30)
+# View of bodies in space: a turn about the vertical axis, then a tilt, in radians; directions to the right, away from
+# the viewer and upwards in the drawing plane.
+_TURN, _TILT = np.deg2rad(-55.0), np.deg2rad(22.0)
+_RIGHT = np.array([np.cos(_TURN), np.sin(_TURN), 0.0])
+_AWAY = np.array([-np.sin(_TURN) * np.cos(_TILT), np.cos(_TURN) * np.cos(_TILT), -np.sin(_TILT)])
+_UP = np.cross(_RIGHT, _AWAY)
+_LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
 _HIGHEST = 3.6
 """Largest height of a panel, inches."""
 _FADED = 0.75
@@ -43,12 +50,10 @@ class Moments(NamedTuple):
     """Slope of the ground, which passes through the origin."""
     stacked: bool = False
     """Whether snapshots are drawn one below the other, for bodies that move less than their own size."""
-    labelled: int | None = None
-    """Vertex beside which times are written; above the body if `None`."""
 
 
 def energies_against_time(
-    t: Float[np.ndarray, " T"], energies: dict[str, Float[np.ndarray, " T"]], *, taken: str | None = None, title: str
+    t: Float[np.ndarray, " T"], energies: Mapping[str, Float[np.ndarray, " T"]], *, taken: str | None = None, title: str
 ) -> Figure:
     """Energies from `motion_energies` over time; gravity and total count from the initial gravitational energy.
 
@@ -57,121 +62,109 @@ def energies_against_time(
     power, unit = style.prefixed(max(float(np.abs(values - values[0]).max()) for values in energies.values()), "J")
     start = energies["gravity"][0] if "gravity" in energies else 0.0
     figure, [[axis]] = style.figure(height=3.4)
-    colours, ends = {}, {}
     for name, values in energies.items():
         line = (values - (start if name in ("gravity", TOTAL) else 0.0)) / power
         label = "gravity (from start)" if name == "gravity" else name
         # The total is drawn wider and behind, so that a curve coinciding with it stays visible.
         width, order = (3.0, 1.9) if name == TOTAL else (1.4, 2.0)
-        colours[label] = COLOURS.get(name, "0.4")
-        axis.plot(t, line, color=colours[label], linewidth=width, label=name, zorder=order)
-        ends[label] = (float(t[-1]), float(line[-1]))
+        axis.plot(t, line, color=COLOURS.get(name, "0.4"), linewidth=width, label=label, zorder=order)
     if taken is not None:
         total = (energies[TOTAL] - start) / power
-        axis.fill_between(t, total, total[0], color="0.87", linewidth=0, zorder=0, label=taken.replace("\n", " "))
+        axis.fill_between(t, total, total[0], color="0.87", linewidth=0, zorder=0, label=taken)
     axis.set(xlabel="t, s", ylabel=f"energy, {unit}", xlim=(t[0], t[-1]))
     style.title(axis, title)
-    if taken is not None:
-        style.legend(axis, handles=[axis.collections[-1]], loc="best")
-    label_ends(axis, ends, colours=colours)
+    style.legend(figure, *axis.get_legend_handles_labels(), loc="outside right upper")
     return figure
 
 
 def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float = style.WIDTH) -> Figure:
-    """Snapshots of bodies, one panel per body, earlier ones paler.
+    """Snapshots of bodies with their times, one panel per body, earlier ones paler.
 
     Raises:
         InputError: no panel, or a panel whose positions, times and mesh do not fit.
     """
     if not panels:
         raise InputError("there is no panel; give at least one")
-    pictures = [_shapes(panel) for panel in panels]
+    places = [_place(panel) for panel in panels]
     columns = min(columns, len(panels))
-    # The height of a row is that of its highest panel.
-    rows = [range(i, min(i + columns, len(pictures))) for i in range(0, len(pictures), columns)]
-    each = width / columns
-    aspects = [np.divide(*np.diff(extent, axis=0)[0, ::-1]) for _, extent in pictures]
-    shapes = [max(aspects[i] * len(row) / columns for i in row) for row in rows]
+    rows = [range(i, min(i + columns, len(panels))) for i in range(0, len(panels), columns)]
+    # The last panel fills the rest of its row, and a row is as high as its highest panel.
+    shapes = [max(np.divide(*(places[i].high - places[i].low)[::-1]) * len(row) / columns for i in row) for row in rows]
     if columns == 1:
-        each = width = min(width, _HIGHEST / shapes[0] + 0.6)
-    heights = [np.clip(each * shape, 1.2, _HIGHEST) + 0.55 for shape in shapes]
+        width = min(width, max(_HIGHEST / shapes[0] + 0.6, 0.09 * len(panels[0].title)))
+    heights = [np.clip(width / columns * shape, 1.2, _HIGHEST) + 0.55 for shape in shapes]
     figure = style.blank(height=sum(heights), width=width)
     grid = figure.add_gridspec(len(rows), columns, height_ratios=heights)
-    axes = []
     for number, row in enumerate(rows):
-        for place, i in enumerate(row):
-            # The last panel fills the rest of its row.
-            axes.append(figure.add_subplot(grid[number, place : columns if i == row[-1] else place + 1]))
-            _draw(axes[-1], panels[i], *pictures[i])
-    for axis, panel, (shapes_of, _) in zip(axes, panels, pictures, strict=True):
-        _label_times(axis, panel, shapes_of)
+        for column, i in enumerate(row):
+            axis = figure.add_subplot(grid[number, column : columns if i == row[-1] else column + 1])
+            style.prepare(axis)
+            _draw(axis, panels[i], places[i])
     return figure
 
 
-class _Shape(NamedTuple):
-    polygons: np.ndarray
-    colours: np.ndarray
-    edges: np.ndarray
-    """Colour of the lines between polygons."""
-    skin: np.ndarray
-    outline: np.ndarray
-    """Colour of the skin."""
-    level: np.ndarray
-    """Position of the origin in the drawing."""
-    label: str
-    corner: np.ndarray
-    """Position of the label."""
+class _Place(NamedTuple):
+    """Where the snapshots of a panel are drawn."""
+
+    offsets: np.ndarray
+    """Offset of every snapshot [k, 2]."""
+    points: np.ndarray
+    """Vertices in the drawing plane [k, n, 2]."""
+    low: np.ndarray
+    high: np.ndarray
+    """Corners of the panel."""
 
 
-def _shapes(panel: Moments) -> tuple[list[_Shape], np.ndarray]:
-    """The snapshots in the drawing plane, and their extent [[x, y] low, [x, y] high]."""
+def _place(panel: Moments) -> _Place:
     positions = np.asarray(panel.positions)
     if positions.ndim != 3 or positions.shape[1:] != panel.mesh.vertices.shape or len(positions) != len(panel.t):
         raise InputError(
             f"'{panel.title}' has positions {list(positions.shape)} at {len(panel.t)} times; "
             f"expected [k, {panel.mesh.vertices.shape[0]}, {panel.mesh.dimension}] at k"
         )
-    skin, plane = boundary(panel.mesh), panel.mesh.dimension == 2
-    shapes, offset = [], np.zeros(2)
-    pitch = 1.4 * max(float(np.ptp(flat[:, 1])) for flat in flattened(positions))
-    for number, (x, t) in enumerate(zip(positions, panel.t, strict=True)):
-        flat = flattened(x) + offset
-        pale = 0.0 if panel.stacked else _FADED * (1.0 - number / max(len(positions) - 1, 1))
-        polygons, colours = drawn(panel.mesh, skin, x)
-        colours, edge, line = (colour + (1.0 - colour) * pale for colour in (colours, EDGE, SKIN))
-        segments, edge = (flat[skin], edge) if plane else (np.zeros((0, 2, 2)), line)
-        above = np.array([flat[:, 0].mean(), flat[:, 1].max()])
-        corner = above if panel.labelled is None else flat[panel.labelled]
-        shapes.append(_Shape(polygons + offset, colours, edge, segments, line, offset, f"{t:.2f} s", corner))
-        offset = offset - (np.array([0.0, pitch]) if panel.stacked else 0.0)
-    every = np.concatenate([shape.polygons.reshape(-1, 2) for shape in shapes])
-    low, high = every.min(axis=0), every.max(axis=0)
+    flat = flattened(positions)
+    pitch = 1.4 * float(np.ptp(flat[..., 1], axis=1).max()) * panel.stacked
+    offsets = -pitch * np.arange(len(flat))[:, None] * np.array([0.0, 1.0])
+    points = flat + offsets[:, None]
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     if panel.ground is not None and not panel.stacked:
         low[1] = min(low[1], panel.ground * low[0])
     margin = 0.05 * float((high - low).max())
-    # Margins leave room for the labels.
-    left, right = (1.0, 5.0) if panel.labelled is not None else (1.0, 1.0) if panel.stacked else (4.0, 2.0)
-    return shapes, np.stack([low - margin * np.array([left, 1.0]), high + margin * np.array([right, 3.0])])
+    # Margins leave room for the times.
+    sides = np.array([1.0 if panel.stacked else 4.0, 1.5]), np.array([1.0 if panel.stacked else 3.0, 3.0])
+    return _Place(offsets, points, low - margin * sides[0], high + margin * sides[1])
 
 
-def _draw(axis: Axes, panel: Moments, shapes: list[_Shape], extent: np.ndarray) -> None:
-    low, high = extent
-    if panel.ground == 0.0 and panel.mesh.dimension == 3:
+def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
+    low, high = place.low, place.high
+    plane, count = panel.mesh.dimension == 2, len(place.points)
+    levels = place.offsets[:, 1] if panel.stacked else np.zeros(1)
+    ground = np.zeros((0, 2))
+    if panel.ground is not None and plane:
+        along = np.linspace(low[0], high[0], 100)
+        ground = np.stack([along, panel.ground * along], axis=-1)
+        for level in levels:
+            draw_ground(axis, (low[0], high[0]), level, panel.ground, depth=0.02 * (high[0] - low[0]))
+    elif panel.ground == 0.0:
         axis.fill(*floor(np.asarray(panel.positions), 0.0).T, color=GROUND, zorder=0)
-    if panel.ground is not None and panel.mesh.dimension == 2:
-        ends = np.array([low[0], high[0]])
-        for shape in shapes if panel.stacked else shapes[:1]:
-            line = shape.level[1] + panel.ground * ends
-            axis.fill_between(ends, line, line - 0.02 * (high[0] - low[0]), color=GROUND, zorder=0, linewidth=0)
-            axis.plot(ends, line, color=GROUND_LINE, linewidth=1.2, zorder=1)
-    for number, shape in enumerate(shapes):
-        above = 2 + 3 * number
-        faces: list = list(shape.colours)
-        looks = {"facecolors": faces, "edgecolors": [tuple(shape.edges)], "linewidths": 0.4, "zorder": above}
-        axis.add_collection(PolyCollection(list(shape.polygons), **looks))
-        looks = {"colors": [tuple(shape.outline)], "linewidths": 1.0, "zorder": above + 1}
-        axis.add_collection(LineCollection(list(shape.skin), **looks))
-    style.prepare(axis)
+    for number, x in enumerate(np.asarray(panel.positions)):
+        pale = 0.0 if panel.stacked else _FADED * (1.0 - number / max(count - 1, 1))
+        add_body(axis, panel.mesh, pale=pale, zorder=2 + 3 * number)(x, place.offsets[number])
+    skin = np.unique(boundary(panel.mesh))
+    for number, (points, t) in enumerate(zip(place.points, panel.t, strict=True)):
+        corner, side = np.array([points[:, 0].mean(), points[:, 1].max()]), np.array([0.0, 1.0])
+        if not panel.stacked and count > 1:
+            # A time has most room at the skin vertex that is farthest from the ground and the other snapshots.
+            others = np.concatenate([ground, *np.delete(place.points, number, axis=0)])
+            room = np.linalg.norm(points[skin][:, None] - others, axis=-1).min(axis=1)
+            corner = points[skin][room.argmax()]
+            side = (corner - points.mean(axis=0)) / np.linalg.norm(np.ptp(points, axis=0))
+            side[0] -= 0.5 * (panel.ground or 0.0)  # away from sloping ground
+        ha, va = (names[int(np.sign(np.round(3 * s)))] for names, s in zip(_SIDES, side, strict=True))
+        axis.annotate(
+            f"{t:.2f} s", corner, 4.0 * np.sign(np.round(3 * side)), textcoords="offset points", ha=ha, va=va,
+            fontsize=7.5, color="0.25", zorder=100,
+        )  # fmt: skip
     axis.grid(False)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="m")
     style.title(axis, panel.title)
@@ -184,26 +177,55 @@ def _draw(axis: Axes, panel: Moments, shapes: list[_Shape], extent: np.ndarray) 
         axis.set_ylabel("m")
 
 
-def _label_times(axis: Axes, panel: Moments, shapes: list[_Shape]) -> None:
-    """Places times beside or above the bodies, where there is room."""
-    filled = [_inside(shape.polygons) for shape in shapes]
-    ground = np.zeros((0, 2))
-    if panel.ground is not None and panel.mesh.dimension == 2:
-        along = np.linspace(*axis.get_xlim(), 100)
-        ground = np.concatenate([np.stack([along, shape.level[1] + panel.ground * along], -1) for shape in shapes])
-    corners = [shape.corner for shape in shapes]
-    if panel.labelled is None and not panel.stacked and panel.mesh.dimension == 2 and len(shapes) > 1:
-        for number, shape in enumerate(shapes):
-            others = np.concatenate([ground, *filled[:number], *filled[number + 1 :]])
-            skin = shape.skin.reshape(-1, 2)
-            # A label has most room at the skin vertex farthest from all other bodies.
-            corners[number] = skin[np.linalg.norm(skin[:, None] - others, axis=-1).min(axis=1).argmax()]
-    points = [(shape.label, (float(x), float(y))) for shape, (x, y) in zip(shapes, corners, strict=True)]
-    first = (1, 0) if panel.labelled is not None else (0, 1)
-    label_points(axis, points, obstacles=np.concatenate([ground, *filled]), size=7.5, first=first)
+_SIDES = ("center", "left", "right"), ("center", "bottom", "top")
+"""Alignment of a text beside its point, by the sign of its direction from it."""
 
 
-def _inside(triangles: np.ndarray) -> np.ndarray:
-    """Points spread over the triangles."""
-    weights = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4
-    return np.einsum("kci,wc->kwi", triangles, weights).reshape(-1, 2)
+def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> Callable[..., None]:
+    """Adds a body to axes; returns the function (positions [n, dim], offset [2]) that draws it.
+
+    In the plane its triangles are drawn, in space the lit faces of its skin that face the viewer, the farthest first.
+    `pale` is the share of white in its colours.
+    """
+    skin, plane = boundary(mesh), mesh.dimension == 2
+    fade = lambda colour: colour + (1.0 - colour) * pale  # noqa: E731
+    body = PolyCollection([], edgecolors=[tuple(fade(EDGE if plane else SKIN))], linewidths=0.5, zorder=zorder)
+    outline = LineCollection([], colors=[tuple(fade(SKIN))], linewidths=1.1, zorder=zorder + 1, capstyle="round")
+    axis.add_collection(body)
+    axis.add_collection(outline)
+
+    def show(x: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
+        points, faces, light = flattened(x) + offset, mesh.elements, np.ones(1)
+        if plane:
+            outline.set_segments(list(points[skin]))
+        else:
+            corners = x[skin]
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+            order = np.argsort(-(corners @ _AWAY).mean(axis=1))
+            order = order[(normal @ _AWAY)[order] < 0]
+            faces, light = skin[order], (0.8 + 0.2 * (normal @ _LIGHT))[order]
+        body.set_verts(list(points[faces]))
+        body.set_facecolor(list(map(tuple, fade(np.clip(light[:, None] * BODY, 0.0, 1.0)))))
+
+    return show
+
+
+def draw_ground(axis: Axes, ends: tuple[float, float], level: float, slope: float, *, depth: float) -> None:
+    """Draws the ground in the plane, y = level + slope x, as a strip of this depth."""
+    line = level + slope * np.array(ends)
+    axis.fill_between(ends, line, line - depth, color=GROUND, zorder=0, linewidth=0)
+    axis.plot(ends, line, color=GROUND_LINE, linewidth=1.2, zorder=1)
+
+
+def floor(positions: Float[np.ndarray, "*k 3"], height: float) -> Float[np.ndarray, "4 2"]:
+    """The rectangle at this height below all positions, in the drawing plane."""
+    flat = positions[..., :2].reshape(-1, 2)
+    (west, south), (east, north) = flat.min(axis=0), flat.max(axis=0)
+    corners = [[west, south, height], [east, south, height], [east, north, height], [west, north, height]]
+    return flattened(np.array(corners))
+
+
+def flattened(positions: Float[np.ndarray, "*k dim"]) -> Float[np.ndarray, "*k 2"]:
+    """Projects positions onto the drawing plane."""
+    return positions if positions.shape[-1] == 2 else np.stack([positions @ _RIGHT, positions @ _UP], axis=-1)

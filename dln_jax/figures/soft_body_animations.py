@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dln_jax.figures import style
 from dln_jax.figures.animations import DPI, write_gif
-from dln_jax.figures.soft_body_drawing import EDGE, GROUND, GROUND_LINE, SKIN, drawn, flattened, floor
+from dln_jax.figures.soft_bodies import GROUND, add_body, draw_ground, flattened, floor
 from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.types import InputError, require_positive
 
@@ -32,6 +31,7 @@ def write_soft_body_gif(
     muscles: Any = None,
     actuation: Float[np.ndarray, "times k"] | None = None,
     ground: float | None = 0.0,
+    slope: float = 0.0,
     title: str = "",
     stride: int = 1,
     frames_per_second: float = 15.0,
@@ -45,7 +45,8 @@ def write_soft_body_gif(
         t: time of every frame, s.
         muscles: pairs of vertices [k, 2], drawn as lines (in the plane).
         actuation: length of the muscles in every frame relative to their rest length; red is short.
-        ground: height of the ground, m; `None` draws none.
+        ground: height of the ground at x = 0, m; `None` draws none.
+        slope: slope of the ground (in the plane).
         title: title above the drawing.
         stride: frames of the motion per frame of the GIF.
         frames_per_second: frame rate of the GIF.
@@ -54,8 +55,9 @@ def write_soft_body_gif(
         InputError: times, vertices or muscles that do not fit the positions, or no frame.
     """
     require_positive(stride=stride, frames_per_second=frames_per_second)
-    _require_fitting(mesh, positions, t, muscles, actuation)
-    figure, show = _prepared(mesh, np.asarray(positions), muscles, actuation, ground)
+    if len(t) != len(positions):
+        raise InputError(f"there are {len(t)} times for {len(positions)} frames; expected one for each")
+    figure, show = _prepared(mesh, np.asarray(positions), muscles, actuation, ground, slope)
     frames = range(0, len(t), stride)
     write_gif(path, figure, show, t, frames=frames, frames_per_second=frames_per_second, title=title)
 
@@ -67,59 +69,31 @@ def soft_body_frame(
     muscles: Any = None,
     actuation: Float[np.ndarray, " k"] | None = None,
     ground: float | None = 0.0,
+    slope: float = 0.0,
 ) -> Figure:
     """One frame of `write_soft_body_gif` as a figure."""
-    state = np.asarray(positions)[None]
-    driven = None if actuation is None else np.asarray(actuation)[None]
-    _require_fitting(mesh, state, np.zeros(1), muscles, driven)
-    figure, show = _prepared(mesh, state, muscles, driven, ground)
+    lengths = None if actuation is None else np.asarray(actuation)[None]
+    figure, show = _prepared(mesh, np.asarray(positions)[None], muscles, lengths, ground, slope)
     show(0)
     return figure
 
 
 def _prepared(
-    mesh: Mesh, positions: np.ndarray, muscles: Any, actuation: np.ndarray | None, ground: float | None
+    mesh: Mesh, positions: np.ndarray, muscles: Any, actuation: Any, ground: float | None, slope: float
 ) -> tuple[Figure, Callable[[int], None]]:
-    """The empty figure, and the function that draws a frame into it."""
-    skin, seen, plane = boundary(mesh), flattened(positions), mesh.dimension == 2
-    below = None if plane or ground is None else floor(positions, ground)
-    figure, axis = _axes(seen if below is None else np.concatenate([seen.reshape(-1, 2), below]), plane, ground)
-    if below is not None:
-        axis.fill(*below.T, color=GROUND, zorder=0)
-    if plane:
-        axis.add_collection(LineCollection(list(seen[0][skin]), colors="0.8", linewidths=1.0, zorder=1))
-    width, edge = (0.6, EDGE) if plane else (0.4, SKIN)
-    body = PolyCollection([], edgecolors=[tuple(edge)], linewidths=width, zorder=2)
-    outline = LineCollection([], colors=[tuple(SKIN)], linewidths=1.2, zorder=3, capstyle="round")
-    lines = LineCollection([], linewidths=3.0, zorder=4, capstyle="round", cmap=_ACTUATION, norm=_ACTUATED)
-    for collection in (body, outline, lines):
-        axis.add_collection(collection)
-    pairs = np.asarray(muscles) if plane and muscles is not None else np.zeros((0, 2), int)
-    if len(pairs) and actuation is not None:
-        bar = figure.colorbar(ScalarMappable(_ACTUATED, _ACTUATION), ax=axis, shrink=0.8, aspect=10, pad=0.01)
-        bar.set_ticks([0.25, 1])
-        bar.ax.tick_params(labelsize=style.SMALL)
-        bar.set_label("muscle length / rest length", fontsize=style.SMALL)
-
-    def show(frame: int) -> None:
-        picture = drawn(mesh, skin, positions[frame])
-        body.set_verts(list(picture.polygons))
-        colours: Any = picture.colours
-        body.set_facecolor(colours)
-        if plane:
-            outline.set_segments(list(seen[frame][skin]))
-            lines.set_segments(list(seen[frame][pairs]))
-            lines.set_array(np.full(len(pairs), 1.0) if actuation is None else np.asarray(actuation[frame]))
-
-    return figure, show
-
-
-def _axes(points: np.ndarray, plane: bool, ground: float | None) -> tuple[Figure, Axes]:
-    """Axes of equal scale that contain all frames."""
-    flat = points.reshape(-1, 2)
-    low, high = np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)
+    """The figure with the ground and axes of equal scale that hold all frames, and the function that draws a frame."""
+    shape = mesh.vertices.shape
+    if positions.ndim != 3 or positions.shape[1:] != shape or len(positions) == 0:
+        raise InputError(f"positions have shape {list(positions.shape)}; expected [T, {shape[0]}, {shape[1]}], T > 0")
+    expected = (len(positions), 0 if muscles is None else len(muscles))
+    if actuation is not None and np.shape(actuation) != expected:
+        raise InputError(f"actuation has shape {list(np.shape(actuation))}; expected {list(expected)}")
+    points, plane = flattened(positions), mesh.dimension == 2
+    below = floor(positions, ground) if ground is not None and not plane else np.zeros((0, 2))
+    every = np.concatenate([points.reshape(-1, 2), below])
+    low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
     if plane and ground is not None:
-        low[1] = min(low[1], ground)
+        low[1] = min(low[1], ground + slope * (low[0] if slope > 0 else high[0]))
     margin = 0.06 * max(high - low)
     low, high = low - margin, high + margin
     height = float(np.clip(style.WIDTH * (high[1] - low[1]) / (high[0] - low[0]), 0.9, 5.4))
@@ -128,19 +102,26 @@ def _axes(points: np.ndarray, plane: bool, ground: float | None) -> tuple[Figure
     axis.set(xlabel="x, m" if plane else "m", ylabel="y, m" if plane else "m")
     axis.grid(False)
     axis.yaxis.set_major_locator(MaxNLocator(4))
-    if plane and ground is not None:
-        axis.axhspan(low[1], ground, color=GROUND, zorder=0)
-        axis.axhline(ground, color=GROUND_LINE, linewidth=1.2, zorder=1)
-    return figure, axis
+    if plane:
+        if ground is not None:
+            draw_ground(axis, (low[0], high[0]), ground, slope, depth=float(np.ptp([low, high], axis=0).sum()))
+        axis.add_collection(LineCollection(list(points[0][boundary(mesh)]), colors="0.8", linewidths=1.0, zorder=1))
+    elif ground is not None:
+        axis.fill(*below.T, color=GROUND, zorder=0)
+    show_body = add_body(axis, mesh)
+    pairs = np.asarray(muscles) if plane and muscles is not None else np.zeros((0, 2), int)
+    lines = LineCollection([], linewidths=3.0, zorder=4, capstyle="round", cmap=_ACTUATION, norm=_ACTUATED)
+    axis.add_collection(lines)
+    if len(pairs) and actuation is not None:
+        bar = figure.colorbar(ScalarMappable(_ACTUATED, _ACTUATION), ax=axis, shrink=0.8, aspect=10, pad=0.01)
+        bar.set_ticks([0.25, 1])
+        bar.ax.tick_params(labelsize=style.SMALL)
+        bar.set_label("muscle length / rest length", fontsize=style.SMALL)
 
+    def show(frame: int) -> None:
+        show_body(positions[frame])
+        if len(pairs):
+            lines.set_segments(list(points[frame][pairs]))
+            lines.set_array(np.ones(len(pairs)) if actuation is None else np.asarray(actuation[frame]))
 
-def _require_fitting(mesh: Mesh, positions: np.ndarray, t: np.ndarray, muscles: Any, actuation: Any) -> None:
-    shape = mesh.vertices.shape
-    if positions.ndim != 3 or positions.shape[1:] != shape or len(positions) == 0:
-        raise InputError(f"positions have shape {list(positions.shape)}; expected [T, {shape[0]}, {shape[1]}], T > 0")
-    if len(t) != len(positions):
-        raise InputError(f"there are {len(t)} times for {len(positions)} frames; expected one for each")
-    if actuation is not None:
-        expected = (len(positions), 0 if muscles is None else len(muscles))
-        if np.shape(actuation) != expected:
-            raise InputError(f"actuation has shape {list(np.shape(actuation))}; expected {list(expected)}")
+    return figure, show

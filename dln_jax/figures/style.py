@@ -5,12 +5,15 @@ apply later, when it makes ticks, are set on each axis.
 """
 
 from collections.abc import Iterable
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
+
+from dln_jax.data.schema import Trajectories
 
 WIDTH, DPI = 7.2, 150
 """Inches, and pixels per inch: 1,080 pixels, the width of a page."""
@@ -58,7 +61,7 @@ def marker(name: str) -> str:
 
 
 def _look(name: str) -> tuple[str, str]:
-    known = [each for each in MODELS if name == each or name.startswith(f"{each}-")]
+    known = [model for model in MODELS if f"{name}-".startswith(f"{model}-")]
     return MODELS[max(known, key=len)] if known else UNKNOWN
 
 
@@ -68,8 +71,7 @@ def figure(
     """A figure and its axes [rows, columns], drawn by Agg; sizes in inches, `options` as for `Figure.subplots`."""
     drawn = blank(height=height, width=width, dpi=dpi)
     axes = drawn.subplots(rows, columns, squeeze=False, **options)
-    for axis in axes.flat:
-        prepare(axis)
+    prepare(*axes.flat)
     return drawn, axes
 
 
@@ -80,16 +82,17 @@ def blank(*, height: float, width: float = WIDTH, dpi: int = DPI) -> Figure:
     return drawn
 
 
-def prepare(axis: Axes) -> None:
+def prepare(*axes: Axes) -> None:
     """Sets text sizes and the grid of axes that were added to a figure."""
-    axis.tick_params(which="both", labelsize=SMALL)
-    for side in (axis.xaxis, axis.yaxis):
-        side.label.set_fontsize(TEXT)
-        side.get_offset_text().set_fontsize(SMALL)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.spines[["bottom", "left"]].set_color("0.4")
-    axis.grid(True, which="major", color="0.9", linewidth=0.7)
-    axis.set_axisbelow(True)
+    for axis in axes:
+        axis.tick_params(which="both", labelsize=SMALL)
+        for side in (axis.xaxis, axis.yaxis):
+            side.label.set_fontsize(TEXT)
+            side.get_offset_text().set_fontsize(SMALL)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.spines[["bottom", "left"]].set_color("0.4")
+        axis.grid(True, which="major", color="0.9", linewidth=0.7)
+        axis.set_axisbelow(True)
 
 
 def title(axis: Axes, text: str, **options) -> None:
@@ -119,6 +122,12 @@ def prefixed(size: float | int, unit: str) -> tuple[float, str]:
 def colours_of(names: Iterable[str]) -> dict[str, str]:
     """Assigns colours in sequence, for everything but models."""
     return {name: CYCLE[number % len(CYCLE)] for number, name in enumerate(names)}
+
+
+def unit_of(data: Trajectories, joint: int, key: Literal["q", "qd", "tau"] = "tau") -> str:
+    """Unit of a joint's position, velocity or force; a joint of unknown kind counts as revolute."""
+    prismatic = data.needs is not None and data.needs.joints[joint] == "prismatic"
+    return {"q": ("rad", "m"), "qd": ("rad/s", "m/s"), "tau": ("N m", "N")}[key][prismatic]
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from dln_jax.figures import style
 from dln_jax.learning.engine.problem import Progress
 
-LEAST_SHARE = 0.2
+SHORTEST_SHARE = 0.2
 """Stages shorter than this fraction of the steps make the stage names vertical."""
 
 
@@ -28,37 +28,30 @@ def training_curve(
     """
     figure, [[axis]] = style.figure(height=3.6)
     stages = [list(ats) for _, ats in itertools.groupby(history, key=lambda at: at.stage)]
-    kinds = (
-        ("loss", "-", style.SKY, loss),
-        ("validation", "--", style.VERMILLION, f"validation {error}"),
-        ("monitor", "-", "black", f"test {error}"),
-    )
-    every = []
-    for number, stage in enumerate(stages):
-        steps = [at.step for at in stage]
-        for field, style_of_line, colour, label in kinds:
+    curves = {
+        "loss": ("-", style.SKY, loss),
+        "validation": ("--", style.VERMILLION, f"validation {error}"),
+        "monitor": ("-", "black", f"test {error}"),
+    }
+    every, last, start = [], history[-1].step, 0
+    upright = min(np.diff([0, *(stage[-1].step for stage in stages)])) < SHORTEST_SHARE * last
+    for stage in stages:
+        for field, (dash, colour, label) in curves.items():
             values = [float(np.median(getattr(at, field))) for at in stage]
             if not np.isnan(values).all():  # no test is monitored
-                marker = "." if len(stage) < 40 else ""
-                named = {"label": label} if number == 0 else {}
-                axis.plot(steps, values, style_of_line, marker=marker, markersize=4, color=colour, **named)
+                look = {"marker": "." if len(stage) < 40 else "", "markersize": 4, "color": colour}
+                axis.plot([at.step for at in stage], values, dash, **look, label=None if start else label)
                 every += values
-    axis.set_yscale(style.scale_of(every))
-    axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
-    last = history[-1].step
-    axis.set_xlim(0, max(1.02 * last, 1))
-    starts = [0, *(stage[-1].step for stage in stages[:-1])]
-    lengths = np.diff([*starts, last])
-    upright = bool(np.any(lengths < LEAST_SHARE * last))
-    for start, length, stage in zip(starts, lengths, stages, strict=True):
         if start:
             axis.axvline(start, color="0.4", linewidth=0.8)
-        if upright:
-            place, turned = (start + 0.004 * last, 0.98), {"rotation": 90.0, "ha": "left", "va": "top"}
-        else:
-            place, turned = (start + length / 2, 1.02), {"rotation": 0.0, "ha": "center", "va": "bottom"}
+        end = stage[-1].step
+        place = (start + 0.004 * last, 0.98) if upright else ((start + end) / 2, 1.02)
         name = axis.text(*place, stage[0].stage, transform=axis.get_xaxis_transform(), color="0.3")
-        name.update({"fontsize": style.SMALL, **turned})
-    axis.set(xlabel="optimiser step", ylabel=unit)
+        name.set(fontsize=style.SMALL, rotation=90.0 * upright, ha="left" if upright else "center")
+        name.set_va("top" if upright else "bottom")
+        start = end
+    axis.set_yscale(style.scale_of(every))
+    axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
+    axis.set(xlim=(0, max(1.02 * last, 1)), xlabel="optimiser step", ylabel=unit)
     style.legend(figure, loc="outside lower center", ncols=4)
     return figure

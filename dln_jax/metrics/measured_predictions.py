@@ -9,7 +9,7 @@ times, 1 / lambda: a more accurate model extends them only by the logarithm of i
 """
 
 import functools
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +21,10 @@ from dln_jax.data.segments import GAP
 from dln_jax.learning import motions, starts
 from dln_jax.learning.measured_motions import MeasuredWindows, motion
 from dln_jax.learning.starts import nearest
-from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.driven import Torque
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.plain import InverseForward
-from dln_jax.metrics.rollouts import valid_prediction_time
+from dln_jax.metrics.rollouts import follow, valid_prediction_time
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
@@ -44,23 +43,6 @@ class Predictions(NamedTuple):
     """Energy drift relative to the largest kinetic energy; NaN for a model without energies."""
 
 
-def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
-    """Cuts segments of `samples` samples to predict, which begin at every `every`-th sample of the trajectories.
-
-    Raises:
-        InputError: no trajectory is that long.
-    """
-    found = []
-    for index in np.unique(data.trajectory):
-        own = np.flatnonzero(data.trajectory == index)
-        found += [own[first : first + samples] for first in range(0, len(own) - samples + 1, every)]
-    if not found:
-        raise InputError(f"no trajectory has {samples} samples to predict; record longer motions, or predict fewer")
-    rows = np.stack(found)
-    t = data.t[rows]
-    return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], np.ones(rows.shape))
-
-
 def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> MeasuredWindows:
     """Cuts whole recordings of free motions to predict: gaps are filled with unmeasured times of weight 0.
 
@@ -71,23 +53,23 @@ def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> Measured
     Raises:
         InputError: no recording has more than `fitted` samples in a row and one to predict.
     """
-    found = []
+    recordings = []
     for index in np.unique(data.trajectory):
         own = np.flatnonzero(data.trajectory == index)
         place = grid_places(data.t[own])
         last_start = -np.inf
         for first in range(len(own) - fitted):
-            whole = place[-1] - place[first] + 1 >= samples
-            in_a_row = place[first + fitted - 1] - place[first] == fitted - 1
-            followed = place[first + fitted] - place[first] < samples
+            elapsed = place[first:] - place[first]
+            whole = elapsed[-1] + 1 >= samples
+            in_a_row, followed = elapsed[fitted - 1] == fitted - 1, elapsed[fitted] < samples
             apart = place[first] - last_start >= max(samples // 2, 1)
             if in_a_row and followed and ((apart and whole) or np.isinf(last_start)):
-                rows = own[first:][place[first:] - place[first] < samples]
-                found.append(on_grid(data.t[rows], data.q[rows], data.qd[rows]))
+                rows = own[first:][elapsed < samples]
+                recordings.append(on_grid(data.t[rows], data.q[rows], data.qd[rows]))
                 last_start = place[first]
-    if not found:
+    if not recordings:
         raise InputError(f"no test motion has {fitted + 1} samples without a gap; record longer ones")
-    return padded(found)
+    return padded(recordings)
 
 
 def grid_places(t: Float[np.ndarray, " N"], *, gap: float = GAP) -> Int[np.ndarray, " N"]:
@@ -109,20 +91,11 @@ def on_grid(t: Float[np.ndarray, " N"], q: Float[np.ndarray, "N d"], qd: Float[n
 
 
 def padded(motions: list[MeasuredWindows]) -> MeasuredWindows:
-    """Pads motions to windows of one length: shorter ones repeat their last time, with weight 0."""
-    longest = max(len(motion.t) for motion in motions)
-
-    def extended(array: np.ndarray, mode: Literal["edge", "constant"]) -> np.ndarray:
-        return np.pad(array, [(0, longest - len(array)), *[(0, 0)] * (array.ndim - 1)], mode)
-
-    alike = [
-        motion._replace(
-            **{key: extended(getattr(motion, key), "edge") for key in ("t", "q", "qd", "tau")},
-            weight=extended(motion.weight, "constant"),
-        )
-        for motion in motions
-    ]
-    return MeasuredWindows(*(np.stack(arrays) for arrays in zip(*alike, strict=True)))
+    """Pads motions to windows of one length: shorter ones repeat their last sample, with weight 0."""
+    longest = np.arange(max(len(motion.t) for motion in motions))
+    alike = (jax.tree.map(lambda array: array[np.minimum(longest, len(array) - 1)], motion) for motion in motions)
+    windows = MeasuredWindows(*map(np.stack, zip(*alike, strict=True)))
+    return windows._replace(weight=windows.weight * [longest < len(motion.t) for motion in motions])
 
 
 def predict_measured(
@@ -153,10 +126,9 @@ def predict_measured(
         raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {segments.t.shape[1]}")
     spread = segments.q.reshape(-1, segments.q.shape[2]).std(axis=0)
     scale = tuple(np.where(spread > 0, spread, 1.0).tolist())
-    arrays = (jnp.asarray(each) for each in segments)
-    known = {"scale": scale, "fitted": fitted, "torque": torque, "substeps": substeps, "momenta": momenta}
-    found = _predict(model, parameters, *arrays, **known)
-    return Predictions(*(np.asarray(each) for each in found))
+    options = {"scale": scale, "fitted": fitted, "torque": torque, "substeps": substeps, "momenta": momenta}
+    predicted = _predict(model, parameters, *map(jnp.asarray, segments), **options)
+    return Predictions(*map(np.asarray, predicted))
 
 
 def valid_times(
@@ -191,9 +163,14 @@ def _predict(
         return motion(dynamics(energies), start, t, tau, torque=torque, substeps=substeps)
 
     def drift(states, t, tau):
+        """Drift of the energy relative to the work along the predicted motion."""
         if momenta or isinstance(energies, InverseForward):
             return jnp.asarray(jnp.nan)
-        return _drift(dynamics(energies), states, t, tau, torque, substeps)
+        system, (q, qd) = dynamics(energies), (states[:, :d], states[:, d:])
+        work = follow(system, q[0], qd[0], tau, t, substeps=substeps, torque=torque).work
+        energy = jax.vmap(system.energy)(q, qd)
+        kinetic = jax.vmap(lambda q, qd: 0.5 * qd @ system.mass_matrix(q, qd) @ qd)(q, qd)
+        return jnp.max(jnp.abs(energy - energy[0] - work)) / jnp.max(kinetic)
 
     def one(t, q, qd, tau, weight):
         first = slice(None, fitted)
@@ -208,22 +185,6 @@ def _predict(
         return states[:, :d], states[:, d:], growth, drift(states, t, tau)
 
     return jax.vmap(one)(t, q, qd, tau, weight)
-
-
-def _drift(system: Dynamics, states, t, tau, torque: Torque, substeps: int):
-    """Drift of the energy relative to the work along the predicted motion."""
-    d = states.shape[1] // 2
-
-    def rate(state, tau):
-        q, qd, _ = state
-        return qd, system.forward_dynamics(q, qd, tau), qd @ (tau - system.friction(q, qd))
-
-    start = (states[0, :d], states[0, d:], jnp.zeros(()))
-    slopes = torque_slopes(tau, t, torque)
-    *_, work = driven(rate, start, tau[:-1], slopes, jnp.diff(t), substeps=substeps, method=looped_rk4)
-    energy = jax.vmap(system.energy)(states[:, :d], states[:, d:])
-    kinetic = jax.vmap(lambda q, qd: 0.5 * qd @ system.mass_matrix(q, qd) @ qd)(states[:, :d], states[:, d:])
-    return jnp.max(jnp.abs(energy - energy[0] - work)) / jnp.max(kinetic)
 
 
 def prediction_metrics(

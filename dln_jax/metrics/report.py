@@ -1,4 +1,4 @@
-"""Reports: one number per row, with its reference or bound, and the conditions of the measurement."""
+"""report.json: one number per row, with its reference or bound, and the conditions of the measurement."""
 
 import datetime
 import importlib.metadata
@@ -7,21 +7,13 @@ import platform
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple
 
 import jax
-import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from dln_jax.files import write_json
 
-REPORT = "report.json"
 PACKAGES = ("dln-jax", "jax", "jaxlib", "dm-haiku", "optax", "numpy", "diffrax")
-WIDTH, NARROWEST = 200, 132
-"""Width of a table in a file or a pipe, and its smallest width in a terminal."""
-UNITS = {"seconds": "s", "us": "us", "j": "J"}
-"""SI units by the words in a quantity's name."""
 
 
 class Row(NamedTuple):
@@ -48,32 +40,7 @@ class Row(NamedTuple):
         return bool(self.value >= self.bound if self.at_least else self.value <= self.bound)
 
 
-def expect(
-    case: str,
-    quantity: str,
-    expected: str,
-    value: SupportsFloat,
-    bound: SupportsFloat,
-    unit: str = "1",
-    *,
-    at_least: bool = False,
-    reference: float | None = None,
-) -> Row:
-    """Returns the row of a number with an expectation from theory: `expected`, and the resulting `bound`."""
-    return Row(case, quantity, float(value), unit, reference, float(bound), at_least, expected)
-
-
-def largest(values: Any) -> float:
-    """The largest of some numbers; NaN if one is NaN, so that it meets no bound."""
-    return float(np.max(np.asarray(values, np.float64)))
-
-
-def unit_of(quantity: str, units: Mapping[str, str] = UNITS) -> str:
-    """SI unit of a quantity: that of the first key whose words its name contains, else 1."""
-    return next((unit for words, unit in units.items() if f"_{words}_" in f"_{quantity}_"), "1")
-
-
-def conditions(**given: Any) -> dict[str, Any]:
+def conditions(**facts: Any) -> dict[str, Any]:
     """Machine, versions, threads, command and date, and all keywords (dtype, seeds, ...)."""
     return {
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}",
@@ -82,7 +49,7 @@ def conditions(**given: Any) -> dict[str, Any]:
         "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "command": " ".join(sys.argv),
         "date": datetime.date.today().isoformat(),
-        **given,
+        **facts,
     }
 
 
@@ -94,68 +61,6 @@ def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> N
     listed = [{**dict(zip(Row._fields[:6], row, strict=False)), "pass": row.passed} for row in rows]
     words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}
     write_json(path, {"conditions": {**facts, **({"expected": words} if words else {})}, "rows": listed})
-
-
-def publish(
-    folder: Path,
-    rows: Sequence[Row],
-    facts: Mapping[str, Any],
-    *,
-    shown: Sequence[Row] | None = None,
-    tables: Sequence[Table | str] = (),
-) -> None:
-    """Writes report.json into a folder; prints a table of its rows (or of `shown`), other tables, and failing rows."""
-    write_report(folder / REPORT, rows, facts)
-    print_report(rows if shown is None else shown, facts, *tables)
-    bound = [row for row in rows if row.passed is not None]
-    failing = [f"{row.case} {row.quantity}" for row in bound if not row.passed]
-    if bound:
-        print(f"{len(bound) - len(failing)} of {len(bound)} pass", *(f"fails: {name}" for name in failing), sep="\n")
-    print(f"report: {folder / REPORT}")
-
-
-def print_report(rows: Sequence[Row], facts: Mapping[str, Any], *others: Table | str) -> None:
-    """Prints the table of some rows, followed by other tables."""
-    console = Console(highlight=False, soft_wrap=True)
-    # Truncated numbers are useless, so that a narrow terminal gets long lines.
-    console.width = max(console.width, NARROWEST) if sys.stdout.isatty() else WIDTH
-    for table in (report_table(rows, facts), *others):
-        print(table) if isinstance(table, str) else console.print(table)
-
-
-def report_table(rows: Sequence[Row], facts: Mapping[str, Any]) -> Table:
-    """Returns a table with one line per row, without empty columns; the caption states the conditions."""
-    passed = {True: "yes", False: "[bold red]no[/]", None: ""}
-    to_reach = ["" if row.bound is None else f"{'≥' if row.at_least else '≤'} {row.bound:.3g}" for row in rows]
-    columns = {
-        **{name: [getattr(row, name) for row in rows] for name in ("case", "quantity", "expected")},
-        "value": [f"{row.value:.3g}" for row in rows],
-        "unit": [row.unit for row in rows],
-        "reference": ["" if row.reference is None else f"{row.reference:.3g}" for row in rows],
-        "to reach": to_reach,
-        "pass": [passed[row.passed] for row in rows],
-    }
-    columns = {name: cells for name, cells in columns.items() if any(cells)}
-    caption = "; ".join((facts["machine"], facts["dtype"], f"{facts['threads']} threads", facts["command"]))
-    table = Table(*columns, caption=caption)
-    for cells in zip(*columns.values(), strict=True):
-        table.add_row(*cells)
-    return table
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    """Returns a table with a line per case and a column per quantity, in order of appearance."""
-    cases = list(dict.fromkeys(row.case for row in rows))
-    columns = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
-    values = {(row.case, row.quantity, row.unit): f"{row.value:.3g}" for row in rows}
-    titles = [quantity.replace("_", " ") + (f", {unit}" if unit != "1" else "") for quantity, unit in columns]
-    lines = [[case, *(values.get((case, *column), "") for column in columns)] for case in cases]
-    return markdown_table(["case", *titles], lines)
-
-
-def markdown_table(titles: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Formats cells as Markdown."""
-    return "".join(f"| {' | '.join(line)} |\n" for line in [titles, ["---"] * len(titles), *lines])
 
 
 def _processor() -> str:

@@ -65,7 +65,7 @@ def follow(
     Raises InputError for no substeps, or a `torque` of another name.
     """
     require_positive(substeps=substeps)
-    return _drive(dynamics, q0, qd0, tau[:-1], torque_slopes(tau, t, torque), jnp.diff(t), substeps)
+    return _drive(dynamics, q0, qd0, tau, torque_slopes(tau, t, torque), t, substeps)
 
 
 def recorded_motions(
@@ -104,10 +104,9 @@ def motion_program(
         q0, qd0, tau, t = records
 
         def drive(q0, qd0, tau, t, slopes):
-            motion = _drive(dynamics, q0, qd0, tau[:-1], slopes, jnp.diff(t), substeps)
-            if not isinstance(dynamics, Dynamics):
-                return motion, None
-            return motion, jax.vmap(dynamics.energy)(motion.q, motion.qd)
+            motion = _drive(dynamics, q0, qd0, tau, slopes, t, substeps)
+            energy = jax.vmap(dynamics.energy)(motion.q, motion.qd) if isinstance(dynamics, Dynamics) else None
+            return motion, energy
 
         slopes = jnp.stack([jax.vmap(functools.partial(torque_slopes, torque=torque))(tau, t) for torque in torques])
         return jax.vmap(lambda slopes: jax.vmap(drive)(q0, qd0, tau, t, slopes))(slopes)
@@ -182,12 +181,11 @@ def normalised_state_error(data: Trajectories, motions: list[Motion]) -> float:
     1 is the error of a constant guess; infinite when a prediction is not finite.
     Raises InputError for a coordinate or rate that is the same in all samples.
     """
-    errors = []
+    errors, samples = [], np.concatenate(_samples(data))
     for key in ("q", "qd"):
-        predicted = np.concatenate([np.asarray(getattr(motion, key)) for motion in motions])
-        truth = getattr(data, key)[np.concatenate(_samples(data))]
+        predicted, true = np.concatenate([getattr(motion, key) for motion in motions]), getattr(data, key)
         with np.errstate(over="ignore", invalid="ignore"):
-            errors.append((predicted - truth) ** 2 / _variance(getattr(data, key), key))
+            errors.append((predicted - true[samples]) ** 2 / _variance(true, key))
     return float(np.sqrt(_mean_or_infinity(np.concatenate(errors, axis=1))))
 
 
@@ -199,15 +197,15 @@ def energy_error(
     It shows the error of the integration, and whether the forward model is consistent with that energy, but not whether
     the energy is right. Infinite if a prediction is not finite.
     """
-    states = (np.concatenate([getattr(motion, key) for motion in motions]) for key in ("q", "qd"))
-    energies = np.asarray(jax.jit(jax.vmap(energy))(*(jnp.asarray(array, dtype) for array in states)), np.float64)
-    bounds = np.cumsum([0] + [len(motion.work) for motion in motions])
-    return _imbalance(np.split(energies, bounds[1:-1]), motions)
+    q, qd = (jnp.asarray(np.concatenate(states), dtype) for states in list(zip(*motions, strict=True))[:2])
+    energies = np.asarray(jax.jit(jax.vmap(energy))(q, qd), np.float64)
+    return _imbalance(np.split(energies, np.cumsum([len(motion.q) for motion in motions])[:-1]), motions)
 
 
-def _imbalance(energies: Sequence[np.ndarray], motions: list[Motion]) -> float:
-    errors = [abs(energy - energy[0] - motion.work) for energy, motion in zip(energies, motions, strict=True)]
-    return _mean_or_infinity(np.concatenate(errors))
+def _imbalance(energies: Sequence[np.ndarray] | np.ndarray, motions: list[Motion]) -> float:
+    """Mean imbalance of energies that are at least as long as their motions."""
+    pairs = zip(energies, (motion.work for motion in motions), strict=True)
+    return _mean_or_infinity(np.concatenate([abs(energy[: len(work)] - energy[0] - work) for energy, work in pairs]))
 
 
 def rollout_metrics(
@@ -237,23 +235,19 @@ def metrics_of_motions(
 ) -> dict[str, float]:
     """Returns `rollout_metrics` from the motions and energies of a `motion_program` with both kinds of torque."""
     held, interpolated = by_trajectory(motions, data, TORQUES).values()
-    groups = _samples(data)
-    durations = [data.t[group[-1]] - data.t[group[0]] for group in groups]
     metrics = {
         "vpt_seconds": float(np.mean(valid_prediction_times(data, held, threshold=threshold))),
         "vpt_interpolated_seconds": float(np.mean(valid_prediction_times(data, interpolated, threshold=threshold))),
-        "rollout_seconds": float(np.mean(durations)),
+        "rollout_seconds": float(np.mean([np.ptp(data.t[group]) for group in _samples(data)])),
         "normalised_state_error": normalised_state_error(data, interpolated),
     }
     if energies is not None:
-        ours = np.asarray(energies, np.float64)[1]
-        own = [energy[: len(group)] for energy, group in zip(ours, groups, strict=True)]
-        metrics["energy_error_j"] = _imbalance(own, interpolated)
+        metrics["energy_error_j"] = _imbalance(np.asarray(energies, np.float64)[1], interpolated)
     return metrics
 
 
-def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, substeps: int) -> Motion:
-    """Integrates through intervals with torque tau[k] + slopes[k] s; the work done is a third state."""
+def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, t, substeps: int) -> Motion:
+    """Integrates with the torque tau[k] + slopes[k] (t - t[k]) from t[k] on; the work done is a third state."""
 
     def rate(state, tau):
         q, qd, _ = state
@@ -262,7 +256,7 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, 
         return qd, dynamics.forward_dynamics(q, qd, tau), qd @ at_work
 
     start = q0, qd0, jnp.zeros_like(q0[0])
-    return Motion(*driven(rate, start, tau, slopes, durations, substeps=substeps, method=looped_rk4))
+    return Motion(*driven(rate, start, tau[:-1], slopes, jnp.diff(t), substeps=substeps, method=looped_rk4))
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""Verdict on a fitted robot: good, doubtful or refused, by its torques on held-out motions.
+"""Verdict on a fitted model: good, doubtful or refused, by its torques on held-out motions or by predicted motions.
 
 The mean squared error e of a joint is compared with four numbers from the same samples: the variance v of its torque
 (the error of predicting the mean), its mean square z (the error of predicting zero), the variance n of its noise, and
@@ -10,14 +10,22 @@ the error of the robot's own file. A joint is
     unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: no conclusion
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
+
+A predicted motion escapes if a state is not finite, or a momentum or a position is further from zero than `RANGE` times
+the farthest measured one; angles may grow, as a pendulum turns over. The error of a motion is the mean square of its
+first `EARLY` samples over the variance of the data, because chaotic motions diverge from any model later on.
+
+    refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the spread)
+    doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the share of noise in the variance is added to both
 """
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import InputError
 
 Level = Literal["good", "doubtful", "refused"]
@@ -33,6 +41,11 @@ WORSE, MUCH_WORSE = 0.01, 2.0
 larger by the second as a factor."""
 CONSTANT = 1e-12
 """A torque is constant if its variance is below this share of the mean square of all torques."""
+
+EARLY, RANGE, MOTION_NOISE = 30, 10.0, 4.0
+"""Number of samples of a motion's error, farthest state of a motion that has not escaped relative to the data, and
+factor of the noise: noise in the measured initial state moves a motion as far as the noise that it is compared with,
+and may grow."""
 
 
 class Verdict(NamedTuple):
@@ -114,32 +127,32 @@ def held_out(
     )
 
 
-def judge(found: HeldOut, names: Sequence[str] | None = None) -> Verdict:
+def judge(errors: HeldOut, names: Sequence[str] | None = None) -> Verdict:
     """Returns the verdict on held-out torques.
 
     Args:
-        found: the numbers.
+        errors: mean squares of the joints.
         names: of the joints; by default joint 1, joint 2, ...
     """
-    names = [f"joint {k + 1}" for k in range(len(found.error))] if names is None else names
-    if not found.zero.any():
+    names = [f"joint {k + 1}" for k in range(len(errors.error))] if names is None else names
+    if not errors.zero.any():
         return Verdict("refused", "every held-out torque is zero", "record driven motions with measured torques")
-    share = found.error / found.unit
+    share = errors.error / errors.unit
     if not np.isfinite(share).all():
         which = _listed(names, ~np.isfinite(share))
         return Verdict("refused", f"the torque of {which} is not finite on held-out motions", "check the data")
-    noise = np.zeros_like(share) if found.noise is None else found.noise / found.unit
+    noise = np.zeros_like(share) if errors.noise is None else errors.noise / errors.unit
     unseen = (noise >= 0.5) & (share > UNEXPLAINED) & (share <= NOISE * noise)
-    numbers = _numbers(found, share, noise, names)
+    numbers = _numbers(errors, share, noise, names)
     unexplained = (share >= 1) & ~unseen
     if share.mean() >= 1 or unexplained.any() or np.where(unseen, 0.0, share - NOISE * noise).mean() >= FAILED:
         beyond = f"more than {FAILED:.0%} of all torques is unexplained"
         constant = f"the torque of {_listed(names, unexplained)} is predicted no better than by a constant"
         remedy = "check the sign, order and unit of tau, and the times of the log (check_data), or record more motions"
         return Verdict("refused", f"{constant if unexplained.any() else beyond}: {numbers}", remedy)
-    worse = 0.0 if found.file is None else share.mean() - np.mean(found.file / found.unit)
-    if found.file is not None and worse > WORSE:
-        level = "refused" if share.mean() > MUCH_WORSE * np.mean(found.file / found.unit) else "doubtful"
+    worse = 0.0 if errors.file is None else share.mean() - np.mean(errors.file / errors.unit)
+    if errors.file is not None and worse > WORSE:
+        level = "refused" if share.mean() > MUCH_WORSE * np.mean(errors.file / errors.unit) else "doubtful"
         remedy = "keep the file's values, or record more and different motions"
         return Verdict(level, f"the robot's file predicts held-out torques better: {numbers}", remedy)
     doubtful = (share > UNEXPLAINED + NOISE * noise) & ~unseen
@@ -156,33 +169,77 @@ def judge(found: HeldOut, names: Sequence[str] | None = None) -> Verdict:
     return Verdict("good", numbers)
 
 
+def judge_motions(
+    predicted: Sequence[Motions],
+    truth: Sequence[Motions],
+    *,
+    size: Float[np.ndarray, " two_d"],
+    bounded: Bool[np.ndarray, " two_d"],
+    noise: Float[np.ndarray, " two_d"] | None = None,
+) -> Verdict:
+    """Returns the verdict on predicted test motions.
+
+    Args:
+        predicted: motions of the model.
+        truth: measured or exact motions at the same times.
+        size: standard deviation of q and p in the data.
+        bounded: mask of q and p that cannot grow without limit: all but angles.
+        noise: standard deviation of the measurements of q and p, if known.
+    """
+    remedy = "state the plant's --needs, try another --model, or record more motions"
+    errors, escaped = [], 0
+    for exact, model in zip(truth, predicted, strict=True):
+        true, states = (np.concatenate([motions.q, motions.p], axis=2) for motions in (exact, model))
+        farthest = RANGE * np.maximum(np.abs(true).max(axis=(0, 1)), size)
+        # A state that is not finite compares as false.
+        stays = np.where(bounded, np.abs(states) <= farthest, np.isfinite(states)).all(axis=(1, 2))
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = ((states - true)[:, :EARLY] / size) ** 2
+        errors += np.where(stays, squares.mean(axis=(1, 2)), np.inf).tolist()
+        escaped += int((~stays).sum())
+    if escaped:
+        reason = f"{escaped} of {len(errors)} predicted test motions grow beyond {RANGE:g} times the range of the data"
+        return Verdict("refused", reason, remedy)
+    share = 0.0 if noise is None else float(np.mean(np.minimum(noise / size, 1.0) ** 2))
+    median = float(np.median(errors))
+    numbers = f"squared error of predicted test motions over the variance {median:.2g}, worst {max(errors):.2g}"
+    numbers += f" (median of {len(errors)}; first {EARLY} samples)" + (f", noise {share:.2g}" if share else "")
+    if not median <= FAILED + MOTION_NOISE * share:
+        return Verdict("refused", numbers, remedy)
+    return (
+        Verdict("doubtful", numbers, remedy)
+        if median > UNEXPLAINED + MOTION_NOISE * share
+        else Verdict("good", numbers)
+    )
+
+
 def worst(first: Verdict, *others: Verdict) -> Verdict:
     """The most severe of several verdicts; of equal ones that are not good, all reasons and remedies."""
     every = [first, *others]
-    level = LEVELS[max(each.number for each in every)]
+    level = LEVELS[max(verdict.number for verdict in every)]
     if level == "good":
         return first
-    those = [each for each in every if each.level == level]
-    remedies = dict.fromkeys(each.remedy for each in those if each.remedy)
-    return Verdict(level, "; ".join(each.reason for each in those), "; ".join(remedies))
+    severe = [verdict for verdict in every if verdict.level == level]
+    remedies = dict.fromkeys(verdict.remedy for verdict in severe if verdict.remedy)
+    return Verdict(level, "; ".join(verdict.reason for verdict in severe), "; ".join(remedies))
 
 
-def verdict_metrics(found: HeldOut, verdict: Verdict) -> dict[str, float | int]:
+def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]:
     """Entries of metrics.json: the verdict as a number, and the mean nMSE of the comparisons."""
-    compared = {"zero": found.zero, "noise": found.noise, "file": found.file}
-    means = {f"{name}_nmse": float(np.mean(each / found.unit)) for name, each in compared.items() if each is not None}
+    compared = {"zero": errors.zero, "noise": errors.noise, "file": errors.file}
+    means = {f"{name}_nmse": float(np.mean(e / errors.unit)) for name, e in compared.items() if e is not None}
     return {"verdict": verdict.number, **means}
 
 
-def _numbers(found: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
+def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
     """Formats all of the numbers as a phrase."""
     worst = int(np.argmax(share))
-    compared = [f"a guess of zero {np.mean(found.zero / found.unit):.3g}"]
-    compared += [] if found.file is None else [f"the robot's file {np.mean(found.file / found.unit):.3g}"]
+    compared = [f"a guess of zero {np.mean(errors.zero / errors.unit):.3g}"]
+    compared += [] if errors.file is None else [f"the robot's file {np.mean(errors.file / errors.unit):.3g}"]
     compared += [f"noise {noise.mean():.2g}"] if noise.any() else []
     single = "" if len(share) == 1 else f", worst {names[worst]} {share[worst]:.3g}"
     return f"held-out nMSE {share.mean():.3g}{single} ({', '.join(compared)})"
 
 
 def _listed(names: Sequence[str], chosen: np.ndarray) -> str:
-    return ", ".join(name for name, each in zip(names, chosen, strict=True) if each)
+    return ", ".join(name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen)

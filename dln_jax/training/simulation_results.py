@@ -127,15 +127,15 @@ def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: s
     write_figure(folder / "energy.png", figure)
     write_figure(folder / "moments.png", moments_figure([picture], columns=1))
     stride = max(round(1 / (FRAMES_PER_SECOND * dt)), math.ceil(shown / MOST_FRAMES), 1)
-    mesh, positions = with_slope(example, x)
     write_soft_body_gif(
         folder / "motion.gif",
-        mesh,
-        positions,
+        example.scene.mesh,
+        x,
         t,
         muscles=example.muscles,
         actuation=None if control is None else np.asarray(control),
-        ground=0.0 if example.ground == 0.0 else None,
+        ground=None if example.ground is None else 0.0,
+        slope=example.ground or 0.0,
         title=scene,
         stride=stride,
         frames_per_second=max(1 / (stride * dt), 1.0),
@@ -158,24 +158,4 @@ def moments(scene: str, example: Example, t: np.ndarray, x: np.ndarray) -> Momen
     within = [moment for moment in example.moments[::every] if moment <= t[-1] + 1e-9]
     times = within if len(within) > 1 else [0.0, t[-1] / 2, t[-1]]
     chosen = np.unique(np.abs(t[:, None] - np.array(times)).argmin(axis=0))
-    # For a beam the times are written beside its tip.
-    rest = example.scene.mesh.vertices
-    tip = int(np.argmax(rest[:, 0] - 1e-6 * rest[:, -1])) if scene == "beam" else None
-    stacked = scene in STACKED
-    return Moments(
-        TITLES[scene], example.scene.mesh, x[chosen], t[chosen], example.ground, stacked=stacked, labelled=tip
-    )
-
-
-def with_slope(example: Example, x: np.ndarray) -> tuple[Mesh, np.ndarray]:
-    """The body and, for sloping ground, a wedge below it, since the animation draws level ground only."""
-    mesh = example.scene.mesh
-    if not example.ground:
-        return mesh, x
-    low, high = float(x[..., 0].min()) - 0.2, float(x[..., 0].max()) + 0.2
-    wedge = np.array([[low, example.ground * low], [high, example.ground * low], [high, example.ground * high]])
-    both = Mesh(
-        np.concatenate([mesh.vertices, wedge]),
-        np.concatenate([mesh.elements, len(mesh.vertices) + np.arange(3, dtype=np.int32)[None]]),
-    )
-    return both, np.concatenate([x, np.broadcast_to(wedge, (len(x), 3, 2))], axis=1)
+    return Moments(TITLES[scene], example.scene.mesh, x[chosen], t[chosen], example.ground, stacked=scene in STACKED)

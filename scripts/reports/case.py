@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from dln_jax.cli.running import command_folder
 from dln_jax.files import is_file, read_json, write_figure, write_json
-from dln_jax.metrics.report import Row, conditions, markdown_table, publish
 from dln_jax.types import InputError
+from scripts.reports.rows import Row, conditions, markdown_table, publish
 
 JOBS = "jobs.json"
 REMEDY = "restore the file, or delete it to measure everything again"

@@ -14,11 +14,11 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.weak_forms import fit_energy, fit_momentum
-from dln_jax.metrics.report import Row
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.case import Findings, spread
 from scripts.reports.robots.arm import ENCODER_NOISE, TORQUE_NOISE, arm, error_of, logs, torque_of
 from scripts.reports.robots.known_kinematics import FULL, QUICK
+from scripts.reports.rows import Row
 
 TOLERANCES: dict[str, Any] = {"negligible": 1e-9, "rank_tolerance": 1e-8}
 WAYS = (

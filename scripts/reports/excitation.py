@@ -14,10 +14,10 @@ from dln_jax.identification.excitation.candidates import Design, functions_at, r
 from dln_jax.identification.excitation.design import CRITERIA, best_design, make_optimiser
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import Task, make_task
-from dln_jax.metrics.report import Row
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.scenes.panda import panda
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row
 
 PERIOD, HARMONICS = 20.0, 5
 SMOOTH = 0.05

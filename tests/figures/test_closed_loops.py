@@ -10,10 +10,10 @@ from dln_jax.figures import (
     closed_loop_traces,
     phase_portrait,
     rotary_pendulum_drawing,
-    success_over_starts,
     write_closed_loop_gif,
 )
 from dln_jax.types import InputError
+from scripts.reports.figures.starts import success_over_starts
 
 T = np.linspace(0, 1, 51)
 Q = np.stack([0.1 * np.sin(3 * T), np.pi * (1 - T)], axis=1)

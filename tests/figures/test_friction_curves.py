@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from dln_jax.figures import friction_curves, friction_laws
+from dln_jax.figures import friction_curves
+from scripts.reports.figures.friction import friction_laws
 
 
 def test_each_joint_has_its_curves_in_the_order_of_its_rates():

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dln_jax.figures import style
-from dln_jax.figures.benchmarks import error_against_time
-from dln_jax.figures.labels import label_points, spread
+from scripts.reports.figures.costs import error_against_time
+from scripts.reports.figures.labels import spread
 
 # How the colour-blind see linear RGB (Machado, Oliveira and Fernandes 2009, severity 1).
 SEEN = {
@@ -65,18 +65,6 @@ def test_heights_are_moved_apart_in_order():
     assert found["c"] == pytest.approx(0.9) and found["d"] == pytest.approx(1.0)
     assert abs(found["a"] - found["b"]) == pytest.approx(0.1) and (found["a"] + found["b"]) / 2 == pytest.approx(0.5)
     assert sorted(spread(dict.fromkeys("abcd", 0.0), gap=0.9).values()) == pytest.approx([0, 1 / 3, 2 / 3, 1])
-
-
-def test_labels_of_points_cover_neither_each_other_nor_obstacles():
-    figure, [[axis]] = style.figure(height=2.0)
-    axis.set(xlim=(0, 1), ylim=(0, 1))
-    wall = np.stack([np.full(200, 0.52), np.linspace(0, 1, 200)], axis=-1)
-    label_points(axis, [("one", (0.5, 0.5)), ("two", (0.5, 0.5))], obstacles=wall)
-    figure.draw_without_rendering()
-    one, two = (text.get_window_extent() for text in axis.texts if text.get_text())
-    assert not one.overlaps(two)
-    covered = axis.transData.transform(wall)
-    assert one.count_contains(covered) == two.count_contains(covered) == 0
 
 
 def test_a_curve_that_is_not_finite_is_said_to_be_so_and_hides_no_other():

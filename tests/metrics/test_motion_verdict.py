@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dln_jax.metrics.motion_verdict import judge_motions
 from dln_jax.metrics.phase_space import Motions
+from dln_jax.metrics.verdict import judge_motions
 
 T = np.linspace(0, 10, 200)
 PHASES = np.linspace(0, 6, 8)[:, None]

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.figures.uncertainty import torque_bands
+from dln_jax.figures.torques import torque_bands
 from dln_jax.files import write_figure
 from dln_jax.learning.linear import linearised_chunks
 from dln_jax.learning.uncertainty import estimate

@@ -12,8 +12,7 @@ from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure
 from dln_jax.metrics.latency import one_step
-from dln_jax.metrics.motion_verdict import judge_motions
-from dln_jax.metrics.verdict import Verdict
+from dln_jax.metrics.verdict import Verdict, judge_motions
 from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, units_of
 from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.training.hamiltonian.training import MOTIONS, RATES, Trained

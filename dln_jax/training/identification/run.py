@@ -9,7 +9,7 @@ from dln_jax.cli.running import command_folder
 from dln_jax.cli.stored_arguments import write_config
 from dln_jax.data.robot_files import write_robot
 from dln_jax.figures.friction import friction_curves
-from dln_jax.figures.identification import torque_by_joint
+from dln_jax.figures.torques import torque_by_joint
 from dln_jax.files import write_bytes, write_figure, write_json
 from dln_jax.identification.consistent import is_consistent
 from dln_jax.identification.identify import Identification, identify, parameters_of

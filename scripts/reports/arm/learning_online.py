@@ -34,13 +34,13 @@ from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.learning.online import empty_replay, learn_online
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import Row
 from dln_jax.models.model import Model, Parameters
 from dln_jax.scenes.two_link_arm import two_link_arm
 from scripts.reports.arm.motions import RATE, RECORDED, Motion, capacity, drawn_letters
 from scripts.reports.arm.rivals import Rival, rivals
 from scripts.reports.case import Case, Findings, spread
 from scripts.reports.figures.letters import written_letters
+from scripts.reports.rows import Row
 
 GAINS = Gains(np.array([60.0, 30.0]), np.array([12.0, 5.0]))
 """P in N m/rad and D in N m s/rad."""

@@ -13,8 +13,6 @@ from matplotlib.figure import Figure
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, partition_labels, select, split
-from dln_jax.figures.benchmarks import error_against_time
-from dln_jax.metrics.report import UNITS, Row, unit_of
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.scenes.datasets.generators import uniform_tests
@@ -32,7 +30,9 @@ from scripts.reports.arm.models import (
     measure_trigonometric,
 )
 from scripts.reports.case import Case, Findings, by_case, rows_in, rows_of
+from scripts.reports.figures.costs import error_against_time
 from scripts.reports.published import ARM, published
+from scripts.reports.rows import UNITS, Row, unit_of
 
 MODELS = (*WIDTHS, TRIGONOMETRIC)
 LAGRANGIAN = "structured-delan"

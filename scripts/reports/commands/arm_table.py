@@ -15,10 +15,10 @@ from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.options import Resumable
 from dln_jax.cli.running import command_folder
 from dln_jax.files import write_bytes, write_figure
-from dln_jax.metrics.report import conditions, publish
 from dln_jax.types import InputError
 from scripts.reports.arm import table
 from scripts.reports.case import Case, compared, measure, say_numbers
+from scripts.reports.rows import conditions, publish
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 from dln_jax.cli.arguments import Unstated
 from dln_jax.cli.options import Folder
 from dln_jax.files import write_bytes
-from dln_jax.metrics.report import Row, conditions, markdown, publish
 from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import Case, Done, Findings, draw, measure
+from scripts.reports.rows import Row, conditions, markdown, publish
 from scripts.reports.speed import costs, exported_c, integrators, one_step
 
 SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Figure] | None]] = {

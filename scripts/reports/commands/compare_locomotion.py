@@ -18,10 +18,10 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.methods import METHODS, Trained, settings_of
 from dln_jax.locomotion.progress import median_to_reach
 from dln_jax.locomotion.task import FALLEN
-from dln_jax.metrics.report import conditions, print_report, write_report
 from dln_jax.training.locomotion import GOAL, Options, announce, learned, prepare, reported, write_run
 from scripts.reports.locomotion import comparison, ppo
 from scripts.reports.locomotion.rows import comparison_rows
+from scripts.reports.rows import conditions, print_report, write_report
 
 
 @dataclass(frozen=True)

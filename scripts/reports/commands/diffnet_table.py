@@ -11,10 +11,10 @@ from dln_jax.cli.options import Resumable
 from dln_jax.cli.running import command_folder
 from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.learning.functions import WIDTHS
-from dln_jax.metrics.report import conditions, publish
 from dln_jax.types import require_seed
 from scripts.reports.case import compared, measure, rows_in, say_numbers
 from scripts.reports.differential_networks.table import QUANTITIES, cases, table_rows
+from scripts.reports.rows import conditions, publish
 
 
 @dataclass(frozen=True)

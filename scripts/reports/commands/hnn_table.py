@@ -19,13 +19,13 @@ from dln_jax.cli.arguments import Unstated, choice, names_in, refuse_given, requ
 from dln_jax.cli.options import Drawn, Resumable
 from dln_jax.cli.running import command_folder
 from dln_jax.files import write_bytes
-from dln_jax.metrics.report import Row, conditions, publish
 from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
 from scripts.reports.case import compared, measure, rows_in, say_numbers
 from scripts.reports.hamiltonian.own_files import QUANTITIES, own_cases, with_bounds
 from scripts.reports.hamiltonian.table import SHOWN, TASKS, cases, table_rows
+from scripts.reports.rows import Row, conditions, publish
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from dln_jax.cli.arguments import Unstated, choice, names_in
 from dln_jax.cli.options import Drawn, Folder
 from dln_jax.cli.running import command_folder
 from dln_jax.files import finite, write_json
-from dln_jax.metrics.report import conditions, markdown, publish
 from dln_jax.types import InputError, require_positive
 from scripts.reports.case import draw, measure, rows_in
+from scripts.reports.rows import conditions, markdown, publish
 from scripts.reports.scale.cases import cases
 from scripts.reports.scale.hosts import CASES, NETWORKS
 

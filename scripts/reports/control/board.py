@@ -15,9 +15,9 @@ from jax import Array
 
 from dln_jax.control import Controller, Hardware, Run, field_of, simulate
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import Row
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
+from scripts.reports.rows import Row
 
 RATE, SECONDS = 500.0, 10.0
 LIMIT = 6.0

@@ -33,7 +33,6 @@ from dln_jax.control import (
     value,
 )
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
 from scripts.reports.control.board import (
     GOAL,
@@ -47,6 +46,7 @@ from scripts.reports.control.board import (
     rows_of_criteria,
     score,
 )
+from scripts.reports.rows import Row
 
 STATE_COST, CONTROL_COST = np.diag([0.97, 0.93, 0.39, 0.26]), np.array([[0.11]])
 """Cost matrices of the regulator, from the board's own controller."""

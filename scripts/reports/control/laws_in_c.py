@@ -21,13 +21,13 @@ from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.metrics.report import Row, expect
 from dln_jax.scenes.chain import chain
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
 from scripts.reports.control.mpc import STACK, one_call
 from scripts.reports.control.swing_ups import SWING_UPS, law_of, parts_of_law
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
+from scripts.reports.rows import Row, expect
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
 
 AGREEMENT = 1e-10

@@ -10,10 +10,10 @@ from dln_jax.control.desktop_plants import PLANTS, DesktopPlant, desktop_plant
 from dln_jax.control.exploration import Excitation, explore
 from dln_jax.control.outcomes import Outcomes
 from dln_jax.control.swing_up_runs import Tried, law_of, nominal_model, try_starts
-from dln_jax.metrics.report import Row
 from dln_jax.training.swing_ups.learned import Errors, Obtained, errors_along, obtain, test_motions
 from dln_jax.types import InputError
 from scripts.reports.case import Findings, spread
+from scripts.reports.rows import Row
 
 SECONDS_OF_DATA = 30.0
 SEEDS = (0, 1, 2)

@@ -25,12 +25,12 @@ from dln_jax.export.low_latency import enable_low_latency
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
-from dln_jax.metrics.report import Row, expect
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError
 from scripts.reports.case import Findings
 from scripts.reports.process import called
+from scripts.reports.rows import Row, expect
 
 RATE, SECONDS, LIMIT, RAIL = 100.0, 6.0, 12.0, 0.5
 """Control rate, Hz, length of a run, s, force limit, N, and half the length of the rail, m."""

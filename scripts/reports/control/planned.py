@@ -27,9 +27,9 @@ from dln_jax.control import (
 )
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
-from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
 from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, criteria, plant, play, rows_of_criteria, score
+from scripts.reports.rows import Row
 
 EVERY = 10
 """Samples of the board per step of the plan."""

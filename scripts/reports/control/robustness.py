@@ -27,12 +27,12 @@ from dln_jax.control import (
 )
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import MIDPOINT, runge_kutta
-from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
 from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, criteria, plant, play, score
 from scripts.reports.control.disturbed_board import CRITERIA, LONGEST, robustness
 from scripts.reports.control.energy_laws import Law, best_law, controllers_by_energy, pumping
 from scripts.reports.control.planned import EVERY, Weights, follower, search
+from scripts.reports.rows import Row
 
 PUBLISHED = {
     "acrobot": {

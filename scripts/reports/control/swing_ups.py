@@ -27,13 +27,14 @@ from dln_jax.control import (
 )
 from dln_jax.control.desktop_plants import TURN
 from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
-from dln_jax.figures.closed_loops import closed_loop_traces, success_over_starts
+from dln_jax.figures.closed_loops import closed_loop_traces
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import Row
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.scenes.scene import Scene
 from scripts.reports.case import Findings
+from scripts.reports.figures.starts import success_over_starts
+from scripts.reports.rows import Row
 
 RATE, SECONDS, CUTOFF = 500.0, 10.0, 50.0
 """Rate of the controller, Hz, length of a run, s, and cut-off of the rates, Hz."""

@@ -27,13 +27,13 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.metrics.report import Row
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings, spread
 from scripts.reports.control.arm_loop import Plant, Tracked, friction_of, in_mujoco, track
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm, logs, measured, motion
 from scripts.reports.robots.known_kinematics import DECIMATE, LAWS, identified, rough
+from scripts.reports.rows import Row
 
 COMPUTED = Gains(np.full(D, 400.0), np.full(D, 40.0))
 """Gains of computed torque, 1/s² and 1/s: critically damped at 20 rad/s."""

@@ -19,11 +19,11 @@ from dln_jax.learning.functions import (
     train,
 )
 from dln_jax.metrics.functions import errors, predictions
-from dln_jax.metrics.report import Row, unit_of
 from dln_jax.nn.activations import activation
 from scripts.reports.case import Case, Findings, rows_of
 from scripts.reports.published import DIFFERENTIAL_NETWORKS as TABLE
 from scripts.reports.published import published
+from scripts.reports.rows import Row, unit_of
 
 OPTIMIZERS = ("gauss-newton", "adam")
 LOSSES = ("type1", "type2")

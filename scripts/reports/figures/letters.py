@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.benchmarks import EXACT, exact_band, exact_ground
-from dln_jax.figures.labels import label_ends
+from scripts.reports.figures.costs import EXACT, exact_band, exact_ground
+from scripts.reports.figures.labels import label_ends
 
 
 def error_lines(curves: Mapping[str, Any], *, x: str, zero: str) -> Figure:

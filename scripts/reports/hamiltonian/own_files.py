@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from dln_jax.metrics.phase_space import Motions, motion_errors, predict
-from dln_jax.metrics.report import Row
 from dln_jax.training.hamiltonian.model_selection import choose_model, description_of
 from dln_jax.training.hamiltonian.recipes import RECIPES
 from dln_jax.training.hamiltonian.tasks import HORIZONS, MEASURED, Problem, Stated, problem_of
@@ -21,6 +20,7 @@ from dln_jax.training.hamiltonian.training import Trained, train
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 from scripts.reports.case import Case, Findings, by_case, rows_of
+from scripts.reports.rows import Row
 
 NAMED, RECIPE, STATED, DEFAULT = "named-task", "named-recipe-on-the-files", "own-files", "own-files-without-needs"
 FACTOR = 2.0

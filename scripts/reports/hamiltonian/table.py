@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from dln_jax.files import write_figure
-from dln_jax.metrics.report import Row, unit_of
 from dln_jax.training.hamiltonian import pixels
 from dln_jax.training.hamiltonian.model_selection import description_of, models_of
 from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once
@@ -18,6 +17,7 @@ from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import require_positive
 from scripts.reports.case import Case, Findings, rows_of
 from scripts.reports.published import HAMILTONIAN, published
+from scripts.reports.rows import Row, unit_of
 
 TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
 """The published tasks."""

@@ -4,7 +4,7 @@ import math
 
 from dln_jax.locomotion.learning import Record
 from dln_jax.locomotion.progress import first_reaching, median_to_reach
-from dln_jax.metrics.report import Row
+from scripts.reports.rows import Row
 
 
 def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goal: float, seed: int) -> list[Row]:

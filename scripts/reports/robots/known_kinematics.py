@@ -20,7 +20,6 @@ from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import Tree, tree_system
-from dln_jax.metrics.report import Row, expect
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.case import Findings
 from scripts.reports.robots.arm import (
@@ -38,6 +37,7 @@ from scripts.reports.robots.arm import (
     torque_of,
 )
 from scripts.reports.robots.pinocchio import regression
+from scripts.reports.rows import Row, expect
 
 LAWS = ("viscous", "coulomb", "offset")
 USUAL_SCALE = 0.01

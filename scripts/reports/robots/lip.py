@@ -18,7 +18,6 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.recursive import RecursiveSystem
-from dln_jax.metrics.report import Row
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.precision import in_float64
@@ -28,6 +27,7 @@ from dln_jax.scenes.robot_arms import Arm, skew_arm, sliding_arm
 from dln_jax.types import FrictionLaw
 from dln_jax.zoo.catalogue import CATALOGUE
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row
 
 ARMS: dict[str, Callable[[], Arm]] = {
     **{f"panda-{d}": (lambda d=d: panda(d)) for d in range(3, 8)},

@@ -20,13 +20,13 @@ from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.friction import FrictionFit, fit_friction
 from dln_jax.learning.kinematics import fit_tree
 from dln_jax.mechanics.trees import Tree
-from dln_jax.metrics.report import Row, expect
 from dln_jax.models.serial_tree import tree_of
 from dln_jax.types import FrictionLaw, Needs
 from scripts.reports.case import Findings
 from scripts.reports.robots.arm import Torque, error_of, torque_of
 from scripts.reports.robots.known_kinematics import USUAL_SCALE
 from scripts.reports.robots.pinocchio import regression
+from scripts.reports.rows import Row, expect
 
 BLOCKS = 10
 CUTOFF, DECIMATE = 5.0, 2

@@ -20,7 +20,6 @@ from dln_jax.data.mjcf import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.files import read_json
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
-from dln_jax.metrics.report import Row, expect
 from dln_jax.metrics.verdict import LEVELS, FitRefused
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.robot_arms import arm_torques
@@ -29,6 +28,7 @@ from dln_jax.training.identification.run import run
 from dln_jax.training.identification.task import Options
 from dln_jax.types import InputError
 from scripts.reports.case import Case, Findings
+from scripts.reports.rows import Row, expect
 
 JOINTS = (2, 3, 4, 6)
 """Numbers of joints of successive arms."""

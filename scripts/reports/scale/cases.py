@@ -7,9 +7,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from dln_jax.metrics.report import Row
 from scripts.reports.case import Case, Findings
 from scripts.reports.figures.scale import speed_ups
+from scripts.reports.rows import Row
 from scripts.reports.scale import hosts
 from scripts.reports.scale.turns import Layout, Measured, taken_in_turns, team, teams_of
 

@@ -12,7 +12,7 @@ the normal equations, and the shorter waits of lanes in smaller groups.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dln_jax.metrics.report import Row
+from scripts.reports.rows import Row
 
 CASES = "hosts/"
 """Prefix of the cases of modelled rows."""

@@ -8,7 +8,6 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.metrics.report import Row, expect, largest
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
 from dln_jax.softbody.scene import Params, SoftScene, State, make_scene
@@ -17,6 +16,7 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.softbody.verdict import Info
+from scripts.reports.rows import Row, expect, largest
 
 GRAVITY = 9.8
 """Gravity of the reference values, m/s²."""

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dln_jax.metrics.report import expect
 from dln_jax.rollout import rollout
 from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh import creatures
@@ -26,6 +25,7 @@ from dln_jax.softbody.scene import SoftScene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.creature import TIME_STEP
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect
 
 BOUND = 1e-7
 STEPS = 100

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.metrics.report import expect, largest
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import SoftScene, make_scene, potential, with_parameters
@@ -23,6 +22,7 @@ from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.soft_bodies.common import GRAVITY, converges, motion, solid
 
 TOLERANCE = 1e-9

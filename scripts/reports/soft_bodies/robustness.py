@@ -10,7 +10,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.metrics.report import expect, largest
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.mesh.simplices import simplex_volumes
@@ -19,6 +18,7 @@ from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.soft_bodies.common import GRAVITY, cantilever_of, converges, motion
 
 DT = 1 / 30

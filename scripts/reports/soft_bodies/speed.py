@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.metrics.report import expect
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.softbody.mesh.shapes import beam
@@ -27,6 +26,7 @@ from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import ElementEnergy
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect
 from scripts.reports.soft_bodies.common import cantilever_of, converges
 from scripts.reports.soft_bodies.gradients import crawling, crawling_scene, gait
 

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import eigsh, spsolve
 
-from dln_jax.metrics.report import expect, largest
 from dln_jax.softbody.mesh.mesh import boundary_vertices, make_mesh, vertices_where
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.scene import Params, SoftScene, element_energies, make_scene, prepare, with_parameters
@@ -26,6 +25,7 @@ from dln_jax.solvers.elements.assembly import entries, gradient, pattern
 from dln_jax.solvers.elements.energies import element_hessians
 from dln_jax.solvers.elements.minimise import minimise
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.soft_bodies.common import GRAVITY, cantilever_of
 
 UNIAXIAL = {2.0: (0.79807754, 646.74466), 0.5: (1.21076739, -935.35206), 10.0: (0.41653193, 3839.4808)}

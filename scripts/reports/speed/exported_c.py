@@ -19,14 +19,14 @@ from matplotlib.figure import Figure
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import FLAGS, load_c
 from dln_jax.export.c.source import export_c
-from dln_jax.figures.benchmarks import call_times
-from dln_jax.metrics.report import Row, expect
 from dln_jax.precision import data_type
 from dln_jax.scenes.chain import chain
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
+from scripts.reports.figures.costs import call_times
 from scripts.reports.robots.pinocchio import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
+from scripts.reports.rows import Row, expect
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, last_level_cache, programs, timed
 
 

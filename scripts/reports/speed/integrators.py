@@ -6,19 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.figures.benchmarks import cost_panels
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.metrics.report import Row
 from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.tasks import Problem, problem_of
 from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import Hamiltonian
 from dln_jax.zoo.descriptions import build
 from scripts.reports.case import Findings
+from scripts.reports.figures.costs import cost_panels
+from scripts.reports.rows import Row
 
 SCENES = {"pendulum": 0.2, "double-pendulum": 0.04, "henon-heiles": 0.4, "two-body": 0.4}
 """Largest time step by scene, s; it is halved repeatedly."""

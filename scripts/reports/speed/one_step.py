@@ -20,7 +20,6 @@ from dln_jax.data.splits import Split
 from dln_jax.export.c.load import FLAGS, STANDARD, compile_c, load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.export.low_latency import enable_low_latency, low_latency
-from dln_jax.figures.benchmarks import EXACT, cost_points
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
@@ -28,14 +27,15 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
-from dln_jax.metrics.report import Row, unit_of
 from dln_jax.precision import data_type
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
 from scripts.reports.arm.models import DEPTH, STEPS, TRIGONOMETRIC, WIDTHS, described
 from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
+from scripts.reports.figures.costs import EXACT, cost_points
 from scripts.reports.process import called
+from scripts.reports.rows import Row, unit_of
 
 WIDE = "structured-delan-64x64"
 SMALL = "structured-delan"

@@ -20,11 +20,11 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.metrics.definiteness import definiteness
-from dln_jax.metrics.report import Row, expect, largest
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.types import Needs
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row, expect, largest
 from scripts.reports.stability.random_models import random_states, untrained
 
 EPS = float(np.finfo(np.float64).eps)

@@ -13,7 +13,6 @@ from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.standardisation import standard_units, to_units
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import expect, largest
 from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.trigonometric import make_trigonometric
@@ -22,6 +21,7 @@ from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.types import InputError, Needs
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.stability.random_models import untrained
 
 WIDTH = 8

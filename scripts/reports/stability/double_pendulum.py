@@ -21,11 +21,11 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import gauss_legendre4, rk4, second_order
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.metrics.report import Row, expect, largest
 from dln_jax.rollout import rollout
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.scenes.scene import Scene
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row, expect, largest
 
 DT = 0.002
 """Time step, s; 1e5 steps are 200 s."""

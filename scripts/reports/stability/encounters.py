@@ -30,8 +30,8 @@ from dln_jax.mechanics.integrators import (
     stormer_verlet,
     symplectic_euler,
 )
-from dln_jax.metrics.report import expect, largest
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 
 GRAVITY = 9.81
 DT = 0.01

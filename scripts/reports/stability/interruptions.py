@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dln_jax.metrics.report import Row
 from dln_jax.types import InputError, require_positive
 from scripts.reports.case import Case, Findings
+from scripts.reports.rows import Row
 
 RUNS = {
     "gauss-newton": ("train_delan", "--optimizer", "gauss-newton", "--steps", "60"),

@@ -8,12 +8,12 @@ import numpy as np
 
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import expect, largest
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.types import Needs
 from scripts.reports.case import Findings
+from scripts.reports.rows import expect, largest
 from scripts.reports.stability.random_models import random_parameters, random_states, untrained
 
 TURNS = 1_000

@@ -23,7 +23,6 @@ from dln_jax.learning.uncertainty import Estimate, estimate
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial
 from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.metrics.report import Row
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -32,6 +31,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.two_link_arm import two_link_arm
 from scripts.reports.case import Case, Findings
+from scripts.reports.rows import Row
 from scripts.reports.uncertainty.arms import VELOCITY_SCALE, arm, motions, plant
 
 LOWEST, HIGHEST = 0.90, 0.98

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.figures.benchmarks import EXACT, FRONT, cost_panels, cost_points
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.metrics.report import Row, markdown
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.training import low_latency_calls
@@ -28,7 +26,9 @@ from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
 from scripts.reports.commands import benchmark
 from scripts.reports.commands.benchmark import SUBJECTS
+from scripts.reports.figures.costs import EXACT, FRONT, cost_panels, cost_points
 from scripts.reports.process import called
+from scripts.reports.rows import Row, markdown
 from scripts.reports.speed import costs as benchmark_costs
 from scripts.reports.speed import integrators as benchmark_integrators
 from scripts.reports.speed import one_step as benchmark_one_step

@@ -23,7 +23,7 @@ from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
 from dln_jax.softbody.verdict import Info
-from dln_jax.training.simulation_results import Motion, finite_moments, warn, with_slope
+from dln_jax.training.simulation_results import Motion, finite_moments, warn
 from dln_jax.types import InputError
 
 
@@ -134,14 +134,6 @@ def test_figures_show_energies_from_the_start_and_refuse_what_does_not_fit():
     axis = energies_against_time(t, energies, taken="lost", title="").axes[0]
     total = next(line for line in axis.get_lines() if line.get_label() == "total")
     assert total.get_ydata() == pytest.approx([0.0, -3.0]) and axis.get_ylabel() == "energy, kJ"
-
-
-def test_a_slope_becomes_a_wedge_below_the_body():
-    example = slope(cells=1)
-    x = example.scene.mesh.vertices[None]
-    mesh, positions = with_slope(example, x)
-    assert len(mesh.elements) == len(example.scene.mesh.elements) + 1 and positions.shape == (1, len(x[0]) + 3, 2)
-    assert positions[0, -1] @ [-0.5, 1.0] == pytest.approx(0.0) and positions[0, -2, 1] < x[0, :, 1].min()
 
 
 def test_steps_that_did_not_converge_are_not_silent(capsys):

@@ -9,11 +9,11 @@ from calls import command, refused
 from conftest import slow_among
 
 from dln_jax.metrics.misfit import velocity_misfit
-from dln_jax.metrics.report import expect
 from dln_jax.types import InputError
 from scripts.reports.case import named
 from scripts.reports.commands import stability
 from scripts.reports.commands.stability import NAMES, cases
+from scripts.reports.rows import expect
 
 LONG = ("sizes", "float32", "lyapunov-time", "close-encounters", "batches")
 STEPS = {"separatrix": 5_000, "lyapunov-time": 20_000}

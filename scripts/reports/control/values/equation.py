@@ -26,9 +26,9 @@ from dln_jax.control.optimal.residual import discounts_down_to, fit_residual
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.report import Row, expect, largest, unit_of
 from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from scripts.reports.case import Findings
+from scripts.reports.rows import Row, expect, largest, unit_of
 
 EXACT = 1e-8
 LIMIT, WEIGHT = 5.5, 2 * 5.5 / np.pi

@@ -23,11 +23,11 @@ from dln_jax.control.optimal.plants import PLANTS, ValuePlant
 from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ValueAndGradient
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.metrics.report import Row, expect
 from dln_jax.solvers.ending import reason
 from scripts.reports.case import Findings
 from scripts.reports.control.values.truths import direct_values, followed
 from scripts.reports.figures.values import value_figure
+from scripts.reports.rows import Row, expect
 
 SEEDS = 3
 TO_REACH = {"pendulum": -30.9, "cart-pole": -25.0}

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dln_jax.figures import style
-from dln_jax.figures.labels import label_ends
+from scripts.reports.figures.labels import label_ends
 
 Numbers = Sequence[float | int] | np.ndarray
 Line = tuple[Numbers, Numbers]

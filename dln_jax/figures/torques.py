@@ -1,0 +1,216 @@
+"""Figures of torques: parts and errors, bands, and torques by joint; and paths of an arm's tip under them."""
+
+import re
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.figures import style
+from dln_jax.metrics.coverage import LEVEL, coverage, half_width
+from dln_jax.metrics.rollouts import Motion, valid_prediction_times
+
+PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
+MOST_JOINTS, MOST_MOTIONS, MOST_PATHS = 4, 6, 24
+"""Largest numbers of joints, motions and paths shown."""
+MOST_BANDS, MOST_BAND_SAMPLES = 7, 400
+"""Largest numbers of joints and samples shown with bands."""
+MOST_SAMPLES = 4000
+"""Largest number of samples drawn by joint."""
+HIGH, LOW = 0.8, 0.36
+"""Height of a panel of forces and of one of errors, inches."""
+
+
+def force_decomposition(data: Trajectories, predicted: dict[str, np.ndarray], *, model: str = "model") -> Figure:
+    """Torque and its parts over the first test motions, one column per joint: truth and model, with the error below.
+
+    All errors share one scale. Motions are joined in time; single states are compared point by point.
+
+    `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour.
+    """
+    shown = np.unique(data.trajectory)[:MOST_MOTIONS]
+    samples = np.flatnonzero(np.isin(data.trajectory, shown))
+    trajectory, joints = data.trajectory[samples], min(data.degrees_of_freedom, MOST_JOINTS)
+    starts = np.flatnonzero(np.r_[True, np.diff(trajectory) != 0])
+    moving = len(samples) > 2 * len(shown)
+    x = _running_time(data.t[samples], starts) if moving else np.arange(len(samples), dtype=float)
+    truths = {key: truth[samples] for key in PARTS if (truth := getattr(data, key)) is not None}
+    errors = {key: predicted[key][samples] - truth for key, truth in truths.items()}
+    largest = max((float(np.abs(error[:, :joints]).max()) for error in errors.values()), default=0.0)
+    factor, prefix = style.prefixed(largest, "")
+    rows = [(key, is_error) for key in PARTS for is_error in (False, True) if not is_error or key in errors]
+    heights = [LOW if is_error else HIGH for _, is_error in rows]
+    figure, axes = style.figure(len(rows), joints, height=sum(heights) + 0.9, sharex=True, height_ratios=heights)
+    figure.get_layout_engine().set(h_pad=0.02, hspace=0.0)  # type: ignore[union-attr]
+    shade, dash, dot = style.colour(model), "--" if moving else "", "" if moving else "."
+    for line, (key, is_error) in zip(axes, rows, strict=True):
+        for joint, axis in enumerate(line):
+            if is_error:
+                axis.plot(x, errors[key][:, joint] / factor, "-" if moving else ".", color=shade, linewidth=0.9)
+                axis.set_ylim(-1.15 * largest / factor, 1.15 * largest / factor)
+            else:
+                if key in truths:
+                    look = {"color": "black", "linewidth": 2.0, "markersize": 4, "label": "truth"}
+                    axis.plot(x, truths[key][:, joint], "-" if moving else "o", **look)
+                axis.plot(x, predicted[key][samples, joint], dash, marker=dot, color=shade, linewidth=1.3, label=model)
+            axis.margins(x=0.01)
+            axis.tick_params(axis="x", bottom=line is axes[-1])
+            for start in starts[1:]:
+                axis.axvline((x[start - 1] + x[start]) / 2, color="0.75", linewidth=0.8, zorder=0)
+        unit = style.unit_of(data, 0)
+        line[0].set_ylabel(f"error,\n{prefix}{unit}" if is_error else f"{PARTS[key]},\n{unit}")
+    names = [str(data.label[index]) for index in trajectory[starts]]
+    for joint, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
+        unit = style.unit_of(data, joint)
+        style.title(top, f"joint {joint + 1}" + (f" ({unit})" if unit != style.unit_of(data, 0) else ""), pad=16)
+        for start, end, name in zip(starts, [*starts[1:], len(x)], names, strict=True):
+            place, size = ((x[start] + x[end - 1]) / 2, 1.04), style.SMALL if len(name) < 4 else 6.5
+            top.annotate(name, place, xycoords=("data", "axes fraction"), ha="center", fontsize=size, color="0.35")
+        bottom.set_xlabel("time, s (test motions in turn)" if moving else "test state")
+    figure.align_ylabels(axes[:, 0])
+    style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _running_time(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Continuous time of motions joined at the median spacing of their samples."""
+    steps = np.diff(t, prepend=t[0])
+    steps[starts[1:]] = np.median(np.delete(steps, starts))
+    return np.cumsum(steps)
+
+
+def torque_by_joint(
+    data: Trajectories, predicted: Float[np.ndarray, "N d"], names: Sequence[str], units: Sequence[str]
+) -> Figure:
+    """Measured and predicted torque and their difference over the first motion, one row per joint.
+
+    Args:
+        data: held-out data.
+        predicted: predicted torque of every sample.
+        names: names of the joints.
+        units: units of their forces, "N m" or "N".
+    """
+    shown = np.flatnonzero(data.trajectory == data.trajectory[0])[:MOST_SAMPLES]
+    figure, axes = style.figure(len(names), 1, height=0.6 + 1.1 * len(names), sharex=True)
+    for joint, axis in enumerate(axes[:, 0]):
+        measured, identified = data.tau[shown, joint], predicted[shown, joint]
+        for values, shade, width, label in (
+            (measured, "black", 1.6, "measured"),
+            (identified, style.BLUE, 1.0, "identified"),
+            (identified - measured, style.VERMILLION, 0.8, "identified minus measured"),
+        ):
+            axis.plot(data.t[shown], values, color=shade, linewidth=width, label=label)
+        style.title(axis, names[joint], loc="left", pad=2, fontsize=style.SMALL)
+        axis.set_ylabel(units[joint], fontsize=style.SMALL)
+        axis.margins(x=0.01)
+    label = str(data.label[data.trajectory[0]])
+    if block := re.fullmatch(r"(.*)\[(\d+)\]", label):  # a block of time, as `data.splits` names it
+        label = f"block {int(block[2]) + 1} of recording {block[1]}"
+    axes[-1, 0].set_xlabel(f"time, s (held out: {label})")
+    figure.align_ylabels(axes[:, 0])
+    style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def torque_bands(
+    data: Trajectories,
+    predicted: Float[np.ndarray, "N d"],
+    std: Float[np.ndarray, "N d"],
+    out_of_distribution: np.ndarray,
+    *,
+    model: str = "model",
+) -> Figure:
+    """Torque errors in their 95 % bands along the first held-out samples, one row per joint, next to their coverage.
+
+    States flagged as out of distribution are shaded. `predicted` and `std` are the model's; its name sets the colour.
+    """
+    d, shown = min(data.degrees_of_freedom, MOST_BANDS), np.arange(min(len(data.t), MOST_BAND_SAMPLES))
+    error = predicted - data.tau
+    covered = coverage(error, std)
+    figure = style.blank(height=max(2.6, 0.85 * d + 0.9))
+    grid = figure.add_gridspec(d, 2, width_ratios=[1.7, 1.0])
+    axes = [figure.add_subplot(grid[joint, 0]) for joint in range(d)]
+    right = figure.add_subplot(grid[:, 1])
+    style.prepare(*axes, right)
+    bands = half_width(LEVEL) * std[shown]
+    within = np.maximum(np.quantile(bands, 0.98, axis=0), np.quantile(np.abs(error[shown]), 0.995, axis=0))
+    # One unit for all joints, so that their errors can be compared.
+    factor, prefix = style.prefixed(float(within[:d].max()), "")
+    starts = np.flatnonzero(np.diff(data.trajectory[shown])) + 0.5
+    for joint, axis in enumerate(axes):
+        band, largest = bands[:, joint] / factor, 1.1 * within[joint] / factor
+        look = {"color": style.colour(model), "alpha": 0.25, "linewidth": 0}
+        axis.fill_between(shown, -band, band, **look, label="95 % band")
+        axis.plot(shown, error[shown, joint] / factor, color="black", linewidth=0.8, label="predicted minus measured")
+        axis.set_ylim(-largest, largest)
+        flagged = np.repeat(out_of_distribution[shown], 2)
+        edges = (shown[:, None] + [-0.5, 0.5]).ravel()
+        axis.fill_between(edges, -largest, largest, where=flagged, color="0.5", alpha=0.25, linewidth=0)
+        for start in starts:
+            axis.axvline(start, color="0.75", linewidth=0.8, zorder=0)
+        axis.set_ylabel(f"joint {joint + 1},\n{prefix}{style.unit_of(data, joint)}")
+        axis.tick_params(axis="x", labelbottom=joint == d - 1)
+        axis.margins(x=0.01)
+    style.legend(figure, *axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2)
+    axes[-1].set_xlabel("held-out sample; grey: out of distribution")
+    right.plot([0, 1], [0, 1], color=style.REFERENCE, linewidth=1.0)
+    right.fill_between([0, 1], [-0.05, 0.95], [0.03, 1.03], color=style.REFERENCE, alpha=0.15, linewidth=0)
+    for joint, shares in enumerate(covered.shares.T[:d]):
+        right.plot(covered.levels, shares, color=style.CYCLE[joint], linewidth=1.2, label=f"joint {joint + 1}")
+    right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of torques in it")
+    style.legend(right, loc="lower right")
+    return figure
+
+
+def tip_paths(
+    data: Trajectories,
+    tip: Callable,
+    *,
+    test: Trajectories,
+    motions: Sequence[Motion],
+    model: str = "model",
+) -> Figure:
+    """Test paths of an arm's tip with the model's rollouts over them, one panel each; training paths behind in grey.
+
+    Args:
+        data: all trajectories, including those of `test`.
+        tip: q -> position [2] in m.
+        test: test trajectories with the same indices as in `data`.
+        motions: rollouts of the model from the test's first states under its torques, as `recorded_motions`, or none; a
+            path ends when the prediction is no longer valid.
+        model: name of the model, which sets the colour.
+    """
+    shown = list(np.unique(test.trajectory))[:MOST_PATHS]
+    columns = min(len(shown), 4)
+    rows = -(-len(shown) // columns)
+    figure, axes = style.figure(rows, columns, height=2.3 * rows + 0.55, sharex=True, sharey=True)
+    places = jax.jit(jax.vmap(tip))
+    positions = np.asarray(places(data.q))
+    training = [positions[data.trajectory == index] for index in np.setdiff1d(data.trajectory, test.trajectory)]
+    times, paths = np.zeros(0), []
+    if motions:
+        times, ends = valid_prediction_times(test, list(motions)), np.cumsum([len(motion.q) for motion in motions])
+        paths = np.split(np.asarray(places(np.concatenate([motion.q for motion in motions]))), ends[:-1])
+    for axis in axes.flat:
+        axis.set_aspect("equal")
+        axis.axis("off")
+    for number, (axis, index) in enumerate(zip(axes.flat, shown, strict=False)):
+        chosen = data.trajectory == index
+        axis.add_collection(LineCollection(training[:MOST_PATHS], colors="0.88", linewidths=0.7))
+        axis.plot(*positions[chosen].T, color="black", linewidth=2.2)
+        title = f"{data.label[index]} (test)"
+        if number < len(times):
+            t = data.t[chosen]
+            path = paths[number][t - t[0] <= times[number] + 1e-9]
+            axis.plot(*path.T, "--", color=style.colour(model), linewidth=1.3)
+            axis.plot(*path[-1], "o", color=style.colour(model), markersize=4)
+            title = f"{data.label[index]}: valid for {times[number]:.1f} of {t[-1] - t[0]:.1f} s"
+        style.title(axis, title, fontsize=style.SMALL)
+    if len(times):
+        caption = f"black: test; dashed: {model} driven by its torques until the prediction fails; grey: training"
+        figure.supxlabel(caption, fontsize=style.SMALL)
+    return figure
