@@ -220,10 +220,12 @@ def write(loop: Loop, condition: Condition, parameters: Parameters, motion: Moti
     recording = tuple(array[:end:step] for array in (q, qd, driven.qdd, run.u))
     if condition.encoder_noise > 0:
         recording = _filtered(run.t[:end], run.y[:end], run.u[:end], step)
-    deviations = (off, driven.tip - driven.wanted_tip)
-    errors = [np.inf if len(lost) else float(np.sqrt(np.mean(np.sum(x[:end] ** 2, axis=1)))) for x in deviations]
+    joint_error, tip_error = (
+        np.inf if len(lost) else float(np.sqrt(np.mean(np.sum(deviation[:end] ** 2, axis=1))))
+        for deviation in (off, driven.tip - driven.wanted_tip)
+    )
     saturated = float(np.mean((np.abs(run.u[: max(end, 1)]) >= LIMITS).any(axis=1)))
-    return Written(*errors, saturated, driven.tip[:end], driven.wanted_tip[: motion.samples]), recording
+    return Written(joint_error, tip_error, saturated, driven.tip[:end], driven.wanted_tip[: motion.samples]), recording
 
 
 def _filtered(t: np.ndarray, q: np.ndarray, tau: np.ndarray, step: int) -> tuple[np.ndarray, ...]:

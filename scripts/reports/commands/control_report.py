@@ -16,10 +16,11 @@ from dln_jax.cli.options import Drawn, Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.control import energy_laws, laws_in_c, learned, mpc, planned, robustness, swing_ups, tracking
+from scripts.reports.control.board import Motor
 from scripts.reports.control.values import equation, fits
 from scripts.reports.figures.robustness import shares
 
-MOTORS = {"acrobot": "elbow", "pendubot": "shoulder"}
+MOTORS: dict[str, Motor] = {"acrobot": "elbow", "pendubot": "shoulder"}
 MEASURES: dict[str, Callable[[bool], Findings]] = {
     **{f"swing-up/{name}": partial(swing_ups.swing_up, name) for name in swing_ups.SWING_UPS},
     **{f"starts/{name}-starts": partial(swing_ups.from_anywhere, name) for name in swing_ups.SWING_UPS},

@@ -144,4 +144,4 @@ def _kepler_distance(speed: float, apocentre: float, t: float) -> float:
     eccentricity = apocentre / axis - 1
     anomaly = np.pi + t * axis**-1.5
     eccentric = brentq(lambda x: x - eccentricity * np.sin(x) - anomaly, anomaly - 1, anomaly + 1, xtol=1e-15)
-    return axis * (1 - eccentricity * np.cos(eccentric))
+    return float(axis * (1 - eccentricity * np.cos(eccentric)))

@@ -93,10 +93,9 @@ def start(command: Sequence[str], place: Path, name: str, *others: str) -> subpr
 
 def lasted(process: subprocess.Popen[str], folder: Path) -> float:
     """Seconds from a run's first checkpoint to its model."""
-    wait_for_checkpoint(process, folder)
+    wait_for(process, folder, "checkpoint*.json")
     began = time.monotonic()
-    while process.poll() is None and not (folder / MODEL).exists():
-        time.sleep(0.005)
+    wait_for(process, folder, MODEL)
     length = time.monotonic() - began
     finished(process, folder)
     return length
@@ -104,16 +103,16 @@ def lasted(process: subprocess.Popen[str], folder: Path) -> float:
 
 def killed(process: subprocess.Popen[str], folder: Path, moment: float) -> bool:
     """Kills a run `moment` seconds after its first checkpoint; returns whether it had no model yet."""
-    wait_for_checkpoint(process, folder)
+    wait_for(process, folder, "checkpoint*.json")
     time.sleep(moment)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     return not (folder / MODEL).exists()
 
 
-def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
-    """Waits until a run has written a checkpoint; `InputError` if it ends before."""
-    while not any(folder.glob("checkpoint*.json")):
+def wait_for(process: subprocess.Popen[str], folder: Path, pattern: str) -> None:
+    """Waits until a run has written a file of this name; `InputError` if it fails before."""
+    while not any(folder.glob(pattern)):
         if process.poll() is not None:
             finished(process, folder)
             return
