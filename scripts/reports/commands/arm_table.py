@@ -32,13 +32,13 @@ class Arguments(Resumable):
     seeds: int = 5
     """Seeds of each model, in one program."""
     splits: int = 7
-    """Further splits of the letters: permuted and cut into so many tests, each letter in one; 0 leaves them out."""
+    """Number of further splits: the permuted letters are cut into this many tests, each letter in one; 0 for none."""
     split_seeds: int = 3
-    """Seeds of the structured Lagrangian on each of them; other models have one."""
+    """Seeds of the structured Lagrangian on each further split; other models have one."""
     steps: Unstated[int] = None
-    """Iterations of Gauss-Newton (default: what each model's validation error takes to level off)."""
+    """Iterations of Gauss-Newton (default: 150, after which the validation errors have levelled off)."""
     adam_steps: int = 20_000
-    """Steps of Adam, 64x64 networks, one seed, on the letters; 0 leaves Adam out."""
+    """Steps of Adam for one seed of 64x64 networks on the letters; 0 leaves Adam out."""
     timed_seeds: int = 5
     """Structured models that are trained one by one, to time Gauss-Newton; 0 leaves them out."""
 

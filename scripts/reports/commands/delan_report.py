@@ -39,7 +39,7 @@ class Arguments(Folder, Drawn):
     test: str = ",".join(CHARACTERS_TEST)
     """Labels of the test trajectories, comma separated; `letters` and `speeds` add other splits of the same size."""
     seeds: int = 1
-    """How many seeds `published` trains, from 0 upwards; each also draws its own validation letters."""
+    """Number of seeds of `published`, from 0 upwards; each also draws its own validation letters."""
     steps: int = 20_000
     """Optimiser steps of `published`."""
     quick: bool = False
@@ -54,14 +54,14 @@ def main(options: Arguments) -> None:
     test = options.test.split(",")
     sets = [split(data, test=test, seed=seed) for seed in range(options.seeds)]
     steps = min(options.steps, QUICK_STEPS) if options.quick else options.steps
-    subjects_cases: dict[str, Callable[[], list[Case]]] = {
+    by_subject: dict[str, Callable[[], list[Case]]] = {
         "published": lambda: published_protocol.cases(name, sets, steps=steps),
         "letters": lambda: [few_letters.against_letters(name, data, test, quick=options.quick)],
         "speeds": lambda: [few_letters.at_speeds(name, data, test, quick=options.quick)],
         "online": lambda: learning_online.cases(name, data, quick=options.quick),
     }
     report_cases(
-        options, "delan_report", [case for subject in subjects for case in subjects_cases[subject]()],
+        options, "delan_report", [case for subject in subjects for case in by_subject[subject]()],
         dtype="float64; published protocol float32", seeds=list(range(options.seeds)), call_path="default jit",
         data="embedded letters" if options.data is None else options.data.name,
     )  # fmt: skip

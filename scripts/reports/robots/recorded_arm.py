@@ -2,7 +2,7 @@
 
 The log is cut into ten blocks; two neighbours at a time are held out, and every other sample is predicted by a model
 that has not seen its block. Errors are over the variance of the whole log, so that a block in which a joint rests does
-not count for more. Laws of friction, the network and the learned frames are chosen by blocks of what is fitted.
+not count for more. Laws of friction, the network and the learned frames are chosen by blocks of the fitted data.
 """
 
 from collections.abc import Sequence

@@ -96,7 +96,7 @@ def backward(quick: bool) -> Findings:
         return jax.value_and_grad(lambda part: loss({**at, **part}))({name: at[name] for name in names})
 
     programs = {name: jax.jit(functools.partial(slopes, names=names)) for name, names in chosen.items()}
-    # In turns, so that what else the machine does falls on all of them.
+    # In turns, so that other load of the machine affects all of them.
     seconds = medians_in_turns({"motion": jax.jit(loss), **programs}, (at,), repetitions=30)
     rows = []
     for name in programs:

@@ -73,7 +73,7 @@ def float32() -> Findings:
             got = largest(abs(value - truth).max(axis=1) / size) / float(np.finfo(np.float32).eps)
             text = (
                 f"{quantity} dynamics within {roundings} eps32 (layers times width: the roundings in series) of the "
-                "sum of |terms|, with what inputs rounded by as much change"
+                "sum of |terms|, plus the effect of inputs rounded by as much"
             )
             rows.append(expect(f"float32/{name}", f"{quantity}_rounding_units", text, got, float(roundings)))
         text = "float32 in, float32 out: nothing is widened"
