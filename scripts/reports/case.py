@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from dln_jax.cli.running import command_folder
 from dln_jax.files import is_file, read_json, write_figure, write_json
 from dln_jax.types import InputError
-from scripts.reports.rows import Row, conditions, markdown_table, publish
+from scripts.reports.rows import Row, conditions, publish
 
 JOBS = "jobs.json"
 REMEDY = "restore the file, or delete it to measure everything again"
@@ -142,17 +142,6 @@ def spread(case: str, quantity: str, values: Any, unit: str = "1", **more: Any) 
     """Rows QUANTITY_median and QUANTITY_worst (the largest) of some values; `more` are other fields of the rows."""
     statistics = {"median": np.median, "worst": np.max}
     return [Row(case, f"{quantity}_{name}", float(of(values)), unit, **more) for name, of in statistics.items()]
-
-
-def compared(rows: Sequence[Row], quantities: Collection[str]) -> str:
-    """Markdown table of some quantities: a line per case, "ours / reference" where there is a reference."""
-    lines: dict[str, dict[str, str]] = {}
-    for row in rows:
-        if row.quantity in quantities:
-            numbers = [row.value] if row.reference is None else [row.value, row.reference]
-            lines.setdefault(row.case, {})[row.quantity] = " / ".join(f"{number:.2g}" for number in numbers)
-    titles = ["case", *(quantity.replace("_", " ") for quantity in quantities)]
-    return markdown_table(titles, [[case, *(line.get(key, "") for key in quantities)] for case, line in lines.items()])
 
 
 def stored_findings(folder: Path, cases: Sequence[Case]) -> dict[str, Findings]:

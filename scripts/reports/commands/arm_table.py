@@ -17,8 +17,8 @@ from dln_jax.cli.running import command_folder
 from dln_jax.files import write_bytes, write_figure
 from dln_jax.types import InputError
 from scripts.reports.arm import table
-from scripts.reports.case import Case, compared, measure, say_numbers
-from scripts.reports.rows import conditions, publish
+from scripts.reports.case import Case, measure, say_numbers
+from scripts.reports.rows import conditions, markdown, publish
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def main(options: Arguments) -> None:
             statistics="medians over seeds; one program for all seeds of a model",
             splits=[" ".join(part.test.label[np.unique(part.test.trajectory)]) for part in parts],
         )
-        shown = compared(rows, table.SHOWN)
+        shown = markdown([row for row in rows if row.quantity in table.SHOWN])
         write_bytes(folder / "table.md", shown.encode())
         write_figure(folder / "pareto.png", table.figure(results))
         beside = [row for row in rows if row.bound is not None or row.reference is not None]

@@ -12,9 +12,9 @@ from dln_jax.cli.running import command_folder
 from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.learning.functions import WIDTHS
 from dln_jax.types import require_seed
-from scripts.reports.case import compared, measure, rows_in, say_numbers
+from scripts.reports.case import measure, rows_in, say_numbers
 from scripts.reports.differential_networks.table import QUANTITIES, cases, table_rows
-from scripts.reports.rows import conditions, publish
+from scripts.reports.rows import conditions, markdown, publish
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,9 @@ def main(options: Arguments) -> None:
             selection="widths and stopping by validation; best of a row over losses and activations, as published",
             samples=samples,
         )
-        tables = [f"mean squared errors on the clean grid, ours / published; {samples}", compared(rows, QUANTITIES)]
+        tables = [
+            f"mean squared errors on the clean grid, ours / published; {samples}",
+            markdown([row for row in rows if row.quantity in QUANTITIES]),
+        ]
         publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
         print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")

@@ -22,10 +22,10 @@ from dln_jax.files import write_bytes
 from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
-from scripts.reports.case import compared, measure, rows_in, say_numbers
+from scripts.reports.case import measure, rows_in, say_numbers
 from scripts.reports.hamiltonian.own_files import QUANTITIES, own_cases, with_bounds
 from scripts.reports.hamiltonian.table import SHOWN, TASKS, cases, table_rows
-from scripts.reports.rows import Row, conditions, publish
+from scripts.reports.rows import Row, conditions, markdown, publish
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ def main(options: Arguments) -> None:
 
 def publish_table(folder: Path, rows: Sequence[Row], facts: Mapping[str, Any], shown: Sequence[str]) -> None:
     """Writes report.json and table.md, and prints the quantities that are `shown`."""
-    table = compared(rows, shown)
-    write_bytes(folder / "table.md", table.encode())
-    publish(folder, rows, facts, shown=[row for row in rows if row.quantity in shown], tables=[table])
+    listed = [row for row in rows if row.quantity in shown]
+    write_bytes(folder / "table.md", markdown(listed).encode())
+    publish(folder, rows, facts, shown=listed, tables=[markdown(listed)])
     print(f"table: {folder / 'table.md'}")
 
 

@@ -26,11 +26,12 @@ from dln_jax.training.hamiltonian.tasks import pieces, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
-from scripts.reports.case import Findings, compared, rows_of
+from scripts.reports.case import Findings, rows_of
 from scripts.reports.commands import hnn_table
 from scripts.reports.hamiltonian import table
-from scripts.reports.hamiltonian.table import BOUNDS, SHOWN, TASKS, table_rows
+from scripts.reports.hamiltonian.table import BOUNDS, TASKS, table_rows
 from scripts.reports.published import HAMILTONIAN
+from scripts.reports.rows import markdown
 
 MEASURED = {
     "spring": ("polynomial-hamiltonian",),
@@ -148,7 +149,7 @@ def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypat
 
 def test_bounds_decide():
     rows = table_rows(rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7}))
-    assert "| 1e-06 / 0.00038 | 2e-07 |" in compared(rows, SHOWN)
+    assert "| 1e-06 / 0.00038 | 2e-07 |" in markdown(rows)
     bare = rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})
     rows = {row.quantity: row for row in table_rows(bare)}
     assert rows["energy_mse"].passed is True and rows["train_seconds"].passed is False
