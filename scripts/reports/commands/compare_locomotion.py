@@ -20,7 +20,6 @@ from dln_jax.locomotion.progress import median_to_reach
 from dln_jax.locomotion.task import FALLEN
 from dln_jax.training.locomotion import GOAL, Options, announce, learned, prepare, reported, write_run
 from scripts.reports.locomotion import comparison, ppo
-from scripts.reports.locomotion.rows import comparison_rows
 from scripts.reports.rows import conditions, print_report, write_report
 
 
@@ -61,7 +60,7 @@ def main(options: Arguments) -> None:
             )
             numbers |= {f"{method}_{name}": value for name, value in metrics.items()}
             curves[method] = [seed.records for seed in trained.learned]
-        rows = comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
+        rows = comparison.comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
         facts = conditions(
             dtype="float64; ppo's networks float32",
             seeds=list(range(options.seed, options.seed + options.seeds)),

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import Controller, Hardware, Run, field_of, simulate
+from dln_jax.control import Controller, Hardware, Linearisation, Run, field_of, holding_controls, linearise, simulate
+from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
@@ -54,14 +55,22 @@ def plant(motor: Motor) -> tuple[Scene, Array]:
     return scene, jnp.asarray(scene.needs.actuation)
 
 
+def closed_loop(motor: Motor, controller: Controller) -> Run:
+    """A run with the board's settings, not compiled."""
+    scene, B = plant(motor)
+    field, lab = field_of(dynamics(scene.energies), B), Hardware(-LIMIT, LIMIT)
+    return simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, hardware=lab)
+
+
 def play(motor: Motor, controller: Controller) -> Run:
     """Runs the closed loop with the board's settings."""
-    scene, B = plant(motor)
-    field = field_of(dynamics(scene.energies), B)
-    lab = Hardware(-LIMIT, LIMIT)
-    return jax.jit(
-        lambda: simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, hardware=lab)
-    )()
+    return jax.jit(lambda: closed_loop(motor, controller))()
+
+
+def at_goal(motor: Motor, system: Dynamics) -> Linearisation:
+    """The linearisation of the plant about its goal."""
+    B = plant(motor)[1]
+    return linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
 
 
 def criteria(motor: Motor, run: Run) -> Criteria:

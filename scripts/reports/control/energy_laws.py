@@ -19,16 +19,11 @@ from jax import Array
 
 from dln_jax.control import (
     Controller,
-    Hardware,
     Run,
-    field_of,
-    holding_controls,
-    linearise,
     lqr,
     partial_linearisation,
     parts_of,
     regulated,
-    simulate,
     switched,
     value,
 )
@@ -37,10 +32,10 @@ from scripts.reports.case import Findings
 from scripts.reports.control.board import (
     GOAL,
     LIMIT,
-    RATE,
-    SECONDS,
     Criteria,
     Motor,
+    at_goal,
+    closed_loop,
     criteria,
     plant,
     rows_of_criteria,
@@ -99,9 +94,9 @@ def pumping(motor: Motor) -> Callable[..., Array]:
 
 def controllers_by_energy(motor: Motor) -> Callable[[Law], Controller]:
     """A law's numbers -> its controller of x = (q, qd)."""
-    scene, B = plant(motor)
+    scene, _ = plant(motor)
     system, joints, far = dynamics(scene.energies), scene.needs.joints, pumping(motor)
-    at = linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
+    at = at_goal(motor, system)
     regulator = lqr(at.A, at.B, STATE_COST, CONTROL_COST)
     near, cost = regulated(regulator, GOAL, at.u, joints), value(regulator, GOAL, joints)
 
@@ -119,10 +114,8 @@ def controllers_by_energy(motor: Motor) -> Callable[[Law], Controller]:
 
 def runs_by_energy(motor: Motor) -> Callable[[Law], Run]:
     """A law's numbers -> its closed loop on the board."""
-    scene, B = plant(motor)
-    field, controller = field_of(dynamics(scene.energies), B), controllers_by_energy(motor)
-    lab, settings = Hardware(-LIMIT, LIMIT), {"seconds": SECONDS, "rate": RATE, "controls": 1}
-    return lambda numbers: simulate(field, controller(numbers), np.zeros(4), hardware=lab, **settings)
+    controller = controllers_by_energy(motor)
+    return lambda numbers: closed_loop(motor, controller(numbers))
 
 
 def runs_of_drawn_laws(motor: Motor, draws: int) -> list[Criteria]:

@@ -20,15 +20,24 @@ from dln_jax.control import (
     Problem,
     error,
     field_of,
-    holding_controls,
-    linearise,
     optimise,
     sampled_lqr,
 )
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from scripts.reports.case import Findings
-from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, criteria, plant, play, rows_of_criteria, score
+from scripts.reports.control.board import (
+    GOAL,
+    LIMIT,
+    RATE,
+    Motor,
+    at_goal,
+    criteria,
+    plant,
+    play,
+    rows_of_criteria,
+    score,
+)
 from scripts.reports.rows import Row
 
 EVERY = 10
@@ -85,9 +94,8 @@ def planned(motor: Motor, weights: Weights, guess: Array, *, iterations: int = 3
 
 def follower(motor: Motor, weights: Weights, plan: Plan) -> Controller:
     """Feedback about the plan, followed by a regulator about the goal."""
-    scene, B = plant(motor)
-    field, joints, dt = field_of(dynamics(scene.energies), B), scene.needs.joints, 1.0 / RATE
-    at = linearise(field, GOAL, holding_controls(dynamics(scene.energies), GOAL[:2], B))
+    scene, dt = plant(motor)[0], 1.0 / RATE
+    at, joints = at_goal(motor, dynamics(scene.energies)), scene.needs.joints
     holding = sampled_lqr(at.A, at.B, np.diag([10.0, 10.0, 1.0, 1.0]), np.eye(1), dt)
     last = EVERY * len(plan.u)
 

@@ -16,9 +16,7 @@ from dln_jax.control import (
     Controller,
     Plan,
     field_of,
-    holding_controls,
     limited,
-    linearise,
     regulated,
     sampled_lqr,
     value,
@@ -28,7 +26,7 @@ from dln_jax.control import (
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import MIDPOINT, runge_kutta
 from scripts.reports.case import Findings
-from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, criteria, plant, play, score
+from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, at_goal, criteria, plant, play, score
 from scripts.reports.control.disturbed_board import CRITERIA, LONGEST, robustness
 from scripts.reports.control.energy_laws import Law, best_law, controllers_by_energy, pumping
 from scripts.reports.control.planned import EVERY, Weights, follower, search
@@ -102,9 +100,9 @@ def recovering(motor: Motor, weights: Weights, plan: Plan, control_cost: float) 
         plan: plan from hanging.
         control_cost: control cost of the regulator.
     """
-    scene, B = plant(motor)
+    scene, _ = plant(motor)
     system, joints = dynamics(scene.closed_form), scene.needs.joints
-    at = linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
+    at = at_goal(motor, system)
     regulator = sampled_lqr(at.A, at.B, STATE_COST, control_cost * np.eye(1), 1 / RATE)
     near, cost, far = regulated(regulator, GOAL, at.u, joints), value(regulator, GOAL, joints), pumping(motor)
     planned, last = follower(motor, weights, plan), EVERY * len(plan.u)
