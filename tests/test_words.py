@@ -10,7 +10,7 @@ FILES = [
     path
     for folder, pattern in (("dln_jax", "*.py"), ("scripts", "*.py"), ("docs", "*.md"), ("docs/examples", "*.py"))
     for path in sorted((ROOT / folder).rglob(pattern))
-    if not {"gallery", "_build"} & set(path.parts)
+    if not {"gallery", "_build", "moved.md"} & set(path.parts)  # moved.md lists the words that were replaced
 ] + [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 REPLACED = {
     r"laborator(y|ies)": "hardware (limits, encoders, noise and delay of a closed loop)",

@@ -59,7 +59,7 @@ class DesktopPlant(NamedTuple):
     substeps: int
     """Integrator steps per sample, enough to resolve stiction."""
     numbers: SwingUpNumbers
-    """Numbers of its swing-up, tuned on the analytic model (`scripts.reports.control.swing_up_gains`)."""
+    """Numbers of its swing-up, tuned by a random search with the analytic model."""
     position: float
     """Standard deviation of the driven coordinate's initial value, m or rad."""
 

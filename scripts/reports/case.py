@@ -1,15 +1,17 @@
-"""Cases, the named measurements of a report, and the loop that measures them and stores the results."""
+"""Cases, the named measurements of a report, and the loop that measures, stores and publishes them."""
 
 import math
 import reprlib
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from dln_jax.files import is_file, matches, read_json, write_figure, write_json
+from dln_jax.cli.running import command_folder
+from dln_jax.files import is_file, read_json, write_figure, write_json
 from dln_jax.types import InputError
 from scripts.reports.rows import Row, conditions, publish
 
@@ -47,48 +49,50 @@ class Done(NamedTuple):
 
 
 def measure(
-    cases: Sequence[Case],
-    report: Callable[[Done], None],
-    *,
-    folder: Path | None = None,
-    resume: bool = False,
+    cases: Sequence[Case], report: Callable[[Done], None], *, folder: Path | None = None, resume: bool = False
 ) -> dict[str, Findings]:
     """Measures the cases one after the other and calls `report` after every case.
 
     Returns the findings by name, in the order of the cases. After every case, jobs.json in `folder` stores all findings
     so far (of rows: case, quantity and value). With `resume`, stored cases are not measured again.
     """
-    found = stored_findings(folder, cases) if folder and resume else {}
+    results = stored_findings(folder, cases) if folder and resume else {}
     for number, case in enumerate(cases, start=1):
         began = time.perf_counter()
-        if case.name not in found:
-            found[case.name] = case.measure()
+        if case.name not in results:
+            results[case.name] = case.measure()
             if folder:
-                kept = {
-                    name: {"rows": [row[:3] for row in rows], "curves": each} for name, (rows, each) in found.items()
+                stored = {
+                    name: {"rows": [row[:3] for row in rows], "curves": curves}
+                    for name, (rows, curves) in results.items()
                 }
-                write_json(folder / JOBS, kept)
+                write_json(folder / JOBS, stored)
         place = f"{number:{len(str(len(cases)))}d}/{len(cases)}"
-        report(Done(place, case, found[case.name], time.perf_counter() - began))
-    return {case.name: found[case.name] for case in cases}
+        report(Done(place, case, results[case.name], time.perf_counter() - began))
+    return {case.name: results[case.name] for case in cases}
 
 
-def measure_and_publish(folder: Path, cases: Sequence[Case], *, figures: bool = True, **facts: Any) -> None:
-    """Measures cases, prints a line and draws a figure per case, and publishes all rows with `facts` as conditions."""
+def report_cases(options: Any, command: str, cases: Sequence[Case], **facts: Any) -> None:
+    """Body of a command: measures cases into its folder, with a line and a figure for each, and publishes all rows.
 
-    def say(done: Done) -> None:
-        bound = [row.passed for row in done.findings.rows if row.passed is not None]
-        passed = f"{sum(bound)}/{len(bound)} pass  " if bound else ""
-        print(f"{done.place}  {done.case.name:30s} {passed}{done.seconds:.1f} s", flush=True)
-        if figures:
-            draw(folder, done.case, done.findings)
+    `facts`, and `quick` of the options, become conditions of the report.
+    """
+    with command_folder(options, command) as folder:
 
-    publish(folder, rows_in(measure(cases, say)), conditions(**facts))
+        def show(done: Done) -> None:
+            bound = [row.passed for row in done.findings.rows if row.passed is not None]
+            passed = f"{sum(bound)}/{len(bound)} pass  " if bound else ""
+            print(f"{done.place}  {done.case.name:30s} {passed}{done.seconds:.1f} s", flush=True)
+            if getattr(options, "figures", True):
+                draw(folder, done.case, done.findings)
+
+        quick = {"quick": options.quick} if hasattr(options, "quick") else {}
+        publish(folder, rows_in(measure(cases, show)), conditions(**facts, **quick))
 
 
-def rows_in(found: Mapping[str, Findings]) -> list[Row]:
+def rows_in(results: Mapping[str, Findings]) -> list[Row]:
     """All rows of the findings."""
-    return [row for findings in found.values() for row in findings.rows]
+    return [row for findings in results.values() for row in findings.rows]
 
 
 def say_numbers(*shown: str) -> Callable[[Done], None]:
@@ -110,6 +114,11 @@ def named(cases: Sequence[Case], *names: str) -> list[Case]:
     return [known[name] for name in names]
 
 
+def in_subjects(cases: Sequence[Case], subjects: Sequence[str]) -> list[Case]:
+    """The cases of some subjects, in the order of the subjects; a case's name begins with that of its subject."""
+    return [case for subject in subjects for case in cases if case.name.split("/")[0] == subject]
+
+
 def draw(folder: Path, case: Case, findings: Findings) -> None:
     """Writes the figure of a case, if it has one, as a PNG file named by the last part of the case's name."""
     if case.draw is not None and findings.curves:
@@ -118,15 +127,21 @@ def draw(folder: Path, case: Case, findings: Findings) -> None:
 
 def by_case(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """The numbers of rows by case and quantity."""
-    found: dict[str, dict[str, float]] = {}
+    numbers: dict[str, dict[str, float]] = {}
     for row in rows:
-        found.setdefault(row.case, {})[row.quantity] = row.value
-    return found
+        numbers.setdefault(row.case, {})[row.quantity] = row.value
+    return numbers
 
 
 def rows_of(case: str, numbers: Mapping[str, float]) -> list[Row]:
     """Converts numbers by quantity to rows without unit, reference or bound, which a table adds later."""
     return [Row(case, quantity, value) for quantity, value in numbers.items()]
+
+
+def spread(case: str, quantity: str, values: Any, unit: str = "1", **more: Any) -> list[Row]:
+    """Rows QUANTITY_median and QUANTITY_worst (the largest) of some values; `more` are other fields of the rows."""
+    statistics = {"median": np.median, "worst": np.max}
+    return [Row(case, f"{quantity}_{name}", float(of(values)), unit, **more) for name, of in statistics.items()]
 
 
 def stored_findings(folder: Path, cases: Sequence[Case]) -> dict[str, Findings]:
@@ -136,32 +151,27 @@ def stored_findings(folder: Path, cases: Sequence[Case]) -> dict[str, Findings]:
         InputError: the file is damaged, or another release wrote it.
     """
     path, known = folder / JOBS, {case.name: case for case in cases}
-    found = {}
+    results = {}
     for name, values in (read_json(path, remedy=REMEDY) if is_file(path) else {}).items():
         if name not in known:
             raise InputError(f"{path}: {name!r:.60} is no case of this table; {REMEDY}")
-        found[name] = _from_json(f"{path}: {name}", values)
-        numbers = by_case(found[name].rows)
+        results[name] = _from_json(f"{path}: {name}", values)
+        numbers = by_case(results[name].rows)
         if others := [case for case in numbers if case not in known[name].quantities]:
             raise InputError(f"{path}: {others[0]!r:.60} is no case of {name}; {REMEDY}")
         for case, quantities in known[name].quantities.items():
             if missing := [quantity for quantity in quantities if quantity not in numbers.get(case, {})]:
                 raise InputError(f"{path}: {case} lacks {missing[0]}; {REMEDY}")
-    return found
+    return results
 
 
 def _from_json(place: str, values: Any) -> Findings:
-    rows, curves = (values.get(key) for key in ("rows", "curves")) if isinstance(values, dict) else (None, None)
-    if not _lists(rows) or not all(len(row) == 3 and all(map(matches, row, (str, str, float | None))) for row in rows):
-        raise InputError(f"{place} holds {reprlib.repr(values)}; expected rows of case, quantity, number; {REMEDY}")
-    if not isinstance(curves, dict) or not _lists(points := list(curves.values())):
-        raise InputError(f"{place} has no curves; {REMEDY}")
-    if not all(matches(x, float | None) for each in points for x in each):
-        raise InputError(f"{place} has a curve that is none; {REMEDY}")
-    number = lambda value: math.nan if value is None else float(value)  # noqa: E731
-    curves = {name: list(map(number, each)) for name, each in curves.items()}
-    return Findings([Row(case, quantity, number(value)) for case, quantity, value in rows], curves)
+    def number(value: Any) -> float:
+        return math.nan if value is None else value + 0.0
 
-
-def _lists(values: Any) -> TypeGuard[list[list[Any]]]:
-    return isinstance(values, list) and all(isinstance(each, list) for each in values)
+    try:
+        rows = [Row(case, quantity, number(value)) for case, quantity, value in values["rows"]]
+        return Findings(rows, {name: [number(x) for x in points] for name, points in values["curves"].items()})
+    except (AttributeError, KeyError, TypeError, ValueError):
+        expected = "rows of case, quantity and number, and curves of numbers"
+        raise InputError(f"{place} holds {reprlib.repr(values)}; expected {expected}; {REMEDY}") from None

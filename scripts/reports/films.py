@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from dln_jax import GaussNewton, control, dynamics, fit, flow
+from dln_jax import GaussNewton, dynamics, fit, flow
 from dln_jax.data.splits import hold_out, split
 from dln_jax.figures import rotary_pendulum_drawing, style
 from dln_jax.learning.dynamics import problem as torque_problem
@@ -26,8 +26,8 @@ from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.nn.activations import tanh
 from dln_jax.scenes.datasets.generators import default_data
 from dln_jax.scenes.datasets.hamiltonian_tasks import three_body
-from dln_jax.scenes.pendulums import LINK_LENGTH, two_link_arm
-from dln_jax.scenes.poles import rotary_pendulum
+from dln_jax.scenes.two_link_arm import LINK_LENGTH, two_link_arm
+from scripts.reports.control.swing_ups import SWING_UPS, closed_loop
 
 Film = Callable[[Axes], Callable[[int], None]]
 """Prepares an axis and returns the function that draws a frame."""
@@ -112,21 +112,7 @@ def three_bodies(frames: int) -> Film:
 
 def swing_up(frames: int) -> Film:
     """A rotary pendulum comes up by its energy, and stays there by a linear-quadratic regulator."""
-    scene, limit = rotary_pendulum(friction=1e-5), 0.05
-    plant, B, kinds = dynamics(scene.energies), np.array(scene.needs.actuation), scene.needs.joints
-    field, goal = control.field_of(plant, B), jnp.zeros(4)
-    at = control.linearise(jax.jit(field), goal, control.holding_controls(plant, goal[:2], B))
-    regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
-    near = control.regulated(regulator, goal, at.u, kinds)
-    swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
-    levels = 10.0 ** np.arange(-2, 1.01, 0.1)
-    region = control.region_of_attraction(
-        field, near, regulator, goal, kinds, lower=-limit, upper=limit, rate=500.0, levels=levels, starts=32
-    )
-    law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, kinds), region.level)
-    start = jnp.array([0.0, np.pi + 0.1, 0.0, 0.0])
-    hardware = control.Hardware(-limit, limit, delay=1)
-    run = control.simulate(field, control.stateless(law), start, seconds=4.0, rate=500.0, controls=1, hardware=hardware)
+    run = closed_loop(SWING_UPS["rotary-pendulum"], seconds=4.0)(jnp.array([0.0, np.pi + 0.1, 0.0, 0.0]))
     q = sampled(run.x[:, :2], frames)
 
     def prepare(axis: Axes) -> Callable[[int], None]:

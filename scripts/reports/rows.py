@@ -19,7 +19,6 @@ __all__ = [
     "expect",
     "largest",
     "markdown",
-    "markdown_table",
     "print_report",
     "publish",
     "report_table",
@@ -107,15 +106,14 @@ def report_table(rows: Sequence[Row], facts: Mapping[str, Any]) -> Table:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Returns a table with a line per case and a column per quantity, in order of appearance."""
-    cases = list(dict.fromkeys(row.case for row in rows))
+    """Markdown table with a line per case and a column per quantity: "ours", or "ours / reference" if there is one."""
     columns = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
-    values = {(row.case, row.quantity, row.unit): f"{row.value:.3g}" for row in rows}
     titles = [quantity.replace("_", " ") + (f", {unit}" if unit != "1" else "") for quantity, unit in columns]
-    lines = [[case, *(values.get((case, *column), "") for column in columns)] for case in cases]
-    return markdown_table(["case", *titles], lines)
-
-
-def markdown_table(titles: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Formats cells as Markdown."""
-    return "".join(f"| {' | '.join(line)} |\n" for line in [titles, ["---"] * len(titles), *lines])
+    lines: dict[str, dict[tuple[str, str], str]] = {}
+    for row in rows:
+        numbers = [row.value] if row.reference is None else [row.value, row.reference]
+        cell = " / ".join(f"{number:.3g}" for number in numbers)
+        lines.setdefault(row.case, {})[row.quantity, row.unit] = cell
+    table = [["case", *titles], ["---"] * (1 + len(titles))]
+    table += [[case, *(cells.get(column, "") for column in columns)] for case, cells in lines.items()]
+    return "".join(f"| {' | '.join(line)} |\n" for line in table)

@@ -22,12 +22,12 @@ from dln_jax.models.model import Parameters
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm.rivals import IDENTIFIED, Rival, rivals, size
-from scripts.reports.case import Case, Findings
+from scripts.reports.case import Case, Findings, spread
 from scripts.reports.figures.letters import error_lines
 from scripts.reports.rows import Row
 
 COUNTS, SPEEDS = (1, 2, 3, 5, 8), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
-ZERO, OUTSIDE = "torque_mean_square", "share_outside_training"
+ZERO, OUT_OF_DISTRIBUTION = "torque_mean_square", "share_outside_training"
 THINNED = 2
 """Every second sample is fitted, 12.5 per second; all samples of the test letters are evaluated."""
 
@@ -64,7 +64,7 @@ Settings = Mapping[str, tuple[int, float]]
 def against_letters(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
     """Errors against the number of training letters; `name` names the data, `test` is the first set of test letters."""
     most = _training_letters(data, test)
-    counts = {f"{count}-letters": (count, 1.0) for count in (*(each for each in COUNTS if each < most), most)}
+    counts = {f"{count}-letters": (count, 1.0) for count in (*(count for count in COUNTS if count < most), most)}
     return _case(f"{name}/letters", data, test, counts, quick, "training letters")
 
 
@@ -104,18 +104,20 @@ def measure(
     for test in splits:
         for seed in range(effort.seeds):
             runs.append(one_run(known, data, test, seed, settings))
-    rows = [Row(f"{each}/{name}", "parameters", float(size(rival))) for each, rival in known.items()]
-    for each in known:
+    rows = [Row(f"{model}/{name}", "parameters", float(size(rival))) for model, rival in known.items()]
+    for model in known:
         for setting in settings:
-            case, values = f"{each}/{name}/{setting}", [run[setting][each] for run in runs]
-            rows.append(Row(case, "torque_mse_median", float(np.median(values)), "N^2 m^2"))
-            rows.append(Row(case, "torque_mse_worst", float(np.max(values)), "N^2 m^2"))
+            values = [run[setting][model] for run in runs]
+            rows += spread(f"{model}/{name}/{setting}", "torque_mse", values, "N^2 m^2")
     for setting in settings:
-        zero, outside = ([run[setting][quantity] for run in runs] for quantity in (ZERO, OUTSIDE))
-        rows.append(Row(f"data/{name}/{setting}", ZERO, float(np.median(zero)), "N^2 m^2"))
-        rows.append(Row(f"data/{name}/{setting}", OUTSIDE, float(np.median(outside))))
+        for quantity, unit in {ZERO: "N^2 m^2", OUT_OF_DISTRIBUTION: "1"}.items():
+            median = float(np.median([run[setting][quantity] for run in runs]))
+            rows.append(Row(f"data/{name}/{setting}", quantity, median, unit))
     several = len({count for count, _ in settings.values()}) > 1
-    curves = {key: [[run[setting][key] for run in runs] for setting in settings] for key in (*known, ZERO, OUTSIDE)}
+    curves = {
+        key: [[run[setting][key] for run in runs] for setting in settings]
+        for key in (*known, ZERO, OUT_OF_DISTRIBUTION)
+    }
     places = [count if several else speed for count, speed in settings.values()]
     return Findings(rows, {"places": places, **curves})
 
@@ -125,21 +127,21 @@ def one_run(
 ) -> dict[str, dict[str, float]]:
     """Torque MSE of the rivals, mean square of the torque, and share of out-of-distribution samples, by setting."""
     held_out, fits = select(data, label_indices(data, test)), {}
-    found: dict[str, dict[str, float]] = {}
+    numbers: dict[str, dict[str, float]] = {}
     for setting, (count, speed) in settings.items():
         if count not in fits:
-            fits[count] = {each: fitted(rival, data, test, count, seed) for each, rival in known.items()}
-        faster_letters = faster(held_out, speed)
-        found[setting] = {
-            **{each: torque_mse(known[each], fit.parameters, faster_letters) for each, fit in fits[count].items()},
-            ZERO: mean_square(faster_letters.tau),
-            OUTSIDE: share_outside(fits[count][IDENTIFIED], faster_letters),
+            fits[count] = {name: fitted(rival, data, test, count, seed) for name, rival in known.items()}
+        letters = faster(held_out, speed)
+        numbers[setting] = {
+            **{name: torque_mse(known[name], fit.parameters, letters) for name, fit in fits[count].items()},
+            ZERO: mean_square(letters.tau),
+            OUT_OF_DISTRIBUTION: share_out_of_distribution(fits[count][IDENTIFIED], letters),
         }
-    return found
+    return numbers
 
 
 def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, seed: int) -> Fit:
-    """Fits a rival to `count` letters outside the test. A seed draws one order: smaller sets are subsets of larger."""
+    """Fits a rival to `count` letters without those of the test; smaller sets are subsets of larger ones."""
     letters = np.setdiff1d(np.unique(data.trajectory), label_indices(data, test))
     chosen = np.random.default_rng([seed, 1]).permutation(letters)[:count].tolist()
     thin = every(data, THINNED)
@@ -171,7 +173,7 @@ def torque_mse(rival: Rival, parameters: Parameters, data: Trajectories) -> floa
     return mean_square(np.asarray(rival.torques(parameters, data.q, data.qd, data.qdd)) - data.tau)
 
 
-def share_outside(fit: Fit, data: Trajectories) -> float:
+def share_out_of_distribution(fit: Fit, data: Trajectories) -> float:
     """Share of samples with an angle, a rate or an acceleration outside the fitted range."""
     now = states(data)
     return float(np.mean(((now < fit.low) | (now > fit.high)).any(axis=1)))

@@ -38,7 +38,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.scenes.pendulums import two_link_arm
 from scripts.reports.arm.motions import RATE, RECORDED, Motion, capacity, drawn_letters
 from scripts.reports.arm.rivals import Rival, rivals
-from scripts.reports.case import Case, Findings
+from scripts.reports.case import Case, Findings, spread
 from scripts.reports.figures.letters import written_letters
 from scripts.reports.rows import Row
 
@@ -102,11 +102,14 @@ class Written(NamedTuple):
 def cases(name: str, data: Trajectories, *, quick: bool = False) -> list[Case]:
     """One case per condition."""
     effort = QUICK if quick else Effort()
-    found = []
-    for condition in effort.conditions:
-        draw = partial(written_letters, title=f"{condition.replace('-', ' ')}, seed 0")
-        found.append(Case(f"{name}/online-{condition}", partial(measure, name, data, condition, effort), draw=draw))
-    return found
+    return [
+        Case(
+            f"{name}/online-{condition}",
+            partial(measure, name, data, condition, effort),
+            draw=partial(written_letters, title=f"{condition.replace('-', ' ')}, seed 0"),
+        )
+        for condition in effort.conditions
+    ]
 
 
 Law = Callable[[Parameters, Gains], Tracker]
@@ -132,16 +135,16 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
     written: dict[str, list[list[Written]]] = {}
     motions = [drawn_letters(data, effort.letters, seed, under.speed) for seed in range(effort.seeds)]
     places = capacity(data, effort.letters)
-    for each, law in laws(learners).items():
+    for model, law in laws(learners).items():
         drive = partial(write, closed_loop(law, under), under)
-        runs = [written_by(drive, learners.get(each), motions[seed], seed, places) for seed in range(effort.seeds)]
-        written[each] = runs
-    rows = [row for each, runs in written.items() for row in rows_of(f"{each}/{name}/{condition}", runs)]
+        learner, seeds = learners.get(model), range(effort.seeds)
+        written[model] = [written_by(drive, learner, motions[seed], seed, places) for seed in seeds]
+    rows = [row for model, runs in written.items() for row in rows_of(f"{model}/{name}/{condition}", runs)]
     curves = {
         "letters": [motion.label for motion in motions[0]],
         "wanted": [visit.wanted for visit in written["exact-model"][0]],
-        "paths": {each: [visit.path for visit in runs[0]] for each, runs in written.items()},
-        "errors": {each: [[visit.tip_error for visit in run] for run in runs] for each, runs in written.items()},
+        "paths": {model: [visit.path for visit in runs[0]] for model, runs in written.items()},
+        "errors": {model: [[visit.tip_error for visit in run] for run in runs] for model, runs in written.items()},
     }
     return Findings(rows, curves)
 
@@ -160,13 +163,11 @@ def rows_of(case: str, runs: Sequence[Sequence[Written]]) -> list[Row]:
     rows = []
     for place, name in {0: "first", 1: "second", len(runs[0]) - 1: "last"}.items():
         for quantity, unit in {"joint_error": "rad", "tip_error": "m"}.items():
-            values = [getattr(run[place], quantity) for run in runs]
-            rows.append(Row(case, f"{name}_{quantity}_median", float(np.median(values)), unit))
-            rows.append(Row(case, f"{name}_{quantity}_worst", float(np.max(values)), unit))
-    every = [each for run in runs for each in run]
-    rows.append(Row(case, "lost_letters", float(sum(np.isinf(each.joint_error) for each in every))))
+            rows += spread(case, f"{name}_{quantity}", [getattr(run[place], quantity) for run in runs], unit)
+    every = [letter for run in runs for letter in run]
+    rows.append(Row(case, "lost_letters", float(sum(np.isinf(letter.joint_error) for letter in every))))
     rows.append(Row(case, "letters", float(len(every))))
-    rows.append(Row(case, "share_saturated", float(np.mean([each.saturated for each in every]))))
+    rows.append(Row(case, "share_saturated", float(np.mean([letter.saturated for letter in every]))))
     return rows
 
 
@@ -216,11 +217,13 @@ def write(loop: Loop, condition: Condition, parameters: Parameters, motion: Moti
     end = int(lost[0]) if len(lost) else motion.samples
     step = round(RATE / (RECORDED * condition.speed))
     q, qd = np.hsplit(run.x[:end], 2)
-    recording = tuple(each[:end:step] for each in (q, qd, driven.qdd, run.u))
+    recording = tuple(array[:end:step] for array in (q, qd, driven.qdd, run.u))
     if condition.encoder_noise > 0:
         recording = _filtered(run.t[:end], run.y[:end], run.u[:end], step)
-    errors = [np.sqrt(np.mean(np.sum(each[:end] ** 2, axis=1))) for each in (off, driven.tip - driven.wanted_tip)]
-    joint_error, tip_error = (np.inf if len(lost) else float(each) for each in errors)
+    joint_error, tip_error = (
+        np.inf if len(lost) else float(np.sqrt(np.mean(np.sum(deviation[:end] ** 2, axis=1))))
+        for deviation in (off, driven.tip - driven.wanted_tip)
+    )
     saturated = float(np.mean((np.abs(run.u[: max(end, 1)]) >= LIMITS).any(axis=1)))
     return Written(joint_error, tip_error, saturated, driven.tip[:end], driven.wanted_tip[: motion.samples]), recording
 

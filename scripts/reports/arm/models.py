@@ -69,8 +69,8 @@ def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5
     _, first = np.unique(sets.test.trajectory, return_index=True)
     t = np.arange(0.0, duration, dt)
     q, _ = generators.rollouts(scene, sets.test.q[first], sets.test.qd[first], t)
-    outside = ((q < sets.train.q.min(axis=0)) | (q > sets.train.q.max(axis=0))).any(axis=2)
-    return float(np.median(np.where(outside.any(axis=1), t[outside.argmax(axis=1)], duration)))
+    left = ((q < sets.train.q.min(axis=0)) | (q > sets.train.q.max(axis=0))).any(axis=2)
+    return float(np.median(np.where(left.any(axis=1), t[left.argmax(axis=1)], duration)))
 
 
 def measure_plant(scene: Scene, sets: Split) -> Measured:
@@ -114,20 +114,17 @@ def measure_trigonometric(sets: Split) -> Measured:
 def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
     """Trains several seeds in one program by Gauss-Newton; medians over seeds, and the spread of the torque error."""
     training, energies = trained(kind, sets, seeds=seeds, steps=steps)
-    systems = [compiled(dynamics(each), jnp.float64) for each in energies]
+    systems = [compiled(dynamics(system), jnp.float64) for system in energies]
     of_seeds = [
         {**on_the_test(of_seed, sets), "whole_circle_torque_mse": torque_mse(system, whole_circle())}
         for of_seed, system in zip(energies, systems, strict=True)
     ]
     if CATALOGUE[kind].properties.energy and not CATALOGUE[kind].properties.definite:
         for numbers, system in zip(of_seeds, systems, strict=True):
-            found = definiteness(system, sets.test.q, sets.test.qd)
-            numbers["share_not_definite"] = found.share_not_definite
-    torques = [each["torque_mse"] for each in of_seeds]
+            numbers["share_not_definite"] = definiteness(system, sets.test.q, sets.test.qd).share_not_definite
+    torques = [numbers["torque_mse"] for numbers in of_seeds]
     numbers = {
-        **{key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]},
-        "torque_mse_mean": float(np.mean(torques)),
-        "torque_mse_standard_deviation": float(np.std(torques)),
+        **{key: float(np.median([seed[key] for seed in of_seeds])) for key in of_seeds[0]},
         "torque_mse_largest": float(np.max(torques)),
         **costs(training, systems[0], sets, seeds=seeds),
     }
@@ -139,8 +136,8 @@ def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[T
     model, optimiser = prepared(kind, sets, steps=steps)
     objective = objective_of(kind, sets.train)
     training = fit(problem(model, sets, objective, seeds=tuple(range(seeds))), optimiser)
-    each = [jax.tree.map(lambda leaf, index=index: leaf[index], training.parameters) for index in range(seeds)]
-    return training, [model.energies(parameters) for parameters in each]
+    of_seeds = [jax.tree.map(lambda leaf, index=index: leaf[index], training.parameters) for index in range(seeds)]
+    return training, [model.energies(parameters) for parameters in of_seeds]
 
 
 def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
@@ -149,7 +146,7 @@ def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
         energies = [linear_fit(sets.train)[1]]
     else:
         _, energies = trained(kind, sets, seeds=seeds, steps=steps)
-    torques = [torque_mse(dynamics(each), sets.test) for each in energies]
+    torques = [torque_mse(dynamics(system), sets.test) for system in energies]
     return {"torque_mse": float(np.median(torques)), "torque_mse_largest": float(np.max(torques))}, {}
 
 
@@ -198,12 +195,9 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
     }, {}
 
 
-def prepared(
-    kind: str, sets: Split, *, steps: int | None, width: int | None = None, depth: int = DEPTH
-) -> tuple[Model, GaussNewton]:
+def prepared(kind: str, sets: Split, *, steps: int | None) -> tuple[Model, GaussNewton]:
     """A model of this kind and its Gauss-Newton optimiser."""
-    model = build(described(kind, sets.train, width=width or WIDTHS[kind], depth=depth))
-    return model, GaussNewton(steps=steps or STEPS)
+    return build(described(kind, sets.train, width=WIDTHS[kind], depth=DEPTH)), GaussNewton(steps=steps or STEPS)
 
 
 def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float], seeds: int) -> Curve:

@@ -30,13 +30,13 @@ def drawn_letters(data: Trajectories, count: int, seed: int, speed: float) -> li
     letters = np.unique(data.trajectory).tolist()
     longest = max(len(reference(select(data, [index]), speed).q) for index in letters)
     order = np.random.default_rng([seed, 2]).permutation(letters)[:count].tolist()
-    found = []
+    motions = []
     for index in order:
         q, qd, qdd = reference(select(data, [index]), speed)
         more = ((0, longest - len(q)), (0, 0))
         padded = Reference(np.pad(q, more, mode="edge"), np.pad(qd, more), np.pad(qdd, more))
-        found.append(Motion(str(data.label[index]), padded, len(q)))
-    return found
+        motions.append(Motion(str(data.label[index]), padded, len(q)))
+    return motions
 
 
 def reference(letter: Trajectories, speed: float = 1.0) -> Reference:

@@ -76,8 +76,8 @@ def textbook(scene: Scene, *, states: int = 1000) -> Findings:
     }
     rows = []
     for name, (derived, textbook_formula, last) in pairs.items():
-        got = jax.jit(jax.vmap(derived))(q, qd, last)
+        computed = jax.jit(jax.vmap(derived))(q, qd, last)
         expected = jax.jit(jax.vmap(textbook_formula))(q, qd, last)
-        error = float(jnp.max(jnp.abs(got - expected)) / jnp.max(jnp.abs(expected)))
+        error = float(jnp.max(jnp.abs(computed - expected)) / jnp.max(jnp.abs(expected)))
         rows.append(Row(f"textbook/{scene.name}", f"{name}_relative_error", error, "1", 0.0, 1e-12))
     return Findings(rows)

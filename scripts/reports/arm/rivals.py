@@ -67,7 +67,7 @@ def _rival(model: Model, refit: Refit) -> Rival:
 
 def _inverse_side(parameters: Parameters) -> Parameters:
     """Drops the network of the forward dynamics, which is not used here."""
-    return {name: each for name, each in parameters.items() if name.startswith("inverse")}
+    return {name: layers for name, layers in parameters.items() if name.startswith("inverse")}
 
 
 def size(rival: Rival) -> int:

@@ -28,17 +28,23 @@ from scripts.reports.arm.models import (
     measure_split,
     measure_trigonometric,
 )
-from scripts.reports.case import Case, Findings, by_case, rows_of
+from scripts.reports.case import Case, Findings, by_case, rows_in, rows_of
 from scripts.reports.figures.costs import error_against_time
 from scripts.reports.published import ARM, published
-from scripts.reports.rows import UNITS, Row, markdown_table, unit_of
+from scripts.reports.rows import UNITS, Row, unit_of
 
 MODELS = (*WIDTHS, TRIGONOMETRIC)
 LAGRANGIAN = "structured-delan"
 STRUCTURED = (LAGRANGIAN, "structured-hnn")
 STRUCTURED_FACTOR = 100.0
 """Factor by which structured models must beat the published errors."""
-FROM_MOMENTA, WHOLE_CIRCLE = "torque_from_momenta_mse", "whole_circle_torque_mse"
+FROM_MOMENTA = "torque_from_momenta_mse"
+SHOWN = (
+    *("torque_mse", FROM_MOMENTA, "inertial_mse", "coriolis_mse", "gravity_mse", "vpt_seconds"),
+    *("whole_circle_torque_mse", "torque_mse_median", "torque_mse_worst", "train_seconds", "parameters"),
+    "one_step_p50_us",
+)
+"""Quantities of the Markdown table."""
 VPT_SHARE = 0.98
 """Share of the true plant's valid prediction time that a structured model must reach."""
 ARM_UNITS = {**UNITS, "forward_mse": "1/s^4", "power_mse": "W^2", "mse": "N^2 m^2"}
@@ -102,26 +108,26 @@ def cases(
     """
     sets = data_sets(None, None, 0)[0] if sets is None else sets
     costs = ("train_seconds", "parameters", "one_step_p50_us")
-    found = []
+    listed = []
     for name, data in sets.items():
         ceilings = ("vpt_seconds", "whole_circle_torque_mean_square")
-        found.append(_case(f"plant/{name}", partial(measure_plant, two_link_arm(), data), ceilings))
-        found.append(_case(f"{TRIGONOMETRIC}/{name}", partial(measure_trigonometric, data), costs))
+        listed.append(_case(f"plant/{name}", partial(measure_plant, two_link_arm(), data), ceilings))
+        listed.append(_case(f"{TRIGONOMETRIC}/{name}", partial(measure_trigonometric, data), costs))
         for kind in WIDTHS:
-            found.append(_case(f"{kind}/{name}", partial(measure_seeds, kind, data, seeds=seeds, steps=steps), costs))
+            listed.append(_case(f"{kind}/{name}", partial(measure_seeds, kind, data, seeds=seeds, steps=steps), costs))
     for kind in MODELS:
         count = split_seeds if kind == LAGRANGIAN else 1
         for number, part in enumerate(parts):
             measure = partial(measure_split, kind, part, seeds=count, steps=steps)
             name = f"{kind}/characters/split-{number + 1}"
-            found.append(_case(name, measure, ("torque_mse", "torque_mse_largest")))
+            listed.append(_case(name, measure, ("torque_mse", "torque_mse_largest")))
     written = sets["characters"]
     if timed_seeds:
         measure = partial(measure_one_by_one, written, seeds=timed_seeds, steps=steps)
-        found.append(_case(f"{LAGRANGIAN}/characters/gauss-newton", measure))
+        listed.append(_case(f"{LAGRANGIAN}/characters/gauss-newton", measure))
     for kind in WIDTHS if adam_steps else ():
-        found.append(_case(f"{kind}/characters/adam", partial(measure_adam, kind, written, steps=adam_steps)))
-    return found
+        listed.append(_case(f"{kind}/characters/adam", partial(measure_adam, kind, written, steps=adam_steps)))
+    return listed
 
 
 def _case(name: str, measure: Callable[[], Measured], quantities: Sequence[str] = ()) -> Case:
@@ -132,16 +138,16 @@ def _case(name: str, measure: Callable[[], Measured], quantities: Sequence[str] 
     return Case(name, findings, {name: quantities})
 
 
-def table_rows(found: Mapping[str, Findings]) -> list[Row]:
+def table_rows(results: Mapping[str, Findings]) -> list[Row]:
     """All numbers with their published values and bounds, and summaries of the models over the splits."""
-    numbers = by_case([row for findings in found.values() for row in findings.rows])
-    numbers |= {f"{kind}/characters/splits": each for kind in MODELS if (each := over_splits(kind, numbers))}
+    numbers = by_case(rows_in(results))
+    numbers |= {f"{kind}/characters/splits": summary for kind in MODELS if (summary := over_splits(kind, numbers))}
     return [_beside(row, numbers) for case in numbers for row in rows_of(case, numbers[case])]
 
 
 def over_splits(kind: str, numbers: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Median test torque error over the further splits, and the error of the worst single run."""
-    parts = [each for case, each in numbers.items() if case.startswith(f"{kind}/characters/split-")]
+    parts = [split for case, split in numbers.items() if case.startswith(f"{kind}/characters/split-")]
     if not parts:
         return {}
     return {
@@ -170,33 +176,7 @@ def _beside(row: Row, numbers: Mapping[str, Mapping[str, float]]) -> Row:
     )
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """Markdown table with the published columns, our numbers beside the published ones, and the models' costs."""
-    found = by_case(rows)
-    parts = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse", "vpt_seconds")
-    columns = [*(("characters", quantity) for quantity in parts), ("uniform", "torque_mse"), ("uniform", "vpt_seconds")]
-    columns += [("characters", FROM_MOMENTA), ("uniform", FROM_MOMENTA), ("characters", WHOLE_CIRCLE)]
-    heads = [f"{dataset} {quantity.replace('_', ' ')}" for dataset, quantity in columns]
-    heads = ["model", *heads, "other splits: median, worst", "training, s", "parameters", "one step, µs"]
-    lines = []
-    for kind in [*MODELS, "plant"]:
-        cells = [kind]
-        for dataset, quantity in columns:
-            case = f"{kind}/{dataset}"
-            ours, theirs = found[case].get(quantity), published(ARM, case, quantity)
-            number = "{:.2f}" if quantity == "vpt_seconds" else "{:.1e}"
-            cells.append(" / ".join(number.format(x) for x in (ours, theirs) if x is not None))
-        splits = found.get(f"{kind}/characters/splits", {})
-        cells.append(", ".join(f"{error:.1e}" for error in splits.values()))
-        costs = found[f"{kind}/characters"]
-        shown = {"train_seconds": ".1f", "parameters": ".0f", "one_step_p50_us": ".0f"}
-        lines.append([*cells, *(format(costs[key], form) if key in costs else "" for key, form in shown.items())])
-    zero = found["plant/characters"]["whole_circle_torque_mean_square"]
-    note = f"\nours / published; medians over seeds. Mean square of torques, whole circle: {zero:.0f} (N m)².\n"
-    return markdown_table(heads, lines) + note
-
-
-def figure(found: Mapping[str, Findings]) -> Figure:
+def figure(results: Mapping[str, Findings]) -> Figure:
     """Figure of error against training time."""
-    curves = {case: each.curves for case, each in found.items() if each.curves}
-    return error_against_time({case: (each["seconds"], each["errors"]) for case, each in curves.items()})
+    curves = {case: findings.curves for case, findings in results.items() if findings.curves}
+    return error_against_time({case: (curve["seconds"], curve["errors"]) for case, curve in curves.items()})

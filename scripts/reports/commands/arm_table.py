@@ -18,7 +18,7 @@ from dln_jax.files import write_bytes, write_figure
 from dln_jax.types import InputError
 from scripts.reports.arm import table
 from scripts.reports.case import Case, measure, say_numbers
-from scripts.reports.rows import conditions, publish
+from scripts.reports.rows import conditions, markdown, publish
 
 
 @dataclass(frozen=True)
@@ -32,45 +32,45 @@ class Arguments(Resumable):
     seeds: int = 5
     """Seeds of each model, in one program."""
     splits: int = 7
-    """Further splits of the letters: permuted and cut into so many tests, each letter in one; 0 leaves them out."""
+    """Number of further splits: the permuted letters are cut into this many tests, each letter in one; 0 for none."""
     split_seeds: int = 3
-    """Seeds of the structured Lagrangian on each of them; other models have one."""
+    """Seeds of the structured Lagrangian on each further split; other models have one."""
     steps: Unstated[int] = None
-    """Iterations of Gauss-Newton (default: what each model's validation error takes to level off)."""
+    """Iterations of Gauss-Newton (default: 150, after which the validation errors have levelled off)."""
     adam_steps: int = 20_000
-    """Steps of Adam, 64x64 networks, one seed, on the letters; 0 leaves Adam out."""
+    """Steps of Adam for one seed of 64x64 networks on the letters; 0 leaves Adam out."""
     timed_seeds: int = 5
     """Structured models that are trained one by one, to time Gauss-Newton; 0 leaves them out."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures the cases that are not stored yet, prints the table and writes it."""
-    require_positive_if_given(given, ("seeds", "split_seeds", "steps"))
+    require_positive_if_given(options, ("seeds", "split_seeds", "steps"))
+    counts = {key: getattr(options, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
     for name in ("splits", "adam_steps", "timed_seeds"):
-        if getattr(given, name) < 0:
-            raise InputError(
-                f"--{name.replace('_', '-')} is {getattr(given, name)}; expected a whole number, 0 or more"
-            )
-    sets, parts = table.data_sets(given.data, given.uniform, given.splits)
-    counts = {key: getattr(given, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
+        if getattr(options, name) < 0:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} is {getattr(options, name)}; expected a whole number, 0 or more")
+    sets, parts = table.data_sets(options.data, options.uniform, options.splits)
     cases = table.cases(sets, parts, **counts)
-    with command_folder(given, "arm_table") as folder:
+    with command_folder(options, "arm_table") as folder:
         say = say_numbers("torque_mse", "vpt_seconds", "train_seconds", "seconds_to_1e-08")
-        found = measure(sorted(cases, key=_late), say, folder=folder, resume=given.resume)
-        rows = table.table_rows({case.name: found[case.name] for case in cases})
+        results = measure(sorted(cases, key=_late), say, folder=folder, resume=options.resume)
+        rows = table.table_rows({case.name: results[case.name] for case in cases})
         facts = conditions(
             dtype="float64; adam float32",
-            seeds=list(range(given.seeds)),
+            seeds=list(range(options.seeds)),
             selection="stopping by validation; sizes settled on seed 0 by validation, its test errors printed beside "
             "them",
-            data="embedded letters" if given.data is None else given.data.name,
+            data="embedded letters" if options.data is None else options.data.name,
             statistics="medians over seeds; one program for all seeds of a model",
             splits=[" ".join(part.test.label[np.unique(part.test.trajectory)]) for part in parts],
         )
-        write_bytes(folder / "table.md", table.markdown(rows).encode())
-        write_figure(folder / "pareto.png", table.figure(found))
-        compared = [row for row in rows if row.bound is not None or row.reference is not None]
-        publish(folder, rows, facts, shown=compared, tables=[table.markdown(rows)])
+        shown = markdown([row for row in rows if row.quantity in table.SHOWN])
+        write_bytes(folder / "table.md", shown.encode())
+        write_figure(folder / "pareto.png", table.figure(results))
+        beside = [row for row in rows if row.bound is not None or row.reference is not None]
+        publish(folder, rows, facts, shown=beside, tables=[shown])
         print(f"table: {folder / 'table.md'}, figure: {folder / 'pareto.png'}")
 
 

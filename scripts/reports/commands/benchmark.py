@@ -1,36 +1,45 @@
-"""Measure speed against error: one report, a table and a figure for each subject.
+"""Measure speed against error: one report, a table and mostly a figure for each subject.
 
 Subjects: one-step (microseconds of single calls against test error, for every model and call path), throughput (batched
-states per second), scaling (cost against the number of joints), training (error against seconds), integrators (steps
-per second against energy drift and trajectory error), precision (float32 against float64), softbody (steps per second
-of soft bodies, their gradients and time steps), c (exported C: warm and cold calls, calls from Python, Jacobians, and
-Pinocchio where it is installed), and all of them. Compilation is timed apart, results are waited for, inputs vary,
-programs that are compared take turns, and medians count.
+states per second), scaling (cost against the number of joints), integrators (steps per second against energy drift and
+trajectory error), c (exported C: warm and cold calls, calls from Python, Jacobians, and Pinocchio where it is
+installed), and all of them. Compilation is timed apart, results are waited for, inputs vary, programs that are compared
+take turns, and medians count.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
+from matplotlib.figure import Figure
 
 from dln_jax.cli.arguments import Unstated
 from dln_jax.cli.options import Folder
 from dln_jax.files import write_bytes
 from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import run_folder
-from scripts.reports.case import Done, draw, measure
+from scripts.reports.case import Case, Done, Findings, draw, measure
 from scripts.reports.rows import Row, conditions, markdown, publish
-from scripts.reports.speed.subjects import cases
+from scripts.reports.speed import costs, exported_c, integrators, one_step
+
+SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Figure] | None]] = {
+    "one-step": (one_step.measure, one_step.draw),
+    "throughput": (costs.measure_throughput, None),
+    "scaling": (costs.measure_scaling, None),
+    "integrators": (integrators.measure, integrators.draw),
+    "c": (exported_c.measure, exported_c.draw),
+}
+"""Functions that measure (quick -> findings) and draw the subjects."""
 
 
 @dataclass(frozen=True)
 class Arguments(Folder):
     """What to measure, and for how long."""
 
-    subject: tyro.conf.Positional[
-        Literal["one-step", "throughput", "scaling", "training", "integrators", "precision", "softbody", "c", "all"]
-    ] = "all"
+    subject: tyro.conf.Positional[Literal["one-step", "throughput", "scaling", "integrators", "c", "all"]] = "all"
     """What is measured."""
     quick: bool = False
     """Fewer cases and repetitions: a look at whether everything runs, in two minutes."""
@@ -39,24 +48,35 @@ class Arguments(Folder):
     these alone)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes; finished subjects are kept even if a later one is interrupted."""
-    if given.against and given.subject != "c":
-        raise InputError(f"--against is for subject c; {given.subject} does not use it")
-    chosen = [
-        case for case in cases(quick=given.quick, c={"against": given.against}) if given.subject in (case.name, "all")
-    ]
-    every: list[Row] = []
-    with run_folder(given.out, "benchmark") as folder:
+    if options.against and options.subject != "c":
+        raise InputError(f"--against is for subject c; {options.subject} does not use it")
+    every = cases(quick=options.quick, c={"against": options.against})
+    published: list[Row] = []
+    with run_folder(options.out, "benchmark") as folder:
 
         def keep(done: Done) -> None:
             rows = done.findings.rows
-            every.extend(rows)
+            published.extend(rows)
             draw(folder, done.case, done.findings)
             write_bytes(folder / f"{done.case.name}.md", markdown(rows).encode())
             facts = conditions(
-                dtype="float32 unless said", seeds=[0], call_path="default jit unless said", quick=given.quick
+                dtype="float32 unless said", seeds=[0], call_path="default jit unless said", quick=options.quick
             )
-            publish(folder, every, facts, shown=[row for row in rows if row.bound is not None] or rows[:40])
+            publish(folder, published, facts, shown=[row for row in rows if row.bound is not None] or rows[:40])
 
-        measure(chosen, keep)
+        measure([case for case in every if options.subject in (case.name, "all")], keep)
+
+
+def cases(*, quick: bool = False, **more: Mapping[str, Any]) -> list[Case]:
+    """All subjects; their rows are named SUBJECT/..., and quick ones have fewer of them and fewer repetitions.
+
+    `more` are further keywords of the functions that measure, by subject.
+    """
+
+    def measured(name: str) -> Findings:
+        findings = SUBJECTS[name][0](quick, **more.get(name, {}))
+        return findings._replace(rows=[row._replace(case=f"{name}/{row.case}") for row in findings.rows])
+
+    return [Case(name, partial(measured, name), draw=draw) for name, (_, draw) in SUBJECTS.items()]

@@ -4,18 +4,46 @@ Prints one table (case, quantity, expected, value, unit, reference, to reach, pa
 figures.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Any
+
+from matplotlib.figure import Figure
 
 from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Drawn, Folder
-from dln_jax.cli.stored_arguments import command_folder
-from scripts.reports.case import measure_and_publish
-from scripts.reports.control.cases import cases
+from dln_jax.precision import in_float64
+from scripts.reports.case import Case, Findings, in_subjects, report_cases
+from scripts.reports.control import energy_laws, laws_in_c, learned, mpc, planned, robustness, swing_ups, tracking
+from scripts.reports.control.board import Motor
+from scripts.reports.control.values import equation, fits
+from scripts.reports.figures.robustness import shares
 
-SUBJECTS = (
-    "swing-up", "starts", "board", "learned", "equation", "value", "tracking", "robustness", "laws", "mpc",
-)  # fmt: skip
+MOTORS: dict[str, Motor] = {"acrobot": "elbow", "pendubot": "shoulder"}
+MEASURES: dict[str, Callable[[bool], Findings]] = {
+    **{f"swing-up/{name}": partial(swing_ups.swing_up, name) for name in swing_ups.SWING_UPS},
+    **{f"starts/{name}-starts": partial(swing_ups.from_anywhere, name) for name in swing_ups.SWING_UPS},
+    **{f"board/{name}-energy": partial(energy_laws.board, motor) for name, motor in MOTORS.items()},
+    **{f"board/{name}-planned": partial(planned.by_plan, motor) for name, motor in MOTORS.items()},
+    **learned.CASES,
+    **equation.CASES,
+    "value/pendulum": fits.pendulum,
+    "value/cart-pole": fits.cart_pole,
+    "tracking/seven-axis": tracking.tracking,
+    **{f"robustness/{name}": partial(robustness.robust, motor) for name, motor in MOTORS.items()},
+    "laws/in-c": laws_in_c.laws,
+    "mpc/cart-pole": mpc.cart_pole_report,
+}
+"""Functions quick -> findings, by SUBJECT/NAME."""
+SUBJECTS = tuple(dict.fromkeys(name.split("/")[0] for name in MEASURES))
+DRAWN: Mapping[str, Callable[[dict[str, Any]], Figure]] = {
+    "swing-up": swing_ups.draw_traces,
+    "starts": swing_ups.draw_starts,
+    "robustness": shares,
+    "value/pendulum": fits.draw_pendulum,
+}
+"""Functions that draw the curves of a subject or a case."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +56,15 @@ class Arguments(Folder, Drawn):
     """Fewer starts, draws and plans."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes."""
-    subjects = names_in("--only", given.only, SUBJECTS)
-    chosen = [case for case in cases(quick=given.quick) if case.name.split("/")[0] in subjects]
-    with command_folder(given, "control") as folder:
-        measure_and_publish(folder, chosen, figures=given.figures, dtype="float64", quick=given.quick)
+    subjects = names_in("--only", options.only, SUBJECTS)
+    report_cases(options, "control", in_subjects(cases(quick=options.quick), subjects), dtype="float64")
+
+
+def cases(*, quick: bool = False) -> list[Case]:
+    """All cases, in float64."""
+    return [
+        Case(name, in_float64(partial(measure, quick)), draw=DRAWN.get(name, DRAWN.get(name.split("/")[0])))
+        for name, measure in MEASURES.items()
+    ]

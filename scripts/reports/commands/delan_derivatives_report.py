@@ -8,8 +8,7 @@ gradients of the torque loss at batch 512, single calls are one state. `mechanic
 from dataclasses import dataclass
 
 from dln_jax.cli.options import Folder
-from dln_jax.zoo.run_folder import run_folder
-from scripts.reports.case import measure_and_publish
+from scripts.reports.case import report_cases
 from scripts.reports.speed.derivatives import cases
 
 
@@ -23,9 +22,8 @@ class Arguments(Folder):
     """Hidden units of the two layers of each network."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes."""
-    chosen = cases(width=given.width, repetitions=given.repetitions)
-    with run_folder(given.out, "delan_derivatives_report") as folder:
-        timed = "default jit, compilation apart, results waited for"
-        measure_and_publish(folder, chosen, dtype="float32", seeds=[0], call_path=timed)
+    chosen = cases(width=options.width, repetitions=options.repetitions)
+    timed = "default jit, compilation apart, results waited for"
+    report_cases(options, "delan_derivatives_report", chosen, dtype="float32", seeds=[0], call_path=timed)

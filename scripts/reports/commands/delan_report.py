@@ -17,10 +17,9 @@ from dln_jax.cli.options import Drawn, Folder
 from dln_jax.data.splits import split
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST
 from dln_jax.types import require_positive
-from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.arm import few_letters, learning_online, published_protocol
 from scripts.reports.arm.table import letters
-from scripts.reports.case import Case, measure_and_publish
+from scripts.reports.case import Case, report_cases
 
 SUBJECTS = ("published", "letters", "speeds", "online")
 QUICK_STEPS = 500
@@ -40,31 +39,29 @@ class Arguments(Folder, Drawn):
     test: str = ",".join(CHARACTERS_TEST)
     """Labels of the test trajectories, comma separated; `letters` and `speeds` add other splits of the same size."""
     seeds: int = 1
-    """How many seeds `published` trains, from 0 upwards; each also draws its own validation letters."""
+    """Number of seeds of `published`, from 0 upwards; each also draws its own validation letters."""
     steps: int = 20_000
     """Optimiser steps of `published`."""
     quick: bool = False
     """Fewer seeds, splits, letters and iterations: to try the command."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes."""
-    require_positive(seeds=given.seeds, steps=given.steps)
-    subjects = names_in("--only", given.only, SUBJECTS)
-    data, name = letters(given.data), "embedded-letters" if given.data is None else given.data.stem
-    test = given.test.split(",")
-    sets = [split(data, test=test, seed=seed) for seed in range(given.seeds)]
-    steps = min(given.steps, QUICK_STEPS) if given.quick else given.steps
-    found: dict[str, Callable[[], list[Case]]] = {
+    require_positive(seeds=options.seeds, steps=options.steps)
+    subjects = names_in("--only", options.only, SUBJECTS)
+    data, name = letters(options.data), "embedded-letters" if options.data is None else options.data.stem
+    test = options.test.split(",")
+    sets = [split(data, test=test, seed=seed) for seed in range(options.seeds)]
+    steps = min(options.steps, QUICK_STEPS) if options.quick else options.steps
+    by_subject: dict[str, Callable[[], list[Case]]] = {
         "published": lambda: published_protocol.cases(name, sets, steps=steps),
-        "letters": lambda: [few_letters.against_letters(name, data, test, quick=given.quick)],
-        "speeds": lambda: [few_letters.at_speeds(name, data, test, quick=given.quick)],
-        "online": lambda: learning_online.cases(name, data, quick=given.quick),
+        "letters": lambda: [few_letters.against_letters(name, data, test, quick=options.quick)],
+        "speeds": lambda: [few_letters.at_speeds(name, data, test, quick=options.quick)],
+        "online": lambda: learning_online.cases(name, data, quick=options.quick),
     }
-    chosen = [case for subject in subjects for case in found[subject]()]
-    with run_folder(given.out, "delan_report") as folder:
-        measure_and_publish(
-            folder, chosen, figures=given.figures, quick=given.quick, seeds=list(range(given.seeds)),
-            dtype="float64; published protocol float32", call_path="default jit",
-            data="embedded letters" if given.data is None else given.data.name,
-        )  # fmt: skip
+    report_cases(
+        options, "delan_report", [case for subject in subjects for case in by_subject[subject]()],
+        dtype="float64; published protocol float32", seeds=list(range(options.seeds)), call_path="default jit",
+        data="embedded letters" if options.data is None else options.data.name,
+    )  # fmt: skip

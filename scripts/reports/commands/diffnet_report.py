@@ -13,8 +13,7 @@ from typing import Annotated
 from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Folder
 from dln_jax.cli.stored_arguments import stored_arguments
-from dln_jax.zoo.run_folder import run_folder
-from scripts.reports.case import measure_and_publish
+from scripts.reports.case import report_cases
 from scripts.reports.differential_networks.one_pass import PLAIN, cases
 
 
@@ -29,16 +28,15 @@ class Arguments(Folder):
     batch: int = 512
     """Samples at once."""
     activation: Annotated[str, choice(PLAIN)] = "tanh"
-    """Of the hidden layers."""
+    """Activation of the hidden layers."""
     repetitions: int = 30
     """Timed calls of each program."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes."""
-    names_in("--activation", given.activation, PLAIN)
-    chosen = cases(**stored_arguments(given))
-    with run_folder(given.out, "diffnet_report") as folder:
-        network = f"{given.depth} layers of {given.width}, {given.activation}, batch {given.batch}"
-        measure_and_publish(folder, chosen, dtype="float32", network=network, repetitions=given.repetitions)
-        print(f"{network}; gradient of the training loss included; medians of {given.repetitions} interleaved calls")
+    names_in("--activation", options.activation, PLAIN)
+    chosen = cases(**stored_arguments(options))
+    network = f"{options.depth} layers of {options.width}, {options.activation}, batch {options.batch}"
+    timed = f"medians of {options.repetitions} interleaved calls, gradient of the training loss included"
+    report_cases(options, "diffnet_report", chosen, dtype="float32", network=network, timed=timed)

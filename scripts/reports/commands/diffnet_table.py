@@ -12,9 +12,9 @@ from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.learning.functions import WIDTHS
 from dln_jax.types import require_seed
-from scripts.reports.case import by_case, measure, rows_in, say_numbers
-from scripts.reports.differential_networks.table import OPTIMIZERS, QUANTITIES, cases, comparison, table_rows
-from scripts.reports.rows import conditions, publish
+from scripts.reports.case import measure, rows_in, say_numbers
+from scripts.reports.differential_networks.table import QUANTITIES, cases, table_rows
+from scripts.reports.rows import conditions, markdown, publish
 
 
 @dataclass(frozen=True)
@@ -24,36 +24,38 @@ class Arguments(Resumable):
     MEASURES_COMPILATION: ClassVar = True
 
     samples: int = 25_600
-    """Of each function."""
+    """Samples of each function."""
     steps: int = 40
-    """Gauss-Newton: iterations on all samples at most, per network."""
+    """Gauss-Newton: largest number of iterations on all samples, per network."""
     coarse_steps: int = 200
-    """Gauss-Newton: iterations before those, at most, on 2,048 of the samples where there are twice as many; 0 for
+    """Gauss-Newton: largest number of iterations before those, on 2,048 samples if there are twice as many; 0 for
     none."""
     epochs: int = 500
     """Adam: passes over the data."""
     seed: int = 0
-    """Of the data, the validation split, the initial parameters and the shuffling; 0 to 4294967295."""
+    """Seed for data, validation split, initial parameters and shuffling (0 to 4294967295)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes."""
-    require_seed(given.seed)
-    chosen = cases(**stored_arguments(given))
-    with command_folder(given, "diffnet_table") as folder:
+    require_seed(options.seed)
+    chosen = cases(**stored_arguments(options))
+    with command_folder(options, "diffnet_table") as folder:
         say = say_numbers(*QUANTITIES, "width", "job_seconds")
-        rows = table_rows(rows_in(measure(chosen, say, folder=folder, resume=given.resume)))
+        rows = table_rows(rows_in(measure(chosen, say, folder=folder, resume=options.resume)))
+        samples = f"{options.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation"
         facts = conditions(
             dtype="float64 for gauss-newton, float32 for adam",
-            seeds=[given.seed],
-            adam=f"{given.epochs} epochs (published: 500), 128 units per layer, batch 512",
-            gauss_newton=f"{given.coarse_steps} iterations on 2,048 samples and {given.steps} on all, at most; width "
-            f"grown through {', '.join(map(str, WIDTHS))} by validation",
+            seeds=[options.seed],
+            adam=f"{options.epochs} epochs (published: 500), 128 units per layer, batch 512",
+            gauss_newton=f"{options.coarse_steps} iterations on 2,048 samples and {options.steps} on all, at most; "
+            f"width grown through {', '.join(map(str, WIDTHS))} by validation",
             selection="widths and stopping by validation; best of a row over losses and activations, as published",
-            samples=f"{given.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation",
+            samples=samples,
         )
-        numbers = by_case(rows)
-        tables = [comparison(numbers, optimizer, facts[optimizer.replace("-", "_")]) for optimizer in OPTIMIZERS]
+        tables = [
+            f"mean squared errors on the clean grid, ours / published; {samples}",
+            markdown([row for row in rows if row.quantity in QUANTITIES]),
+        ]
         publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
         print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")
-        print(facts["samples"])

@@ -26,14 +26,14 @@ class Arguments(Folder):
     """Frames shown in a second."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Makes the films, draws and writes them."""
-    require_positive(frames=given.frames, frames_per_second=given.frames_per_second)
+    require_positive(frames=options.frames, frames_per_second=options.frames_per_second)
     jax.config.update("jax_enable_x64", True)
-    with command_folder(given, "film_strip") as folder:
+    with command_folder(options, "film_strip") as folder:
         films = {}
         for title, film in FILMS.items():
-            films[title] = film(given.frames)
+            films[title] = film(options.frames)
             print(f"{title}: done")
         figure, axes = style.figure(1, len(films), height=2.1, width=9.0, dpi=DPI)
         shows = []
@@ -46,6 +46,6 @@ def main(given: Arguments) -> None:
             for draw in shows:
                 draw(frame)
 
-        path, frames = folder / "films.gif", range(given.frames)
-        write_gif(path, figure, show, None, frames=frames, frames_per_second=given.frames_per_second)
+        path, frames = folder / "films.gif", range(options.frames)
+        write_gif(path, figure, show, None, frames=frames, frames_per_second=options.frames_per_second)
         print(f"run folder: {folder}")

@@ -9,10 +9,11 @@ table, writes report.json and table.md, and draws each task's motions and energi
 --task measured) with their needs stated and without, beside the named tasks on the same starts.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from dln_jax.cli.arguments import Unstated, choice, names_in, refuse_given, require_positive_if_given
 from dln_jax.cli.options import Drawn, Resumable
@@ -22,9 +23,9 @@ from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
 from scripts.reports.case import measure, rows_in, say_numbers
-from scripts.reports.hamiltonian.own_files import compared, own_cases, own_markdown
-from scripts.reports.hamiltonian.table import SHOWN, TASKS, cases, markdown, table_rows
-from scripts.reports.rows import conditions, publish
+from scripts.reports.hamiltonian.own_files import QUANTITIES, own_cases, with_bounds
+from scripts.reports.hamiltonian.table import SHOWN, TASKS, cases, table_rows
+from scripts.reports.rows import Row, conditions, markdown, publish
 
 
 @dataclass(frozen=True)
@@ -47,62 +48,64 @@ class Arguments(Resumable, Drawn):
     """Iterations of each fit (default: each task's own)."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures the cases that are not stored yet, prints the table and writes it."""
-    if given.own is not None:
-        compare_own_files(given, given.own)
+    if options.own is not None:
+        compare_own_files(options, options.own)
         return
-    names = chosen_tasks(given)
-    counts = {key: getattr(given, key) for key in ("seeds", "steps", "trajectories", "real_pendulum")}
+    names = chosen_tasks(options)
+    counts = {key: getattr(options, key) for key in ("seeds", "steps", "trajectories", "real_pendulum")}
     cases(names, folder=None, **counts)  # refuses before anything is written
-    with command_folder(given, "hnn_table") as folder:
-        chosen = cases(names, folder=folder if given.figures else None, **counts)
-        if REAL not in names and REAL in given.tasks.split(","):
+    with command_folder(options, "hnn_table") as folder:
+        chosen = cases(names, folder=folder if options.figures else None, **counts)
+        if REAL not in names and REAL in options.tasks.split(","):
             print(f"{REAL} is left out: its data are not part of this project; give them by --real-pendulum FILE")
         say = say_numbers("clean_field_mse", "energy_mse", "published_energy_mse", "train_seconds", "compile_seconds")
-        found = measure(chosen, say, folder=folder, resume=given.resume)
-        rows = table_rows(rows_in(found))
+        rows = table_rows(rows_in(measure(chosen, say, folder=folder, resume=options.resume)))
         facts = conditions(
             dtype="float64",
-            seeds=list(range(given.seeds)),
+            seeds=list(range(options.seeds)),
             selection="parameters by validation trajectories alone; sizes and budgets are the same for all seeds",
             data="published protocols, seed 0",
             limits="seconds of a training, compilation included: "
             + ", ".join(f"{name} {RECIPES[name].seconds:g}" for name in names if name != PIXELS),
             statistics="medians over seeds; compilation is apart from train_seconds",
         )
-        write_bytes(folder / "table.md", markdown(rows).encode())
-        publish(folder, rows, facts, shown=[row for row in rows if row.quantity in SHOWN], tables=[markdown(rows)])
-        print(f"table: {folder / 'table.md'}")
+        publish_table(folder, rows, facts, SHOWN)
 
 
-def compare_own_files(given: Arguments, own: Path) -> None:
+def publish_table(folder: Path, rows: Sequence[Row], facts: Mapping[str, Any], shown: Sequence[str]) -> None:
+    """Writes report.json and table.md, and prints the quantities that are `shown`."""
+    listed = [row for row in rows if row.quantity in shown]
+    write_bytes(folder / "table.md", markdown(listed).encode())
+    publish(folder, rows, facts, shown=listed, tables=[markdown(listed)])
+    print(f"table: {folder / 'table.md'}")
+
+
+def compare_own_files(options: Arguments, own: Path) -> None:
     """Compares own files with the named tasks."""
-    refuse_given(given, ["trajectories", "real_pendulum"], "for the table without --own")
-    require_positive_if_given(given, ["seeds", "steps"])
-    counts = {"seeds": given.seeds, "steps": given.steps}
-    chosen = own_cases(own, names_in("--tasks", given.tasks, TASKS), **counts, report=partial(print, flush=True))
-    with command_folder(given, "hnn_table") as folder:
-        found = measure(chosen, say_numbers("energy_mse", "energy_mse_largest"), folder=folder, resume=given.resume)
-        rows = compared(rows_in(found))
+    refuse_given(options, ["trajectories", "real_pendulum"], "for the table without --own")
+    require_positive_if_given(options, ["seeds", "steps"])
+    counts = {"seeds": options.seeds, "steps": options.steps}
+    chosen = own_cases(own, names_in("--tasks", options.tasks, TASKS), **counts, report=partial(print, flush=True))
+    with command_folder(options, "hnn_table") as folder:
+        results = measure(chosen, say_numbers(*QUANTITIES), folder=folder, resume=options.resume)
         facts = conditions(
             dtype="float64",
-            seeds=list(range(given.seeds)),
+            seeds=list(range(options.seeds)),
             data="named tasks: published protocols, seed 0; own files: " + str(own),
             statistics="median and largest over seeds of the named task, and over files; the same test starts",
         )
-        write_bytes(folder / "table.md", own_markdown(rows).encode())
-        publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=[own_markdown(rows)])
-        print(f"table: {folder / 'table.md'}")
+        publish_table(folder, with_bounds(rows_in(results)), facts, QUANTITIES)
 
 
-def chosen_tasks(given: Arguments) -> list[str]:
+def chosen_tasks(options: Arguments) -> list[str]:
     """The tasks whose data are available; checks the data before anything is written."""
-    names = names_in("--tasks", given.tasks, TASKS)
-    if given.real_pendulum is None:
+    names = names_in("--tasks", options.tasks, TASKS)
+    if options.real_pendulum is None:
         names = [name for name in names if name != REAL]
         if not names:
             raise InputError(f"{REAL} needs its data, which are not part of this project; give --real-pendulum FILE")
     elif REAL in names:
-        problem_of(REAL, data=given.real_pendulum)
+        problem_of(REAL, data=options.real_pendulum)
     return names

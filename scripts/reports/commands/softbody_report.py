@@ -1,33 +1,54 @@
 """Measure soft bodies: closed forms, hard cases, gradients and speed, each number beside what one may expect.
 
-Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), writes report.json, and draws
-figures. All of it is float64 unless a case says otherwise.
+Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), and writes report.json. All of it
+is float64. Only `speed` depends on the machine.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 from dln_jax.cli.arguments import choice, names_in
-from dln_jax.cli.options import Drawn, Folder
-from dln_jax.cli.stored_arguments import command_folder
-from scripts.reports.case import measure_and_publish
-from scripts.reports.soft_bodies import SUBJECTS, cases
+from dln_jax.cli.options import Folder
+from dln_jax.precision import in_float64
+from scripts.reports.case import Case, in_subjects, report_cases
+from scripts.reports.soft_bodies import gradients, motions, robustness, speed, statics
+
+MEASURES = {
+    "references": (
+        *(motions.invariants, motions.orders, motions.block, motions.slope),
+        *(statics.uniaxial, statics.patch_test, statics.elastica, statics.cantilever),
+    ),
+    "hard": (
+        *(robustness.time_steps, robustness.materials, robustness.bad_starts, robustness.mass_ratio, robustness.chain),
+    ),
+    "gradients": (gradients.crawler,),
+    "speed": (speed.creature, speed.beams, speed.backward, speed.solver_choice),
+}
+"""Functions quick -> findings, by subject."""
 
 
 @dataclass(frozen=True)
-class Arguments(Folder, Drawn):
+class Arguments(Folder):
     """What to measure."""
 
-    only: Annotated[str, choice(SUBJECTS, several=True)] = ",".join(SUBJECTS)
+    only: Annotated[str, choice(MEASURES, several=True)] = ",".join(MEASURES)
     """Subjects (default: all)."""
     quick: bool = False
     """Smaller meshes, fewer and shorter motions: 90 s instead of minutes."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes."""
-    subjects = names_in("--only", given.only, SUBJECTS)
-    chosen = [case for each in subjects for case in cases(quick=given.quick) if case.name.startswith(f"{each}/")]
-    with command_folder(given, "softbody") as folder:
-        facts = {"dtype": "float64, and float32 where a case says so", "seeds": [0], "quick": given.quick}
-        measure_and_publish(folder, chosen, figures=given.figures, **facts)
+    subjects = names_in("--only", options.only, MEASURES)
+    chosen = in_subjects(cases(quick=options.quick), subjects)
+    report_cases(options, "softbody", chosen, dtype="float64", seeds=[0])
+
+
+def cases(*, quick: bool = False) -> list[Case]:
+    """All cases, named SUBJECT/NAME, in float64; quick ones are smaller."""
+    return [
+        Case(f"{subject}/{measure.__name__.replace('_', '-')}", in_float64(partial(measure, quick)))
+        for subject, measures in MEASURES.items()
+        for measure in measures
+    ]

@@ -7,13 +7,11 @@ Prints a table, medians over splits and the worst, and writes report.json.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 from dln_jax.cli.arguments import Unstated, names_in
 from dln_jax.cli.options import Folder
 from dln_jax.types import InputError, require_positive
-from dln_jax.zoo.run_folder import run_folder
-from scripts.reports.case import measure_and_publish, named
+from scripts.reports.case import named, report_cases
 from scripts.reports.uncertainty.cases import cases
 
 
@@ -21,12 +19,10 @@ from scripts.reports.uncertainty.cases import cases
 class Arguments(Folder):
     """What to measure on."""
 
-    MEASURES_COMPILATION: ClassVar = False
-
     cases: Unstated[str] = None
     """Names of cases, comma separated (default: all)."""
     splits: int = 5
-    """Of each case; every one of the recordings' and letters' holds out other motions."""
+    """Number of splits of each case; every split of recordings and letters holds out other motions."""
     steps: int = 150
     """Iterations of Gauss-Newton for a network."""
     ur10: Unstated[Path] = None
@@ -35,16 +31,15 @@ class Arguments(Folder):
     """Recordings of a double pendulum: t, q, tau and trajectory."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Measures, prints and writes."""
-    require_positive(splits=given.splits, steps=given.steps)
-    for path in (given.ur10, given.double_pendulum):
+    require_positive(splits=options.splits, steps=options.steps)
+    for path in (options.ur10, options.double_pendulum):
         if path is not None and not path.is_file():
             raise InputError(f"{path}: no such file; expected an npz of a recording")
-    every = cases(
-        splits=given.splits, recorded_arm=given.ur10, recorded_pendulum=given.double_pendulum, steps=given.steps
+    chosen = cases(
+        splits=options.splits, steps=options.steps, recorded_arm=options.ur10, recorded_pendulum=options.double_pendulum
     )
-    if given.cases is not None:
-        every = named(every, *names_in("--cases", given.cases, [case.name for case in every]))
-    with run_folder(given.out, "uncertainty_report") as folder:
-        measure_and_publish(folder, every, dtype="float64")
+    if options.cases is not None:
+        chosen = named(chosen, *names_in("--cases", options.cases, [case.name for case in chosen]))
+    report_cases(options, "uncertainty_report", chosen, dtype="float64")

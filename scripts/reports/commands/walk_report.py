@@ -38,15 +38,15 @@ class Arguments(Folder):
     """Also print the files of each walk, in the order in which they are entered."""
 
 
-def main(given: Arguments) -> None:
+def main(options: Arguments) -> None:
     """Traces both commands, prints the counts and writes them."""
-    with command_folder(given, "walk_report") as folder:
+    with command_folder(options, "walk_report") as folder:
         walks = measured()
         for name, walk in walks.items():
             files, arrows = BOUNDS[name]
             bound = "" if arrows is None else f" (to reach {arrows})"
             print(f"{name}: {len(walk.files)} files (to reach {files}), {len(walk.arrows)} arrows{bound}")
-            if given.files:
+            if options.files:
                 print("\n".join(f"  {file}" for file in walk.files))
         write_json(folder / "walks.json", {name: walk._asdict() for name, walk in walks.items()})
         print(f"run folder: {folder}")

@@ -1,4 +1,4 @@
-"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo or our own equations, with a model of the hardware.
+"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo, with a model of the hardware.
 
 Torques are limited and one sample late. Only angles are measured, by 14-bit encoders on the motor side of a 100:1 gear;
 rates are low-passed differences of angles.
@@ -13,10 +13,7 @@ import numpy as np
 
 from dln_jax.control import Reference, Tracker, saturated, where_finite
 from dln_jax.data.robots import Robot
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
-from dln_jax.mechanics.trees import tree_system
 from scripts.reports.robots.arm import STEP, D, Motion, simulator
 from scripts.reports.robots.known_kinematics import USUAL_SCALE
 
@@ -58,28 +55,6 @@ def in_mujoco(robot: Robot) -> Plant:
     return start
 
 
-def in_equations(robot: Robot) -> Plant:
-    """The same tree in our equations, with smooth dry friction, by the classical Runge-Kutta method."""
-    system = dynamics(tree_system(robot.tree, friction_of(robot)))
-
-    @jax.jit
-    def after(x: Any, tau: Any) -> Any:
-        field = lambda t, x: jnp.concatenate([x[D:], system.forward_dynamics(x[:D], x[D:], tau)])  # noqa: E731
-        return runge_kutta(CLASSICAL, field)(0.0, x, STEP)
-
-    def start(wanted: Motion) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        x = np.concatenate([wanted.q[0], wanted.qd[0]])
-
-        def step(tau: np.ndarray) -> np.ndarray:
-            nonlocal x
-            x = np.asarray(after(x, tau))
-            return x[:D]
-
-        return x[:D], step
-
-    return start
-
-
 def friction_of(robot: Robot) -> Any:
     """Friction of the joints, with a smooth law of dry friction."""
     return joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE)
@@ -90,9 +65,9 @@ def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, sampl
 
     @jax.jit
     def asked(q: Any, qd: Any, now: Reference) -> Any:
-        found = law(q, qd, now)
-        tau, usable = found if isinstance(found, tuple) else (found, jnp.asarray(True))
-        return saturated(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
+        answer = law(q, qd, now)
+        tau, usable = answer if isinstance(answer, tuple) else (answer, jnp.asarray(True))
+        return limited(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
 
     q, step = plant(wanted)
     count = len(wanted.q) if samples is None else samples
@@ -102,7 +77,7 @@ def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, sampl
         seen = ENCODER_STEP * np.round(q / ENCODER_STEP)
         qd = qd if before is None else qd + share * ((seen - before) / STEP - qd)
         before = seen
-        tau, usable = asked(seen, qd, Reference(*(each[number] for each in wanted)))
+        tau, usable = asked(seen, qd, Reference(*(values[number] for values in wanted)))
         off.append(q - wanted.q[number])
         used += bool(usable)
         # Torques act one sample late; the first torque holds the arm at the start.

@@ -13,10 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import ClosedLoopRun, Controller, Hardware, field_of, simulate
+from dln_jax.control import Controller, Hardware, Linearisation, Run, field_of, holding_controls, linearise, simulate
+from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
+from scripts.reports.rows import Row
 
 RATE, SECONDS = 500.0, 10.0
 LIMIT = 6.0
@@ -43,6 +46,8 @@ class Criteria(NamedTuple):
 
 
 SIZES = Criteria(20.0, 60.0, 20.0, 0.1, 400.0)
+UNITS = ("s", "J", "N² m² s", "N m", "rad²/s")
+"""Units of the criteria."""
 
 
 def plant(motor: Motor) -> tuple[Scene, Array]:
@@ -51,14 +56,22 @@ def plant(motor: Motor) -> tuple[Scene, Array]:
     return scene, jnp.asarray(scene.needs.actuation)
 
 
-def play(motor: Motor, controller: Controller) -> ClosedLoopRun:
-    """Runs the closed loop with the board's settings."""
+def closed_loop(motor: Motor, controller: Controller) -> Run:
+    """A run with the board's settings, not compiled."""
     scene, B = plant(motor)
-    field = field_of(dynamics(scene.energies), B)
-    lab = Hardware(-LIMIT, LIMIT)
-    return jax.jit(
-        lambda: simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, hardware=lab)
-    )()
+    field, lab = field_of(dynamics(scene.energies), B), Hardware(-LIMIT, LIMIT)
+    return simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, hardware=lab)
+
+
+def play(motor: Motor, controller: Controller) -> Run:
+    """Runs the closed loop with the board's settings."""
+    return jax.jit(lambda: closed_loop(motor, controller))()
+
+
+def at_goal(motor: Motor, system: Dynamics) -> Linearisation:
+    """The linearisation of the plant about its goal."""
+    B = plant(motor)[1]
+    return linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
 
 
 def criteria(motor: Motor, run: ClosedLoopRun) -> Criteria:
@@ -78,8 +91,15 @@ def criteria(motor: Motor, run: ClosedLoopRun) -> Criteria:
     )
 
 
-def score(found: Criteria) -> float:
+def score(numbers: Criteria) -> float:
     """Score of version 2, from 0 to 1; 0 without success or if a criterion is NaN."""
-    if not np.isfinite(found).all():
+    if not np.isfinite(numbers).all():
         return 0.0
-    return 1 - float(np.mean([np.tanh(np.pi * value / size) for value, size in zip(found, SIZES, strict=True)]))
+    return 1 - float(np.mean([np.tanh(np.pi * value / size) for value, size in zip(numbers, SIZES, strict=True)]))
+
+
+def rows_of_criteria(case: str, numbers: Criteria) -> list[Row]:
+    """The five criteria of the score."""
+    return [
+        Row(case, key, float(number), unit) for key, number, unit in zip(numbers._fields, numbers, UNITS, strict=True)
+    ]

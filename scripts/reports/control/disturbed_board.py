@@ -14,6 +14,7 @@ pushes, so pushes on the passive joint have no effect. As on the board, a run su
 goal. A criterion is the share of successes, and the score the mean of the six criteria.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -83,22 +84,22 @@ def disturbances(seed: int = 0) -> dict[str, list[Disturbance]]:
     """All disturbances of the table by criterion; values of noise repeat ten times, and pushes are random."""
     base, random = undisturbed(), np.random.default_rng(seed)
     factors = np.linspace(1 - SPREAD, 1 + SPREAD, VALUES)
-    model = [base._replace(rotor=each) for each in np.linspace(0, ROTOR, VALUES)]
+    model = [base._replace(rotor=inertia) for inertia in np.linspace(0, ROTOR, VALUES)]
     # Two of the board's parameters are products; one factor varies, and the inertias about the joints stay.
     of_links = (("centres", 0), ("inertias", 0), ("centres", 1), ("masses", 1), ("inertias", 1))
     model += [base._replace(links=_scaled(*which, factor)) for which in of_links for factor in factors]
     for key, most in (("viscous", VISCOUS), ("dry", DRY)):
         signed = np.linspace(-most, most, VALUES)
-        model += [base._replace(**{key: each * unit}) for unit in np.eye(2) for each in signed]
+        model += [base._replace(**{key: friction * unit}) for unit in np.eye(2) for friction in signed]
     noise = lambda key, most: [  # noqa: E731
-        base._replace(**{key: each}) for each in np.linspace(0, most, VALUES) for _ in range(REPETITIONS)
+        base._replace(**{key: size}) for size in np.linspace(0, most, VALUES) for _ in range(REPETITIONS)
     ]
     return {
         "model": model,
         "rate_noise": noise("rate_noise", RATES_NOISE),
         "torque_noise": noise("torque_noise", TORQUE_NOISE),
-        "response": [base._replace(response=each) for each in np.linspace(SLOWEST, FASTEST, VALUES)],
-        "delay": [base._replace(delay=each) for each in range(LONGEST + 1)],
+        "response": [base._replace(response=k) for k in np.linspace(SLOWEST, FASTEST, VALUES)],
+        "delay": [base._replace(delay=samples) for samples in range(LONGEST + 1)],
         "pushes": [_pushed(random) for _ in range(PUSHED)],
     }
 
@@ -165,12 +166,12 @@ def successes(motor: Motor, controller: Controller, all_of: list[Disturbance], s
     """Whether the runs end near the goal; False for a run that diverges to NaN."""
     count, joints = len(all_of), plant(motor)[0].needs.joints
     keys = jax.random.split(jax.random.key(seed), count)
-    run = jax.jit(jax.vmap(lambda each, key: last_state(motor, controller, each, key)))
+    run = jax.jit(jax.vmap(lambda disturbance, key: last_state(motor, controller, disturbance, key)))
     ends = []
     # Neighbours are similar, so a controller that waits for a delay does not hold up very different runs.
     for first in range(0, count, TOGETHER):
         places = np.minimum(np.arange(first, first + TOGETHER), count - 1)
-        chunk = jax.tree.map(lambda *each: jnp.asarray(np.stack(each)), *(all_of[place] for place in places))
+        chunk = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *(all_of[place] for place in places))
         ends.append(np.asarray(run(chunk, keys[places])))
     off = np.abs(jax.vmap(lambda x: error(x, GOAL, joints))(jnp.asarray(np.concatenate(ends)[:count])))
     # NaN compares as False, hence as a failure.
@@ -180,11 +181,11 @@ def successes(motor: Motor, controller: Controller, all_of: list[Disturbance], s
 def robustness(motor: Motor, controller: Controller, seed: int = 0, *, every: int = 1) -> dict[str, float]:
     """The share of successes by criterion, and their mean; uses one in `every` disturbances, for a quick look."""
     table = {name: listed[::every] for name, listed in disturbances(seed).items()}
-    found = successes(motor, controller, [each for listed in table.values() for each in listed], seed)
+    ends_well = successes(motor, controller, list(itertools.chain(*table.values())), seed)
     ends = np.cumsum([len(listed) for listed in table.values()])
     shares = {}
-    for name, each in zip(table, np.split(found, ends[:-1]), strict=True):
+    for name, good in zip(table, np.split(ends_well, ends[:-1]), strict=True):
         repeated = name.endswith("noise") and every == 1
-        often = each.reshape(-1, REPETITIONS).mean(axis=1) > 0.5 if repeated else each
+        often = good.reshape(-1, REPETITIONS).mean(axis=1) > 0.5 if repeated else good
         shares[name] = float(np.mean(often))
     return {**shares, "mean": float(np.mean(list(shares.values())))}

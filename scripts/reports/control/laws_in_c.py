@@ -13,32 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import (
-    EnergyGains,
-    Gains,
-    Reference,
-    computed_torque,
-    energy_shaping,
-    feed_forward,
-    field_of,
-    holding_controls,
-    linearise,
-    lqr,
-    parts_of,
-    regulated,
-    switched,
-    value,
-)
+from dln_jax.control import Gains, Reference, computed_torque, feed_forward
+from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.scenes.chain import chain
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
-from scripts.reports.control.mpc_calls import STACK, first_state, one_call
-from scripts.reports.control.values.laws import drawn_law
+from scripts.reports.control.mpc import STACK, one_call
+from scripts.reports.control.swing_ups import SWING_UPS, law_of, parts_of_law
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
 from scripts.reports.rows import Row, expect
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
@@ -64,13 +51,12 @@ class Law(NamedTuple):
 
 def regulator() -> Law:
     """A linear-quadratic regulator of four states and one motor, with wrapped angle errors."""
-    return Law(_rotary()[0], (np.zeros(4),))
+    return Law(parts_of_law(SWING_UPS["rotary-pendulum"]).regulator, (np.zeros(4),))
 
 
 def swing_up() -> Law:
     """The energy law, with the regulator near the top."""
-    near, cost, swing = _rotary()
-    return Law(switched(lambda x: swing(x[:2], x[2:]), near, cost, 0.1), (np.array([0.0, np.pi, 0.0, 0.0]),), 0.3)
+    return Law(law_of(SWING_UPS["rotary-pendulum"]), (np.array([0.0, np.pi, 0.0, 0.0]),), 0.3)
 
 
 def tree_by_computed_torque() -> Law:
@@ -95,13 +81,16 @@ def network_by_computed_torque(d: int = 7, width: int = 32) -> Law:
 
 
 def value_policy() -> Law:
-    """Optimal control of a cart-pole by a value network of two layers of 64."""
-    return Law(drawn_law("cart-pole"), (np.zeros(4),))
+    """Optimal control of a cart-pole by an untrained value network of two layers of 64."""
+    problem = PLANTS["cart-pole"]().problem
+    network = value_network(problem, widths=(64, 64), scale=30.0)
+    parameters = network.init(jax.random.key(0))
+    return Law(hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem), (np.zeros(4),))
 
 
 def one_iteration() -> Law:
     """A call of `mpc` with one iteration for a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
-    return Law(one_call(STEPS), tuple(map(np.asarray, first_state(STEPS))), 1e-4)
+    return Law(*one_call(STEPS), 1e-4)
 
 
 LAWS: dict[str, Callable[[], Law]] = {
@@ -139,11 +128,11 @@ def agreement(name: str, law: Law, loaded: Any) -> Row:
     """Largest difference between C and JAX at random states, relative to the largest element of the result."""
     in_jax, in_c, random, worst = jax.jit(law.function), getattr(loaded, name), np.random.default_rng(0), 0.0
     for _ in range(STATES):
-        state = [each + law.spread * random.normal(size=np.shape(each)) for each in law.examples]
+        state = [example + law.spread * random.normal(size=np.shape(example)) for example in law.examples]
         ours, theirs = (jax.tree.leaves(function(*state)) for function in (in_c, in_jax))
-        sizes = [max(float(jnp.max(jnp.abs(each))), 1e-12) for each in theirs]
+        sizes = [max(float(jnp.max(jnp.abs(leaf))), 1e-12) for leaf in theirs]
         off = [float(np.max(np.abs(a - np.asarray(b)))) for a, b in zip(ours, theirs, strict=True)]
-        worst = max(worst, *(each / size for each, size in zip(off, sizes, strict=True)))
+        worst = max(worst, *np.divide(off, sizes).tolist())
     words = f"largest of {STATES} drawn states, relative to the answer"
     return expect(f"laws/{name}", "difference_from_jax", words, worst, AGREEMENT)
 
@@ -156,16 +145,6 @@ def rows_of(name: str, times: Times) -> list[Row]:
         Row(case, "cold_p50_us", float(cold[0]), "us"),
         Row(case, "cold_p999_us", float(cold[1]), "us"),
     ]
-
-
-def _rotary() -> tuple[Callable, Callable, Callable]:
-    scene = rotary_pendulum(friction=1e-5)
-    plant, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints
-    goal = np.zeros(4)
-    at = linearise(field_of(plant, B), goal, holding_controls(plant, goal[:2], B))
-    found = lqr(at.A, at.B, np.diag([1.0, 1.0, 0.01, 0.01]), [[50.0]])
-    near, cost = regulated(found, goal, at.u, joints), value(found, goal, joints)
-    return near, cost, energy_shaping(plant, parts_of(B), [0.0, 0.0], EnergyGains(2e7, 20.0, 5.0))
 
 
 def _tracking(follow: Callable, d: int) -> Law:

@@ -1,18 +1,35 @@
-"""The board's robustness table for planned, energy-based and combined controllers: rows and a figure."""
+"""The board's robustness table for planned, energy-based, and combined controllers that recover.
 
-from typing import Any
+A recovering controller follows the plan first; then a regulator acts, and the energy law where that is too far. It
+trusts only angles; rates are their differences. It measures the delay when the plant first moves, and predicts the
+current state by the known model (`control.with_prediction`).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from matplotlib.figure import Figure
+import numpy as np
+from jax import Array
 
-from dln_jax.control import Controller
+from dln_jax.control import (
+    Controller,
+    Plan,
+    field_of,
+    limited,
+    regulated,
+    sampled_lqr,
+    value,
+    with_differences,
+    with_prediction,
+)
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.integrators import MIDPOINT, runge_kutta
 from scripts.reports.case import Findings
-from scripts.reports.control.board import Motor, criteria, plant, play, score
-from scripts.reports.control.disturbed_board import CRITERIA, robustness
-from scripts.reports.control.energy_laws import Law, best_law, controllers_by_energy
-from scripts.reports.control.planned import Weights, follower, search
-from scripts.reports.control.recovering import Recovery, by_angles, recovering
-from scripts.reports.figures.robustness import shares
+from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, at_goal, criteria, plant, play, score
+from scripts.reports.control.disturbed_board import CRITERIA, LONGEST, robustness
+from scripts.reports.control.energy_laws import Law, best_law, controllers_by_energy, pumping
+from scripts.reports.control.planned import EVERY, Weights, follower, search
 from scripts.reports.rows import Row
 
 PUBLISHED = {
@@ -47,24 +64,77 @@ RECOVERIES: dict[Motor, tuple[tuple[float, float, float], float, float, float, f
 }
 CONTROL_COSTS: dict[Motor, float] = {"elbow": 1.0, "shoulder": 10.0}
 """Control costs of the regulators that take over after the plan."""
+CUTOFF = 1000.0
+"""Cut-off of the differences, Hz: above the sampling rate, so that they are hardly filtered."""
+STATE_COST = np.diag([10.0, 10.0, 1.0, 1.0])
+"""State cost of the regulator."""
 
 
-def recovery(motor: Motor) -> Recovery:
-    """The chosen numbers of `RECOVERIES`."""
-    *law, sweep, period = RECOVERIES[motor]
-    return Recovery(Law(*map(jnp.array, law)), sweep, period)
+class Recovery(NamedTuple):
+    """Numbers of the controllers after the plan."""
+
+    law: Law
+    """The energy law, and the level at which the regulator takes over."""
+    sweep: Any = 0.0
+    """Amplitude of the sweep of the target energy, J: a wrong model has a wrong energy of the goal."""
+    period: Any = 2.0
+    """Period of the sweep, s."""
+
+
+def by_angles(motor: Motor, controller: Controller) -> Controller:
+    """A controller of x that uses only the measured angles and predicts the current state if they are delayed."""
+    scene, B = plant(motor)
+    field = field_of(dynamics(scene.closed_form), B)
+    step = lambda x, u: runge_kutta(MIDPOINT, lambda t, x: field(x, u))(0.0, x, 1 / RATE)  # noqa: E731
+    predicting = with_prediction(controller, step, states=4, controls=1, most=LONGEST)
+    seeing = with_differences(predicting, 2, rate=RATE, cutoff=CUTOFF, order=2)
+    return Controller(seeing.start, lambda memory, t, y: seeing.act(memory, t, y[:2]))
+
+
+def recovering(motor: Motor, weights: Weights, plan: Plan, control_cost: float) -> Callable[[Recovery], Controller]:
+    """The plan; after its end the regulator where its value function is below the law's level, else the energy law.
+
+    Args:
+        motor: driven joint of the board's plant.
+        weights: weights of the plan's cost.
+        plan: plan from hanging.
+        control_cost: control cost of the regulator.
+    """
+    scene, _ = plant(motor)
+    system, joints = dynamics(scene.closed_form), scene.needs.joints
+    at = at_goal(motor, system)
+    regulator = sampled_lqr(at.A, at.B, STATE_COST, control_cost * np.eye(1), 1 / RATE)
+    near, cost, far = regulated(regulator, GOAL, at.u, joints), value(regulator, GOAL, joints), pumping(motor)
+    planned, last = follower(motor, weights, plan), EVERY * len(plan.u)
+
+    def controller(recovery: Recovery) -> Controller:
+        law = recovery.law
+
+        def act(memory: tuple[Any, Array, Array], t: Array, y: Array) -> tuple[tuple[Any, Array, Array], Array]:
+            inner, number, tau = memory
+            inner, by_plan = planned.act(inner, t, y)
+            beyond = recovery.sweep * jnp.sin(2 * jnp.pi * (number - last) / (RATE * recovery.period))
+            by_energy = tau + law.share * (limited(far(y, law.gains, beyond), -law.most, law.most) - tau)
+            u = jnp.where(number < last, by_plan, jnp.where(cost(y) <= law.level, near(y), by_energy))
+            u = limited(u, -LIMIT, LIMIT)
+            return (inner, number + 1, u), u
+
+        return Controller((planned.start, jnp.asarray(0), jnp.zeros(1)), act)
+
+    return controller
 
 
 def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
     """Our controllers by name, with gains and plans of the undisturbed plant."""
-    weights = Weights()
-    _, plan, weights = search(motor, (HORIZON,), (weights,), guesses=1)
-    law = best_law(motor, 20 if quick else DRAWS)
+    _, plan, weights = search(motor, (HORIZON,), (Weights(),), guesses=1)
+    *law, sweep, period = RECOVERIES[motor]
+    recovery = Recovery(Law(*map(jnp.array, law)), sweep, period)
+    by_plan = follower(motor, weights, plan)
     return {
-        "ours-planned": follower(motor, weights, plan),
-        "ours-by-energy": controllers_by_energy(motor)(law),
-        "ours-planned-by-angles": by_angles(motor, follower(motor, weights, plan)),
-        "ours-recovering": by_angles(motor, recovering(motor, weights, plan, CONTROL_COSTS[motor])(recovery(motor))),
+        "ours-planned": by_plan,
+        "ours-by-energy": controllers_by_energy(motor)(best_law(motor, 20 if quick else DRAWS)),
+        "ours-planned-by-angles": by_angles(motor, by_plan),
+        "ours-recovering": by_angles(motor, recovering(motor, weights, plan, CONTROL_COSTS[motor])(recovery)),
     }
 
 
@@ -72,21 +142,16 @@ def robust(motor: Motor, quick: bool) -> Findings:
     """Shares of successes by criterion, their mean, and the score of the undisturbed plant."""
     name, table = plant(motor)[0].name, {}
     rows: list[Row] = []
-    best = max(each[-1] for each in PUBLISHED[name].values())
+    best = max(shares[-1] for shares in PUBLISHED[name].values())
     words = "mean share of successes, beside the board's best"
     for which, controller in controllers(motor, quick).items():
         case = f"robustness/{name}/{which.removeprefix('ours-')}"
-        found = robustness(motor, controller, every=10 if quick else 1)
-        table[which] = found
-        rows += [Row(case, f"share_{key}", found[key]) for key in CRITERIA]
-        rows.append(Row(case, "share_mean", found["mean"], reference=best, expected=words))
+        shares = robustness(motor, controller, every=10 if quick else 1)
+        table[which] = shares
+        rows += [Row(case, f"share_{key}", shares[key]) for key in CRITERIA]
+        rows.append(Row(case, "share_mean", shares["mean"], reference=best, expected=words))
         rows.append(Row(case, "score_undisturbed", score(criteria(motor, play(motor, controller)))))
     for rival, values in PUBLISHED[name].items():
-        shown = [*(each / 100 for each in values[:-1]), values[-1]]
+        shown = [*(percentage / 100 for percentage in values[:-1]), values[-1]]
         table[rival] = dict(zip((*CRITERIA, "mean"), shown, strict=True))
     return Findings(rows, {name: table})
-
-
-def draw(curves: dict[str, Any]) -> Figure:
-    """Draws the board's table with our controllers above it."""
-    return shares(curves)

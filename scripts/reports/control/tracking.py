@@ -1,7 +1,7 @@
 """A seven-axis arm that follows references in closed loop with known, identified and learned models.
 
-The arm is that of the robot report (`robots.arm`) with dry friction, simulated in MuJoCo. Without MuJoCo our own
-equations with a smooth law of friction replace it. The loop is in `arm_loop`.
+The arm is that of the robot report (`robots.arm`) with dry friction, simulated in MuJoCo. The loop is in
+`arm_loop`.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,7 @@ from dln_jax.data.encoders import smooth
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import Split, drawn, every, hold_out, select
-from dln_jax.identification import identify, parameters_of
-from dln_jax.learning.dynamics import problem, suited_network
+from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.friction import fit_friction
@@ -27,14 +26,12 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
-from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
-from scripts.reports.case import Findings
-from scripts.reports.control.arm_loop import Plant, Tracked, friction_of, in_equations, in_mujoco, track
-from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm, measured, motion
-from scripts.reports.robots.known_kinematics import DECIMATE, LAWS, logs, rough
+from scripts.reports.case import Findings, spread
+from scripts.reports.control.arm_loop import Plant, Tracked, friction_of, in_mujoco, track
+from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm, logs, measured, motion
+from scripts.reports.robots.known_kinematics import DECIMATE, LAWS, identified, rough
 from scripts.reports.rows import Row
 
 COMPUTED = Gains(np.full(D, 400.0), np.full(D, 40.0))
@@ -69,18 +66,14 @@ def models(robot: Robot, seed: int, effort: Effort, random: np.random.Generator)
     seen = smooth(from_arrays(measured(logs(robot, random, effort.motions), random))).data
     data = every(seen, DECIMATE)
     scale = fit_friction(rough(robot.tree), data, LAWS).shape["velocity_scale"]
-    shape = tuple(np.broadcast_to(scale, D).tolist())
-    tree = make_rigid_tree(rough(robot.tree), friction=LAWS, velocity_scale=shape)
-    start = tree.init(jax.random.key(0))
-    start = start._replace(viscous=jnp.full(D, 0.5), coulomb=jnp.full(D, 0.5))
-    found = identify(tree, start, data, joints=robot.tree.joints)
+    model, parameters = identified(robot.tree, data, scale)
     needs = robot.tree.needs._replace(friction=True)
     fitted = fit_tree(needs, data, velocity_scale=float(np.median(scale)), settings=effort.searched)
     learned = make_serial_tree(needs, velocity_scale=float(np.median(scale)))
     few = select(seen, np.unique(seen.trajectory)[: FEW + 1])
     return {
         "known": (dynamics(tree_system(robot.tree, friction_of(robot))), None),
-        "identified": (dynamics(tree.energies(parameters_of(found.theta, start))), None),
+        "identified": (dynamics(model.energies(parameters)), None),
         "learned-tree": (dynamics(learned.energies(fitted.parameters)), None),
         "network": (network(robot, seen, seed, float(np.median(scale)), effort), within(seen)),
         "bad-network": (network(robot, few, seed, float(np.median(scale)), effort), within(few)),
@@ -97,8 +90,8 @@ def network(robot: Robot, data: Trajectories, seed: int, scale: float, effort: E
         train = drawn(train, chosen.samples, seed)
     steps = 2 if effort is QUICK else STEPS
     optimiser = GaussNewton(steps=steps) if chosen.optimizer == "gauss-newton" else Adam(steps=steps * 100)
-    found = fit(problem(model, Split(train, validation, validation), seeds=seed), optimiser)
-    return dynamics(model.energies(found.parameters))
+    training = fit(problem(model, Split(train, validation, validation), seeds=seed), optimiser)
+    return dynamics(model.energies(training.parameters))
 
 
 def within(data: Trajectories) -> Callable[..., Any]:
@@ -115,24 +108,21 @@ def within(data: Trajectories) -> Callable[..., Any]:
 
 def laws(known: dict[str, tuple[Dynamics, Any]], held_out: Trajectories) -> dict[str, Any]:
     """Control laws by name, feedback alone first. `judged` also requires that the model explains held-out motions."""
-    found: dict[str, Any] = {"feedback-alone": lambda q, qd, now: feedback(AHEAD, q, qd, now)}
+    by_name: dict[str, Any] = {"feedback-alone": lambda q, qd, now: feedback(AHEAD, q, qd, now)}
     for name, (model, outside) in known.items():
         ahead, computed = feed_forward(model, AHEAD), computed_torque(model, COMPUTED)
-        found |= {f"feed-forward/{name}": ahead, f"computed-torque/{name}": computed}
+        by_name |= {f"feed-forward/{name}": ahead, f"computed-torque/{name}": computed}
         if outside is not None:
-            found[f"trusted/{name}"] = trusted(model, computed, ahead, out_of_distribution=outside)
+            by_name[f"trusted/{name}"] = trusted(model, computed, ahead, outside=outside)
             usable = judged(model, held_out).usable
-            found[f"judged/{name}"] = trusted(model, computed, ahead, out_of_distribution=outside, usable=usable)
-    return found
+            by_name[f"judged/{name}"] = trusted(model, computed, ahead, outside=outside, usable=usable)
+    return by_name
 
 
 def tracking(quick: bool) -> Findings:
     """Rms errors, mrad, by law and model over seeds of the data and unseen motions; failures count separately."""
     effort, robot = QUICK if quick else FULL, arm(coulomb=True)
-    try:
-        plant = in_mujoco(robot)
-    except InputError:
-        plant = in_equations(robot)
+    plant = in_mujoco(robot)
     by_law: dict[str, list[Tracked]] = {}
     errors: dict[str, list[float]] = {}
     for seed in range(effort.seeds):
@@ -141,8 +131,8 @@ def tracking(quick: bool) -> Findings:
             errors.setdefault(name, []).append(nmse)
         for name, runs in of_laws.items():
             by_law.setdefault(name, []).extend(runs)
-    rows = [Row(f"tracking/model/{name}", "nmse", float(np.median(each))) for name, each in errors.items()]
-    return Findings([*rows, *(row for name, each in by_law.items() for row in rows_of(name, each))])
+    rows = [Row(f"tracking/model/{name}", "nmse", float(np.median(values))) for name, values in errors.items()]
+    return Findings([*rows, *(row for name, runs in by_law.items() for row in rows_of(name, runs))])
 
 
 def one_seed(
@@ -159,7 +149,7 @@ def one_seed(
         tau = jax.jit(jax.vmap(model.inverse_dynamics))(test.q, test.qd, test.qdd)
         errors[name] = float(np.mean(normalised_error(np.asarray(tau), test.tau)))
     return errors, {
-        name: [track(plant, law, each, effort.samples) for each in wanted]
+        name: [track(plant, law, motion, effort.samples) for motion in wanted]
         for name, law in laws(known, held_out).items()
     }
 
@@ -168,11 +158,8 @@ def rows_of(name: str, runs: list[Tracked]) -> list[Row]:
     """Median and worst rms error over finite runs, and the number of runs that failed."""
     case, rms = f"tracking/{name}", np.array([run.rms for run in runs])
     sound = rms[np.isfinite(rms)]
-    rows = [Row(case, f"rms_mrad_{key}", float(of(sound)) if len(sound) else np.inf, "mrad") for key, of in SPREADS]
+    rows = spread(case, "rms_mrad", sound if len(sound) else np.inf, "mrad")
     rows.append(Row(case, "failures", float(len(rms) - len(sound)), expected=f"of {len(rms)} runs"))
     if name.startswith(("trusted", "judged")):
         rows.append(Row(case, "share_trusted", float(np.mean([run.trusted for run in runs]))))
     return rows
-
-
-SPREADS = (("median", np.median), ("worst", np.max))

@@ -1,10 +1,4 @@
-"""Value, Jacobian and Hessian of one pass against jax.hessian of the same network, float32.
-
-For n inputs and one output, all compute value, gradient and Hessian of a network for every sample, and the gradient
-with respect to its parameters of a loss that reads all three, which is a training step without its optimiser. The
-rivals are jax.grad and jax.hessian, of a plain network in jax.numpy and of this library's `value`, to which the
-formulas of its activations already give faster derivatives.
-"""
+"""Value, Jacobian and Hessian of one pass against jax.hessian of the same network, float32."""
 
 from collections.abc import Callable
 from functools import partial

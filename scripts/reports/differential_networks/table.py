@@ -2,10 +2,8 @@
 
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-
-from rich.table import Table
 
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
@@ -33,7 +31,6 @@ ACTIVATIONS = ("relu", "softplus", "tanh", "cos")
 QUANTITIES = ("value_mse", "gradient_mse", "hessian_mse")
 FACTORS = {"sin": 30.0, "cos_sin": 10.0}
 """Factor by which our best error of a row must beat the best published one."""
-TITLES = {"sin": ("1-D f", "1-D f'", "1-D f''"), "cos_sin": ("2-D f", "2-D gradient", "2-D Hessian")}
 
 
 def cases(
@@ -47,7 +44,7 @@ def cases(
         "sin": (functions.sine(samples=samples, seed=seed), functions.sine_grid()),
         "cos_sin": (functions.cosine_sine(samples=samples, seed=seed), functions.cosine_sine_grid()),
     }
-    found = []
+    listed = []
     for optimizer, function, loss, name in itertools.product(OPTIMIZERS, problems, LOSSES, ACTIVATIONS):
         if (optimizer, name) == ("gauss-newton", "relu"):
             continue
@@ -62,8 +59,8 @@ def cases(
         optimisers.check(optimiser)
         case = f"{function}/{loss}/{name}/{optimizer}"
         job = partial(findings, case, sets, test, network, optimiser)
-        found.append(Case(case, job, {case: (*QUANTITIES, "width", "job_seconds")}))
-    return found
+        listed.append(Case(case, job, {case: (*QUANTITIES, "width", "job_seconds")}))
+    return listed
 
 
 def findings(case: str, sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> Findings:
@@ -83,36 +80,21 @@ def trained(sets: SampleSplit, test: FunctionSamples, network: Network, optimise
     return {
         **errors(predicted.mean, test),
         "width": network.width,
-        **{name: sum(getattr(each, name) for each in every) for name in ("train_seconds", "compile_seconds")},
+        **{name: sum(getattr(training, name) for training in every) for name in ("train_seconds", "compile_seconds")},
         "job_seconds": time.perf_counter() - began,
     }
 
 
 def table_rows(rows: Sequence[Row]) -> list[Row]:
     """All numbers with their published references, the best of every published row, and the total time."""
-    found = []
+    listed = []
     for row in rows:
         theirs = published(TABLE, row.case.rpartition("/")[0], row.quantity)  # without the optimiser
-        found.append(row._replace(unit=unit_of(row.quantity), reference=theirs))
+        listed.append(row._replace(unit=unit_of(row.quantity), reference=theirs))
     for function, factor in FACTORS.items():
         for quantity in QUANTITIES:
             ours = [row.value for row in rows if row.case.startswith(f"{function}/") and row.quantity == quantity]
-            theirs = min(each[quantity] for case, each in TABLE.values.items() if case.startswith(f"{function}/"))
-            found.append(Row(f"{function}/best", quantity, min(ours), "1", theirs, theirs / factor))
+            theirs = min(numbers[quantity] for case, numbers in TABLE.values.items() if case.startswith(f"{function}/"))
+            listed.append(Row(f"{function}/best", quantity, min(ours), "1", theirs, theirs / factor))
     seconds = sum(row.value for row in rows if row.quantity == "job_seconds")
-    return [*found, Row("table/all", "table_seconds", seconds, "s", bound=900.0)]
-
-
-def comparison(found: Mapping[str, Mapping[str, float]], optimizer: str, recipe: str) -> Table:
-    """The published table, with our numbers above the published ones."""
-    recipes = list(itertools.product(LOSSES, ACTIVATIONS))
-    columns = [f"{loss} {name}" for loss, name in recipes]
-    table = Table("", "", *columns, title=f"{optimizer}: {recipe}", caption="mean squared errors on the clean grid")
-    for function, titles in TITLES.items():
-        cases = [f"{function}/{loss}/{name}" for loss, name in recipes]
-        for title, quantity in zip(titles, QUANTITIES, strict=True):
-            ours = [found.get(f"{case}/{optimizer}", {}).get(quantity) for case in cases]
-            table.add_row(title, "ours", *("" if value is None else f"{value:.1e}" for value in ours))
-            theirs = [f"{TABLE.values[case][quantity]:.1e}" for case in cases]
-            table.add_row("", "published", *theirs, style="dim", end_section=True)
-    return table
+    return [*listed, Row("table/all", "table_seconds", seconds, "s", bound=900.0)]

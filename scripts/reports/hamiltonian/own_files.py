@@ -20,7 +20,7 @@ from dln_jax.training.hamiltonian.training import Trained, train
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 from scripts.reports.case import Case, Findings, by_case, rows_of
-from scripts.reports.rows import Row, markdown_table
+from scripts.reports.rows import Row
 
 NAMED, RECIPE, STATED, DEFAULT = "named-task", "named-recipe-on-the-files", "own-files", "own-files-without-needs"
 FACTOR = 2.0
@@ -34,14 +34,14 @@ def files_of(folder: Path, tasks: Sequence[str]) -> dict[str, list[Path]]:
     Raises:
         InputError: the folder has no such file.
     """
-    found = {task: sorted(folder.glob(f"{task}-*.npz")) for task in tasks if task in HORIZONS}
-    found = {task: files for task, files in found.items() if files}
-    if not found:
+    by_task = {task: sorted(folder.glob(f"{task}-*.npz")) for task in tasks if task in HORIZONS}
+    by_task = {task: files for task, files in by_task.items() if files}
+    if not by_task:
         raise InputError(
             f"{folder} has no files such as spring-101.npz of the tasks {', '.join(tasks)}; "
             "python -m tests.published_motions FOLDER writes some"
         )
-    return found
+    return by_task
 
 
 def own_cases(
@@ -88,9 +88,9 @@ def measured(
         if RECIPES[task].weights is not None:  # the task has noise
             fit(RECIPE, named._replace(fitted=stated.fitted), recipe, file.name)
     rows = []
-    for kind, each in errors.items():
-        numbers = {"energy_mse": float(np.median(each)), "energy_mse_largest": float(np.max(each))}
-        rows += rows_of(f"{task}/{kind}", numbers | {"trainings": float(len(each))})
+    for kind, values in errors.items():
+        numbers = {"energy_mse": float(np.median(values)), "energy_mse_largest": float(np.max(values))}
+        rows += rows_of(f"{task}/{kind}", numbers | {"trainings": float(len(values))})
     return Findings(rows)
 
 
@@ -108,7 +108,7 @@ def energy_error(named: Problem, trained: Trained) -> float:
     return motion_errors(predicted, named.truth, named.energy)["energy_mse"]
 
 
-def compared(rows: Sequence[Row]) -> list[Row]:
+def with_bounds(rows: Sequence[Row]) -> list[Row]:
     """Adds the named task's median as reference, and `FACTOR` times it as bound, to the rows of own files."""
     numbers = by_case(rows)
 
@@ -120,18 +120,3 @@ def compared(rows: Sequence[Row]) -> list[Row]:
         return row._replace(reference=named, bound=FACTOR * named)
 
     return [beside(row) for row in rows]
-
-
-def own_markdown(rows: Sequence[Row]) -> str:
-    """Markdown table of median energy errors, with the largest in brackets, one line per task."""
-    numbers = by_case(rows)
-    tasks = list(dict.fromkeys(case.split("/")[0] for case in numbers))
-
-    def cell(task: str, kind: str) -> str:
-        found = numbers.get(f"{task}/{kind}")
-        return "" if found is None else f"{found['energy_mse']:.1e} ({found['energy_mse_largest']:.1e})"
-
-    kinds = (NAMED, RECIPE, STATED, DEFAULT)
-    return markdown_table(["task", *(kind.replace("-", " ") for kind in kinds)], [
-        [task, *(cell(task, kind) for kind in kinds)] for task in tasks
-    ])  # fmt: skip

@@ -15,9 +15,9 @@ from dln_jax.training.hamiltonian.recipes import RECIPES
 from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import require_positive
-from scripts.reports.case import Case, Findings, by_case, rows_of
+from scripts.reports.case import Case, Findings, rows_of
 from scripts.reports.published import HAMILTONIAN, published
-from scripts.reports.rows import Row, markdown_table, unit_of
+from scripts.reports.rows import Row, unit_of
 
 TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
 """The published tasks."""
@@ -34,14 +34,6 @@ SHOWN = (
     *("test_loss", "clean_field_mse", "energy_mse", "energy_mse_standard_error", "energy_mse_median"),
     *("energy_mse_over_baseline", "published_energy_mse", "rollout_mse", "train_seconds", "compile_seconds"),
 )
-TITLES = {
-    "test_loss": "test loss",
-    "clean_field_mse": "clean field",
-    "energy_mse": "energy MSE",
-    "published_energy_mse": "energy MSE, q²+p²",
-    "rollout_mse": "rollout MSE",
-    "train_seconds": "training, s",
-}
 
 
 def cases(
@@ -58,15 +50,15 @@ def cases(
     `steps` of a fit default to the task's own and `trajectories` to the published number; the measured task needs the
     file `real_pendulum`. With a `folder`, a task's figure is drawn as soon as the task is measured.
     """
-    given = {"steps": steps, "trajectories": trajectories}
-    require_positive(seeds=seeds, **{key: value for key, value in given.items() if value is not None})
-    found = []
+    counts = {"steps": steps, "trajectories": trajectories}
+    require_positive(seeds=seeds, **{key: value for key, value in counts.items() if value is not None})
+    listed = []
     for name in names:
         task = pixel_task if name == PIXELS else partial(phase_task, name, data=real_pendulum if name == REAL else None)
         kinds = pixels.MODELS if name == PIXELS else models_of(name)
-        measure = partial(task, seeds=seeds, folder=folder, **given)
-        found.append(Case(name, measure, {f"{name}/{kind}": () for kind in kinds}))
-    return found
+        measure = partial(task, seeds=seeds, folder=folder, **counts)
+        listed.append(Case(name, measure, {f"{name}/{kind}": () for kind in kinds}))
+    return listed
 
 
 def phase_task(
@@ -99,15 +91,15 @@ def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folde
     energetic["energy_mse_over_baseline"] = energetic["energy_mse"] / baseline["energy_mse"]
     if folder is not None:
         pixels.draw_pixels(seen, data, folder)
-    return Findings([row for kind, each in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", each)])
+    return Findings([row for kind, of_kind in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", of_kind)])
 
 
 def medians(runs: Sequence[tuple[dict[str, float], *tuple[Any, ...]]]) -> dict[str, float]:
     """Medians of all quantities over the seeds, and the largest energy error."""
     of_seeds = [numbers for numbers, *_ in runs]
-    found = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
-    found["energy_mse_largest"] = float(np.max([each["energy_mse"] for each in of_seeds]))
-    return {key: value for key, value in found.items() if not np.isnan(value)}
+    numbers = {key: float(np.median([seed[key] for seed in of_seeds])) for key in of_seeds[0]}
+    numbers["energy_mse_largest"] = float(np.max([seed["energy_mse"] for seed in of_seeds]))
+    return {key: value for key, value in numbers.items() if not np.isnan(value)}
 
 
 def table_rows(rows: Sequence[Row]) -> list[Row]:
@@ -127,20 +119,3 @@ def beside(case: str, quantity: str) -> float | None:
     task, kind = case.split("/")
     name = kind if kind == "phase-network" else "black-box-hnn"
     return published(HAMILTONIAN, f"{task}/{name}", quantity)
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    """Markdown table, one line per case; "ours / published" for the model that suits the scene and the baseline."""
-    lines, compared = [], {*BOUNDS, *(f"{task}/phase-network" for task in TASKS)}
-    for case, numbers in by_case(rows).items():
-        cells = [case]
-        for quantity in TITLES:
-            value, theirs = numbers.get(quantity), beside(case, quantity) if case in compared else None
-            text = "" if value is None else f"{value:.1f}" if quantity == "train_seconds" else f"{value:.1e}"
-            if f"{quantity}_standard_error" in numbers:
-                text += f" ± {numbers[f'{quantity}_standard_error']:.0e}"
-            if value is not None and theirs is not None:
-                text += f" / {theirs:.1e}"
-            cells.append(text)
-        lines.append(cells)
-    return markdown_table(["task / model", *TITLES.values()], lines)

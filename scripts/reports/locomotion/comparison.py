@@ -1,4 +1,4 @@
-"""Figure of learning methods side by side, and where one gets ahead of another."""
+"""Methods of learning to move, compared by their cost until a creature travels one body length: rows and a figure."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from dln_jax.figures import style
 from dln_jax.locomotion.learning import Record
-from dln_jax.training.locomotion import median_to_reach
+from dln_jax.locomotion.progress import first_reaching, median_to_reach
+from scripts.reports.rows import Row
 
 Curves = Mapping[str, Sequence[Sequence[Record]]]
 """Records of the seeds, by the name of the method."""
@@ -42,6 +43,27 @@ def crossover(first: Sequence[Sequence[Record]], second: Sequence[Sequence[Recor
     if len(behind) == 0 or behind[-1] == len(places) - 1:
         return None
     return float(places[behind[-1] + 1])
+
+
+def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goal: float, seed: int) -> list[Row]:
+    """Steps and seconds of the methods, and ratios to gradients; only the crawler's numbers have bounds.
+
+    `curves` holds, by method, the records of successive seeds starting at `seed`; `goal` is in body lengths.
+    """
+    rows, needed, crawls, steps = [], {}, creature == "crawler", "environment_steps_to_one_body_length"
+    for method, seeds in curves.items():
+        case = f"{creature}/{method}"
+        for number, records in enumerate(seeds, start=seed):
+            first = first_reaching(records, goal)
+            rows.append(Row(case, f"{steps}_seed_{number}", math.nan if first is None else float(first.steps)))
+        median, seconds = (median_to_reach(seeds, goal, field) for field in ("steps", "seconds"))
+        needed[method] = float(max(r[-1].steps for r in seeds)) if math.isinf(median) else median
+        bound = 60.0 if method == "gradient" and crawls else None
+        rows += [Row(case, steps, median), Row(case, "seconds_to_one_body_length", seconds, "s", bound=bound)]
+    name, bound = "environment_steps_ratio_to_gradient", 3.0 if crawls else None
+    ratios = {method: needed[method] / needed["gradient"] for method in curves if method != "gradient"}
+    rows += [Row(f"{creature}/{method}", name, ratio, bound=bound, at_least=True) for method, ratio in ratios.items()]
+    return rows
 
 
 def comparison_figure(curves: Curves, *, distance: float, title: str) -> Figure:

@@ -28,7 +28,7 @@ class PPOSettings(NamedTuple):
 
     lanes: int = 16
     steps: int = 80
-    """Of each lane between two updates."""
+    """Steps of each lane between two updates."""
     batch: int = 256
     epochs: int = 10
     learning_rate: float = 1e-3
@@ -39,9 +39,9 @@ class PPOSettings(NamedTuple):
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     deviation: float = 0.6
-    """Of the actions at first."""
+    """Standard deviation of the first actions."""
     width: int = 64
-    """Of the two hidden layers, of actor and critic."""
+    """Units of the two hidden layers of actor and critic."""
 
 
 STEPS = 300_000

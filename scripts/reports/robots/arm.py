@@ -1,29 +1,30 @@
 """A seven-axis arm simulated in MuJoCo, with the logs that an engineer would have.
 
-The frames are a Panda's (modified Denavit-Hartenberg rows). Masses and centres are similar to its own; moments of
+The frames are a Panda's. Masses and centres are similar to its own; moments of
 inertia are those of ellipsoids about the centre. Motors have armature; joints have viscous and optionally dry friction.
 MuJoCo treats dry friction as a constraint, so none of our laws is exact. A PD controller at 1 kHz follows Fourier
 series; logs have 125 samples per second, with noise on encoders and torques.
 """
 
+import functools
 import importlib
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import INSTALL, Robot
 from dln_jax.data.schema import Trajectories, from_arrays
-from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import inertial_parameters, serial
+from dln_jax.metrics.errors import normalised_error
+from dln_jax.models.model import Model, Parameters
+from dln_jax.scenes.panda import panda
 from dln_jax.types import InputError
 
 D = 7
-RIGHT = np.pi / 2
-ROWS = (
-    *((0, 0, 0.333, 0), (-RIGHT, 0, 0, 0), (RIGHT, 0, 0.316, 0), (RIGHT, 0.0825, 0, 0)),
-    *((-RIGHT, -0.0825, 0.384, 0), (RIGHT, 0, 0, 0), (RIGHT, 0.088, 0, 0)),
-)
-"""Denavit-Hartenberg rows alpha, a, d, theta; rad and m."""
 MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
 """Masses of the links, kg."""
 CENTRES = (
@@ -58,6 +59,10 @@ TORQUE_NOISE = np.array([0.5, 0.5, 0.4, 0.4, 0.2, 0.1, 0.1])
 """Standard deviations of the noise on torques, N m."""
 
 
+Torque = Callable[[Any, Any, Any], np.ndarray]
+"""q, qd, qdd [N, d] -> tau [N, d]."""
+
+
 class Motion(NamedTuple):
     """References of a motion for T steps of the controller; fields [T, d]."""
 
@@ -84,7 +89,8 @@ def arm(*, coulomb: bool) -> Robot:
         inertial_parameters(m, c, m * (np.sum(np.square(s)) * np.eye(3) - np.diag(np.square(s))))
         for m, c, s in zip(MASSES, CENTRES, SPREADS, strict=True)
     ]
-    tree: Tree = serial(*dh_frames(ROWS), links, armature=np.array(ARMATURE))
+    frames = panda().tree
+    tree = serial(frames.rotations, frames.positions, links, armature=np.array(ARMATURE))
     free = np.tile([-np.inf, np.inf], (D, 1))
     return Robot(tree, np.array(VISCOUS), np.array(COULOMB) * coulomb, free, free)
 
@@ -147,12 +153,17 @@ def simulator(robot: Robot) -> tuple[Any, Any, Any]:
     return mujoco, model, mujoco.MjData(model)
 
 
-def trajectories(logs: list[Log]) -> Trajectories:
-    """Converts logs to noise-free trajectories with q, qd, qdd and tau."""
-    counts = [len(log.q) for log in logs]
-    arrays = {key: np.concatenate([getattr(log, key) for log in logs]) for key in ("q", "qd", "qdd", "tau")}
+def logs(robot: Robot, random: np.random.Generator, count: int) -> Trajectories:
+    """Noise-free logs of random motions under PD control, as trajectories with q, qd, qdd and tau."""
+    return trajectories([follow(robot, motion(random)) for _ in range(count)])
+
+
+def trajectories(recorded: list[Log]) -> Trajectories:
+    """Converts logs to noise-free trajectories."""
+    counts = [len(log.q) for log in recorded]
+    arrays = {key: np.concatenate([getattr(log, key) for log in recorded]) for key in ("q", "qd", "qdd", "tau")}
     t = np.concatenate([STEP * EVERY * np.arange(count) for count in counts])
-    return from_arrays({"t": t, "trajectory": np.repeat(np.arange(len(logs)), counts), **arrays})
+    return from_arrays({"t": t, "trajectory": np.repeat(np.arange(len(counts)), counts), **arrays})
 
 
 def measured(data: Trajectories, random: np.random.Generator) -> dict[str, np.ndarray]:
@@ -164,3 +175,20 @@ def measured(data: Trajectories, random: np.random.Generator) -> dict[str, np.nd
         "trajectory": data.trajectory,
         "label": data.label,
     }
+
+
+def torque_of(model: Model, parameters: Parameters) -> Torque:
+    """The inverse dynamics of a model for many states."""
+    batch = _torques(model)
+    return lambda q, qd, qdd: np.asarray(batch(parameters, q, qd, qdd))
+
+
+@functools.lru_cache(maxsize=4)
+def _torques(model: Model) -> Callable[..., Any]:
+    """One program for all parameters."""
+    return jax.jit(lambda parameters, *x: jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*x))
+
+
+def error_of(torque: Torque, test: Trajectories) -> np.ndarray:
+    """nMSE by joint [d]."""
+    return normalised_error(torque(test.q, test.qd, test.qdd), test.tau)

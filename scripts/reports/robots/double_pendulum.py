@@ -7,17 +7,15 @@ by torques of filtered motions and by its valid prediction time.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import jax
 import numpy as np
 
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, load
 from dln_jax.learning.measured_motions import MeasuredWindows
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import predict_measured, valid_times
 from dln_jax.types import InputError
+from scripts.reports.robots.arm import torque_of
 from scripts.reports.robots.double_pendulum_fits import (
     CUTOFF,
     RATE,
@@ -30,7 +28,6 @@ from scripts.reports.robots.double_pendulum_fits import (
     fit_motions,
     fit_stacked,
     fit_torques,
-    low_passed,
 )
 from scripts.reports.rows import Row
 
@@ -43,12 +40,7 @@ HORIZON, EVERY = 2.2, 0.5
 HELD_OUT = (("02", "11"), ("00", "12"), ("04", "13"), ("01", "05"), ("03", "13"))
 """Held-out recordings, by split."""
 WAYS = ("least-squares", "chosen-scale", "low-passed", "stacked", "motions", "both")
-QUANTITIES = {
-    "torque_nmse": ("1", False),
-    "torque_nmse_low_passed": ("1", False),
-    "vpt_seconds": ("s", True),
-    "vpt_mean_seconds": ("s", True),
-}
+QUANTITIES = {"torque_nmse": ("1", False), "vpt_mean_seconds": ("s", True)}
 """Unit of a quantity, and whether larger is better."""
 
 Numbers = dict[str, float]
@@ -57,16 +49,15 @@ Numbers = dict[str, float]
 def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
     """Torque errors and valid prediction times on held-out recordings by method: median, worst, and by split.
 
-    The results of least squares bound the other methods. `torque_nmse` is the error along filtered motions;
-    `torque_nmse_low_passed` is the low-passed error along less filtered motions.
+    The results of least squares bound the other methods. `torque_nmse` is the error along filtered motions.
     """
     logs = read(path)
-    found = [split_numbers(logs, labels) for labels in held_out]
+    splits = [split_numbers(logs, labels) for labels in held_out]
     listed = []
     for way in WAYS:
         for quantity, (unit, longer) in QUANTITIES.items():
-            values, rival = ([each[name][quantity] for each in found] for name in (way, WAYS[0]))
-            of_splits = {f"_{'_'.join(labels)}": lambda each, n=n: each[n] for n, labels in enumerate(held_out)}
+            values, rival = ([numbers[name][quantity] for numbers in splits] for name in (way, WAYS[0]))
+            of_splits = {f"_{'_'.join(labels)}": lambda values, n=n: values[n] for n, labels in enumerate(held_out)}
             for suffix, of in {"": np.median, "_worst": np.min if longer else np.max, **of_splits}.items():
                 bound = float(of(rival)) if way != WAYS[0] else None
                 row = Row(f"double-pendulum/{way}", quantity + suffix, float(of(values)), unit, None, bound, longer)
@@ -78,7 +69,7 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
     """Numbers by method and quantity, with the recordings of these labels held out."""
     index = {label: place for place, label in enumerate(logs.fine.label)}
     test = [index[label] for label in held_out]
-    rest = logs.of(each for each in np.unique(logs.fine.trajectory) if each not in test)
+    rest = logs.of(index for index in np.unique(logs.fine.trajectory) if index not in test)
     scale = choose_scale(rest)
     fits = (
         fit_torques(rest),
@@ -88,29 +79,25 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
         fit_motions(rest, scale),
         fit_both(rest, scale),
     )
-    return {way: judged(found, logs.of(test), logs) for way, found in zip(WAYS, fits, strict=True)}
+    return {way: judged(fitted, logs.of(test), logs) for way, fitted in zip(WAYS, fits, strict=True)}
 
 
-def judged(found: Fitted, held: Logs, every: Logs) -> Numbers:
-    """Torque errors relative to the variance over all recordings, averaged over joints, and valid prediction times."""
-    torque = jax.jit(jax.vmap(dynamics(found.model.energies(found.parameters)).inverse_dynamics))
-    variance = every.coarse.tau.var(axis=0)
-
-    def error(data: Trajectories, filtered: Any) -> float:
-        off = np.asarray(torque(data.q, data.qd, data.qdd)) - data.tau
-        parts = [filtered(off[data.trajectory == index]) for index in np.unique(data.trajectory)]
-        return float(np.mean(np.concatenate(parts) ** 2 / variance))
-
+def judged(fitted: Fitted, held: Logs, every: Logs) -> Numbers:
+    """Torque error relative to the variance over all recordings, averaged over joints, and mean prediction time."""
+    data, torque = held.coarse, torque_of(*fitted)
+    off = torque(data.q, data.qd, data.qdd) - data.tau
     segments = cut_segments(held.fine, round(HORIZON * RATE), every=round(EVERY * RATE))
-    predicted = predict_measured(*found, segments, fitted=WINDOW)
+    predicted = predict_measured(*fitted, segments, fitted=WINDOW)
     times = valid_times(segments, predicted, fitted=WINDOW, variance=every.fine.q.var(axis=0))
-    numbers = (
-        error(held.coarse, lambda off: off),
-        error(held.fine, low_passed),
-        float(np.median(times)),
-        float(np.mean(times)),
-    )
+    numbers = (float(np.mean(off**2 / every.coarse.tau.var(axis=0))), float(np.mean(times)))
     return dict(zip(QUANTITIES, numbers, strict=True))
+
+
+def read(path: Path) -> Logs:
+    """Reads the recordings, resampled to equal steps, filtered, and trimmed at both ends."""
+    data = load(path)
+    known = {"rate": BASE, "trim": TRIM, "decimate": round(BASE / RATE), "filter_torque": True}
+    return Logs(*(smooth(data, cutoff, **known).data for cutoff in (CUTOFF, FINE)))
 
 
 def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
@@ -128,10 +115,3 @@ def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWin
     rows = np.stack(pieces)
     t = data.t[rows]
     return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], np.ones(rows.shape))
-
-
-def read(path: Path) -> Logs:
-    """Reads the recordings, resampled to equal steps, filtered, and trimmed at both ends."""
-    data = load(path)
-    known = {"rate": BASE, "trim": TRIM, "decimate": round(BASE / RATE), "filter_torque": True}
-    return Logs(*(smooth(data, cutoff, **known).data for cutoff in (CUTOFF, FINE)))

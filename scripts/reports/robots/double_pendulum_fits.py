@@ -1,16 +1,16 @@
 """Methods to fit a double pendulum with motors, without the held-out recordings.
 
-    least-squares   torques of filtered motions, as engineers do it; q and tau filtered alike
+    least-squares   torques of filtered motions, as engineers fit them; q and tau are filtered alike
     chosen-scale    the same, with the velocity scale of dry friction that explains each recording best from the others
-    low-passed      what is filtered is the regressor of less filtered motions, and tau with it
-    stacked         the equations of both, which count alike
-    motions         the windows of `learning.measured_motions`, through an integrator with the torques, which are off
-                    by as much as the low-passed equations are
-    both            motions and torques in one objective (`torques_beside_motions`), with friction by load
+    low-passed      the regressor of less filtered motions is filtered, and tau with it
+    stacked         the equations of both, with equal weights
+    motions         the windows of `learning.measured_motions`, through an integrator with the torques; the allowed
+                    error of the torques is that of the low-passed equations
+    both            motions and torques in one objective (`learning.torques_beside_motions`), with friction by load
 
-All but the first have the chosen scale. Recorded torques explain slow accelerations well and those above 3 Hz badly:
-forces act that were not recorded. Least squares of torques are drawn to small inertias by them, which are best for
-torques and bad for predictions; to match motions is the reverse.
+All but the first have the chosen scale. Recorded torques explain slow accelerations well and those above 3 Hz badly,
+because forces act that were not recorded. They draw least squares of torques to small inertias, which are best for
+torques and bad for predictions; fits to motions do the reverse.
 """
 
 import functools
@@ -40,8 +40,8 @@ from dln_jax.types import FrictionLaw, Needs
 from scripts.reports.robots.torques_beside_motions import cut_torque_windows, with_torques
 
 CUTOFF, RATE = 6.0, 100.0
-"""Hz: the one at which the least squares of filtered motions predict held-out recordings best, of 2, 3, 4, 6, 8, 10, 12
-and 25; and of what is fitted."""
+"""Cut-off, Hz, at which least squares of filtered motions predict held-out recordings best (of 2, 3, 4, 6, 8, 10, 12,
+25), and rate of the fitted samples, Hz."""
 WINDOW = 11
 """Samples of a window and of a prediction's fitted start: 0.1 s."""
 NOISE = 2e-3
@@ -67,7 +67,7 @@ class Logs(NamedTuple):
     def of(self, recordings: Iterable[int]) -> "Logs":
         """The selected recordings."""
         indices = list(recordings)
-        return Logs(*(select(each, indices) for each in self))
+        return Logs(*(select(data, indices) for data in self))
 
 
 class Fitted(NamedTuple):
@@ -90,12 +90,12 @@ def choose_scale(logs: Logs) -> float:
     errors = {}
     for scale in SCALES:
         equations = _equations(ten_parameters(scale), logs)
-        found = []
+        squares = []
         for out in equations:
             x = _solved([equations[index] for index in equations if index != out])
             A, b = equations[out]
-            found.append((A @ x - b) ** 2)
-        errors[scale] = float(np.mean(np.concatenate(found)))
+            squares.append((A @ x - b) ** 2)
+        errors[scale] = float(np.mean(np.concatenate(squares)))
     return min(errors, key=errors.__getitem__)
 
 
@@ -159,15 +159,14 @@ def _equations(model: Model, logs: Logs, *, cutoff: float | None = None) -> dict
     """Weighted columns and torques by recording: of coarse motions, or low-passed, of fine motions with `cutoff`."""
     data = logs.coarse if cutoff is None else logs.fine
     scale = logs.coarse.tau.std(axis=0)
-    zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
-    Phi = np.asarray(design(model)(zero, data.q, data.qd, data.qdd)[0])
-    found = {}
+    Phi = np.asarray(design(model)(_zeros(model), data.q, data.qd, data.qdd)[0])
+    equations = {}
     for index in np.unique(data.trajectory):
-        columns, tau = (each[data.trajectory == index] / scale for each in (np.moveaxis(Phi, 2, 1), data.tau))
+        columns, tau = (array[data.trajectory == index] / scale for array in (np.moveaxis(Phi, 2, 1), data.tau))
         if cutoff is not None:
             columns, tau = low_passed(columns, cutoff), low_passed(tau, cutoff)
-        found[int(index)] = np.moveaxis(columns, 1, 2).reshape(-1, Phi.shape[2]), tau.ravel()
-    return found
+        equations[int(index)] = np.moveaxis(columns, 1, 2).reshape(-1, Phi.shape[2]), tau.ravel()
+    return equations
 
 
 def low_passed(values: np.ndarray, cutoff: float = CUTOFF) -> np.ndarray:
@@ -184,5 +183,8 @@ def _solved(equations: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 
 
 def _parameters(model: Model, x: np.ndarray) -> Any:
-    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
-    return ravel_pytree(like)[1](jnp.asarray(x))
+    return ravel_pytree(_zeros(model))[1](jnp.asarray(x))
+
+
+def _zeros(model: Model) -> Any:
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))

@@ -4,7 +4,7 @@ The rival gets the same samples, filter and columns, and in a second run also ou
 noise-free unseen motions of the true arm.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.data.encoders import smooth
+from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import every
 from dln_jax.identification import identify, parameters_of
@@ -19,11 +20,23 @@ from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import Tree, tree_system
-from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.case import Findings
-from scripts.reports.robots.arm import D, Log, Motion, arm, exact_torque, follow, measured, motion, trajectories
-from scripts.reports.robots.rivals import regression
+from scripts.reports.robots.arm import (
+    D,
+    Log,
+    Motion,
+    Torque,
+    arm,
+    error_of,
+    exact_torque,
+    follow,
+    logs,
+    measured,
+    motion,
+    torque_of,
+)
+from scripts.reports.robots.pinocchio import regression
 from scripts.reports.rows import Row, expect
 
 LAWS = ("viscous", "coulomb", "offset")
@@ -35,9 +48,6 @@ CLEAN, SEEN = 1e-12, 1.65e-3
 """nMSE to reach: on clean data with viscous friction, and on noisy data with dry friction (a regressor's result)."""
 TRACKING = 1.1
 """Tracking error to reach, relative to the error with true parameters."""
-
-Torque = Callable[[Any, Any, Any], np.ndarray]
-"""q, qd, qdd [N, d] -> tau [N, d]."""
 
 
 class Effort(NamedTuple):
@@ -57,14 +67,8 @@ def rough(tree: Tree) -> Tree:
     return tree._replace(inertias=np.tile(ball, (tree.degrees_of_freedom, 1)), armature=np.full(D, 0.05))
 
 
-def torque_of(model: Any, parameters: Any) -> Torque:
-    """The inverse dynamics of a batch."""
-    batch = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
-    return lambda q, qd, qdd: np.asarray(batch(q, qd, qdd))
-
-
-def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = False) -> Torque:
-    """Our identification: physically consistent, with torques weighted by their noise, optionally by Huber's loss.
+def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = False) -> tuple[Any, Any]:
+    """Model and parameters of our identification: physically consistent, torques weighted by their noise.
 
     Args:
         tree: tree with known frames.
@@ -74,10 +78,9 @@ def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = Fal
     """
     shape = tuple(np.broadcast_to(scale, D).tolist())
     model = make_rigid_tree(rough(tree), friction=LAWS, velocity_scale=shape)
-    known = model.init(jax.random.key(0))
-    known = known._replace(viscous=jnp.full(D, 0.5), coulomb=jnp.full(D, 0.5))
-    found = identify(model, known, data, joints=tree.joints, robust=robust)
-    return torque_of(model, parameters_of(found.theta, known))
+    start = model.init(jax.random.key(0))._replace(viscous=jnp.full(D, 0.5), coulomb=jnp.full(D, 0.5))
+    solution = identify(model, start, data, joints=tree.joints, robust=robust)
+    return model, parameters_of(solution.theta, start)
 
 
 def clean(quick: bool) -> Findings:
@@ -87,9 +90,9 @@ def clean(quick: bool) -> Findings:
         random = np.random.default_rng(seed)
         train, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
         model = make_rigid_tree(rough(robot.tree), friction=True)
-        known = model.init(jax.random.key(0))
-        found = identify(model, known, every(train, DECIMATE), joints=robot.tree.joints, consistent=False)
-        errors.append(error(torque_of(model, parameters_of(found.theta, known)), test).mean())
+        start = model.init(jax.random.key(0))
+        solution = identify(model, start, every(train, DECIMATE), joints=robot.tree.joints, consistent=False)
+        errors.append(error_of(torque_of(model, parameters_of(solution.theta, start)), test).mean())
     words = f"of torques on unseen motions, the worst of {effort.seeds} seeds"
     return Findings([expect("arm/clean-viscous", "nmse", words, max(errors), CLEAN)])
 
@@ -105,21 +108,22 @@ def noisy(quick: bool) -> Findings:
         data = every(smooth(from_arrays(measured(train, random))).data, DECIMATE)
         scales = fit_friction(rough(robot.tree), data, LAWS).shape["velocity_scale"]
         methods = {
-            "ours": identified(robot.tree, data, scales),
-            "ours-robust": identified(robot.tree, data, USUAL_SCALE, robust=True),
+            "ours": torque_of(*identified(robot.tree, data, scales)),
+            "ours-robust": torque_of(*identified(robot.tree, data, USUAL_SCALE, robust=True)),
         }
         for name, scale in (("pinocchio", USUAL_SCALE), ("pinocchio-with-our-scales", scales)):
-            rival = regression(robot.tree, data, velocity_scale=scale)
-            if rival is not None:
-                methods[name] = rival.torque
+            if (rival := regression(robot.tree, data, velocity_scale=scale)) is not None:
+                methods[name] = rival
         for name, torque in methods.items():
-            by_method.setdefault(name, []).append(error(torque, test))
+            by_method.setdefault(name, []).append(error_of(torque, test))
         for name, values in tracking(robot, methods, random, effort.unseen).items():
             tracked.setdefault(name, []).extend(values)
-    return Findings([*rows_of_errors(by_method, effort.seeds), *rows_of_tracking(tracked)], curves_of(by_method))
+    return Findings([*rows_of_errors(by_method, effort.seeds), *rows_of_tracking(tracked)])
 
 
-def tracking(robot: Any, methods: dict[str, Torque], random: np.random.Generator, count: int) -> dict[str, list[float]]:
+def tracking(
+    robot: Robot, methods: dict[str, Torque], random: np.random.Generator, count: int
+) -> dict[str, list[float]]:
     """Rms tracking errors, mrad, on unseen motions under PD control, by model of the feed-forward and without any."""
     true = tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE))
     exact = jax.jit(jax.vmap(dynamics(true).inverse_dynamics))
@@ -129,38 +133,34 @@ def tracking(robot: Any, methods: dict[str, Torque], random: np.random.Generator
         "true-parameters": lambda wanted: np.asarray(exact(*wanted)),
         **{name: lambda wanted, torque=torque: torque(*wanted) for name, torque in methods.items()},
     }
-    found: dict[str, list[float]] = {name: [] for name in feeds}
+    errors: dict[str, list[float]] = {name: [] for name in feeds}
     for _ in range(count):
         wanted = motion(random)
         for name, feed in feeds.items():
-            found[name].append(1e3 * rms(follow(robot, wanted, feed(wanted))))
-    return found
+            errors[name].append(1e3 * rms(follow(robot, wanted, feed(wanted))))
+    return errors
 
 
 def rows_of_errors(by_method: dict[str, list[np.ndarray]], seeds: int) -> list[Row]:
-    """Median and worst over seeds of the mean nMSE over joints, and the medians of our fit by joint."""
+    """Median and worst over seeds of the mean nMSE over joints, and our errors relative to the rivals'."""
     means = {name: np.mean(errors, axis=1) for name, errors in by_method.items()}
     rows = []
-    for name, each in means.items():
+    for name, values in means.items():
         case, bound = f"arm/noisy-coulomb/{name}", SEEN if name == "ours" else None
-        rows.append(Row(case, "nmse", float(np.median(each)), bound=bound, expected=f"median of {seeds} seeds"))
-        rows.append(Row(case, "nmse_worst", float(np.max(each))))
-    rows += [
-        Row("arm/noisy-coulomb/ours", f"nmse_joint_{joint + 1}", float(value))
-        for joint, value in enumerate(np.median(by_method["ours"], axis=0))
-    ]
-    for name in means:
+        rows.append(Row(case, "nmse", float(np.median(values)), bound=bound, expected=f"median of {seeds} seeds"))
+        rows.append(Row(case, "nmse_worst", float(np.max(values))))
         if name.startswith("pinocchio"):
             words = f"median over seeds of ours over {name}, the same samples and filter"
-            rows.append(
-                expect("arm/noisy-coulomb/ours", f"over_{name}", words, np.median(means["ours"] / means[name]), 1)
-            )
+            ratio = np.median(means["ours"] / values)
+            rows.append(expect("arm/noisy-coulomb/ours", f"over_{name}", words, ratio, 1))
     return rows
 
 
 def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
     """Median errors over motions and seeds, and our errors relative to those with true parameters."""
-    rows = [Row(f"arm/tracking/{name}", "rms_mrad", float(np.median(each)), "mrad") for name, each in tracked.items()]
+    rows = [
+        Row(f"arm/tracking/{name}", "rms_mrad", float(np.median(errors)), "mrad") for name, errors in tracked.items()
+    ]
     words = "median over motions of ours over that with true parameters and dry friction of the usual scale"
     for name in (name for name in tracked if name.startswith("ours")):
         ratio = np.median(np.divide(tracked[name], tracked["true-parameters"]))
@@ -168,24 +168,6 @@ def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
     return rows
 
 
-def curves_of(by_method: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:
-    """Median nMSE over seeds, by method and joint."""
-    return {name: np.median(errors, axis=0).tolist() for name, errors in by_method.items()}
-
-
-def logs(robot: Any, random: np.random.Generator, count: int) -> Trajectories:
-    """Noise-free logs of random motions under PD control."""
-    return trajectories([follow(robot, motion(random)) for _ in range(count)])
-
-
-def error(torque: Torque, test: Trajectories) -> np.ndarray:
-    """nMSE by joint [d] on true states."""
-    return normalised_error(torque(test.q, test.qd, test.qdd), test.tau)
-
-
 def rms(log: Log) -> float:
     """Root mean square tracking error, rad."""
     return float(np.sqrt(np.mean((log.q - log.reference) ** 2)))
-
-
-MEASURES: Sequence[Callable[[bool], Findings]] = (clean, noisy)

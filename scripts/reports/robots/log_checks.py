@@ -50,8 +50,12 @@ class _Arm(NamedTuple):
     torques: Callable[..., Any]
 
 
+@functools.cache
 def random_arm(seed: int, d: int) -> _Arm:
-    """An arm with random frames; every third is branched, and one with seven joints is the Panda."""
+    """An arm with random frames; every third is branched, and one with seven joints is the Panda.
+
+    Arms are cached because their programs take long to compile.
+    """
     random = np.random.default_rng([seed, d])
     if d == 7 and seed % 2:
         tree = panda().tree
@@ -107,7 +111,7 @@ def simulate(arm: _Arm, seed: int, *, repeats: bool) -> Simulated:
     n = int(rate * random.uniform(15, 40) / runs)
     t = np.arange(n) / rate
     parts = [motion(random, d, t) for _ in range(runs)]
-    q, qd, qdd = (np.concatenate(each) for each in zip(*parts, strict=True))
+    q, qd, qdd = map(np.concatenate, zip(*parts, strict=True))
     tau = np.asarray(arm.torques(q, qd, qdd))
     size = np.maximum(tau.std(axis=0), 1e-2 * tau.std(axis=0).max())
     if random.random() < 0.6:
@@ -157,8 +161,8 @@ def _late(arrays: Arrays, random: np.random.Generator, d: int) -> Arrays:
     step = float(arrays["t"][1] - arrays["t"][0])
     shift = max(1, round(random.uniform(0.005, 0.05) / step))
     tau = arrays["tau"].copy()
-    for each in np.unique(arrays["trajectory"]):
-        here = arrays["trajectory"] == each
+    for index in np.unique(arrays["trajectory"]):
+        here = arrays["trajectory"] == index
         tau[here] = np.concatenate([np.repeat(tau[here][:1], shift, 0), tau[here][:-shift]])
     return {**arrays, "tau": tau}
 
@@ -203,36 +207,28 @@ FAULTS: Mapping[str, tuple[_Fault, tuple[str, ...], str]] = {
 def sound(few: bool, *, with_robot: bool) -> Findings:
     """The share of sound logs with a false finding."""
     count, name = QUICK if few else SOUND, "with-robot" if with_robot else "without-robot"
-    found = []
+    alarms = []
     for number in range(count):
         log = drawn(number, repeats=number % 2 == 1)
-        found.append(bool(false_findings(log, log.robot if with_robot else None)))
+        alarms.append(bool(false_findings(log, log.robot if with_robot else None)))
     words = f"of {count} sound logs with a false error or warning; every other log repeats rows"
-    row = expect(f"log-checks/sound-{name}", "false_alarms", words, np.mean(found), FALSE_ALARMS)
-    return Findings([row], {name: [float(each) for each in found]})
+    return Findings([expect(f"log-checks/sound-{name}", "false_alarms", words, np.mean(alarms), FALSE_ALARMS)])
 
 
 def faulty(few: bool, *, kind: str) -> Findings:
     """The share of faulty logs in which the fault is detected and named."""
-    count, found = 1 if few else FAULTY, []
-    fault, checks, given = FAULTS[kind]
+    count, detected = 1 if few else FAULTY, []
+    fault, checks, inputs = FAULTS[kind]
     for number in range(count):
         log = drawn(1000 + 100 * list(FAULTS).index(kind) + number, repeats=False)
-        found.append(any(finding in checks for finding in planted(log, fault, given, number)))
-    words = f"of {count} logs, by {checks[0]}" + (" with the robot" if given in ("robot", "tilted") else "")
-    row = expect(f"log-checks/{kind}", "found", words, np.mean(found), FOUND, at_least=True)
-    return Findings([row], {kind: [float(each) for each in found]})
+        detected.append(any(finding in checks for finding in planted(log, fault, inputs, number)))
+    words = f"of {count} logs, by {checks[0]}" + (" with the robot" if inputs in ("robot", "tilted") else "")
+    return Findings([expect(f"log-checks/{kind}", "found", words, np.mean(detected), FOUND, at_least=True)])
 
 
 def drawn(number: int, *, repeats: bool) -> Simulated:
     """The log with this number."""
-    return simulate(_arm(SEED + (number // 6) % 2, 2 + number % 6), SEED + number, repeats=repeats)
-
-
-@functools.cache
-def _arm(seed: int, d: int) -> _Arm:
-    """A random arm; arms are cached because their programs take long to compile."""
-    return random_arm(seed, d)
+    return simulate(random_arm(SEED + (number // 6) % 2, 2 + number % 6), SEED + number, repeats=repeats)
 
 
 def false_findings(log: Simulated, robot: Robot | None) -> list[str]:
@@ -241,14 +237,14 @@ def false_findings(log: Simulated, robot: Robot | None) -> list[str]:
     return [name for name in _checks(log.arrays, robot) if name not in true]
 
 
-def planted(log: Simulated, fault: _Fault, given: str, seed: int) -> list[str]:
+def planted(log: Simulated, fault: _Fault, inputs: str, seed: int) -> list[str]:
     """Findings in a log with a planted fault."""
     random, d = np.random.default_rng([SEED, seed, 2]), log.arrays["q"].shape[1]
     arrays = dict(log.arrays)
-    if given == "rates":
+    if inputs == "rates":
         arrays |= {"qd": log.rates[0], "qdd": log.rates[1]}
-    robot = log.robot if given in ("robot", "tilted") else None
-    if given == "tilted":
+    robot = log.robot if inputs in ("robot", "tilted") else None
+    if inputs == "tilted":
         axis, angle = random.normal(size=3), np.radians(random.uniform(10, 40))
         down = np.asarray(log.robot.tree.gravity, float)
         axis = np.cross(down, axis)

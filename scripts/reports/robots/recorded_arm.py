@@ -2,15 +2,12 @@
 
 The log is cut into ten blocks; two neighbours at a time are held out, and every other sample is predicted by a model
 that has not seen its block. Errors are over the variance of the whole log, so that a block in which a joint rests does
-not count for more. Laws of friction, the network and the learned frames are chosen by blocks of what is fitted.
+not count for more. Laws of friction, the network and the learned frames are chosen by blocks of the fitted data.
 """
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import jax
 import numpy as np
 
 from dln_jax.data import schema
@@ -21,35 +18,32 @@ from dln_jax.data.splits import in_blocks, select, with_joints
 from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.friction import FrictionFit, fit_friction
 from dln_jax.learning.kinematics import fit_tree
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree
 from dln_jax.models.serial_tree import tree_of
 from dln_jax.types import FrictionLaw, Needs
 from scripts.reports.case import Findings
-from scripts.reports.robots.rivals import regression
+from scripts.reports.robots.arm import Torque, error_of, torque_of
+from scripts.reports.robots.known_kinematics import USUAL_SCALE
+from scripts.reports.robots.pinocchio import regression
 from scripts.reports.rows import Row, expect
 
 BLOCKS = 10
 CUTOFF, DECIMATE = 5.0, 2
-"""Hz, of the filter of all, and every so manyth sample of the log."""
+"""Cut-off of the filter of all data, Hz, and stride of the samples."""
 LAWS: tuple[tuple[FrictionLaw, ...], ...] = (
     ("viscous", "coulomb", "offset"),
     ("viscous", "coulomb", "stribeck", "offset"),
     ("asymmetric", "offset"),
 )
 """Candidate sets of friction laws."""
-USUAL_SCALE = 0.01
-"""Velocity scale of the rival's dry friction, rad/s, which it does not fit."""
 LEARNED_SCALES = (0.01, 0.1)
-"""rad/s, of the dry friction of a learned tree while its frames are found; chosen from."""
+"""Candidate velocity scales, rad/s, of the dry friction of a learned tree while its frames are fitted."""
 CHOOSING = 4
 """Stride of the fitted blocks that serve as validation."""
 
-Predict = Callable[[Trajectories], np.ndarray]
-
 
 def recorded_arm(log: Path, robot: Path, quick: bool) -> Findings:
-    """Errors of every block by models that have not seen it; of one pair of blocks alone where it is to be quick.
+    """Errors of every block by models that have not seen it; a quick run holds out one pair of blocks.
 
     Raises:
         InputError: what `read_robot` or `schema.load` refuse, or joints that do not agree.
@@ -61,32 +55,28 @@ def recorded_arm(log: Path, robot: Path, quick: bool) -> Findings:
     squares: dict[str, list[np.ndarray]] = {}
     for pair in pairs:
         held = select(data, pair)
-        for name, predict in methods(tree, select(data, np.setdiff1d(np.unique(data.trajectory), pair))).items():
-            squares.setdefault(name, []).append((predict(held) - held.tau) ** 2)
-    variance = data.tau.var(axis=0)
-    curves = {name: (np.mean(np.concatenate(found), axis=0) / variance).tolist() for name, found in squares.items()}
-    return Findings(rows_of(squares, variance, tree.names), curves)
+        for name, torque in methods(tree, select(data, np.setdiff1d(np.unique(data.trajectory), pair))).items():
+            squares.setdefault(name, []).append((torque(held.q, held.qd, held.qdd) - held.tau) ** 2)
+    return Findings(rows_of(squares, data.tau.var(axis=0), tree.names))
 
 
-def methods(tree: Tree, data: Trajectories) -> dict[str, Predict]:
-    """Predictors by method, fitted to these blocks."""
+def methods(tree: Tree, data: Trajectories) -> dict[str, Torque]:
+    """Torques by method, fitted to these blocks."""
     present = np.unique(data.trajectory)
     chosen = present[1::CHOOSING]
     train, validation = select(data, np.setdiff1d(present, chosen)), select(data, chosen)
-    laws = min(LAWS, key=lambda each: error(fit_friction(tree, train, each), validation))
+    laws = min(LAWS, key=lambda laws: error_of(torque_by(fit_friction(tree, train, laws)), validation).mean())
     full = fit_friction(tree, data, laws)
     # The tree has seen what the network's size is chosen by, which leaves a network less to better there.
     with_network = fit_residual(full.model, full.parameters, tree.needs, train, validation)
-    found: dict[str, Predict] = {
-        "usual-friction": predictor(*_parts(fit_friction(tree, data, LAWS[0]))),
-        "chosen-friction": predictor(*_parts(full)),
-        "with-residual": predictor(with_network.model, with_network.parameters),
+    torques = {
+        "usual-friction": torque_by(fit_friction(tree, data, LAWS[0])),
+        "chosen-friction": torque_by(full),
+        "with-residual": torque_of(with_network.model, with_network.parameters),
+        "learned-tree": torque_by(fit_friction(learned(tree.needs, train, validation), data, laws)),
     }
-    found["learned-tree"] = predictor(*_parts(fit_friction(learned(tree.needs, train, validation), data, laws)))
     rival = regression(tree, data, velocity_scale=USUAL_SCALE)
-    if rival is not None:
-        found["pinocchio"] = lambda held: rival.torque(held.q, held.qd, held.qdd)
-    return found
+    return torques if rival is None else {**torques, "pinocchio": rival}
 
 
 def learned(needs: Needs, train: Trajectories, validation: Trajectories) -> Tree:
@@ -98,34 +88,22 @@ def learned(needs: Needs, train: Trajectories, validation: Trajectories) -> Tree
     return tree._replace(rotations=np.asarray(tree.rotations), positions=np.asarray(tree.positions))
 
 
-def predictor(model: Any, parameters: Any) -> Predict:
-    """A function from held-out samples to their torques."""
-    batch = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
-    return lambda held: np.asarray(batch(held.q, held.qd, held.qdd))
-
-
-def error(fit: FrictionFit, validation: Trajectories) -> float:
-    """Mean over joints of squared errors over the variance of their torque."""
-    left = predictor(*_parts(fit))(validation) - validation.tau
-    return float(np.mean(np.mean(left**2, axis=0) / validation.tau.var(axis=0)))
-
-
-def _parts(fit: FrictionFit) -> tuple[Any, Any]:
-    return fit.model, fit.parameters
+def torque_by(fit: FrictionFit) -> Torque:
+    """The torques of a fit."""
+    return torque_of(fit.model, fit.parameters)
 
 
 def rows_of(squares: dict[str, list[np.ndarray]], variance: np.ndarray, names: Sequence[str]) -> list[Row]:
     """Rows by method: mean nMSE over joints for all blocks and for the worst pair of blocks, and nMSE by joint."""
-    over = functools.partial(np.mean, axis=0)
-    pairs = {name: np.array([over(each) / variance for each in found]) for name, found in squares.items()}
-    every = {name: over(np.concatenate(found)) / variance for name, found in squares.items()}
+    every = {name: np.mean(np.concatenate(errors), axis=0) / variance for name, errors in squares.items()}
+    bound = float(every["pinocchio"].mean()) if "pinocchio" in every else None
     rows = []
-    for name, each in every.items():
-        case = f"recorded-arm/{name}"
-        bound = None if name == "pinocchio" or "pinocchio" not in every else float(every["pinocchio"].mean())
-        rows.append(Row(case, "nmse", float(each.mean()), bound=bound, expected="mean over joints, blocks held out"))
-        rows.append(Row(case, "nmse_worst_blocks", float(pairs[name].mean(axis=1).max())))
-        rows += [Row(case, f"nmse_{joint}", float(value)) for joint, value in zip(names, each, strict=True)]
+    for name, errors in every.items():
+        case, limit = f"recorded-arm/{name}", None if name == "pinocchio" else bound
+        worst = max(float(np.mean(pair.mean(axis=0) / variance)) for pair in squares[name])
+        rows.append(Row(case, "nmse", float(errors.mean()), bound=limit, expected="mean over joints, blocks held out"))
+        rows.append(Row(case, "nmse_worst_blocks", worst))
+        rows += [Row(case, f"nmse_{joint}", float(value)) for joint, value in zip(names, errors, strict=True)]
     words = "with the network over without it, whose error it is to lower"
-    without, extended = every["chosen-friction"].mean(), every["with-residual"].mean()
-    return [*rows, expect("recorded-arm/with-residual", "over_without", words, extended / without, 1.0)]
+    ratio = every["with-residual"].mean() / every["chosen-friction"].mean()
+    return [*rows, expect("recorded-arm/with-residual", "over_without", words, ratio, 1.0)]

@@ -1,7 +1,6 @@
 """Speed of a seven-axis tree: calls of exported C beside Pinocchio's, and batches in JAX beside Pinocchio's loop."""
 
 import tempfile
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,13 +15,11 @@ from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.latency import medians_in_turns
 from scripts.reports.case import Findings
 from scripts.reports.robots.arm import D, arm
-from scripts.reports.robots.rivals import pinocchio, pinocchio_model
+from scripts.reports.robots.pinocchio import RIVALS, Timed, call_all, pinocchio_functions, seconds_of_calls
 from scripts.reports.rows import Row, expect
-from scripts.reports.speed.calls_from_python import Timed, call_all, seconds_of_calls
 
 CASE = "seven-axis-tree"
 BATCH = 10_000
-RIVALS = {"inverse_dynamics": "rnea", "forward_dynamics": "aba"}
 MOST = 2.0
 """Largest time of our calls, relative to Pinocchio's."""
 
@@ -32,19 +29,13 @@ def speed(quick: bool) -> Findings:
     tree = arm(coulomb=False).tree
     system = tree_system(tree)
     exported = functions_of_system(system, D, dtype=np.float64)
-    pin = pinocchio()
-    rivals = {}
-    if pin is not None:
-        model = pinocchio_model(pin, tree)
-        of_states = model.createData()
-        # Without armature: ours adds it, and Pinocchio does a little less.
-        rivals = {name: Timed(partial(getattr(pin, name), model, of_states), D, np.float64) for name in RIVALS.values()}
-    repetitions = 20 if quick else 200
+    # Without armature: ours adds it, and Pinocchio does a little less.
+    rivals = pinocchio_functions(tree)
     with tempfile.TemporaryDirectory() as place:
         export_c({name: exported[name] for name in RIVALS}, Path(place) / "arm")
         loaded = load_c(Path(place) / "arm")
-        ours = {name: Timed(getattr(loaded, name), D, np.float64) for name in RIVALS}
-        seconds = seconds_of_calls({**ours, **rivals}, repetitions=repetitions)
+        ours = {name: Timed(getattr(loaded, name), D) for name in RIVALS}
+        seconds = seconds_of_calls({**ours, **rivals}, repetitions=20 if quick else 200)
     rows = [Row(f"{CASE}/{name}", "python_us", 1e6 * seconds[name], "us") for name in RIVALS]
     for name, rival in RIVALS.items() if rivals else ():
         rows.append(Row(f"{CASE}/{name}", "pinocchio_us", 1e6 * seconds[rival], "us"))
@@ -57,6 +48,6 @@ def speed(quick: bool) -> Findings:
     if "rnea" in rivals:
         listed = list(zip(*states, strict=True))
         loops["pinocchio"] = lambda: call_all(rivals["rnea"].function, listed)
-    for name, each in medians_in_turns(loops, (), repetitions=3 if quick else 15).items():
-        rows.append(Row(f"{CASE}/batch-of-{BATCH}", f"{name}_states_per_second", BATCH / each, "1/s"))
+    for name, median in medians_in_turns(loops, (), repetitions=3 if quick else 15).items():
+        rows.append(Row(f"{CASE}/batch-of-{BATCH}", f"{name}_states_per_second", BATCH / median, "1/s"))
     return Findings(rows)

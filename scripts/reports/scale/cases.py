@@ -49,13 +49,13 @@ def measure_crawlers(lanes: Sequence[int], steps: int, turns: int, count: int) -
     with contextlib.ExitStack() as stack:
         teams = teams_of(stack, layouts(count))
         for number in lanes:
-            found = taken_in_turns(teams, {"work": "crawlers", "lanes": number, "steps": steps}, turns)
-            alone = found[BASE].seconds / (number * steps)
+            times = taken_in_turns(teams, {"work": "crawlers", "lanes": number, "steps": steps}, turns)
+            alone = times[BASE].seconds / (number * steps)
             case = f"crawlers/{number}"
-            rows += compared(case, found, "seconds_per_lane_step", number * steps)
-            facts = found[BASE].facts
+            rows += compared(case, times, "seconds_per_lane_step", number * steps)
+            facts = times[BASE].facts
             rows += [Row(case, name, facts[name]) for name in ("useful_iterations_share", "converged_share")]
-            curves[str(number)] = gains(found)
+            curves[str(number)] = gains(times)
     generation = max(lanes)
     modelled = hosts.rows("evolution", generation * EPISODE * alone, hosts.of_results(generation))
     return Findings(rows + modelled, {"measured": curves, "modelled": {"evolution": hosts.curves(modelled)}})
@@ -66,16 +66,16 @@ def measure_training(samples: int, turns: int, count: int) -> Findings:
     rows, curves, lines = [], {}, {}
     with contextlib.ExitStack() as stack:
         teams = teams_of(stack, layouts(count))
-        for name, given in TRAININGS.items():
-            found = taken_in_turns(teams, {"work": "training", "samples": samples, **given}, turns)
-            facts = found[BASE].facts
+        for name, work in TRAININGS.items():
+            times = taken_in_turns(teams, {"work": "training", "samples": samples, **work}, turns)
+            facts = times[BASE].facts
             parameters = int(facts["parameters"])
-            rows += compared(f"training/{name}", found, "seconds_per_step", facts["steps"])
+            rows += compared(f"training/{name}", times, "seconds_per_step", facts["steps"])
             rows.append(Row(f"training/{name}", "parameters", parameters))
             exchange = hosts.of_gradient(parameters) if name == "adam" else hosts.of_normal_equations(parameters)
-            modelled = hosts.rows(name, found[BASE].seconds / facts["steps"], exchange)
+            modelled = hosts.rows(name, times[BASE].seconds / facts["steps"], exchange)
             rows += modelled
-            curves[name], lines[name] = gains(found), hosts.curves(modelled)
+            curves[name], lines[name] = gains(times), hosts.curves(modelled)
     return Findings(rows, {"measured": curves, "modelled": lines})
 
 
@@ -94,36 +94,31 @@ def measure_accelerator(quick: bool, lanes: int, turns: int) -> Findings:
         )
         for dtype in ("float32", "float64")
     }
-    for name, given in TRAININGS.items():
-        work = {"work": "training", "samples": SAMPLES, **given}
-        asked[f"training/{name}"] = (work, "seconds_per_step", float(given["steps"]))
+    for name, training in TRAININGS.items():
+        work = {"work": "training", "samples": SAMPLES, **training}
+        asked[f"training/{name}"] = (work, "seconds_per_step", float(training["steps"]))
     asked["crawlers"] = ({"work": "crawlers", "lanes": lanes, "steps": STEPS}, "seconds_per_lane_step", lanes * STEPS)
     with contextlib.ExitStack() as stack:
-        teams = teams_of(stack, {BASE: Layout(), _named(kind): Layout(platform=platform)})
+        teams = teams_of(stack, {BASE: Layout(), "-".join(kind.lower().split()): Layout(platform=platform)})
         for name, (work, quantity, count) in asked.items():
             rows += compared(f"accelerator/{name}", taken_in_turns(teams, work, turns), quantity, count)
     return Findings(rows)
 
 
-def compared(case: str, found: Mapping[str, Measured], quantity: str, count: float | int) -> list[Row]:
+def compared(case: str, times: Mapping[str, Measured], quantity: str, count: float) -> list[Row]:
     """Time of one in `count` work items by layout, number of busy cores, and speed-up over one device."""
     rows = []
-    for name, each in found.items():
+    for name, measured in times.items():
         at = f"{case}/{name}"
-        rows += [Row(at, quantity, each.seconds / count, "s"), Row(at, "busy_cores", each.processors)]
-        rows += [Row(at, "speed_up", found[BASE].seconds / each.seconds)] if name != BASE else []
-    return rows
+        rows += [Row(at, quantity, measured.seconds / count, "s"), Row(at, "busy_cores", measured.processors)]
+    return rows + [Row(f"{case}/{name}", "speed_up", gain) for name, gain in gains(times).items()]
 
 
-def gains(found: Mapping[str, Measured]) -> dict[str, float]:
+def gains(times: Mapping[str, Measured]) -> dict[str, float]:
     """Speed-ups of the other layouts over one device."""
-    return {name: found[BASE].seconds / each.seconds for name, each in found.items() if name != BASE}
+    return {name: times[BASE].seconds / measured.seconds for name, measured in times.items() if name != BASE}
 
 
 def draw(x: str, curves: dict[str, Any]) -> Figure:
     """Draws measured and modelled speed-ups."""
     return speed_ups(curves["measured"], curves["modelled"], hosts=hosts.HOSTS, x=x)
-
-
-def _named(kind: str) -> str:
-    return "-".join(kind.lower().split())

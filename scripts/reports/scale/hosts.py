@@ -12,9 +12,6 @@ the normal equations, and the shorter waits of lanes in smaller groups.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from rich.table import Table
-
-from scripts.reports.case import by_case
 from scripts.reports.rows import Row
 
 CASES = "hosts/"
@@ -90,14 +87,3 @@ def rows(work: str, seconds: float, exchange: Exchange) -> list[Row]:
 def curves(modelled: Sequence[Row]) -> dict[str, list[float]]:
     """Speed-ups by network, from the rows of one work."""
     return {name: [row.value for row in modelled if row.case.endswith(f"/{name}")] for name in NETWORKS}
-
-
-def table(modelled: Sequence[Row]) -> Table:
-    """Table of speed-ups with one line per work and network, and one column per number of hosts."""
-    titles = [f"{hosts} host{'s' if hosts > 1 else ''}" for hosts in HOSTS]
-    shown = Table("times as fast as one", *titles, caption="modelled, not measured: see the conditions in report.json")
-    for case, numbers in by_case(modelled).items():
-        values = [f"{numbers[name]:.3g}" for hosts in HOSTS if (name := f"speed_up_of_{hosts}") in numbers]
-        if values:
-            shown.add_row(case.removeprefix(CASES), *values)
-    return shown

@@ -8,15 +8,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from dln_jax.types import InputError
-
-ROOT = Path(__file__).parents[3]
-"""Folder of the package that the processes import."""
+from scripts.reports.process import search_path
 
 
 class Layout(NamedTuple):
@@ -52,18 +49,18 @@ def team(layout: Layout) -> Iterator[tuple[Team, dict[str, Any]]]:
         InputError: a process ended instead of answering.
     """
     command = [sys.executable, "-m", "scripts.reports.scale.worker", str(layout.devices), str(layout.processes)]
-    told = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "PYTHONPATH": _path()}
-    told |= {"JAX_PLATFORMS": layout.platform} if layout.platform else {}
+    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "PYTHONPATH": search_path()}
+    environment |= {"JAX_PLATFORMS": layout.platform} if layout.platform else {}
     port = str(_free_port())
     with contextlib.ExitStack() as stack:
-        said = [stack.enter_context(tempfile.TemporaryFile()) for _ in range(layout.processes)]
+        errors = [stack.enter_context(tempfile.TemporaryFile()) for _ in range(layout.processes)]
         workers = [
-            stack.enter_context(_ended(_started([*command, str(number), port], told, error)))
-            for number, error in enumerate(said)
+            stack.enter_context(_worker([*command, str(number), port], environment, error))
+            for number, error in enumerate(errors)
         ]
 
         def ask(question: Any) -> list[dict[str, Any]]:
-            for worker, error in zip(workers, said, strict=True):
+            for worker, error in zip(workers, errors, strict=True):
                 try:
                     print(json.dumps(question), file=worker.stdin, flush=True)
                 except BrokenPipeError:
@@ -71,7 +68,7 @@ def team(layout: Layout) -> Iterator[tuple[Team, dict[str, Any]]]:
             return answers()
 
         def answers() -> list[dict[str, Any]]:
-            return [_answer(worker, error) for worker, error in zip(workers, said, strict=True)]
+            return [_answer(worker, error) for worker, error in zip(workers, errors, strict=True)]
 
         yield ask, answers()[0]
 
@@ -83,10 +80,10 @@ def taken_in_turns(teams: Mapping[str, Team], work: Mapping[str, Any], repetitio
     for _ in range(repetitions + 1):
         for name, ask in teams.items():
             answers = ask(None)
-            seconds = max(each["seconds"] for each in answers)
-            turns[name].append((seconds, sum(each["processor_seconds"] for each in answers) / seconds))
+            seconds = max(answer["seconds"] for answer in answers)
+            turns[name].append((seconds, sum(answer["processor_seconds"] for answer in answers) / seconds))
     # The first turn warms up.
-    medians = {name: np.median(each[1:], axis=0) for name, each in turns.items()}
+    medians = {name: np.median(pairs[1:], axis=0) for name, pairs in turns.items()}
     return {name: Measured(float(medians[name][0]), float(medians[name][1]), facts[name]) for name in teams}
 
 
@@ -95,17 +92,16 @@ def teams_of(stack: contextlib.ExitStack, layouts: Mapping[str, Layout]) -> dict
     return {name: stack.enter_context(team(layout))[0] for name, layout in layouts.items()}
 
 
-def _started(command: Sequence[str], told: Mapping[str, str], error: IO[bytes]) -> subprocess.Popen[str]:
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, env=told, stdin=pipe, stdout=pipe, stderr=error, text=True)
-
-
 @contextlib.contextmanager
-def _ended(worker: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
-    # A process that waits for a peer which has ended would not notice that its input is closed.
+def _worker(
+    command: Sequence[str], environment: Mapping[str, str], error: IO[bytes]
+) -> Iterator[subprocess.Popen[str]]:
+    pipe = subprocess.PIPE
+    worker = subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=error, text=True)
     try:
         yield worker
     finally:
+        # A process that waits for a peer which has ended would not notice that its input is closed.
         worker.kill()
         worker.communicate()
 
@@ -121,10 +117,6 @@ def _silent(error: IO[bytes]) -> InputError:
     error.seek(0)
     lines = error.read().decode(errors="replace").strip().splitlines() or ["it printed nothing"]
     return InputError(f"a process that was to be measured ended: {lines[-1]}")
-
-
-def _path() -> str:
-    return os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
 def _free_port() -> int:

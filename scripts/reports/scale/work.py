@@ -79,7 +79,7 @@ def training(mesh: Mesh | None, *, optimiser: str, samples: int, steps: int, wid
     def size(parameters: Any) -> Any:
         return unmonitored(jnp.sum(ravel_pytree(parameters)[0] ** 2))
 
-    arrays = tuple(jnp.asarray(each) for each in (data.q, data.qd, data.qdd, data.tau))
+    arrays = tuple(map(jnp.asarray, (data.q, data.qd, data.qdd, data.tau)))
     problem = Problem(residual, parameters, arrays, size)
     shared = sharing(problem, mesh)
     if optimiser == "adam":
@@ -97,10 +97,8 @@ def training(mesh: Mesh | None, *, optimiser: str, samples: int, steps: int, wid
 
 def inverse_dynamics(mesh: Mesh | None, *, batch: int, dtype: str) -> Work:
     """Torques of a structured DeLaN of two joints and two hidden layers of 64 for a batch of states."""
-    model, keys = (
-        make_delan(two_link_arm().needs, width=64, depth=2, dtype=dtype),
-        jax.random.split(jax.random.key(0), 4),
-    )
+    model = make_delan(two_link_arm().needs, width=64, depth=2, dtype=dtype)
+    keys = jax.random.split(jax.random.key(0), 4)
     energies = model.energies(model.init(keys[0]))
     states = replicate(tuple(jax.random.normal(key, (batch, 2), dtype) for key in keys[1:]), mesh)
     shared = spread(lambda _, states: jax.vmap(dynamics(energies).inverse_dynamics)(*states), mesh)

@@ -1,7 +1,7 @@
 """One process of a measurement of scale: `python -m scripts.reports.scale.worker LAYOUT PROCESS PORT`.
 
-Reads lines of JSON from standard input: {"work": NAME, ...} compiles, and is answered by what it came to; null does it
-once, and is answered by seconds. It ends with its input, and after a stated time without an answer.
+Reads lines of JSON from standard input: {"work": NAME, ...} compiles the work, and is answered by facts about it; null
+does it once, and is answered by seconds. The process ends with its input, or if an answer takes too long.
 """
 
 import faulthandler
@@ -38,9 +38,9 @@ def main(devices: int, processes: int, process: int, port: int) -> None:
     work = None
     for line in sys.stdin:
         faulthandler.dump_traceback_later(LIMIT, exit=True)
-        given = json.loads(line)
-        if given is not None:
-            work = WORK[given.pop("work")](batch_mesh(devices), **given)
+        question = json.loads(line)
+        if question is not None:
+            work = WORK[question.pop("work")](batch_mesh(devices), **question)
             answer(**work.facts)
         elif work is not None:
             start = jax.block_until_ready(work.fresh())

@@ -15,9 +15,8 @@ from dln_jax.softbody.step import Step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.softbody.terms.term import Term
 from dln_jax.softbody.verdict import Info
-from scripts.reports.rows import Row, expect
+from scripts.reports.rows import Row, expect, largest
 
 GRAVITY = 9.8
 """Gravity of the reference values, m/s²."""
@@ -32,10 +31,10 @@ class Seen(NamedTuple):
     converged: Bool[np.ndarray, " T"]
 
 
-def solid(mesh: Mesh, *others: Term, modulus: float, poisson_ratio: float = 0.3, **scene: Any) -> SoftScene:
+def solid(mesh: Mesh, *, modulus: float, poisson_ratio: float = 0.3, **scene: Any) -> SoftScene:
     """A stable neo-Hookean body under its weight; Young's modulus in Pa."""
     material = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus, poisson_ratio=poisson_ratio)
-    return make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY)), *others], **scene)
+    return make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY))], **scene)
 
 
 def cantilever_of(mesh: Mesh, modulus: float = 1e6, **others: Any) -> SoftScene:
@@ -43,9 +42,11 @@ def cantilever_of(mesh: Mesh, modulus: float = 1e6, **others: Any) -> SoftScene:
     return solid(mesh, modulus=modulus, held=vertices_where(mesh, lambda x: x[:, 0] == 0), **others)
 
 
-def converges(name: str, converged: Any) -> Row:
-    """Row that counts the steps that did not converge."""
-    return expect(name, "steps_not_converged", "every step converges", np.sum(~np.asarray(converged)), 0.0)
+def converges(name: str, converged: Any, iterations: Any = None, most: int = 0, text: str = "") -> list[Row]:
+    """Rows of the number of steps that did not converge, and of the largest number of iterations if it has a bound."""
+    count = np.sum(~np.asarray(converged))
+    rows = [expect(name, "steps_not_converged", "every step converges", count, 0.0)]
+    return rows if iterations is None else [*rows, expect(name, "most_iterations", text, largest(iterations), most)]
 
 
 def motion(step: Step, steps: int) -> Callable[[Params, State], Seen]:

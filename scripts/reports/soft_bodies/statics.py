@@ -60,24 +60,24 @@ def uniaxial(quick: bool) -> Findings:
         forces = gradient(energies, everywhere, x, data)
         return x, jnp.where(rest[:, 0] == 1, forces[:, 0], 0).sum(), info.converged
 
-    cases = []
+    rows = []
     for stretch, (lateral, stress) in UNIAXIAL.items():
         x, force, converged = stretched(jnp.asarray(stretch))
         name = f"uniaxial/stretch-{stretch:g}"
         wide = largest(abs(np.asarray(x)[:, 1:] - lateral * rest[:, 1:])) / lateral
         text = "to the published digits, at every vertex"
-        cases += [
+        rows += [
             expect(name, "not_converged", "the solver says so", not converged, 0.0),
             expect(name, "lateral_stretch_error", text, wide, 2e-8, reference=lateral),
             expect(name, "nominal_stress_error", text, abs(force / stress - 1), 2e-8, reference=stress),
         ]
-    return Findings(cases)
+    return Findings(rows)
 
 
 def patch_test(quick: bool) -> Findings:
     """Irregular meshes whose boundary is moved affinely: the inside follows, to rounding."""
     random = np.random.default_rng(0)
-    cases = []
+    rows = []
     space, plane = box((1.0, 1.0, 1.0), (2, 2, 2)), beam(1.0, 1.0, 4, 4)
     for mesh in (space,) if quick else (plane, space):
         outside = boundary_vertices(mesh)
@@ -93,19 +93,19 @@ def patch_test(quick: bool) -> Findings:
         start[inside] += random.uniform(-0.03, 0.03, start[inside].shape)
         x, info = jax.jit(lambda x, scene=scene: static_solve(scene, scene.params, x=x, tolerance=1e-9))(start)
         name, error = f"patch-test/{d}-d", largest(abs(np.asarray(x) - affine))
-        cases.append(expect(name, "not_converged", "the solver says so", not info.converged, 0.0))
-        cases.append(expect(name, "largest_position_error", "x = F X inside, to rounding", error, 1e-12, "m"))
-    return Findings(cases)
+        rows.append(expect(name, "not_converged", "the solver says so", not info.converged, 0.0))
+        rows.append(expect(name, "largest_position_error", "x = F X inside, to rounding", error, 1e-12, "m"))
+    return Findings(rows)
 
 
 def elastica(quick: bool) -> Findings:
     """A slender cantilever bent far by a load on its tip, under refinement."""
     loads = [1.0, 10.0] if quick else list(ELASTICA)
     meshes = [(200, 4), (400, 8)] if quick else [(200, 4), (400, 8), (800, 16)]
-    found = np.stack([_bent(cells, loads) for cells in meshes])
-    tips, converged = found[..., :2], found[..., 2].all()
+    solutions = np.stack([_bent(cells, loads) for cells in meshes])
+    tips, converged = solutions[..., :2], solutions[..., 2].all()
     extrapolated = tips[-1] + (tips[-1] - tips[-2]) / 3
-    cases = [expect("elastica", "not_converged", "every equilibrium is found", float(not converged), 0.0)]
+    rows = [expect("elastica", "not_converged", "every equilibrium is found", float(not converged), 0.0)]
     for index, load in enumerate(loads):
         name = f"elastica/load-{load:g}"
         for axis, quantity in enumerate(("deflection", "shortening")):
@@ -113,13 +113,12 @@ def elastica(quick: bool) -> Findings:
             error = abs(extrapolated[index, axis] / expected - 1)
             text = f"{expected} L, extrapolated from {len(meshes)} meshes; beams of {SLENDERNESS} : 1 shear a little"
             bound = 0.02 if quick else 2e-3
-            cases.append(expect(name, f"{quantity}_error", text, error, bound, reference=expected))
+            rows.append(expect(name, f"{quantity}_error", text, error, bound, reference=expected))
         if not quick:
             order = float(np.log2((tips[1, index, 0] - tips[0, index, 0]) / (tips[2, index, 0] - tips[1, index, 0])))
             text = "deflections converge with order 2"
-            cases.append(expect(name, "order_error", text, abs(order - 2), 0.25, reference=2.0))
-    curves = {"loads": loads, "cells": [cells[1] for cells in meshes], "tips": tips, "extrapolated": extrapolated}
-    return Findings(cases, curves)
+            rows.append(expect(name, "order_error", text, abs(order - 2), 0.25, reference=2.0))
+    return Findings(rows)
 
 
 def _bent(cells: tuple[int, int], loads: list[float]) -> np.ndarray:
@@ -144,12 +143,12 @@ def _bent(cells: tuple[int, int], loads: list[float]) -> np.ndarray:
         x, info = static_solve(scene, params, x=x, iterations=500)
         return x, info.converged
 
-    x, found = scene.params.rest, []
+    x, tips = scene.params.rest, []
     for load in loads:
         x, converged = solve(x, jnp.asarray(load))
         at = np.asarray(x)[middle].reshape(-1, 2).mean(axis=0)
-        found.append([height / 2 - at[1], 1 - at[0], float(converged)])
-    return np.array(found)
+        tips.append([height / 2 - at[1], 1 - at[0], float(converged)])
+    return np.array(tips)
 
 
 def cantilever(quick: bool) -> Findings:
@@ -160,32 +159,32 @@ def cantilever(quick: bool) -> Findings:
     order is that of the singular corners.
     """
     cells = [(32, 8), (64, 16)] if quick else [(32, 8), (64, 16), (128, 32)]
-    found = np.array([_clamped(scene) for scene in map(_cantilever, cells)])
-    extrapolated = found[-1] + (found[-1] - found[-2]) / 3
+    numbers = np.array([_clamped(scene) for scene in map(_cantilever, cells)])
+    extrapolated = numbers[-1] + (numbers[-1] - numbers[-2]) / 3
     lowered = BENDING_FREQUENCY * (1 + (BENDING_FREQUENCY / SHEAR_FREQUENCY) ** 2) ** -0.5
     expected = {
         "deflection": (BENDING + SHEAR, 0.02, "m", "bending 3.7632 mm and shear 0.2446 mm"),
         "bending_frequency": (lowered, 0.02, "Hz", "Euler-Bernoulli's 10.096 Hz, lowered by shear (Southwell)"),
         "axial_frequency": (AXIAL_FREQUENCY, 0.01, "Hz", "sqrt(E/rho)/4L"),
     }
-    cases = []
+    rows = []
     for index, (quantity, (value, bound, unit, text)) in enumerate(expected.items()):
         error = float(abs(extrapolated[index] / value - 1))
         text += f"; extrapolated from {len(cells)} meshes: {extrapolated[index]:.5g} {unit}"
-        cases.append(expect("cantilever", f"{quantity}_error", text, error, bound, reference=value))
+        rows.append(expect("cantilever", f"{quantity}_error", text, error, bound, reference=value))
         if not quick and quantity != "axial_frequency":
-            order = float(np.log2((found[1, index] - found[0, index]) / (found[2, index] - found[1, index])))
+            order = float(np.log2((numbers[1, index] - numbers[0, index]) / (numbers[2, index] - numbers[1, index])))
             text = "linear elements lock: convergence is of order 2, a little less at the clamped corners"
-            cases.append(expect("cantilever", f"{quantity}_order", text, order, 1.5, at_least=True, reference=2.0))
+            rows.append(expect("cantilever", f"{quantity}_order", text, order, 1.5, at_least=True, reference=2.0))
     text = f"{BENDING_FREQUENCY} Hz is the limit of a slender beam, which bounds it from above"
-    cases.append(expect("cantilever", "bending_frequency", text, extrapolated[1], BENDING_FREQUENCY, "Hz"))
+    rows.append(expect("cantilever", "bending_frequency", text, extrapolated[1], BENDING_FREQUENCY, "Hz"))
     scene = _cantilever(cells[0])
     x, info = jax.jit(lambda params: static_solve(scene, params))(scene.params)
     sag = float(-(x[_tip(scene), 1] - scene.params.rest[_tip(scene), 1]).mean())
     text = "the nonlinear equilibrium is the linear one, to second order in deflection / length"
-    cases.append(expect("cantilever", "not_converged", "the solver says so", float(not info.converged), 0.0))
-    cases.append(expect("cantilever", "nonlinear_to_linear", text, abs(sag / found[0, 0] - 1), 1e-4))
-    return Findings(cases)
+    rows.append(expect("cantilever", "not_converged", "the solver says so", float(not info.converged), 0.0))
+    rows.append(expect("cantilever", "nonlinear_to_linear", text, abs(sag / numbers[0, 0] - 1), 1e-4))
+    return Findings(rows)
 
 
 def _cantilever(cells: tuple[int, int]) -> SoftScene:

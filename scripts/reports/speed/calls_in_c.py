@@ -1,8 +1,8 @@
 """Times of single functions of exported C, measured in C: loops of warm calls, and calls after emptying the caches.
 
 Calls of a control loop are cold: they come once a millisecond, and other code has used the caches in between. The
-timing program is generated from the header of an export, so that it fits any exporter: declarations are
-`void NAME_function(const real q[2], real dt, real tau[2]);`, and a function that returns a number returns its result.
+timing program `time_calls.c.in` is completed from the header of an export, so that it fits any exporter: declarations
+are `void NAME_function(const real q[2], real dt, real tau[2]);`, and a function may return a number as its result.
 """
 
 import json
@@ -22,105 +22,7 @@ from dln_jax.types import InputError
 SMALLEST, LARGEST = 8, 64
 """Bounds on the memory that is read to empty the caches, MiB; within them it is twice the last-level cache."""
 
-_PROGRAM = """\
-#define _POSIX_C_SOURCE 199309L
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <time.h>
-
-#include "$name.h"
-
-#ifdef __clang__
-#define COMPILER __VERSION__
-#elif defined __GNUC__
-#define COMPILER "gcc " __VERSION__
-#else
-#define COMPILER "an unknown compiler"
-#endif
-
-enum { STATES = 64, INPUTS = $inputs, RESULTS = $results, LINE = 64, PAIRS = 1001 };
-
-static $real states[STATES][INPUTS], results[RESULTS];
-
-static void call(const $real *x, $real *y)
-{
-    $call;
-}
-
-static long long now(void)
-{
-    struct timespec time;
-    clock_gettime(CLOCK_MONOTONIC, &time);
-    return 1000000000LL * time.tv_sec + time.tv_nsec;
-}
-
-static int compare(const void *one, const void *other)
-{
-    const long long a = *(const long long *)one, b = *(const long long *)other;
-    return (a > b) - (a < b);
-}
-
-/* What a pair of readings takes by itself, the median */
-static long long timer(void)
-{
-    static long long pairs[PAIRS];
-    for (int k = 0; k < PAIRS; ++k) {
-        const long long start = now();
-        pairs[k] = now() - start;
-    }
-    qsort(pairs, PAIRS, sizeof pairs[0], compare);
-    return pairs[PAIRS / 2];
-}
-
-int main(int arguments, char **argument)
-{
-    const long repeats = arguments == 5 ? atol(argument[1]) : 0, calls = arguments == 5 ? atol(argument[2]) : 0;
-    const long cold = arguments == 5 ? atol(argument[3]) : 0, bytes = arguments == 5 ? atol(argument[4]) : 0;
-    volatile unsigned char *evicting = malloc((size_t)bytes + 1);
-    unsigned long seed = 1;
-    const long long reading = timer();
-    double sum = 0;
-    if (arguments != 5 || !evicting) return 1;
-    /* Pages that were never written are all one. */
-    memset((void *)evicting, 1, (size_t)bytes + 1);
-    for (int k = 0; k < STATES; ++k)
-        for (int i = 0; i < INPUTS; ++i) {
-            seed = (1103515245UL * seed + 12345UL) & 0x7fffffffUL;
-            states[k][i] = ($real)seed / ($real)0x20000000UL - 2;
-        }
-    for (int k = 0; k < STATES; ++k) {
-        call(states[k], results);
-        for (int i = 0; i < RESULTS; ++i) sum += (double)(results[i] < 0 ? -results[i] : results[i]);
-    }
-    printf("{\\"timer_ns\\": %lld, \\"hot_ns\\": [", reading);
-    for (long repeat = -1; repeat < repeats; ++repeat) {
-        const long long start = now();
-        for (long k = 0; k < calls; ++k) call(states[k % STATES], results);
-        /* The first repeat warms up. */
-        const double each = (double)(now() - start - reading) / (double)calls;
-        if (repeat >= 0) printf("%s%.3f", repeat ? ", " : "", each);
-    }
-    printf("], \\"cold_ns\\": [");
-    for (long k = 0; k < cold; ++k) {
-        const volatile $real *state = states[k % STATES];
-        unsigned char read = 0;
-        for (long i = 0; i < bytes; i += LINE) read ^= evicting[i];
-        /* A loop has just made the state, and its clock is at hand. */
-        for (int i = 0; i < INPUTS; ++i) (void)state[i];
-        evicting[0] = read;
-        (void)now();
-        const long long start = now();
-        call(states[k % STATES], results);
-        const long long stop = now();
-        printf("%s%lld", k ? ", " : "", stop - start - reading);
-    }
-    printf("], \\"compiler\\": \\"%s\\", \\"sum\\": ", COMPILER);
-    if (sum - sum == 0) printf("%.17g}\\n", sum);
-    else printf("null}\\n");
-    return 0;
-}
-"""
+_PROGRAM = Path(__file__).with_name("time_calls.c.in").read_text()
 _PROTOTYPE = r"^(void|double|float)\s+{name}_(\w+)\(([^)]*)\);"
 _ARGUMENT = re.compile(r"\s*(const\s+)?(double|float)\s+(\w+)(?:\[([\d* ]+)\])?\s*")
 
@@ -153,9 +55,9 @@ class Times(NamedTuple):
 
 def prototypes(header: str, name: str) -> dict[str, Prototype]:
     """The functions NAME_... declared in a header with numbers of one type, by their names without NAME_."""
-    found = {}
+    declared = {}
     for returned, function, text in re.findall(_PROTOTYPE.format(name=re.escape(name)), header, re.MULTILINE):
-        arguments = [match for each in text.split(",") if (match := _ARGUMENT.fullmatch(each))]
+        arguments = [match for argument in text.split(",") if (match := _ARGUMENT.fullmatch(argument))]
         reals = {match[2] for match in arguments} | {returned} - {"void"}
         if len(arguments) <= text.count(",") or len(reals) != 1:
             continue
@@ -163,8 +65,8 @@ def prototypes(header: str, name: str) -> dict[str, Prototype]:
         written = {match[3] for match in arguments if match[4] and not match[1]}
         inputs = {key: size for key, size in sizes.items() if key not in written}
         results = {key: sizes[key] for key in sizes if key in written}
-        found[function] = Prototype(reals.pop(), inputs, results, returned != "void")
-    return found
+        declared[function] = Prototype(reals.pop(), inputs, results, returned != "void")
+    return declared
 
 
 def program(name: str, function: str, prototype: Prototype) -> str:
@@ -194,17 +96,17 @@ def programs(export: Path, model: Path, functions: Iterable[str], *, name: str =
     Raises:
         InputError: the export declares none of the functions, or the header does not compile.
     """
-    declared, found = prototypes((export / f"{name}.h").read_text(), name), {}
+    declared, built = prototypes((export / f"{name}.h").read_text(), name), {}
     for function in functions:
         if function in declared:
             source = model.with_name(f"time_{function}.c")
             source.write_text(program(name, function, declared[function]))
-            found[function] = source.with_suffix("")
+            built[function] = source.with_suffix("")
             # Compiled separately from the model, so that no call is inlined into the loop.
-            compile_c([*STANDARD, *FLAGS, f"-I{export}", str(source), str(model), "-lm", "-o", str(found[function])])
-    if not found:
+            compile_c([*STANDARD, *FLAGS, f"-I{export}", str(source), str(model), "-lm", "-o", str(built[function])])
+    if not built:
         raise InputError(f"{export / f'{name}.h'} declares none of {', '.join(functions)}; export it again")
-    return found
+    return built
 
 
 def timed(program: Path, *, repeats: int, calls: int, cold: int, mebibytes: int) -> Times:
@@ -224,10 +126,10 @@ def timed(program: Path, *, repeats: int, calls: int, cold: int, mebibytes: int)
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise InputError(f"{program.name} ended with status {done.returncode}; does the model's demo run?")
-    found = json.loads(done.stdout)
-    hot, cold_calls = (np.asarray(found[key], float) for key in ("hot_ns", "cold_ns"))
-    total = math.nan if found["sum"] is None else found["sum"]
-    return Times(hot, cold_calls, found["timer_ns"], total, found["compiler"])
+    answer = json.loads(done.stdout)
+    hot, cold_calls = (np.asarray(answer[key], float) for key in ("hot_ns", "cold_ns"))
+    total = math.nan if answer["sum"] is None else answer["sum"]
+    return Times(hot, cold_calls, answer["timer_ns"], total, answer["compiler"])
 
 
 def last_level_cache() -> int | None:

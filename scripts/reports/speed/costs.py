@@ -4,14 +4,12 @@ Throughput counts batched states, and is also compared with the full-Hessian met
 """
 
 import time
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from matplotlib.figure import Figure
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
@@ -20,65 +18,40 @@ from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.pendulums import chain
 from dln_jax.types import Lagrangian
 from scripts.reports.case import Findings
-from scripts.reports.figures.costs import cost_curves, cost_panels
 from scripts.reports.rows import Row
 
 BATCHES = (1, 10, 100, 1_000, 10_000, 100_000)
-QUICK = (1, 1_000)
 SIZES = (2, 4, 7, 12)
 TRAINING_BATCH = 512
-NAMES = ("inverse", "forward")
-JOINTS, QUICK_JOINTS = (1, 2, 3, 4, 6, 8, 10, 12, 30), (2, 4)
+JOINTS = (1, 2, 3, 4, 6, 8, 10, 12, 30)
 FITTED = (2, 12)
 """Range of joints in which exponents of growth are fitted."""
-UNITS = {
-    **{"inverse_p50_us": "us", "inverse_p99_us": "us", "inverse_compile_seconds": "s"},
-    **{"training_step_ms": "ms", "training_compile_seconds": "s", "training_memory_mib": "MiB"},
-}
-SHOWN = {
-    "one call": ("inverse_p50_us", "µs"),
-    "training step": ("training_step_ms", "ms"),
-    "compilation of a training step": ("training_compile_seconds", "s"),
-    "memory of a training step": ("training_memory_mib", "MiB"),
-}
+UNITS = {"inverse_p50_us": "us", "training_step_ms": "ms", "training_compile_seconds": "s"}
 
 
 def measure_throughput(quick: bool) -> Findings:
     """Inverse and forward dynamics by batch; the full-Hessian method by d, at one batch."""
     repetitions = 10 if quick else 40
-    batches = QUICK if quick else BATCHES
-    rows: list[Row] = []
-    for batch in batches:
+    rows = []
+    for batch in (1, 1_000) if quick else BATCHES:
         energies, states = structured(2, batch)
         model = dynamics(energies)
         programs = {
             "inverse": jax.jit(jax.vmap(model.inverse_dynamics)),
-            "inverse_again": jax.jit(jax.vmap(model.inverse_dynamics)),
             "forward": jax.jit(jax.vmap(model.forward_dynamics)),
         }
-        seconds = medians_in_turns(programs, states, repetitions=repetitions)
-        case, noise = f"structured-delan/batch-{batch}", abs(seconds["inverse_again"] / seconds["inverse"] - 1)
-        rows += [Row(case, f"{name}_states_per_second", batch / seconds[name], "1/s") for name in NAMES]
-        rows.append(Row(case, "noise_of_repetition", noise, "1"))
-    rates = {name: [row.value for row in rows if row.quantity.startswith(name)] for name in NAMES}
-    rows += [hessian_row(d, repetitions) for d in (SIZES[:1] if quick else SIZES)]
-    return Findings(rows, {name: (list(batches), each) for name, each in rates.items()})
-
-
-titles = {"x": "batch", "y": "states per second", "title": "structured DeLaN, d = 2, 64x64, float32"}
-draw_throughput = partial(cost_curves, **titles)
-
-
-def hessian_row(d: int, repetitions: int) -> Row:
-    """Throughput relative to the full-Hessian method."""
-    energies, states = structured(d, TRAINING_BATCH)
-    ways = {
-        "ours": jax.jit(jax.vmap(dynamics(energies).inverse_dynamics)),
-        "full": jax.jit(jax.vmap(by_full_hessian(lagrangian(energies)))),
-    }
-    seconds = medians_in_turns(ways, states, repetitions=repetitions)
-    bound = 4.0 if d == 2 else None
-    return Row(f"full-hessian/d-{d}", "speedup", seconds["full"] / seconds["ours"], "1", None, bound, at_least=True)
+        for name, seconds in medians_in_turns(programs, states, repetitions=repetitions).items():
+            rows.append(Row(f"structured-delan/batch-{batch}", f"{name}_states_per_second", batch / seconds, "1/s"))
+    for d in SIZES[:1] if quick else SIZES:
+        energies, states = structured(d, TRAINING_BATCH)
+        ways = {
+            "ours": jax.jit(jax.vmap(dynamics(energies).inverse_dynamics)),
+            "full": jax.jit(jax.vmap(by_full_hessian(lagrangian(energies)))),
+        }
+        seconds = medians_in_turns(ways, states, repetitions=repetitions)
+        bound, speedup = 4.0 if d == 2 else None, seconds["full"] / seconds["ours"]
+        rows.append(Row(f"full-hessian/d-{d}", "speedup", speedup, bound=bound, at_least=True))
+    return Findings(rows)
 
 
 def structured(d: int, batch: int) -> tuple[NaturalSystem, tuple[Array, ...]]:
@@ -100,24 +73,16 @@ def by_full_hessian(L: Lagrangian):
 
 
 def measure_scaling(quick: bool) -> Findings:
-    """Latency of single calls, a training step at batch 512, compilation and memory, and their exponents of growth."""
-    sizes = QUICK_JOINTS if quick else JOINTS
-    found = {d: cost(d, calls=500 if quick else 4_000, repetitions=10 if quick else 30) for d in sizes}
-    rows = [Row(f"structured-delan/d-{d}", *item, UNITS[item[0]]) for d in sizes for item in found[d].items()]
-    by_quantity = {name: [each[name] for each in found.values()] for name in UNITS}
-    inside = [index for index, d in enumerate(sizes) if FITTED[0] <= d <= FITTED[1]]
-    for quantity, values in by_quantity.items():
-        slope = np.polyfit(np.log([sizes[i] for i in inside]), np.log([values[i] for i in inside]), 1)[0]
+    """Latency of single calls, a training step at batch 512 and its compilation, and their exponents of growth."""
+    sizes = (2, 4) if quick else JOINTS
+    costs = {d: cost(d, calls=500 if quick else 4_000, repetitions=10 if quick else 30) for d in sizes}
+    rows = [Row(f"structured-delan/d-{d}", *item, UNITS[item[0]]) for d in sizes for item in costs[d].items()]
+    fitted = [d for d in sizes if FITTED[0] <= d <= FITTED[1]]
+    for quantity in UNITS:
+        slope = np.polyfit(np.log(fitted), np.log([costs[d][quantity] for d in fitted]), 1)[0]
         bound = 2.0 if quantity == "inverse_p50_us" else None
-        rows.append(Row("structured-delan/growth", f"{quantity}_exponent", float(slope), "1", None, bound))
-    places = list(map(float, sizes))
-    return Findings(rows, {title: (places, by_quantity[name], unit) for title, (name, unit) in SHOWN.items()})
-
-
-def draw_scaling(lines: dict) -> Figure:
-    """Draws the costs against the number of joints."""
-    panels = {name: {"structured-delan": (sizes, values)} for name, (sizes, values, _) in lines.items()}
-    return cost_panels(panels, x="joints", y=[unit for *_, unit in lines.values()])
+        rows.append(Row("structured-delan/growth", f"{quantity}_exponent", float(slope), bound=bound))
+    return Findings(rows)
 
 
 def cost(d: int, *, calls: int, repetitions: int) -> dict[str, float]:
@@ -141,8 +106,5 @@ def cost(d: int, *, calls: int, repetitions: int) -> dict[str, float]:
     began = time.perf_counter()
     compiled = jax.jit(step).lower(*arguments).compile()
     seconds = time.perf_counter() - began
-    analysis = compiled.memory_analysis()
-    memory = analysis.temp_size_in_bytes / 2**20 if analysis else float("nan")
     training = medians_in_turns({"step": compiled}, arguments, repetitions=repetitions)["step"]
-    of_a_call = (single.p50_us, single.p99_us, single.compile_seconds)
-    return dict(zip(UNITS, (*of_a_call, 1e3 * training, seconds, memory), strict=True))
+    return dict(zip(UNITS, (single.p50_us, 1e3 * training, seconds), strict=True))

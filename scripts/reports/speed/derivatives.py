@@ -1,9 +1,4 @@
-"""Measure two ways to the derivatives in a structured DeLaN's inverse dynamics, for each number of joints.
-
-The jvp/vjp way differentiates the Cholesky network once along the motion and pulls one vector back through it; the
-one-pass way carries all d partial derivatives of both networks forward (`nn.differential_mlp`). Training steps are
-gradients of the torque loss at batch 512, single calls are one state. `mechanics.natural` follows the outcome.
-"""
+"""Two ways to the derivatives in a structured DeLaN's inverse dynamics, for each number of joints."""
 
 from collections.abc import Callable
 from functools import partial
@@ -43,7 +38,7 @@ def compared(case: str, d: int, batch: int, width: int, repetitions: int) -> Fin
     )
     states = jax.random.normal(keys[2], (4, batch, d), jnp.float32)
 
-    def program(way: Callable) -> Callable:
+    def compiled(way: Callable) -> Callable:
         def loss(layers, states):
             tau = jax.vmap(lambda q, qd, qdd: way(layers, q, qd, qdd))(*states[:3])
             return jnp.mean((tau - states[3]) ** 2)
@@ -52,8 +47,8 @@ def compared(case: str, d: int, batch: int, width: int, repetitions: int) -> Fin
             return jax.jit(lambda states: way(layers, *states[:3, 0]))
         return jax.jit(lambda states: jax.grad(loss)(layers, states))
 
-    programs = {"jvp_vjp_us": program(by_jvp_and_vjp), "one_pass_us": program(by_one_pass)}
-    for one, other in zip(*(jax.tree.leaves(each(states)) for each in programs.values()), strict=True):
+    programs = {"jvp_vjp_us": compiled(by_jvp_and_vjp), "one_pass_us": compiled(by_one_pass)}
+    for one, other in zip(*(jax.tree.leaves(program(states)) for program in programs.values()), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-2, atol=1e-3 * float(jnp.max(jnp.abs(one))))
     medians = medians_in_turns(programs, (states,), repetitions=repetitions)
     rows = [Row(case, name, 1e6 * value, "us") for name, value in medians.items()]

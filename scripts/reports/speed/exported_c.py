@@ -5,7 +5,6 @@ calls are those of all turns. Before a cold call twice the last-level cache is r
 random, since times do not depend on them.
 """
 
-import json
 import math
 import tempfile
 import time
@@ -26,8 +25,8 @@ from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
 from scripts.reports.figures.costs import call_times
+from scripts.reports.robots.pinocchio import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
 from scripts.reports.rows import Row, expect
-from scripts.reports.speed.calls_from_python import Timed, pinocchio_functions, seconds_of_calls
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, last_level_cache, programs, timed
 
 
@@ -51,8 +50,6 @@ LARGEST = {"structured-delan-64x64-f64-d-7": Arm(64, "f64", 7)}
 """An arm that is only exported and compiled."""
 FUNCTIONS = INVERSE, FORWARD, JACOBIAN = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian")
 """Functions to time, if an export declares them."""
-RIVALS = {INVERSE: "rnea", FORWARD: "aba"}
-"""Pinocchio's functions with the same arguments."""
 OURS, OTHERS = "ours", "against"
 TURNS, QUICK_TURNS = 5, 2
 SECONDS = 20.0
@@ -112,15 +109,14 @@ def measure(quick: bool, against: Path | None = None) -> Findings:
             if against:
                 (others / name).mkdir(parents=True)
                 timing[OTHERS] = programs(against / name, compiled(against / name, others / name), FUNCTIONS)
-            each = {(whose, function): path for whose, found in timing.items() for function, path in found.items()}
+            built = {(whose, function): path for whose, paths in timing.items() for function, path in paths.items()}
             turns = [
-                {key: timed(program, mebibytes=evicting(), **effort) for key, program in each.items()}
+                {key: timed(program, mebibytes=evicting(), **effort) for key, program in built.items()}
                 for _ in range(QUICK_TURNS if quick else TURNS)
             ]
             every += turns[0].values()
-            rows += stated(name, json.loads((ours / name / "model.json").read_text()))
-            rows += rows_of_calls(name, ARMS[name], {key: [turn[key] for turn in turns] for key in each})
-            print(f"{name}: {sum(making[name]):.1f} s to make; {len(each)} functions timed", flush=True)
+            rows += rows_of_calls(name, ARMS[name], {key: [turn[key] for turn in turns] for key in built})
+            print(f"{name}: {sum(making[name]):.1f} s to make; {len(built)} functions timed", flush=True)
         loaded = {name: load_c(ours / name) for name in names}
         making |= {name: made(arm, ours / name) for name, arm in LARGEST.items()}
     rows += from_python(loaded, repetitions=20 if quick else 200)
@@ -150,21 +146,10 @@ def made(arm: Arm, folder: Path) -> tuple[float, float]:
 
 def rows_of_making(arm: str, seconds: tuple[float, float], compiler: str) -> list[Row]:
     """Rows of the times returned by `made` and of their sum, which has a bound for the largest export."""
-    rows = [Row(arm, f"{what}_seconds", each, "s") for what, each in zip(("export", "compiler"), seconds, strict=True)]
+    rows = [Row(arm, f"{what}_seconds", s, "s") for what, s in zip(("export", "compiler"), seconds, strict=True)]
     words = f"export, and {compiler} {' '.join(FLAGS)}"
     bound = SECONDS if arm in LARGEST else None
     return [*rows, Row(arm, "making_seconds", sum(seconds), "s", bound=bound, expected=words)]
-
-
-def stated(arm: str, description: Mapping[str, Any]) -> list[Row]:
-    """Stack and operations of the timed functions, if the description of an export states them."""
-    found, units = description["functions"], {"stack_bytes": "B", "operations": "1"}
-    return [
-        Row(f"{arm}/{function}", key, float(found[function][key]), unit)
-        for function in FUNCTIONS
-        for key, unit in units.items()
-        if isinstance(found.get(function), dict) and key in found[function]
-    ]
 
 
 def rows_of_calls(name: str, arm: Arm, turns: Mapping[tuple[str, str], Sequence[Times]]) -> list[Row]:
@@ -172,13 +157,11 @@ def rows_of_calls(name: str, arm: Arm, turns: Mapping[tuple[str, str], Sequence[
     rows = []
     for (whose, function), times in turns.items():
         case = f"{name}/{function}" if whose == OURS else f"{name}/{function}/{whose}"
-        cold = np.percentile(np.concatenate([each.cold for each in times]), [50, 99, 99.9, 100])
-        of_turns = [hot(each) for each in times]
-        rows.append(Row(case, "hot_ns", float(np.median(of_turns)), "ns"))
-        rows.append(Row(case, "hot_spread_ns", float(np.ptp(of_turns)), "ns"))
-        rows.append(Row(case, "hot_best_ns", min(float(each.hot.min()) for each in times), "ns"))
-        for quantile, value in zip(("p50", "p99", "p999", "worst"), cold, strict=True):
-            rows.append(Row(case, f"cold_{quantile}_ns", float(value), "ns"))
+        cold = np.percentile(np.concatenate([turn.cold for turn in times]), [50, 99, 99.9])
+        of_turns = [hot(turn) for turn in times]
+        numbers = [np.median(of_turns), np.ptp(of_turns), *cold]
+        names = ("hot", "hot_spread", "cold_p50", "cold_p99", "cold_p999")
+        rows += [Row(case, f"{name}_ns", float(number), "ns") for name, number in zip(names, numbers, strict=True)]
         if function == JACOBIAN:
             words, bound = f"d + 3 times the time of {INVERSE}", arm.d + 3.0 if whose == OURS else None
             rows.append(
@@ -211,11 +194,11 @@ def ratio(one: Sequence[Times], other: Sequence[Times], number: Callable[[Times]
 def from_python(exports: Mapping[str, Any], *, repetitions: int) -> list[Row]:
     """Times of calls from Python, µs, of loaded exports by arm and of Pinocchio, and their ratios."""
     functions = {
-        f"{name}/{each}": Timed(getattr(loaded, each), ARMS[name].d, data_type(ARMS[name].precision))
+        f"{name}/{function}": Timed(getattr(loaded, function), ARMS[name].d, data_type(ARMS[name].precision))
         for name, loaded in exports.items()
-        for each in RIVALS
+        for function in RIVALS
     }
-    rivals = pinocchio_functions(ARMS[RIVALLED].d) if RIVALLED in exports else {}
+    rivals = pinocchio_functions(rival_arm(ARMS[RIVALLED].d)) if RIVALLED in exports else {}
     seconds = seconds_of_calls({**functions, **rivals}, repetitions=repetitions)
     rows = [Row(case, "python_us", 1e6 * seconds[case], "us") for case in functions]
     for function, rival in RIVALS.items():
@@ -228,15 +211,15 @@ def from_python(exports: Mapping[str, Any], *, repetitions: int) -> list[Row]:
 
 def curves_of(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Times by ARM/FUNCTION, origin of the code, and kind of call, ns."""
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    panels: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
         if row.quantity in WAYS:
             case = row.case.removesuffix(f"/{OTHERS}")
             owner = "exported C" if case == row.case else "other export"
             owner = "Pinocchio" if row.quantity == "pinocchio_us" else owner
-            times = found.setdefault(case, {}).setdefault(owner, {})
+            times = panels.setdefault(case, {}).setdefault(owner, {})
             times[WAYS[row.quantity]] = row.value * (1e3 if row.unit == "us" else 1.0)
-    return found
+    return panels
 
 
 def draw(times: dict[str, dict[str, dict[str, float]]]) -> Figure:

@@ -46,7 +46,7 @@ def measure(quick: bool) -> Findings:
                     continue
                 swept = sweep(problem, H, step, dt=SCENES[scene], halvings=2 if quick else HALVINGS)
                 name = method if kind == "exact" else f"{method}, learned"
-                lines.setdefault(scene, {})[name] = ([1e6 / each[1] for each in swept], [each[3] for each in swept])
+                lines.setdefault(scene, {})[name] = ([1e6 / point[1] for point in swept], [point[3] for point in swept])
                 for dt, rate, drift, error in swept:
                     case = f"{scene}/{kind}/{method}/dt-{dt:.4g}"
                     rows += [
@@ -120,7 +120,7 @@ def sweep(
     energies = jax.jit(jax.vmap(jax.vmap(H)))
     start, began = (q[:, 0], p[:, 0]), energies(q[:, :1], p[:, :1])
     program = functools.partial(motions, step)
-    found = []
+    swept = []
     for halving in range(halvings):
         substeps = max(1, round(float(t[1] - t[0]) / dt)) * 2**halving
         q_hat, p_hat = program(start, t, substeps)
@@ -128,5 +128,5 @@ def sweep(
         drift = float(jnp.max(jnp.abs(energies(q_hat, p_hat) - began)))
         error = float(jnp.sqrt(jnp.mean(jnp.concatenate([q_hat - q[:, 1:], p_hat - p[:, 1:]], axis=2) ** 2)))
         if np.isfinite(drift) and np.isfinite(error):
-            found.append((float(t[1] - t[0]) / substeps, len(q) * float(t[-1] - t[0]) / seconds, drift, error))
-    return found
+            swept.append((float(t[1] - t[0]) / substeps, len(q) * float(t[-1] - t[0]) / seconds, drift, error))
+    return swept

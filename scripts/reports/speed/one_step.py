@@ -1,24 +1,21 @@
 """benchmark one-step: microseconds of single calls against test error, for every model and call path.
 
-JAX fixes its mode of dispatch when it starts, so every mode is timed in its own process, which runs this module.
+Every mode of dispatch is timed in its own process.
 """
 
 import json
 import re
 import subprocess
-import sys
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.running import run
 from dln_jax.data.splits import Split
 from dln_jax.export.c.load import FLAGS, STANDARD, compile_c, load_c
 from dln_jax.export.c.run import export_run
@@ -30,14 +27,14 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
-from dln_jax.training.low_latency_calls import last_line
-from dln_jax.types import InputError
+from dln_jax.precision import data_type
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
 from scripts.reports.arm.models import DEPTH, STEPS, TRIGONOMETRIC, WIDTHS, described
 from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
 from scripts.reports.figures.costs import EXACT, cost_points
+from scripts.reports.process import called
 from scripts.reports.rows import Row, unit_of
 
 WIDE = "structured-delan-64x64"
@@ -63,7 +60,7 @@ def measure(quick: bool) -> Findings:
         folders = [train_into(Path(place), name, sets, quick=quick) for name in names]
         predicted = [predictions(load(folder).energies, sets.test, jnp.float64) for folder in folders]
         turns = [
-            time_in_a_process(folders, dispatch, calls=CALLS // 20 if quick else CALLS)
+            called(times_of_runs, folders, dispatch, CALLS // 20 if quick else CALLS)
             for _ in range(1 if quick else PROCESSES)
             for dispatch in ("default", "low-latency")
         ]
@@ -71,10 +68,10 @@ def measure(quick: bool) -> Findings:
     for name, answers in zip(names, predicted, strict=True):
         error = errors(answers, sets.test)["torque_mse"]
         rows.append(Row(name, "torque_mse", error, "N^2 m^2"))
-        for path, functions in over_processes([turn[name] for turn in turns]).items():
-            rows += rows_of(f"{name}/{path}", functions)
-            if "p50_us" in functions["inverse"]:
-                places[f"{name}, {path}"] = (functions["inverse"]["p50_us"], error)
+        for path, numbers in over_processes([turn[name] for turn in turns]).items():
+            rows += rows_of(f"{name}/{path}", numbers)
+            if "p50_us" in numbers:
+                places[f"{name}, {path}"] = (numbers["p50_us"], error)
     return Findings(rows, places)
 
 
@@ -102,91 +99,61 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
     return folder
 
 
-def time_in_a_process(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
-    """The measurements of `main`, by run."""
-    command = [sys.executable, "-m", "scripts.reports.speed.one_step", "--dispatch", dispatch, "--calls", str(calls)]
-    done = subprocess.run([*command, "--runs", *map(str, folders)], capture_output=True)
-    if done.returncode:
-        raise InputError(f"timing in a process of its own failed: {last_line(done.stderr)}")
-    return json.loads(last_line(done.stdout))
-
-
-def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
-    """Medians of the quantities over processes, and the spread of the median call."""
-    found: dict[str, dict[str, dict[str, float]]] = {}
+def over_processes(turns: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Medians of the quantities by call path over processes, and the spread of the median call."""
+    merged: dict[str, dict[str, float]] = {}
     for path in dict.fromkeys(path for turn in turns for path in turn):
         of_path = [turn[path] for turn in turns if path in turn]
-        found[path] = {}
-        for name in of_path[0]:
-            numbers = {key: [each[name][key] for each in of_path] for key in of_path[0][name]}
-            found[path][name] = {key: float(np.median(values)) for key, values in numbers.items()}
-            if "p50_us" in numbers:
-                found[path][name]["p50_spread_us"] = float(np.ptp(numbers["p50_us"]))
-    return found
+        merged[path] = {key: float(np.median([numbers[key] for numbers in of_path])) for key in of_path[0]}
+        if "p50_us" in of_path[0]:
+            merged[path]["p50_spread_us"] = float(np.ptp([numbers["p50_us"] for numbers in of_path]))
+    return merged
 
 
-def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
-    """Rows of the functions' quantiles."""
-    rows = []
-    for name, latency in functions.items():
-        if "calls_per_second" in latency:
-            rate, bound = latency["calls_per_second"], LOOP_BOUNDS.get(case)
-            rows.append(Row(case, f"{name}_calls_per_second", rate, "1/s", bound=bound, at_least=True))
-            continue
-        shown = ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
-        numbers = {f"{name}_{key}": latency[key] for key in shown}
-        numbers[f"{name}_p99_over_p50"] = latency["p99_us"] / latency["p50_us"]
-        rows += [Row(case, key, value, unit_of(key), bound=BOUNDS.get((case, key))) for key, value in numbers.items()]
-    return rows
+def rows_of(case: str, numbers: dict[str, float]) -> list[Row]:
+    """Rows of a call path: quantiles of its calls, or calls per second of a loop in C."""
+    if "calls_per_second" in numbers:
+        rate, bound = numbers["calls_per_second"], LOOP_BOUNDS.get(case)
+        return [Row(case, "inverse_calls_per_second", rate, "1/s", bound=bound, at_least=True)]
+    shown = {f"inverse_{key}": numbers[key] for key in ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")}
+    shown["inverse_p99_over_p50"] = numbers["p99_us"] / numbers["p50_us"]
+    return [Row(case, key, value, unit_of(key), bound=BOUNDS.get((case, key))) for key, value in shown.items()]
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """What to time."""
+def times_of_runs(folders: Sequence[Path], dispatch: str, calls: int) -> dict[str, Any]:
+    """Times of inverse dynamics by run and call path, for a process of its own.
 
-    runs: tuple[Path, ...]
-    """Folders of trained runs of the two-link arm."""
-    dispatch: Literal["default", "low-latency"] = "default"
-    """default: jitted functions as they are; low-latency: without a change of threads, with NumPy in and out, and C."""
-    calls: int = 20_000
-    """Calls that are timed, of each."""
-
-
-def main(given: Arguments) -> None:
-    """Times, and prints JSON: microseconds by run, call path and function."""
-    if given.dispatch == "low-latency":
+    The dispatch "default" leaves jitted functions as they are; "low-latency" calls them without a change of threads,
+    with NumPy in and out, and in C.
+    """
+    if dispatch == "low-latency":
         enable_low_latency()
     test = published_split(letters(None)).test
-    states = {
-        "inverse": tuple(array[:STATES] for array in (test.q, test.qd, test.qdd)),
-        "forward": tuple(array[:STATES] for array in (test.q, test.qd, test.tau)),
-    }
-    print(json.dumps({folder.name: times_of(folder, states, given) for folder in given.runs}))
+    states = [array[:STATES] for array in (test.q, test.qd, test.qdd)]
+    return {folder.name: times_of(folder, states, dispatch, calls) for folder in folders}
 
 
-def times_of(folder: Path, states: dict[str, tuple[np.ndarray, ...]], given: Arguments) -> dict[str, Any]:
-    """Times of one run by call path and function."""
+def times_of(folder: Path, states: Sequence[np.ndarray], dispatch: str, calls: int) -> dict[str, Any]:
+    """Times of one run by call path."""
     precision = json.loads((folder / "model.json").read_text())["model"]["precision"]
-    dtype = {"f32": np.float32, "f64": np.float64}[precision]
-    system = load(folder).dynamics
-    jitted = {"inverse": jax.jit(system.inverse_dynamics), "forward": jax.jit(system.forward_dynamics)}
-    host = {name: list(zip(*(array.astype(dtype) for array in states[name]), strict=True)) for name in jitted}
-    device = {name: [tuple(map(jnp.asarray, state)) for state in host[name]] for name in jitted}
+    jitted = jax.jit(load(folder).dynamics.inverse_dynamics)
+    host = list(zip(*(array.astype(data_type(precision)) for array in states), strict=True))
+    device = [tuple(map(jnp.asarray, state)) for state in host]
 
-    def timed(functions: dict[str, Callable], states: dict[str, list[tuple]]) -> dict[str, dict[str, float]]:
-        return {name: one_step(each, states[name], calls=given.calls)._asdict() for name, each in functions.items()}
+    def timed(function: Callable, states: list[tuple]) -> dict[str, float]:
+        return one_step(function, states, calls=calls)._asdict()
 
-    if given.dispatch == "default":
+    if dispatch == "default":
         return {"default-jit": timed(jitted, device)}
-    packed = {name: low_latency(function, *host[name][0], numpy=True) for name, function in jitted.items()}
-    found = {"low-latency-jit": timed(jitted, device), "low-latency-numpy": timed(packed, host)}
+    packed = low_latency(jitted, *host[0], numpy=True)
     with tempfile.TemporaryDirectory() as place:
-        export_run(folder, Path(place), name=EXPORTED, functions=("inverse_dynamics", "forward_dynamics"))
-        exported = load_c(place, name=EXPORTED)
-        functions = {"inverse": exported.inverse_dynamics, "forward": exported.forward_dynamics}
-        found["c-from-python"] = timed(functions, host)
-        found["c-loop"] = {"inverse": {"calls_per_second": calls_in_c(Path(place), 20 * given.calls)}}
-    return found
+        export_run(folder, Path(place), name=EXPORTED, functions=("inverse_dynamics",))
+        return {
+            "low-latency-jit": timed(jitted, device),
+            "low-latency-numpy": timed(packed, host),
+            "c-from-python": timed(load_c(place, name=EXPORTED).inverse_dynamics, host),
+            "c-loop": {"calls_per_second": calls_in_c(Path(place), 20 * calls)},
+        }
 
 
 def calls_in_c(place: Path, calls: int) -> float:
@@ -194,8 +161,4 @@ def calls_in_c(place: Path, calls: int) -> float:
     demo = place / "demo"
     compile_c([*FLAGS, *STANDARD, *map(str, place.glob("*.c")), "-lm", "-o", str(demo)])
     printed = [subprocess.run([demo, str(calls)], capture_output=True, text=True, check=True).stdout for _ in range(3)]
-    return max(float(rate) for each in printed for rate in re.findall(r"inverse_dynamics: (\d+) calls/s", each))
-
-
-if __name__ == "__main__":
-    run(main, Arguments, prog="python -m scripts.reports.speed.one_step")
+    return max(float(rate) for text in printed for rate in re.findall(r"inverse_dynamics: (\d+) calls/s", text))

@@ -48,9 +48,9 @@ def mass_conditions() -> Findings:
         solve = jax.jit(partial(_solve, build))
         for condition, factor in zip(CONDITIONS, factors, strict=True):
             name = f"condition-{condition:.0e}/{path}".replace("e+", "e")
-            tau, found, slope, mass = (np.asarray(part) for part in solve(factor, q, qd, qdd))
-            residual, size = _residual(factor @ factor.T, q, qd, found, tau)
-            change = abs(found - qdd).max(axis=1) / (abs(qdd).max(axis=1) + abs(qd).max(axis=1) ** 2)
+            tau, solved, slope, mass = (np.asarray(part) for part in solve(factor, q, qd, qdd))
+            residual, size = _residual(factor @ factor.T, q, qd, solved, tau)
+            change = abs(solved - qdd).max(axis=1) / (abs(qdd).max(axis=1) + abs(qd).max(axis=1) ** 2)
             within = f"{FACTOR:.0f} d eps"
             text = f"|M qdd + c - tau| <= {within} of its terms, whatever the condition"
             got = largest(residual / (unit * size))
@@ -81,7 +81,7 @@ def sizes() -> Findings:
     for d in SIZES:
         scene = chain(d)
         q, qd, qdd = random_states(4, d, _RANGES)
-        found, accelerations = _there_and_back(dynamics(scene.energies), q, qd, qdd)
+        tau, accelerations = _there_and_back(dynamics(scene.energies), q, qd, qdd)
         parts, mass = jax.jit(
             lambda *states, scene=scene: jax.lax.map(
                 lambda state: (closed_form.decompose(scene.closed_form, *state), scene.mass_matrix(state[0])), states
@@ -90,10 +90,10 @@ def sizes() -> Findings:
         angle, rate = abs(np.cumsum(q, axis=1)).max(axis=1), abs(np.cumsum(qd, axis=1)).max(axis=1)
         row_sum = abs(np.asarray(mass)).sum(axis=2).max(axis=1)
         size = row_sum * (abs(qdd).max(axis=1) + rate**2) + abs(np.asarray(parts.gravity)).max(axis=1)
-        error = abs(found - np.asarray(sum(parts))).max(axis=1) / (size * (1 + angle))
+        error = abs(tau - np.asarray(sum(parts))).max(axis=1) / (size * (1 + angle))
         text = f"the energy's tau equals the closed form within {FACTOR:.0f} d eps of its terms, angles summed along"
         rows.append(expect(f"d-{d}/chain", "inverse_rounding_units", text, largest(error) / (d * EPS), FACTOR))
-        rows.append(_round_trip(f"d-{d}/chain", qdd, accelerations, np.asarray(mass), found))
+        rows.append(_round_trip(f"d-{d}/chain", qdd, accelerations, np.asarray(mass), tau))
     for d in SIZES:
         system = untrained(make_delan(Needs(joints=("revolute",) * d), width=8, dtype=jnp.float64))
         q, qd, qdd = random_states(4, d, _RANGES)
@@ -191,10 +191,10 @@ def _there_and_back(system: Dynamics, *states) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(tau), np.asarray(accelerations)
 
 
-def _round_trip(name: str, qdd: np.ndarray, found: np.ndarray, mass: np.ndarray, tau: np.ndarray) -> Row:
+def _round_trip(name: str, qdd: np.ndarray, solved: np.ndarray, mass: np.ndarray, tau: np.ndarray) -> Row:
     d = qdd.shape[1]
     condition = np.linalg.cond(mass, p=np.inf)
     size = abs(qdd).max(axis=1) + abs(tau).max(axis=1) / abs(mass).sum(axis=2).max(axis=1)
     text = f"qdd -> tau -> qdd within {FACTOR:.0f} d eps kappa, kappa up to {condition.max():.0e}"
-    got = largest(abs(found - qdd).max(axis=1) / (d * EPS * condition * size))
+    got = largest(abs(solved - qdd).max(axis=1) / (d * EPS * condition * size))
     return expect(name, "round_trip_rounding_units", text, got, FACTOR)

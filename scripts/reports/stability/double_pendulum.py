@@ -69,7 +69,7 @@ def lyapunov_time(steps: int) -> Findings:
     name, ten = "lyapunov/double-pendulum", "every motion is chaotic: it lasts for ten Lyapunov times at least"
     both = "derivative of the step and second motion agree; curvature and rounding leave about 1e-5 / (lambda 1 s)"
     different = largest(abs(by_pairs / exponents - 1))
-    cases = [
+    rows = [
         expect(name, "smallest_exponent", ten, exponents.min(), 10 / t[-1], "1/s", at_least=True),
         expect(name, "exponents_relative_difference", both, different, 1e-3),
     ]
@@ -78,11 +78,10 @@ def lyapunov_time(steps: int) -> Findings:
         score = float(np.median(seen[cause] / expected))
         text = f"median time until the prediction is 1 rad off, in units of {what} / lambda: 1, within a factor of 2"
         name = f"lyapunov/{cause}"
-        cases.append(expect(name, "horizon_score", text, score, 0.5, at_least=True, reference=1.0))
-        cases.append(expect(name, "horizon_score_upper", text, score, 2.0, reference=1.0))
-    cases.append(_energy_drift(scene, steps))
-    curves = {"t": t, "exponents": exponents, "rounding": rounded, "coarse": coarse, "tangent": chaos.tangent}
-    return Findings(cases, curves)
+        rows.append(expect(name, "horizon_score", text, score, 0.5, at_least=True, reference=1.0))
+        rows.append(expect(name, "horizon_score_upper", text, score, 2.0, reference=1.0))
+    rows.append(_energy_drift(scene, steps))
+    return Findings(rows)
 
 
 def _motions(system: Dynamics, steps: int) -> Chaos:
@@ -103,7 +102,7 @@ def _motions(system: Dynamics, steps: int) -> Chaos:
         direction = jnp.full(4, 0.5)
         return rollout(advance, (x, direction, direction), steps=steps, observe=lambda state, seen: seen)[1]
 
-    x, tangent, pair = (np.asarray(each) for each in jax.jit(jax.vmap(motion, out_axes=1))(STARTS))
+    x, tangent, pair = map(np.asarray, jax.jit(jax.vmap(motion, out_axes=1))(STARTS))
     return Chaos(x[..., :2], x[..., 2:], tangent, pair)
 
 

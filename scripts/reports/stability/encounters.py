@@ -19,13 +19,12 @@ one of tolerance / r² in energy; a few dozen steps are that near.
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import brentq
 
 from dln_jax.mechanics.integrators import (
     adaptive_rollout,
-    explicit_euler,
     gauss_legendre4,
     implicit_midpoint,
-    rk4,
     rollout,
     second_order,
     stormer_verlet,
@@ -49,7 +48,7 @@ NEAREST = 1e-3
 
 
 def separatrix(steps: int) -> Findings:
-    """Energy errors of all methods over `steps` steps, and whether the symplectic ones ever go over the top."""
+    """Energy errors of the symplectic methods over `steps` steps, and whether they ever go over the top."""
 
     def force(q):
         return GRAVITY * jnp.sin(q)
@@ -59,8 +58,6 @@ def separatrix(steps: int) -> Findings:
         return p, -force(q)
 
     methods = {
-        "explicit-euler": explicit_euler(field),
-        "rk4": rk4(field),
         "symplectic-euler": symplectic_euler(lambda t, q, p: p, lambda t, q, p: -force(q)),
         "stormer-verlet": stormer_verlet(lambda t, p: p, lambda t, q: -force(q)),
         "implicit-midpoint": implicit_midpoint(field),
@@ -72,29 +69,21 @@ def separatrix(steps: int) -> Findings:
         "implicit-midpoint": GRAVITY**2 * DT**2 / 6,
         "gauss-legendre-4": GRAVITY * (GRAVITY * DT**2) ** 2,
     }
-    # Only the angles at the ends of swings and the largest error so far matter.
-    kept = np.unique(np.geomspace(1, steps, 200).astype(int))
     start = (jnp.array([np.pi - BELOW_UPRIGHT]), jnp.zeros(1))
     t = DT * jnp.arange(steps + 1)
-    cases, curves = [], {}
+    rows = []
     for name, step in methods.items():
         q, p = jax.jit(lambda t, step=step: rollout(step, start, t))(t)
         q, p = np.asarray(q)[:, 0], np.asarray(p)[:, 0]
-        with np.errstate(over="ignore", invalid="ignore"):
-            energy = p**2 / 2 + GRAVITY * (1 - np.cos(q))
-        # The running maximum keeps the error of a lost motion from shrinking again.
-        error = np.maximum.accumulate(abs(energy - energy[0]))
-        curves[name] = error[kept]
-        if name not in references:
-            continue
+        energy = p**2 / 2 + GRAVITY * (1 - np.cos(q))
         reference = float(references[name])
         text = f"energy error over {steps:,} steps of {DT} s below the amplitude of the modified energy, no drift"
-        got, bound = largest(error), HIGHER_ORDERS * reference
-        cases.append(expect(f"separatrix/{name}", "largest_energy_error", text, got, bound, "J", reference=reference))
+        got, bound = largest(abs(energy - energy[0])), HIGHER_ORDERS * reference
+        rows.append(expect(f"separatrix/{name}", "largest_energy_error", text, got, bound, "J", reference=reference))
         text = f"released {BELOW_UPRIGHT:g} rad below upright, it never goes over the top: |q| < pi"
         below = float(np.pi) - largest(abs(q))
-        cases.append(expect(f"separatrix/{name}", "least_angle_from_upright", text, below, 0.0, "rad", at_least=True))
-    return Findings(cases, {"steps": kept, "errors": curves, "references": references})
+        rows.append(expect(f"separatrix/{name}", "least_angle_from_upright", text, below, 0.0, "rad", at_least=True))
+    return Findings(rows)
 
 
 def close_encounters() -> Findings:
@@ -150,12 +139,9 @@ def _wrong_steps(field, start, ends, dts) -> tuple[int, int]:
 
 
 def _kepler_distance(speed: float, apocentre: float, t: float) -> float:
-    """Distance at the time t on the orbit that starts at its apocentre: Kepler's equation, by bisection."""
+    """Distance at the time t on the orbit that starts at its apocentre, by Kepler's equation."""
     axis = 1 / (2 / apocentre - speed**2)
     eccentricity = apocentre / axis - 1
     anomaly = np.pi + t * axis**-1.5
-    low, high = anomaly - 1.0, anomaly + 1.0
-    for _ in range(100):
-        middle = (low + high) / 2
-        low, high = (middle, high) if middle - eccentricity * np.sin(middle) < anomaly else (low, middle)
-    return axis * (1 - eccentricity * np.cos(low))
+    eccentric = brentq(lambda x: x - eccentricity * np.sin(x) - anomaly, anomaly - 1, anomaly + 1, xtol=1e-15)
+    return float(axis * (1 - eccentricity * np.cos(eccentric)))

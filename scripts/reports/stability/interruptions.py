@@ -43,11 +43,12 @@ def cases(names: Sequence[str] = tuple(RUNS), *, kills: int = 10, seed: int = 0)
 
 
 def killed_and_resumed(name: str, random: np.random.Generator, kills: int) -> Findings:
-    """Number of resumed runs identical to the unbroken one, and the moments of the kills, s after a checkpoint."""
+    """Number of resumed runs identical to the unbroken one."""
     with tempfile.TemporaryDirectory() as place:
         same, moments = interrupted(RUNS[name], Path(place), random, kills=kills)
-    row = Row(name, "resumed_bit_for_bit", same, "runs", bound=kills, at_least=True)
-    return Findings([row], {"moments": moments})
+    shown = ", ".join(f"{moment:.2f}" for moment in moments)
+    words = f"as the unbroken run; killed s after a checkpoint: {shown}"
+    return Findings([Row(name, "resumed_bit_for_bit", same, "runs", bound=kills, at_least=True, expected=words)])
 
 
 def interrupted(
@@ -92,10 +93,9 @@ def start(command: Sequence[str], place: Path, name: str, *others: str) -> subpr
 
 def lasted(process: subprocess.Popen[str], folder: Path) -> float:
     """Seconds from a run's first checkpoint to its model."""
-    wait_for_checkpoint(process, folder)
+    wait_for(process, folder, "checkpoint*.json")
     began = time.monotonic()
-    while process.poll() is None and not (folder / MODEL).exists():
-        time.sleep(0.005)
+    wait_for(process, folder, MODEL)
     length = time.monotonic() - began
     finished(process, folder)
     return length
@@ -103,16 +103,16 @@ def lasted(process: subprocess.Popen[str], folder: Path) -> float:
 
 def killed(process: subprocess.Popen[str], folder: Path, moment: float) -> bool:
     """Kills a run `moment` seconds after its first checkpoint; returns whether it had no model yet."""
-    wait_for_checkpoint(process, folder)
+    wait_for(process, folder, "checkpoint*.json")
     time.sleep(moment)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     return not (folder / MODEL).exists()
 
 
-def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
-    """Waits until a run has written a checkpoint; `InputError` if it ends before."""
-    while not any(folder.glob("checkpoint*.json")):
+def wait_for(process: subprocess.Popen[str], folder: Path, pattern: str) -> None:
+    """Waits until a run has written a file of this name; `InputError` if it fails before."""
+    while not any(folder.glob(pattern)):
         if process.poll() is not None:
             finished(process, folder)
             return
@@ -121,6 +121,6 @@ def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
 
 def finished(process: subprocess.Popen[str], folder: Path) -> None:
     """Waits for the end of a run; `InputError` if it failed."""
-    said = process.communicate()[1]
+    errors = process.communicate()[1]
     if process.returncode:
-        raise InputError(f"the run in {folder} failed: {said.strip()[-200:]}")
+        raise InputError(f"the run in {folder} failed: {errors.strip()[-200:]}")

@@ -36,7 +36,7 @@ def noise() -> Findings:
     scene = two_link_arm()
     data, random = generators.uniform(scene, samples=SAMPLES), np.random.default_rng(1)
     model = make_trigonometric(scene.needs)
-    cases, curves = [], {"torque": ([], []), "acceleration": ([], [])}
+    rows = []
     inertia = np.linalg.norm(np.asarray(jax.vmap(scene.mass_matrix)(jnp.asarray(data.q))), axis=(1, 2))
     for level in LEVELS:
         for kind, key in (("torque", "tau"), ("acceleration", "qdd")):
@@ -54,10 +54,8 @@ def noise() -> Findings:
                 predicted = variance * fit.rank / SAMPLES + level**4 * mean_square(column(data, "tau_inertial"))
                 text = "|M|² s² P / N plus the square of the bias s²/var(qdd) of M"
             name, text = f"noise/{kind}-{level:g}", f"torque MSE in units of {text}"
-            cases.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
-            curves[kind][0].append(error)
-            curves[kind][1].append(predicted)
-    return Findings(cases, {"levels": LEVELS, **curves})
+            rows.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
+    return Findings(rows)
 
 
 def missing_friction() -> Findings:
@@ -66,7 +64,7 @@ def missing_friction() -> Findings:
     data, random = generators.uniform(scene, samples=SAMPLES), np.random.default_rng(2)
     sigma = 1e-2 * float(data.tau.std())
     noisy = data._replace(tau=data.tau + sigma * random.normal(size=data.tau.shape))
-    cases = []
+    rows = []
     for kind, needs in (("lacking", scene.needs._replace(friction=False)), ("having", scene.needs)):
         model = make_trigonometric(needs)
         fit = fit_linear(model, noisy)
@@ -75,21 +73,21 @@ def missing_friction() -> Findings:
         missing = misfit.missing.sum()
         if kind == "having":
             text = "a model with friction leaves noise, in which nothing is found"
-            cases.append(expect(name, "joints_reported", text, missing, 0.0))
+            rows.append(expect(name, "joints_reported", text, missing, 0.0))
             continue
         text = "both joints are reported, by the power that the residual takes"
-        cases.append(expect(name, "joints_reported", text, missing, 2.0, at_least=True))
+        rows.append(expect(name, "joints_reported", text, missing, 2.0, at_least=True))
         # A sum over samples of qd (noise and what the fit left), over that of qd².
         allowed = float(np.max(DEVIATIONS * misfit.residual_rms / np.sqrt(np.sum(noisy.qd**2, axis=0))))
         errors = f"{DEVIATIONS:.0f} standard errors"
         text = f"the coefficient is {FRICTION} within {errors}: friction is odd in time, tau not"
         got = abs(misfit.coefficient - FRICTION).max()
-        cases.append(expect(name, "coefficient_error", text, got, allowed, "N m s"))
+        rows.append(expect(name, "coefficient_error", text, got, allowed, "N m s"))
         text = "the residual is that of friction, b rms(qd), far above the noise"
         got = np.min(misfit.residual_rms) / sigma
         expected = FRICTION * float(np.sqrt(np.mean(noisy.qd**2))) / sigma
-        cases.append(expect(name, "residual_over_noise", text, got, 0.8 * expected, at_least=True, reference=expected))
-    return Findings(cases)
+        rows.append(expect(name, "residual_over_noise", text, got, 0.8 * expected, at_least=True, reference=expected))
+    return Findings(rows)
 
 
 def _fit(model: Model, data: Trajectories, **noisy: np.ndarray) -> tuple[LinearFit, float]:

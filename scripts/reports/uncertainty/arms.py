@@ -11,20 +11,10 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial, tree_system
+from dln_jax.mechanics.trees import Tree, inertial_parameters, serial, tree_system
+from dln_jax.scenes.panda import panda
 from dln_jax.types import Vector
 
-RIGHT = np.pi / 2
-PANDA = (
-    *((0, 0, 0.333, 0), (-RIGHT, 0, 0, 0), (RIGHT, 0, 0.316, 0), (RIGHT, 0.0825, 0, 0)),
-    *((-RIGHT, -0.0825, 0.384, 0), (RIGHT, 0, 0, 0), (RIGHT, 0.088, 0, 0)),
-)
-"""Modified Denavit-Hartenberg rows: alpha, a, d, theta; rad and m."""
-UR10 = (
-    *((0, 0, 0.1273, 0), (RIGHT, 0, 0, 0), (0, -0.612, 0, 0)),
-    *((0, -0.5723, 0.163941, 0), (RIGHT, 0, 0.1157, 0), (-RIGHT, 0, 0.0922, 0)),
-)
-"""Denavit-Hartenberg rows of the manufacturer, in the same order."""
 VELOCITY_SCALE = 0.05
 """Velocity scale of dry friction, rad/s."""
 SECONDS, STEP = 6.0, 0.04
@@ -40,7 +30,8 @@ def arm(d: int) -> Tree:
         inertial_parameters(5.0 / (1 + i / 2), 0.1 * random.normal(size=3), 0.03 * np.diag(random.uniform(0.5, 1.5, 3)))
         for i in range(d)
     ]
-    return serial(*dh_frames(PANDA[:d]), links, armature=np.full(d, 0.05))
+    frames = panda().tree
+    return serial(frames.rotations[:d], frames.positions[:d], links, armature=np.full(d, 0.05))
 
 
 def plant(tree: Tree, *, unmodelled: bool) -> Plant:
@@ -67,16 +58,16 @@ def plant(tree: Tree, *, unmodelled: bool) -> Plant:
 def motions(
     torque: Plant, d: int, count: int, *, noise: float, seed: int, reach: float = 1.0, speed: float = 1.0
 ) -> Trajectories:
-    """Motions of four sines a joint with drawn amplitudes, frequencies and phases.
+    """Motions of four sines per joint with drawn amplitudes, frequencies and phases.
 
     Args:
         torque: torques of a `plant`.
         d: number of its joints.
         count: number of motions.
         noise: standard deviation of the first torque's noise, N m; it falls to 30 % of that at the last joint.
-        seed: of everything drawn.
-        reach: multiplies amplitudes.
-        speed: multiplies frequencies.
+        seed: seed of everything drawn.
+        reach: factor on amplitudes.
+        speed: factor on frequencies.
     """
     random, t = np.random.default_rng(seed), np.arange(0, SECONDS, STEP)
     rate = speed * 2 * np.pi * random.uniform(0.05, 0.5, (count, 1, d, 4))
@@ -85,7 +76,7 @@ def motions(
     middle = random.uniform(-0.3, 0.3, (count, 1, d))
     q = middle + np.sum(size * np.sin(phase), axis=-1)
     qd, qdd = np.sum(size * rate * np.cos(phase), axis=-1), -np.sum(size * rate**2 * np.sin(phase), axis=-1)
-    q, qd, qdd = (each.reshape(-1, d) for each in (q, qd, qdd))
+    q, qd, qdd = (array.reshape(-1, d) for array in (q, qd, qdd))
     tau = np.asarray(torque(q, qd, qdd))
     tau = tau + noise * np.linspace(1, 0.3, d) * random.normal(size=tau.shape)
     trajectory = np.repeat(np.arange(count), len(t))

@@ -72,8 +72,7 @@ def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys
     assert rows["trigonometric/characters", "torque_mse"]["pass"] is False
     assert rows["feed-forward/uniform", "torque_mse"]["pass"] is True
     lines = (tmp_path / "table" / "table.md").read_text().splitlines()
-    assert sum(line.startswith("| ") for line in lines) == 2 + len(table.MODELS) + 1
-    assert "1.0e-07 / 5.4e-06" in next(line for line in lines if line.startswith("| structured-hnn"))
+    assert "1e-07 / 5.4e-06" in next(line for line in lines if line.startswith("| structured-hnn/characters |"))
     assert (tmp_path / "table" / "pareto.png").read_bytes().startswith(b"\x89PNG")
     # On the other splits every letter is a test once; their median and the worst single run are rows.
     before = 2  # the published data sets come first

@@ -1,6 +1,7 @@
 """The benchmarks' own parts: the full-Hessian reference, integrators in one program for every dt, reports and paths."""
 
 import json
+import os
 import subprocess
 
 import jax
@@ -17,19 +18,20 @@ from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.pendulums import chain
 from dln_jax.training import low_latency_calls
 from dln_jax.training.hamiltonian.tasks import Problem
-from dln_jax.types import Needs
+from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import save
 from scripts.reports.arm.models import described
 from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
 from scripts.reports.commands import benchmark
+from scripts.reports.commands.benchmark import SUBJECTS
 from scripts.reports.figures.costs import EXACT, FRONT, cost_panels, cost_points
+from scripts.reports.process import called
 from scripts.reports.rows import Row, markdown
 from scripts.reports.speed import costs as benchmark_costs
 from scripts.reports.speed import integrators as benchmark_integrators
 from scripts.reports.speed import one_step as benchmark_one_step
-from scripts.reports.speed.subjects import SUBJECTS
 
 
 def test_the_full_hessian_way_gives_the_same_torques(d=2):
@@ -62,20 +64,20 @@ def test_halving_the_step_of_a_sweep_gains_by_the_order(method, order):
 
 def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, capsys):
     rows = [Row("a/b", "p50_us", 3.0, "us", None, 2.0), Row("a/b", "ratio", 2.0, "1"), Row("c", "ratio", 4.0, "1")]
-    monkeypatch.setitem(
-        SUBJECTS,
-        "scaling",
-        (lambda quick: Findings(rows, {"x": ([1.0, 2.0], [3.0, 4.0], "s")}), SUBJECTS["scaling"][1]),
-    )
-    command(benchmark, "scaling", "--quick", "--out", str(tmp_path / "out"))
+    curves = {"pendulum": {"rk4": ([1.0, 2.0], [3.0, 4.0])}}
+    monkeypatch.setitem(SUBJECTS, "integrators", (lambda quick: Findings(rows, curves), SUBJECTS["integrators"][1]))
+    command(benchmark, "integrators", "--quick", "--out", str(tmp_path / "out"))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert [row["case"] for row in report["rows"]] == ["scaling/a/b", "scaling/a/b", "scaling/c"]
+    assert [row["case"] for row in report["rows"]] == ["integrators/a/b", "integrators/a/b", "integrators/c"]
     assert report["rows"][0]["pass"] is False and report["conditions"]["quick"] is True
-    assert (tmp_path / "out" / "scaling.png").read_bytes().startswith(b"\x89PNG")
-    table = (tmp_path / "out" / "scaling.md").read_text()
-    assert table == markdown([row._replace(case=f"scaling/{row.case}") for row in rows])
-    assert table.splitlines()[0] == "| case | p50 us, us | ratio |" and table.splitlines()[-1] == "| scaling/c |  | 4 |"
-    assert "already contains" in refused(capsys, benchmark, "scaling", "--out", str(tmp_path / "out"))
+    assert (tmp_path / "out" / "integrators.png").read_bytes().startswith(b"\x89PNG")
+    table = (tmp_path / "out" / "integrators.md").read_text()
+    assert table == markdown([row._replace(case=f"integrators/{row.case}") for row in rows])
+    assert (
+        table.splitlines()[0] == "| case | p50 us, us | ratio |"
+        and table.splitlines()[-1] == "| integrators/c |  | 4 |"
+    )
+    assert "already contains" in refused(capsys, benchmark, "integrators", "--out", str(tmp_path / "out"))
 
 
 def test_figures_of_points_and_panels_draw():
@@ -147,24 +149,28 @@ def test_a_process_that_fails_leaves_the_row_out_with_a_reason(case, tmp_path, m
     assert len(said) == 1 and reason in said[0] and "\n" not in said[0]
 
 
-def test_call_paths_are_timed(small_run, tmp_path, capsys, monkeypatch):
+def test_call_paths_are_timed(small_run, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark_one_step, "enable_low_latency", lambda: None)  # a process of its own would be needed
-    for dispatch in ("default", "low-latency"):
-        command(benchmark_one_step, "--runs", str(small_run), "--dispatch", dispatch, "--calls", "10")
-    first, second = (json.loads(line)["structured-delan"] for line in capsys.readouterr().out.splitlines())
+    plain = run_of("feed-forward", tmp_path)
+    times = [benchmark_one_step.times_of_runs([small_run, plain], way, 10) for way in ("default", "low-latency")]
+    first, second = (turn["structured-delan"] for turn in times)
     assert set(first) == {"default-jit"}
     assert {"low-latency-jit", "low-latency-numpy", "c-from-python", "c-loop"} == set(second)
-    assert second["c-loop"]["inverse"]["calls_per_second"] > 0
-    plain = str(run_of("feed-forward", tmp_path))
-    command(benchmark_one_step, "--runs", plain, "--dispatch", "low-latency", "--calls", "10")
-    assert set(json.loads(capsys.readouterr().out)["feed-forward"]) == set(second)
+    assert second["c-loop"]["calls_per_second"] > 0
+    assert set(times[1]["feed-forward"]) == set(second)
     merged = benchmark_one_step.over_processes([first, second, second])
-    assert merged["c-from-python"]["inverse"]["p50_spread_us"] == 0 and set(merged) == {*first, *second}
+    assert merged["c-from-python"]["p50_spread_us"] == 0 and set(merged) == {*first, *second}
     rows = [
         row
-        for path, functions in merged.items()
-        for row in benchmark_one_step.rows_of(f"structured-delan/{path}", functions)
+        for path, numbers in merged.items()
+        for row in benchmark_one_step.rows_of(f"structured-delan/{path}", numbers)
     ]
     bounds = {row.case: row.bound for row in rows if row.bound is not None}
     assert bounds == {"structured-delan/c-loop": 1_500_000.0}
-    assert {row.quantity for row in rows} >= {"inverse_p50_us", "forward_p999_us", "inverse_calls_per_second"}
+    assert {row.quantity for row in rows} >= {"inverse_p50_us", "inverse_p999_us", "inverse_calls_per_second"}
+
+
+def test_a_function_is_called_in_a_process_of_its_own():
+    assert called(os.getenv, "OWN", OWN="yes") == "yes"
+    with pytest.raises(InputError, match="ZeroDivisionError"):
+        called(divmod, 1, 0)

@@ -2,9 +2,9 @@
 
 from calls import refused
 
+from dln_jax.control.outcomes import hanging_starts
 from scripts.reports.commands import control_report
-from scripts.reports.control.cases import SWING_UPS, cases
-from scripts.reports.control.energy_laws import success
+from scripts.reports.control.swing_ups import SWING_UPS, tried
 
 
 def test_an_unknown_subject_is_one_line(capsys, tmp_path, monkeypatch):
@@ -14,8 +14,10 @@ def test_an_unknown_subject_is_one_line(capsys, tmp_path, monkeypatch):
 
 
 def test_every_subject_has_cases():
-    assert {case.name.split("/")[0] for case in cases()} == set(control_report.SUBJECTS)
+    names = [case.name for case in control_report.cases()]
+    assert len(set(names)) == len(names) and {name.split("/")[0] for name in names} == set(control_report.SUBJECTS)
 
 
 def test_poles_come_up_on_hardware_from_encoders_alone():
-    assert success(SWING_UPS["rotary-pendulum"], 8, seconds=3.0).share == 1
+    case = SWING_UPS["rotary-pendulum"]
+    assert tried(case, hanging_starts(8, 0, position=case.position), seconds=3.0).share == 1

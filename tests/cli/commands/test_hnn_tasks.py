@@ -30,8 +30,9 @@ from dln_jax.zoo.run import load
 from scripts.reports.case import Findings, rows_of
 from scripts.reports.commands import hnn_table
 from scripts.reports.hamiltonian import table
-from scripts.reports.hamiltonian.table import BOUNDS, TASKS, markdown, table_rows
+from scripts.reports.hamiltonian.table import BOUNDS, TASKS, table_rows
 from scripts.reports.published import HAMILTONIAN
+from scripts.reports.rows import markdown
 
 MEASURED = {
     "spring": ("polynomial-hamiltonian",),
@@ -148,18 +149,16 @@ def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypat
 
 
 def test_bounds_decide():
-    line = markdown(
-        rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7})
-    ).splitlines()[-1]
-    assert "1.0e-06 ± 2e-07 / 3.8e-04" in line
+    rows = table_rows(rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7}))
+    assert "| 1e-06 / 0.00038 | 2e-07 |" in markdown(rows)
     bare = rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})
     rows = {row.quantity: row for row in table_rows(bare)}
     assert rows["energy_mse"].passed is True and rows["train_seconds"].passed is False
     assert all(row.bound is None for row in table_rows(rows_of("spring/phase-network", {"energy_mse": 1e-6})))
     suited = {task: RECIPES[task].suits for task in TASKS if task in RECIPES} | {"pixels": "black-box-hnn"}
     assert {f"{task}/{name}" for task, name in suited.items()} == set(BOUNDS)
-    compared = ("black-box-hnn", "phase-network")
-    assert {f"{task}/{name}" for task in TASKS for name in compared} == set(HAMILTONIAN.values)
+    rivals = ("black-box-hnn", "phase-network")
+    assert {f"{task}/{name}" for task in TASKS for name in rivals} == set(HAMILTONIAN.values)
     assert set(RECIPES) == set(hnn_tasks.TASKS)
 
 

@@ -609,7 +609,7 @@ SCRIPTS = {
     "train_hnn_pixels": (train_hnn_pixels, "--trajectories", "6"),
     "diffnet_table": (diffnet_table, "--samples", "20"),
     "train_locomotion": (train_locomotion,),
-    "benchmark": (benchmark, "precision"),
+    "benchmark": (benchmark, "scaling"),
     "stability": (stability,),
     "softbody_report": (softbody_report,),
     "diffnet_report": (diffnet_report,),

@@ -5,7 +5,7 @@ import pytest
 from calls import refused
 
 from scripts.reports.commands import robot_report
-from scripts.reports.robots import cases, log_checks
+from scripts.reports.robots import log_checks
 from scripts.reports.robots.known_kinematics import rows_of_errors, rows_of_tracking
 from scripts.reports.robots.recorded_arm import rows_of
 
@@ -26,8 +26,9 @@ def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch
 
 
 def test_recordings_are_cases_where_they_are_given(tmp_path):
-    names = {case.name for case in cases(log=tmp_path, robot=tmp_path, pendulum=tmp_path)}
-    assert names - {case.name for case in cases()} == {"recordings/arm", "recordings/double-pendulum"}
+    options = robot_report.Arguments(log=tmp_path, robot=tmp_path, double_pendulum=tmp_path)
+    names = {case.name for case in robot_report.cases(options)}
+    assert names - {case.name for case in robot_report.cases()} == {"recordings/arm", "recordings/double-pendulum"}
 
 
 def test_errors_are_held_against_the_rival():
@@ -50,8 +51,8 @@ def test_some_faults_of_logs_are_found_and_a_sound_log_has_none():
         assert log_checks.false_findings(log, None) == []
     assert log_checks.false_findings(log, log.robot) == []
     for kind in ("swapped-columns", "flipped-sign", "saturated-torque", "rates-exchanged"):
-        fault, checks, given = log_checks.FAULTS[kind]
-        assert set(checks) & set(log_checks.planted(log_checks.drawn(1, repeats=False), fault, given, 0)), kind
+        fault, checks, inputs = log_checks.FAULTS[kind]
+        assert set(checks) & set(log_checks.planted(log_checks.drawn(1, repeats=False), fault, inputs, 0)), kind
 
 
 def test_blocks_count_by_the_whole_logs_variance():

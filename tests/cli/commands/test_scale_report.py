@@ -91,7 +91,7 @@ def test_the_report_tells_what_was_measured_from_what_is_modelled(monkeypatch, c
     )
     said = capsys.readouterr().out
     assert given == [{"quick": False, "lanes": (8, 4), "count": 3}]
-    assert "accelerator: not measured, JAX sees none" in said and "modelled, not measured" in said
+    assert "accelerator: not measured, JAX sees none" in said and "| hosts/evolution/1_gbit |" in said
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert len(report["rows"]) == len(crawlers.rows) and report["conditions"]["networks"]["1_gbit"]["rate"] == 1e9
     assert json.loads((tmp_path / "out/metrics.json").read_text())["crawlers/8/2-devices/speed_up"] == 1.5

@@ -56,7 +56,7 @@ def test_one_letter_identifies_the_arm_at_every_speed(letters, identified):
     fit = few_letters.fitted(identified, letters, ["s"], 1, 0)
     at = {speed: few_letters.faster(few_letters.select(letters, [2]), speed) for speed in few_letters.SPEEDS}
     assert max(few_letters.torque_mse(identified, fit.parameters, data) for data in at.values()) < 1e-20
-    assert few_letters.share_outside(fit, at[2.0]) > 0.5
+    assert few_letters.share_out_of_distribution(fit, at[2.0]) > 0.5
 
 
 def test_torques_of_another_arm_are_refused(letters):

@@ -7,8 +7,7 @@ import pytest
 
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import rates
-from scripts.reports.control.values.equation import THETA, limited_value
-from scripts.reports.control.values.robust import moved, rod
+from scripts.reports.control.values.equation import THETA, limited_value, moved, rod
 
 
 def test_a_limit_that_is_far_away_does_not_count():

@@ -1,24 +1,18 @@
-"""Runs survive the report's file and are drawn from it; starts are counted from anywhere."""
-
-import json
+"""Runs and outcomes of swing-ups are drawn."""
 
 import numpy as np
 
-from scripts.reports.control import traces
-from scripts.reports.control.cases import SWING_UPS
+from scripts.reports.control import swing_ups
 
 
-def test_traces_are_drawn_from_numbers(monkeypatch):
-    monkeypatch.setattr(traces, "SECONDS", 0.2)
-    monkeypatch.setattr(traces, "SHOWN", 2)
-    case = SWING_UPS["rotary-pendulum"]
-    curves = json.loads(json.dumps(traces.traces(case)))
-    arm, pole, control, energy = traces.draw_traces(curves).axes
+def test_traces_are_drawn():
+    case = swing_ups.SWING_UPS["rotary-pendulum"]
+    arm, pole, control, energy = swing_ups.draw_traces(swing_ups.traces(case, count=2, seconds=0.2)).axes
     limits = sorted(float(line.get_ydata()[0]) for line in control.lines[1:])
     assert limits == [-case.limit, case.limit] and np.abs(control.lines[0].get_ydata()).max() <= case.limit
     assert len(arm.lines) == len(pole.lines) == len(energy.lines) == 3
 
 
 def test_starts_are_drawn_from_numbers():
-    curves = {"angle": [0.1, 2.0], "rate": [0.0, 1.0], "seconds": [0.5, float("inf")]}
-    assert "1 of 2" in traces.draw_starts(curves).axes[0].get_title(loc="left")
+    curves = {"x": [[0.1, 0.0], [2.0, 1.0]], "seconds": [0.5, float("inf")]}
+    assert "1 of 2" in swing_ups.draw_starts(curves).axes[0].get_title(loc="left")

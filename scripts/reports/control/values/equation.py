@@ -16,16 +16,19 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control import field_of, linearise, lqr
+from dln_jax.control.balance import Law
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
-from dln_jax.control.optimal.plants import PLANTS, evaluate, starts
-from dln_jax.control.optimal.problem import ControlProblem, hjb_policy
-from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
-from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.optimal.evaluation import evaluate, starts
+from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.residual import discounts_down_to, fit_residual
+from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from scripts.reports.case import Findings
-from scripts.reports.control.values import robust
-from scripts.reports.control.values.fits import PUBLISHED
+from scripts.reports.rows import Row, expect, largest, unit_of
 
 EXACT = 1e-8
 LIMIT, WEIGHT = 5.5, 2 * 5.5 / np.pi
@@ -35,6 +38,19 @@ LINE = ControlProblem(
 )
 THETA = (1 + np.sqrt(2)) / 2, (1 - np.sqrt(2)) / 2
 """theta in V = theta x²: the cost to go, and the equation's other solution."""
+SHARE = 0.15
+"""Relative range of mass and length that the worst disturbance may use."""
+FACTORS = {"model": (1.0, 1.0), "heavy_and_long": (1.15, 1.15), "far": (1.3, 1.15)}
+"""Factors on mass and length of the evaluated plants; the last one lies beyond the trained range."""
+
+
+def fitted(problem: ControlProblem, network: ValueNetwork, seed: int, **options: Any) -> tuple[Any, float]:
+    """Fits a network to the equation; returns the fit and its time, s. Options as for `fit_residual`."""
+    of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+    began = time.perf_counter()
+    start = network.init(of_parameters)
+    fit = fit_residual(problem, network.value_and_gradient, start, of_samples, **options)
+    return fit, time.perf_counter() - began
 
 
 def line(quick: bool) -> Findings:
@@ -46,21 +62,21 @@ def line(quick: bool) -> Findings:
         ("continued", discounts_down_to(0.0, first=100.0), THETA[0]),
         ("not_continued", [0.0], THETA[1]),
     ):
-        found = fit_hjb(
+        fit = fit_residual(
             LINE, form, jnp.asarray(-3.0), jax.random.key(0), discounts=discounts, samples=64, validation=64
         )
         words = "the cost to go, from a start that is nearer to the other solution"
-        error = abs(float(found.parameters) / aim - 1)
+        error = abs(float(fit.parameters) / aim - 1)
         rows.append(
             expect(case, f"{name}_theta_relative_error", words, error, EXACT, reference=aim)
             if name == "continued"
-            else Row(case, f"{name}_theta", float(found.parameters), reference=aim)
+            else Row(case, f"{name}_theta", float(fit.parameters), reference=aim)
         )
     x = np.linspace(0.1, 5, 20 if quick else 50)[:, None]
     limited = LINE._replace(action_cost=limited_atan(LIMIT, WEIGHT))
     for name, problem, truth in (
         ("quadratic", LINE, THETA[0] * x[:, 0] ** 2),
-        ("limited", limited, np.array([limited_value(*each) for each in x])),
+        ("limited", limited, np.array([limited_value(*point) for point in x])),
     ):
         numbers = by_network(problem, x, truth, widths=(8,) if quick else (8, 8), seeds=1 if quick else 3)
         rows += [Row(case, f"network_{name}_{key}", value, unit_of(key)) for key, value in numbers.items()]
@@ -120,13 +136,8 @@ def by_network(
     errors, seconds = [], []
     for seed in range(seeds):
         network = value_network(problem, widths=widths, scale=float(np.max(truth)), floor=1e-3 if widths else 0.0)
-        of_parameters, of_samples = jax.random.split(jax.random.key(seed))
-        began = time.perf_counter()
-        fit = fit_hjb(
-            problem, network.value_and_gradient, network.init(of_parameters), of_samples,
-            samples=samples, validation=samples, iterations=iterations,
-        )  # fmt: skip
-        seconds.append(time.perf_counter() - began)
+        fit, spent = fitted(problem, network, seed, samples=samples, validation=samples, iterations=iterations)
+        seconds.append(spent)
         V = jax.vmap(lambda x, fit=fit, network=network: network.value_and_gradient(fit.parameters, x)[0])(x)
         errors.append(np.abs(V / truth - 1))
     return {
@@ -143,18 +154,14 @@ def published(quick: bool) -> Findings:
     network = value_network(plant.problem, widths=widths, scale=30.0)
     returns, up, left, seconds = [], [], [], []
     for seed in range(seeds):
-        of_parameters, of_samples = jax.random.split(jax.random.key(seed))
-        began = time.perf_counter()
-        fit = fit_hjb(
-            plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
-            samples=samples, iterations=iterations,
-        )  # fmt: skip
-        seconds.append(time.perf_counter() - began)
+        fit, spent = fitted(plant.problem, network, seed, samples=samples, iterations=iterations)
+        seconds.append(spent)
         left.append(fit.validation)
-        found = evaluate(plant, _law(network.value_and_gradient, fit.parameters, plant.problem), starts(plant, "down"))
-        returns.append(float(np.mean(found.returns)))
-        up.append(float(np.mean(np.isfinite(found.settled))))
-    reference = PUBLISHED["pendulum"]
+        law = hjb_policy(lambda x, fit=fit: network.value_and_gradient(fit.parameters, x), plant.problem)
+        runs = evaluate(plant, law, starts(plant, "down"))
+        returns.append(float(np.mean(runs.returns)))
+        up.append(float(np.mean(np.isfinite(runs.settled))))
+    reference = plant.reference["down"]
     return Findings(
         [
             Row(case, "down_return_median", float(np.median(returns)), reference=reference),
@@ -166,14 +173,47 @@ def published(quick: bool) -> Findings:
     )
 
 
-def _law(value_and_gradient: Callable[..., Any], parameters: Any, problem: ControlProblem) -> Callable[[Array], Array]:
-    return hjb_policy(lambda x: value_and_gradient(parameters, x), problem)
+def rod(x: Array, u: Array, p: Array) -> Array:
+    """dx/dt of the published pendulum with p = (mass, length)."""
+    mass, length = p
+    return jnp.stack([x[1], 3 / (mass * length**2) * (u[0] + mass * 9.81 * length / 2 * jnp.sin(x[0]))])
+
+
+def robust(quick: bool) -> Findings:
+    """Returns and successes of downward starts on altered pendulums, with and without the worst disturbance."""
+    case, seeds, plant = "equation/robust", 1 if quick else 3, PLANTS["pendulum"]()
+    x, rows = starts(plant, "down", 20 if quick else 100), []
+    for name, share in (("trusting", 0.0), ("robust", SHARE)):
+        laws = [robust_law(plant.problem, share, seed, quick) for seed in range(seeds)]
+        for where, factors in FACTORS.items():
+            runs = [evaluate(plant._replace(problem=moved(plant.problem, factors)), law, x) for law in laws]
+            returns, up = [np.mean(run.returns) for run in runs], [np.mean(np.isfinite(run.settled)) for run in runs]
+            rows.append(Row(case, f"{name}_{where}_return_median", float(np.median(returns))))
+            rows.append(Row(case, f"{name}_{where}_up_share_worst", float(min(up))))
+    return Findings(rows)
+
+
+def robust_law(problem: ControlProblem, share: float, seed: int, quick: bool) -> Law:
+    """Trains a value against the worst disturbance of mass and length by a share, and returns its policy."""
+    network = value_network(problem, widths=(8, 8) if quick else (16, 16), scale=30.0)
+    disturbance = worst_disturbance(rod, [1.0, 1.0], Bounds(parameters=share)) if share else None
+    effort = {"samples": 512, "iterations": 5} if quick else {"samples": 2048, "iterations": 15}
+    fit, _ = fitted(problem, network, seed, rounds=6, disturbance=disturbance, **effort)
+    return hjb_policy(lambda x: network.value_and_gradient(fit.parameters, x), problem)
+
+
+def moved(problem: ControlProblem, factors: tuple[float, float]) -> ControlProblem:
+    """The problem of a pendulum with mass and length multiplied by these factors."""
+    p = jnp.asarray(factors)
+    return problem._replace(
+        drift=lambda x: rod(x, jnp.zeros(1), p), actuation=lambda x: jnp.array([[0.0], [3 / (p[0] * p[1] ** 2)]])
+    )
 
 
 CASES: dict[str, Callable[[bool], Findings]] = {
     "equation/line": line,
     "equation/flexible-cart-pole": linear,
     "equation/pendulum": published,
-    "equation/robust": robust.pendulum,
+    "equation/robust": robust,
 }
 """Cases of the control report."""

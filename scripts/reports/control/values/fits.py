@@ -17,9 +17,11 @@ from matplotlib.figure import Figure
 from dln_jax.control.optimal.fitted import fit_values
 from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import interpolated
-from dln_jax.control.optimal.plants import FITS, PLANTS, SECONDS, ValuePlant, ValueSettings, evaluate, starts
-from dln_jax.control.optimal.problem import ValueAndGradient, hjb_policy
-from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.control.optimal.plant_fits import FITS, Fit
+from dln_jax.control.optimal.plants import PLANTS, ValuePlant
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import ValueAndGradient
+from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.solvers.ending import reason
 from scripts.reports.case import Findings
 from scripts.reports.control.values.truths import direct_values, followed
@@ -51,16 +53,21 @@ class Trained(NamedTuple):
 def trained(plant: ValuePlant, fit: ValueSettings, seeds: int) -> Trained:
     """Trains values by fitted value iteration, one seed after the other."""
     network = value_network(plant.problem, widths=fit.widths, scale=fit.scale)
-    found = fit_values(plant.problem, network, range(seeds), numbers=fit.numbers)
-    return Trained([_value(network, each.parameters) for each in found], [each.train_seconds for each in found])
+    fits = fit_values(plant.problem, network, range(seeds), numbers=fit.numbers)
+
+    def in_double(parameters: Any) -> ValueAndGradient:
+        parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
+        return lambda x: network.value_and_gradient(parameters, x)
+
+    return Trained([in_double(fit.parameters) for fit in fits], [fit.train_seconds for fit in fits])
 
 
 def mean_value(values: Sequence[ValueAndGradient]) -> ValueAndGradient:
     """The mean of several values and gradients."""
 
     def mean(x: Array) -> tuple[Array, Array]:
-        each, slopes = zip(*(value(x) for value in values), strict=True)
-        return jnp.mean(jnp.stack(each)), jnp.mean(jnp.stack(slopes), axis=0)
+        levels, slopes = zip(*(value(x) for value in values), strict=True)
+        return jnp.mean(jnp.stack(levels)), jnp.mean(jnp.stack(slopes), axis=0)
 
     return mean
 
@@ -76,27 +83,24 @@ def pendulum(quick: bool) -> Findings:
     nodes = states_of_box(plant, 80)
     truth, before = np.asarray(extrapolated(coarse, fine, nodes)), np.asarray(interpolated(fine.grid, fine.V, nodes))
     counted, ridge = truth > LEAST * truth.max(), beside_ridge(fine, nodes, plant.limit)
-    found = trained(plant, fit, seeds)
-    of_all = [np.asarray(_V(value)(nodes.reshape(-1, 2))).reshape(truth.shape) for value in found.values]
-    case = "value/pendulum"
+    training = trained(plant, fit, seeds)
+    of_all = [np.asarray(_V(value)(nodes.reshape(-1, 2))).reshape(truth.shape) for value in training.values]
+    case, by_grid = "value/pendulum", lookahead(plant.problem, fine, most=plant.limit)
     rows = [
-        *_returns(case, plant, found),
+        *_returns(case, plant, training),
         *_errors(case, of_all, truth, counted),
         *(
             Row(case, f"beside_ridge_{quantity}", of(_relative(of_all, truth)[:, counted & ridge]))
             for quantity, of in (("median_relative_error", np.median), ("worst_relative_error", np.max))
         ),
-        Row(case, "ridge_share", float(np.mean(ridge[counted]))),
         expect(case, "grid_converged", reason(fine.ending), float(fine.converged), 1.0, at_least=True),
         Row(case, "grid_median_relative_extrapolation", float(np.median(_relative([before], truth)[:, counted]))),
-        _of_grid(case, plant, fine),
-        Row(case, "grid_value_hanging", float(interpolated(fine.grid, fine.V, jnp.array([np.pi, 0.0])))),
+        Row(case, "grid_down_return", float(np.mean(evaluate(plant, by_grid, starts(plant, "down")).returns))),
     ]
-    runs = evaluate(plant, _law(plant, found.values[0]), starts(plant, "down", 12)).x
-    curves = {"nodes": nodes, "truth": truth, "V": of_all[0], "runs": runs}
-    for name, u in (("u", _controls(plant, found.values[0], nodes)), ("best", interpolated(fine.grid, fine.u, nodes))):
-        curves[name] = np.asarray(u)
-    return Findings(rows, curves)
+    runs = evaluate(plant, _law(plant, training.values[0]), starts(plant, "down", 12)).x
+    u = np.asarray(jax.jit(jax.vmap(_law(plant, training.values[0])))(nodes.reshape(-1, 2))).reshape(truth.shape)
+    curves = {"nodes": nodes, "truth": truth, "V": of_all[0], "runs": runs, "u": u}
+    return Findings(rows, {**curves, "best": np.asarray(interpolated(fine.grid, fine.u, nodes))})
 
 
 def cart_pole(quick: bool) -> Findings:
@@ -105,17 +109,13 @@ def cart_pole(quick: bool) -> Findings:
     if quick:
         numbers = fit.numbers._replace(iterations=3, starts=128, seconds=0.5, steps=50)
         fit = fit._replace(widths=(24, 24), numbers=numbers)
-    found = trained(plant, fit, seeds)
+    training = trained(plant, fit, seeds)
     x = starts(plant, "uniform", 4 if quick else 100)
-    truth = _direct(plant, found.values, x, iterations=5 if quick else 25)
-    of_all = [np.asarray(_V(value)(x)) for value in found.values]
+    truth = _direct(plant, training.values, x, iterations=5 if quick else 25)
+    of_all = [np.asarray(_V(value)(x)) for value in training.values]
     case = "value/cart-pole"
-    rows = [*_returns(case, plant, found), *_errors(case, of_all, truth, truth > LEAST * truth.max())]
+    rows = [*_returns(case, plant, training), *_errors(case, of_all, truth, truth > LEAST * truth.max())]
     return Findings(rows)
-
-
-CASES: dict[str, Callable[[bool], Findings]] = {"value/pendulum": pendulum, "value/cart-pole": cart_pole}
-"""Cases of the control report."""
 
 
 def states_of_box(plant: ValuePlant, count: int) -> Float[np.ndarray, "A B 2"]:
@@ -125,10 +125,10 @@ def states_of_box(plant: ValuePlant, count: int) -> Float[np.ndarray, "A B 2"]:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
-def beside_ridge(found: GridValue, nodes: np.ndarray, limit: float, *, distance: float = 0.1) -> np.ndarray:
+def beside_ridge(solution: GridValue, nodes: np.ndarray, limit: float, *, distance: float = 0.1) -> np.ndarray:
     """Whether the best control changes by half its limit within `distance` in rad, or 2.5 times that in rad/s."""
     near = [nodes + distance * np.array([i, 2.5 * j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    controls = np.stack([np.asarray(interpolated(found.grid, found.u, each)) for each in near])
+    controls = np.stack([np.asarray(interpolated(solution.grid, solution.u, points)) for points in near])
     return np.ptp(controls, axis=0) > 0.5 * limit
 
 
@@ -138,46 +138,34 @@ def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None =
     return solve_on_grid(plant.problem, points, low=[-angle, -EDGE], high=[angle, EDGE], limit=plant.limit, start=start)
 
 
-def _of_grid(case: str, plant: ValuePlant, found: GridValue) -> Row:
-    """Return of the grid's own policy, for comparison."""
-    got = evaluate(plant, lookahead(plant.problem, found, limit=plant.limit), starts(plant, "down"))
-    return Row(case, "grid_down_return", float(np.mean(got.returns)))
-
-
 def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, iterations: int) -> np.ndarray:
     """Lowest cost of direct optimisations that start from the controls of the values' policies."""
     dt = 0.0125
     guesses = np.stack([followed(plant.problem, _law(plant, value), x, dt=dt, steps=200) for value in values])
-    found = direct_values(plant.problem, x, guesses, limit=plant.limit, dt=dt, iterations=iterations)
-    return np.min(found, axis=0)
+    return np.min(direct_values(plant.problem, x, guesses, limit=plant.limit, dt=dt, iterations=iterations), axis=0)
 
 
-def _returns(case: str, plant: ValuePlant, found: Trained) -> list[Row]:
+def _returns(case: str, plant: ValuePlant, training: Trained) -> list[Row]:
     """Returns by kind of starts: over the seeds, and of the mean value."""
     x = np.concatenate([starts(plant, "down"), starts(plant, "uniform")])
     half = len(x) // 2
-    each = [evaluate(plant, _law(plant, value), x) for value in found.values]
-    together = evaluate(plant, _law(plant, mean_value(found.values)), x)
+    runs = [evaluate(plant, _law(plant, value), x) for value in training.values]
+    together = evaluate(plant, _law(plant, mean_value(training.values)), x)
     rows = []
     for where, part in (("down", slice(half)), ("uniform", slice(half, None))):
-        means = [float(np.mean(run.returns[part])) for run in each]
-        up = float(min(np.mean(np.isfinite(run.settled[part])) for run in each))
-        if where == "down":
-            words = f"mean of {half} starts, the median of {len(means)} seeds"
-            bound, reference = TO_REACH[case.split("/")[1]], PUBLISHED[case.split("/")[1]]
-            rows.append(expect(case, "down_return", words, np.median(means), bound, at_least=True, reference=reference))
-        else:
-            rows.append(Row(case, "uniform_return", float(np.median(means))))
+        means = [float(np.mean(run.returns[part])) for run in runs]
+        up = float(min(np.mean(np.isfinite(run.settled[part])) for run in runs))
+        words = f"mean of {half} starts, the median of {len(means)} seeds"
+        down = where == "down"
+        bound, reference = (TO_REACH[case.split("/")[1]], plant.reference[where]) if down else (None, None)
+        median = float(np.median(means))
         rows += [
+            Row(case, f"{where}_return", median, "1", reference, bound, at_least=True, expected=words),
             expect(case, f"{where}_up_share", "of the worst seed", up, 1.0, at_least=True),
             Row(case, f"{where}_return_worst_seed", float(np.min(means))),
-            Row(case, f"{where}_return_median_start", float(np.median([run.returns[part] for run in each]))),
-            Row(case, f"{where}_return_worst_start", float(np.min([run.returns[part] for run in each]))),
             Row(case, f"{where}_return_of_mean_value", float(np.mean(together.returns[part]))),
-            Row(case, f"{where}_settled_median", float(np.median([run.settled[part] for run in each])), "s"),
         ]
-    rows.append(Row(case, "control_most", max(run.largest for run in each)))
-    seconds = found.seconds
+    seconds = training.seconds
     return [
         *rows,
         Row(case, "train_seconds", float(np.median(seconds)), "s"),
@@ -204,11 +192,6 @@ def _relative(of_all: Sequence[np.ndarray], truth: np.ndarray) -> np.ndarray:
     return np.abs(np.stack(of_all) - truth) / np.maximum(truth, LEAST * truth.max())
 
 
-def _value(network: ValueNetwork, parameters: Any) -> ValueAndGradient:
-    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
-    return lambda x: network.value_and_gradient(parameters, x)
-
-
 def _V(value: ValueAndGradient) -> Callable[[np.ndarray], Array]:
     return jax.jit(jax.vmap(lambda x: value(x)[0]))
 
@@ -217,16 +200,8 @@ def _law(plant: ValuePlant, value: ValueAndGradient) -> Callable[[Array], Array]
     return hjb_policy(value, plant.problem)
 
 
-def _controls(plant: ValuePlant, value: ValueAndGradient, nodes: np.ndarray) -> np.ndarray:
-    return np.asarray(jax.jit(jax.vmap(_law(plant, value)))(nodes.reshape(-1, 2))).reshape(nodes.shape[:2])
-
-
 def draw_pendulum(curves: dict[str, Any]) -> Figure:
     """Draws the first seed's value beside the grid solution."""
     plant = PLANTS["pendulum"]()
     values, controls = (curves["V"], curves["truth"]), (curves["u"], curves["best"])
     return value_figure(curves["nodes"], values, controls, curves["runs"], limit=plant.limit, seconds=SECONDS)
-
-
-DRAWINGS: dict[str, Callable[[dict[str, Any]], Figure]] = {"value/pendulum": draw_pendulum}
-"""Functions that draw a case's curves, by name."""
