@@ -26,7 +26,7 @@ SEEN_BY_USERS = ("figures", "low_latency")
 """Options for output that only the first process produces."""
 
 
-def mesh_of(options: Scaled) -> Mesh | None:
+def mesh_of(options: Any) -> Mesh | None:
     """The mesh of devices that share a command's batches; `None` for a single device.
 
     A single process defaults to one device: most networks are small, and sharing them is slower.
@@ -53,7 +53,7 @@ def membership_in(options: Any) -> Membership | None:
     return member
 
 
-def joined(member: Membership, options: Any, *, seconds: int) -> Any:
+def joined(member: Membership, options: Any, *, seconds: int = processes.JOINING) -> Any:
     """Joins the other processes of a command and returns the arguments of this one.
 
     Raises:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select_samples
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by

@@ -25,10 +25,10 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import GAP, window_indices
+from dln_jax.data.splits import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.learning.motions import nearest, require_windows, weighted, without_start
-from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
+from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import looped_rk4

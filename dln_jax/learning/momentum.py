@@ -15,10 +15,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.data.arrays import on_device
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import segments
+from dln_jax.data.splits import segments
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, fit_momentum, momentum_and_rest, window_weights

@@ -31,7 +31,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import GAP, window_indices
+from dln_jax.data.splits import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.mechanics.dynamics import Flow, PlainFlow
 from dln_jax.mechanics.equations import flow

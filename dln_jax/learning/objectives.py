@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array, vmap
 from jaxtyping import Float
 
-from dln_jax.data.magnitudes import spread
+from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import arrays_of
 from dln_jax.mechanics.equations import Energies, System, driving_force, dynamics, hamiltonian_of

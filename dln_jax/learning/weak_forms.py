@@ -27,7 +27,7 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.sampling import EVEN
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import segments
+from dln_jax.data.splits import segments
 from dln_jax.learning.linear import unravelled
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.mechanics.dynamics import Dynamics

@@ -1,5 +1,6 @@
 """Metrics of a model: errors, rollouts, definiteness, misfit, latency, coverage."""
 
+from dln_jax.errors import FitRefused
 from dln_jax.metrics.coverage import Coverage, coverage
 from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import errors, mean_square, normalised_error, predictions
@@ -18,7 +19,7 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_times,
 )
 from dln_jax.metrics.soft_body_energies import motion_energies
-from dln_jax.metrics.verdict import FitRefused, HeldOut, Verdict, held_out, judge
+from dln_jax.metrics.verdict import HeldOut, Verdict, held_out, judge
 
 __all__ = [
     "Coverage",

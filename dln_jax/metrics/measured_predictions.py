@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import GAP
+from dln_jax.data.splits import GAP
 from dln_jax.learning import motions
 from dln_jax.learning.measured_motions import MeasuredWindows, motion
-from dln_jax.learning.starts import nearest
-from dln_jax.mechanics.driven import Torque
+from dln_jax.learning.motions import nearest
+from dln_jax.mechanics.discrete import Torque
+from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.plain import InverseForward
 from dln_jax.metrics.rollouts import follow, valid_prediction_time
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
 from dln_jax.models.model import Model, Scale, inputs_of, model_of, per_coordinate, perceptrons, unsaturated
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Needs, Scalar, Vector

@@ -24,7 +24,7 @@ from jax.typing import DTypeLike
 
 from dln_jax.mechanics.equations import Canonical
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.natural import NaturalHamiltonian
 from dln_jax.models.lagrangian import black_box_terms, structured_terms
 from dln_jax.models.model import (
     Model,

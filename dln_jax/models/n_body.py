@@ -20,7 +20,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.natural import NaturalHamiltonian
 from dln_jax.models.model import Model, model_of, perceptrons
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive

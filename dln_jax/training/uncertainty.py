@@ -9,12 +9,12 @@ import jax
 import numpy as np
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.figures.uncertainty import torque_bands
-from dln_jax.learning.linear import linearised_chunks
+from dln_jax.figures.torques import torque_bands
+from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.uncertainty import Uncertainty, highest, scores_of_rows, torque_deviation
+from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
 from dln_jax.training.pipeline import png
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
@@ -90,7 +90,7 @@ def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Traject
     parts, first = [], 0
     with jax.enable_x64(True):
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
-        for rows, *_ in linearised_chunks(model, parameters, data, CHUNK):
+        for rows, *_ in design_chunks(design(model), parameters, data, CHUNK, even=False):
             part = slice(first, first + len(rows))
             parts.append(_bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part])))
             first = part.stop
@@ -101,4 +101,5 @@ def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Traject
 @jax.jit
 @partial(jax.vmap, in_axes=(None, 0, 0))
 def _bands(uncertainty: Uncertainty, rows: Any, state: tuple[Any, ...]) -> tuple[Any, Any]:
-    return torque_deviation(rows, uncertainty), ~(highest(scores_of_rows(rows, state, uncertainty)) <= 1)
+    std = deviation_of_rows(rows, uncertainty.factor, uncertainty.noise, uncertainty.inflation)
+    return std, exceeds(scores_of_rows(rows, state, uncertainty))

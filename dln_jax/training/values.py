@@ -21,7 +21,6 @@ from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at
 from dln_jax.control.optimal.residual import ResidualStage, discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.state_space import Law
-from dln_jax.files import matches
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
@@ -172,7 +171,7 @@ def by_equation(
             text = f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}"
             report(next(done), len(seeds) * stages, text)
 
-        found = fit_hjb(
+        solution = fit_hjb(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
             discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=report_progress,
         )  # fmt: skip
@@ -186,12 +185,12 @@ def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) ->
     for where in ("down", "uniform"):
         evaluation = evaluate(plant, law, starts(plant, where, count, seed))
         numbers |= {
-            f"{where}_return_mean": float(np.mean(found.returns)),
-            f"{where}_return_median": float(np.median(found.returns)),
-            f"{where}_return_worst": float(np.min(found.returns)),
-            f"{where}_up_share": float(np.mean(np.isfinite(found.settled))),
-            f"{where}_settled_median_seconds": float(np.median(found.settled)),
-            f"{where}_control_most": found.largest,
+            f"{where}_return_mean": float(np.mean(evaluation.returns)),
+            f"{where}_return_median": float(np.median(evaluation.returns)),
+            f"{where}_return_worst": float(np.min(evaluation.returns)),
+            f"{where}_up_share": float(np.mean(np.isfinite(evaluation.settled))),
+            f"{where}_settled_median_seconds": float(np.median(evaluation.settled)),
+            f"{where}_control_most": evaluation.largest,
         }
     return numbers
 

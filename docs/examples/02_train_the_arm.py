@@ -19,8 +19,9 @@ from dln_jax.figures import force_decomposition, style
 from dln_jax.learning.dynamics import problem
 from dln_jax.mechanics.integrators import rk4, rollout, second_order
 from dln_jax.nn.activations import tanh
-from dln_jax.scenes.datasets.default_data import default_data
-from dln_jax.scenes.two_link_arm import LINK_LENGTH, two_link_arm
+from dln_jax.scenes import two_link_arm
+from dln_jax.scenes.datasets.generators import default_data
+from dln_jax.scenes.pendulums import LINK_LENGTH
 
 jax.config.update("jax_enable_x64", True)
 

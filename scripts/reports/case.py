@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import is_file, read_json, write_figure, write_json
 from dln_jax.types import InputError
 from scripts.reports.rows import Row, conditions, publish

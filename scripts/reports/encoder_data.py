@@ -13,7 +13,7 @@ from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.weak_forms import fit_energy, fit_momentum
+from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.case import Findings, spread
 from scripts.reports.robots.arm import ENCODER_NOISE, TORQUE_NOISE, arm, error_of, logs, torque_of

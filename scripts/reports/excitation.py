@@ -15,8 +15,8 @@ from dln_jax.identification.excitation.design import CRITERIA, best_design, make
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import Task, make_task
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.scenes.panda import panda
 from scripts.reports.case import Findings
+from scripts.reports.robots.simulated_arms import panda
 from scripts.reports.rows import Row
 
 PERIOD, HARMONICS = 20.0, 5

@@ -26,7 +26,7 @@ from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.nn.activations import tanh
 from dln_jax.scenes.datasets.generators import default_data
 from dln_jax.scenes.datasets.hamiltonian_tasks import three_body
-from dln_jax.scenes.two_link_arm import LINK_LENGTH, two_link_arm
+from dln_jax.scenes.pendulums import LINK_LENGTH, two_link_arm
 from scripts.reports.control.swing_ups import SWING_UPS, closed_loop
 
 Film = Callable[[Axes], Callable[[int], None]]

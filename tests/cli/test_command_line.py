@@ -20,7 +20,8 @@ from dln_jax.cli.arguments import Unstated, choice, names_in
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.progress import progress
 from dln_jax.cli.running import interrupted, run
-from dln_jax.metrics.verdict import FitRefused, Verdict
+from dln_jax.errors import FitRefused
+from dln_jax.metrics.verdict import Verdict
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 ROOT = Path(__file__).parents[2]

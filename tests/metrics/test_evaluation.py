@@ -13,8 +13,7 @@ from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from scripts.reports.rows import Row, conditions, write_report
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dln_jax.metrics.verdict import LEVELS, FitRefused, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
+from dln_jax.errors import FitRefused
+from dln_jax.metrics.verdict import LEVELS, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.types import InputError
 
 RANDOM = np.random.default_rng(3)

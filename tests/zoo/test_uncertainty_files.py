@@ -114,18 +114,6 @@ def test_it_is_stored_in_the_precision_of_the_model(tmp_path):
     assert load(tmp_path).torque_std(*STATES[0]).dtype == jnp.float32
 
 
-@pytest.mark.parametrize("ranged", [True, False])
-def test_files_of_earlier_releases_keep_their_flags(folder, ranged):
-    stored = known()
-    reach = stored.domain.reach if ranged else np.zeros(0)
-    older = stored._replace(domain=stored.domain._replace(harmless=None, centre=np.zeros_like(reach), reach=reach))
-    save_uncertainty(folder, older)
-    run = load(folder)
-    for state in STATES[:8]:
-        # No deviation is above its limit, so that only the range can put these states outside.
-        assert bool(run.outside(*state.tolist())) == (ranged and np.abs(state).max() > 0.9)
-
-
 def test_a_state_out_of_range_is_outside_only_where_the_deviation_matters(folder):
     stored = known()
     run = load_with(folder, stored)

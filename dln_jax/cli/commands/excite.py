@@ -13,24 +13,6 @@ from typing import Annotated
 
 from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.options import Drawn, Folder
-from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder
-from dln_jax.data import schema
-from dln_jax.data.motion_tables import write_motion
-from dln_jax.data.robots import Robot, read_robot
-from dln_jax.figures.joints import excitation_figure
-from dln_jax.files import write_figure, write_json
-from dln_jax.identification.excitation.candidates import Design, random_designs
-from dln_jax.identification.excitation.design import CRITERIA, as_trajectories, design_set, error_ratio, together
-from dln_jax.identification.excitation.fourier import require_sampling
-from dln_jax.identification.excitation.limits import MotionLimits, heights_above, limits_of_robot, used
-from dln_jax.identification.excitation.task import Task, make_task
-from dln_jax.mechanics.trees import inertial_parameters, with_payload
-from dln_jax.models.model import Model, Parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.sizes import require_memory
-from dln_jax.training.results import print_numbers
-from dln_jax.types import InputError, require_positive
 
 VALIDATION = "validation"
 

@@ -18,7 +18,7 @@ from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.options import Resumable
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.sweeps.executors import cores, here, ray, run, slurm
 from dln_jax.cli.sweeps.grid import closest, grid_of, jobs_of, pairs
 from dln_jax.cli.sweeps.job import Job, status_of

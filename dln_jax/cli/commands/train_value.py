@@ -5,13 +5,11 @@ and the returns of the law in the published evaluation (100 starts), and writes 
 value.json (load them with dln_jax.training.values.load_value), metrics.json and config.json.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated
 
-from dln_jax.cli.arguments import Unstated, Variants, choice
-from dln_jax.cli.options import Folder, Scaled
+from dln_jax.cli.arguments import Unstated, choice
 
 
 @dataclass(frozen=True)

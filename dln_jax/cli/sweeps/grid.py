@@ -14,10 +14,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from dln_jax.cli.arguments import parse
-from dln_jax.cli.running import with_compilation_cache
+from dln_jax.cli.arguments import arguments_for, parse
+from dln_jax.cli.options import CompilationCache
 from dln_jax.cli.sweeps.job import Job
-from dln_jax.types import InputError
+from dln_jax.errors import InputError
 
 RANGE = re.compile(r"(-?\d{1,18}):(-?\d{1,18})(?::(-?\d{1,18}))?")
 MOST_JOBS = 10_000
@@ -100,7 +100,10 @@ def jobs_of(
         InputError: an option that the command lacks or that the sweep sets itself, a value of the wrong type, or a
             missing file.
     """
-    known = [*(field.name for field in dataclasses.fields(arguments)), "compilation_cache"]
+    # Options that only some choices read, such as a model's, are those of the first job.
+    stated = {**fixed, **{name: texts[0] for name, texts in grid.items()}}
+    whole = arguments_for(arguments, stated)
+    known = [*(field.name for field in dataclasses.fields(whole)), "compilation_cache"]
     if both := [name for name in grid if name in fixed]:
         raise InputError(f"{both[0]} is in --grid and in --fixed; leave it out of one")
     if "out" not in known:
@@ -113,7 +116,7 @@ def jobs_of(
             raise InputError(f"{source} has {name}, which every job gets from the sweep; leave it out")
         if name not in known:
             raise InputError(f"{source}: {command} has no option {name}{closest(name, known)} (see {command} --help)")
-        words[name] = {text: _word(arguments, source, name, text) for text in texts}
+        words[name] = {text: _word(whole, source, name, text) for text in texts}
     first = {name: next(iter(by_text.values())) for name, by_text in words.items()}
     prog = f"python -m dln_jax {command}"
     for name, (source, texts) in options.items():
@@ -121,7 +124,7 @@ def jobs_of(
         for text in {"0" if text.isdecimal() and len(text) < 10 else text: text for text in texts}.values():
             line = [*(first | {name: words[name][text]}).values()]
             try:
-                parsed = parse(with_compilation_cache(arguments), prog=prog, description=None, line=line)
+                parsed = parse(arguments, prog=prog, description=None, line=line, common=CompilationCache)
             except InputError as error:
                 raise InputError(f"{source}: {error}") from None
             value = getattr(parsed.own, name, None)

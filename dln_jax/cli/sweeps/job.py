@@ -1,7 +1,6 @@
 """One job of a sweep: a command in its own process, and a status file in its folder that records how it ended."""
 
 import re
-import reprlib
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_type_hints
 
 from filelock import FileLock
 
-from dln_jax.files import in_words, is_file, matches, read_json, write_json
+from dln_jax.files import as_type, is_file, read_json, write_json
 from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 
@@ -113,8 +112,8 @@ def status_of(folder: Path) -> Status:
         return Status("done" if is_file(folder / "run" / METRICS) else "missing")
     stored = read_json(path, remedy=remedy)
     for name, hint in get_type_hints(Status).items():
-        if name in stored and not matches(stored[name], hint):
-            raise InputError(f"{path}: {name} is {reprlib.repr(stored[name])}; expected {in_words(hint)}; {remedy}")
+        if name in stored:
+            as_type(stored[name], hint, name=f"{path}: {name}", remedy=remedy)
     status = Status(**{name: stored[name] for name in Status._fields if name in stored})
     if status.attempt < 0 or not _RUN.fullmatch(status.run) or (folder / status.run).is_symlink():
         raise InputError(f"{path}: attempt {status.attempt}, run '{status.run:.60}' are not those of a job; {remedy}")

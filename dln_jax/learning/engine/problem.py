@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.data.magnitudes import on_device
+from dln_jax.data.arrays import on_device
 from dln_jax.scale.mesh import on_devices, spread
 from dln_jax.types import InputError, Scalar
 

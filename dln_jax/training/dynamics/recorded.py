@@ -18,7 +18,7 @@ from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.registry import scene_named
 from dln_jax.scenes.scene import Scene
-from dln_jax.training.dynamics.options import AUTO, ArmOptions, Options
+from dln_jax.training.dynamics.options import AUTO, ArmOptions, Options, SelectionOptions
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import entry_of
 

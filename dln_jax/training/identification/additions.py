@@ -10,8 +10,6 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.figures.torques import torque_bands
-from dln_jax.files import write_figure
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.residual import Candidate, ResidualFit, fit_residual
 from dln_jax.mechanics.equations import dynamics

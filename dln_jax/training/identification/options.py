@@ -24,7 +24,7 @@ class Robot:
     """Labels of held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
     blocks of time)."""
     lock: Unstated[str] = None
-    """Joints that do not move, such as a gripper's; "*finger*" names all with finger in their name (default: none)."""
+    """Joints that do not move; "*finger*" names all with finger in their name (default: all move)."""
     friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = "viscous,coulomb,offset"
     """Friction laws whose coefficients are identified (default: viscous,coulomb,offset)."""
     velocity_scale: Unstated[float] = None

@@ -12,14 +12,24 @@ from typing import Any, ClassVar
 
 from dln_jax.cli.arguments import Unstated
 from dln_jax.cli.options import Drawn, Folder, Scaled
-from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.cli.scaled import mesh_of
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.gradient import settings_of
 from dln_jax.locomotion.task import FALLEN
-from dln_jax.training.locomotion import GOAL, Options, announce, learned, prepare, reported, write_run
-from scripts.reports.locomotion import comparison, ppo
 from scripts.reports.rows import conditions, print_report, write_report
+from dln_jax.training.locomotion import (
+    GOAL,
+    LocomotionOptions,
+    announce,
+    median_to_reach,
+    prepare,
+    reported,
+    trained,
+    write_run,
+)
+from scripts.reports.locomotion import comparison, evolution, ppo
+from scripts.reports.locomotion.comparison import comparison_rows
 
 
 @dataclass(frozen=True)
@@ -29,7 +39,9 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     MEASURES_COMPILATION: ClassVar = True
 
     seeds: int = 3
-    """Number of seeds of each method, one after the other."""
+    """Of each method, one after the other."""
+    steps: Unstated[int] = None
+    """Environment steps of each seed (default: 40000 by gradients, 500000 by evolution, 300000 by ppo)."""
     until: Unstated[float] = 1.2
     """Body lengths at which a seed ends (default: 1.2)."""
     lanes: Unstated[int] = None
@@ -38,34 +50,32 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
 
 def main(options: Arguments) -> None:
     """Trains by all methods, prints the comparison and writes it."""
-    mesh = mesh_of(options)
-    ppo.check(options.lanes, mesh)
-    task = prepare(options, METHODS, mesh)
-    settings: dict[str, Any] = {
-        method: settings_of(method, options.creature, options.window, options.lanes) for method in METHODS
-    }
-    settings["ppo"] = ppo.settings_of(options.lanes)
+    mesh, lanes = mesh_of(options), options.lanes
+    task = prepare(options, mesh)
+    rivals = {"ppo": (ppo, ppo.train_by_ppo), "evolution": (evolution, evolution.train_by_evolution)}
+    for rival, _ in rivals.values():
+        rival.check(lanes, mesh)
+    settings: dict[str, Any] = {"gradient": settings_of(task, options.window, lanes)}
+    settings |= {method: rival.settings_of(lanes) for method, (rival, _) in rivals.items()}
+    ways = {"gradient": partial(trained, task, options, mesh)}
+    for method, (rival, run) in rivals.items():
+        by_rival = partial(run, task, lanes=lanes, mesh=mesh)
+        ways[method] = partial(reported, options, method, options.steps or rival.STEPS, by_rival)
     with command_folder(options, "compare_locomotion") as folder:
         announce(task)
         curves, numbers = {}, {}
-        by_ppo = partial(ppo.train_by_ppo, task, lanes=options.lanes, mesh=mesh)
-        ways: dict[str, Callable[[], Trained]] = {
-            method: partial(learned, task, method, options, mesh) for method in METHODS
-        }
-        ways["ppo"] = lambda: reported(options, "ppo", options.steps or ppo.STEPS, by_ppo)
         for method, train in ways.items():
             policies = train()
             (folder / method).mkdir()
-            metrics = write_run(
-                folder / method, task, method, trained, options, settings[method], figures=options.figures
-            )
+            stated = settings[method]._asdict()
+            metrics = write_run(folder / method, task, policies, stated, method=method, figures=options.figures)
             numbers |= {f"{method}_{name}": value for name, value in metrics.items()}
-            curves[method] = [seed.records for seed in trained.learned]
-        rows = comparison.comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
+            curves[method] = [seed.records for seed in policies.learned]
+        rows = comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
         facts = conditions(
             dtype="float64; ppo's networks float32",
             seeds=list(range(options.seed, options.seed + options.seeds)),
-            settings={method: numbers._asdict() for method, numbers in settings.items()},
+            settings={method: values._asdict() for method, values in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
             counted="environment steps of learning; one episode after each evaluation is apart",
             seconds="wall time with compilation and evaluation, which the first seed pays and every seed is charged",

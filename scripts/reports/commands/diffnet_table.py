@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dln_jax.cli.options import Resumable
-from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.cli.stored_arguments import stored_arguments
+from dln_jax.cli.stored_arguments import command_folder, stored_arguments
 from dln_jax.learning.functions import WIDTHS
 from dln_jax.types import require_seed
 from scripts.reports.case import measure, rows_in, say_numbers

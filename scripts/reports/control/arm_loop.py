@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import Reference, Tracker, saturated, where_finite
+from dln_jax.control import Reference, Tracker, where_finite
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.friction import joint_dissipation
 from scripts.reports.robots.arm import STEP, D, Motion, simulator

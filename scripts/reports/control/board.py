@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import Controller, Hardware, Linearisation, Run, field_of, holding_controls, linearise, simulate
+from dln_jax.control import Controller, Hardware, Linearisation, field_of, holding_controls, linearise, simulate
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
+from dln_jax.zoo.run import Run
 from scripts.reports.rows import Row
 
 RATE, SECONDS = 500.0, 10.0

@@ -17,17 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import (
-    ClosedLoopRun,
-    Controller,
-    Run,
-    lqr,
-    partial_linearisation,
-    parts_of,
-    regulated,
-    switched,
-    value,
-)
+from dln_jax.control import ClosedLoopRun, Controller, lqr, partial_linearisation, parts_of, regulated, switched, value
 from dln_jax.mechanics.equations import dynamics
 from scripts.reports.case import Findings
 from scripts.reports.control.board import (

@@ -15,13 +15,13 @@ import numpy as np
 
 from dln_jax.control import Gains, Reference, computed_torque, feed_forward
 from dln_jax.control.optimal.plants import PLANTS
-from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.scenes.chain import chain
+from dln_jax.scenes.pendulums import chain
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
 from scripts.reports.control.mpc import STACK, one_call

@@ -9,8 +9,6 @@ import numpy as np
 from dln_jax.control.closed_loop import Outcomes
 from dln_jax.control.desktop_plants import PLANTS, DesktopPlant, Tried, desktop_plant, law_of, nominal_model, try_starts
 from dln_jax.control.exploration import Excitation, explore
-from dln_jax.control.outcomes import Outcomes
-from dln_jax.control.swing_up_runs import Tried, law_of, nominal_model, try_starts
 from dln_jax.training.swing_ups.learned import Errors, Obtained, errors_along, obtain, test_motions
 from dln_jax.types import InputError
 from scripts.reports.case import Findings, spread

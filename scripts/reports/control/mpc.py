@@ -25,7 +25,7 @@ from dln_jax.export.low_latency import enable_low_latency
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
-from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError
 from scripts.reports.case import Findings

@@ -16,9 +16,9 @@ from dln_jax.control import (
     Controller,
     Plan,
     field_of,
-    limited,
     regulated,
     sampled_lqr,
+    saturated,
     value,
     with_differences,
     with_prediction,
@@ -114,9 +114,9 @@ def recovering(motor: Motor, weights: Weights, plan: Plan, control_cost: float) 
             inner, number, tau = memory
             inner, by_plan = planned.act(inner, t, y)
             beyond = recovery.sweep * jnp.sin(2 * jnp.pi * (number - last) / (RATE * recovery.period))
-            by_energy = tau + law.share * (limited(far(y, law.gains, beyond), -law.most, law.most) - tau)
+            by_energy = tau + law.share * (saturated(far(y, law.gains, beyond), -law.most, law.most) - tau)
             u = jnp.where(number < last, by_plan, jnp.where(cost(y) <= law.level, near(y), by_energy))
-            u = limited(u, -LIMIT, LIMIT)
+            u = saturated(u, -LIMIT, LIMIT)
             return (inner, number + 1, u), u
 
         return Controller((planned.start, jnp.asarray(0), jnp.zeros(1)), act)

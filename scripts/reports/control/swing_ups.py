@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from dln_jax.control import (
     EnergyGains,
     Hardware,
-    Run,
     energy_shaping,
     field_of,
     holding_controls,
@@ -25,13 +24,13 @@ from dln_jax.control import (
     value,
     with_differences,
 )
+from dln_jax.control.closed_loop import Outcomes, hanging_starts, outcomes
 from dln_jax.control.desktop_plants import TURN
-from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
 from dln_jax.figures.closed_loops import closed_loop_traces
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.cart_pole import cart_pole
-from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from dln_jax.scenes.scene import Scene
+from dln_jax.zoo.run import Run
 from scripts.reports.case import Findings
 from scripts.reports.figures.starts import success_over_starts
 from scripts.reports.rows import Row

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.figures.joints import friction_curves
 from dln_jax.mechanics.friction import FrictionShape, unit_force
-from dln_jax.mechanics.loaded import Load, carrying
+from dln_jax.mechanics.joint_friction import Load, carrying
 
 
 def friction_laws() -> Figure:

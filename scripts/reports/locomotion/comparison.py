@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from dln_jax.figures import style
 from dln_jax.locomotion.learning import Record
-from dln_jax.locomotion.progress import first_reaching, median_to_reach
+from dln_jax.training.locomotion import first_reaching, median_to_reach
 from scripts.reports.rows import Row
 
 Curves = Mapping[str, Sequence[Sequence[Record]]]

@@ -21,8 +21,8 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, serial
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.model import Model, Parameters
-from dln_jax.scenes.panda import panda
 from dln_jax.types import InputError
+from scripts.reports.robots.simulated_arms import panda
 
 D = 7
 MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)

@@ -18,7 +18,6 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.closed_form import RecursiveSystem
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.precision import in_float64

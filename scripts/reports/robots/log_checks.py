@@ -18,8 +18,8 @@ from dln_jax.data import schema
 from dln_jax.data.checks import quick
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
-from dln_jax.scenes.panda import panda
 from scripts.reports.case import Findings
+from scripts.reports.robots.simulated_arms import panda
 from scripts.reports.rows import expect
 
 SOUND, FAULTY, QUICK = 60, 10, 6

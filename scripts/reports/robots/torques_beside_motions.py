@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.segments import GAP, window_indices
+from dln_jax.data.splits import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, arrays_of, mean_square, unmonitored
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters

@@ -16,18 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.cli.commands import train_delan
-from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
+from dln_jax.errors import FitRefused
 from dln_jax.files import read_json
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
-from dln_jax.metrics.verdict import LEVELS, FitRefused
+from dln_jax.metrics.verdict import LEVELS
 from dln_jax.precision import in_float64
-from dln_jax.scenes.datasets.robot_arms import arm_torques
-from dln_jax.scenes.robot_arms import Arm
-from dln_jax.training.identification.run import run
+from dln_jax.training.dynamics.run import run
 from dln_jax.training.identification.task import Options
 from dln_jax.types import InputError
 from scripts.reports.case import Case, Findings
+from scripts.reports.robots.simulated_arms import Arm, arm_torques
 from scripts.reports.rows import Row, expect
 
 JOINTS = (2, 3, 4, 6)

@@ -23,8 +23,8 @@ from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import pattern
-from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import ElementEnergy
+from dln_jax.solvers.elements.selection import search_takes_at_most
 from scripts.reports.case import Findings
 from scripts.reports.rows import expect
 from scripts.reports.soft_bodies.common import cantilever_of, converges

@@ -10,7 +10,7 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
-from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulums import double_pendulum
 from dln_jax.types import Needs
 from scripts.reports.case import Findings
 from scripts.reports.rows import expect, largest

@@ -12,8 +12,8 @@ from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import Tree, inertial_parameters, serial, tree_system
-from dln_jax.scenes.panda import panda
 from dln_jax.types import Vector
+from scripts.reports.robots.simulated_arms import panda
 
 VELOCITY_SCALE = 0.05
 """Velocity scale of dry friction, rad/s."""

@@ -2,7 +2,7 @@
 
 from calls import refused
 
-from dln_jax.control.outcomes import hanging_starts
+from dln_jax.control.closed_loop import hanging_starts
 from scripts.reports.commands import control_report
 from scripts.reports.control.swing_ups import SWING_UPS, tried
 

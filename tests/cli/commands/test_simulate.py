@@ -23,7 +23,7 @@ from dln_jax.softbody.mesh.shapes import body_length, crawler
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
 from dln_jax.softbody.verdict import Info
-from dln_jax.training.simulation_results import Motion, finite_moments, warn
+from dln_jax.training.simulation_results import finite_moments, warn
 from dln_jax.types import InputError
 
 

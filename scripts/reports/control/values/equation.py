@@ -16,17 +16,16 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control import field_of, linearise, lqr
-from dln_jax.control.balance import Law
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
-from dln_jax.control.optimal.evaluation import evaluate, starts
-from dln_jax.control.optimal.plants import PLANTS
-from dln_jax.control.optimal.policy import hjb_policy
-from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import discounts_down_to, fit_residual
+from dln_jax.control.optimal.plants import PLANTS, evaluate, starts
+from dln_jax.control.optimal.problem import ControlProblem, hjb_policy
+from dln_jax.control.optimal.residual import discounts_down_to
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
+from dln_jax.control.state_space import Law
+from dln_jax.identification.residual import fit_residual
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
+from dln_jax.scenes.poles import flexible_cart_pole
 from scripts.reports.case import Findings
 from scripts.reports.rows import Row, expect, largest, unit_of
 

@@ -17,10 +17,8 @@ from matplotlib.figure import Figure
 from dln_jax.control.optimal.fitted import fit_values
 from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import interpolated
-from dln_jax.control.optimal.plant_fits import FITS, Fit
-from dln_jax.control.optimal.plants import PLANTS, ValuePlant
-from dln_jax.control.optimal.policy import hjb_policy
-from dln_jax.control.optimal.problem import ValueAndGradient
+from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant
+from dln_jax.control.optimal.problem import ValueAndGradient, hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.solvers.ending import reason
 from scripts.reports.case import Findings
