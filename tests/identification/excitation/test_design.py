@@ -152,10 +152,12 @@ def linear_arm(theta):
     return LagrangianSystem(lagrangian, lambda q, qd: 0.5 * viscous * jnp.sum(qd**2))
 
 
+LINEAR = Model(lambda key: jnp.array([0.7, 0.3, 0.2, 4.0, 0.1]), linear_arm)
+
+
 def test_the_regressor_and_its_slope_are_those_of_autodiff():
-    parameters = jnp.array([0.7, 0.3, 0.2, 4.0, 0.1])
-    model = Model(lambda key: parameters, linear_arm)
-    regressor, theta = linear_force(model, parameters)
+    parameters = LINEAR.init(jax.random.key(0))
+    regressor, theta = linear_force(LINEAR, parameters)
     at = [*map(jnp.array, ([0.3, -1.1], [0.05, -0.8], [2.0, 1.0]))]
     rows = np.random.default_rng(0).normal(size=(2, len(theta)))
 
@@ -169,7 +171,7 @@ def test_the_regressor_and_its_slope_are_those_of_autodiff():
         slopes, Phi = jax.jit(jax.grad(weighted, argnums=(0, 1, 2), has_aux=True))(*at)
         return Phi, np.array(slopes)
 
-    Phi, slopes = with_slopes(lambda *at: linearised(model, parameters, *at)[0])
+    Phi, slopes = with_slopes(lambda *at: linearised(LINEAR, parameters, *at)[0])
     ours, our_slopes = with_slopes(regressor)
     assert np.allclose(ours, Phi, atol=1e-12) and np.allclose(our_slopes, slopes, atol=1e-10)
     tau = jax.jit(dynamics(linear_arm(parameters)).inverse_dynamics)(*at)
@@ -249,9 +251,9 @@ def test_bad_input_is_one_line(message):
     assert "\n" not in str(error.value)
 
 
-def test_limits_that_no_motion_keeps_are_refused(task):
+def test_limits_that_no_motion_keeps_are_refused():
     weak = LIMITS._replace(force=np.array([[-0.1, 0.1], [-0.1, 0.1]]))
-    impossible = make_task(MODEL, PARAMETERS, weak, period=6.0, harmonics=3)
+    impossible = make_task(LINEAR, LINEAR.init(jax.random.key(0)), weak, period=6.0, harmonics=3)
     with pytest.raises(InputError, match="force by"):
         random_designs(impossible, 1)
 
