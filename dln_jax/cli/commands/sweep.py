@@ -79,10 +79,10 @@ def main(options: Arguments) -> None:
     pairs("--slurm", options.slurm or "")
     command = options.command.replace("-", "_")
     arguments = arguments_of(command)
-    jobs_of(command, arguments, grid, fixed, Path())  # refused before there is a folder
+    jobs = jobs_of(command, arguments, grid, fixed, Path())  # mistakes are refused before there is a folder
     with command_folder(options, "sweep") as out:
         folder = out.absolute()
-        jobs = jobs_of(command, arguments, grid, fixed, folder)
+        jobs = [job._replace(folder=folder / job.folder) for job in jobs]
         left = [job for job in jobs if status_of(job.folder).state != "done"]
         if options.where == "later":
             (folder / LATER).write_text("".join(f"{shlex.join(job.line(job.folder / 'run'))}\n" for job in left))

@@ -118,13 +118,13 @@ def jobs_of(
             raise InputError(f"{source}: {command} has no option {name}{closest(name, known)} (see {command} --help)")
         words[name] = {text: _word(whole, source, name, text) for text in texts}
     first = {name: next(iter(by_text.values())) for name, by_text in words.items()}
-    prog = f"python -m dln_jax {command}"
+    prog, whole = f"python -m dln_jax {command}", with_compilation_cache(arguments)
     for name, (source, texts) in options.items():
         # Parsing takes milliseconds, so that one whole number is checked for all.
         for text in {"0" if text.isdecimal() and len(text) < 10 else text: text for text in texts}.values():
             line = [*(first | {name: words[name][text]}).values()]
             try:
-                parsed = parse(arguments, prog=prog, description=None, line=line, common=CompilationCache)
+                parsed = parse(whole, prog=prog, description=None, line=line)
             except InputError as error:
                 raise InputError(f"{source}: {error}") from None
             value = getattr(parsed.own, name, None)

@@ -21,6 +21,8 @@ from dln_jax.identification.excitation.task import independent_columns, linear_f
 from dln_jax.learning.linear import fit_linear, linearised
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.models.model import Model
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.types import InputError
 
@@ -138,8 +140,24 @@ def test_columns_that_others_explain_are_left_out():
     )
 
 
+def linear_arm(theta):
+    """Energies of two links that are linear in five parameters; much quicker to compile than a tree."""
+    first, second, coupling, weight, viscous = theta
+
+    def lagrangian(q, qd):
+        both = qd[0] + qd[1]
+        kinetic = 0.5 * first * qd[0] ** 2 + 0.5 * second * both**2 + coupling * jnp.cos(q[1]) * qd[0] * both
+        return kinetic - weight * jnp.sin(q[0] + q[1])
+
+    return LagrangianSystem(lagrangian, lambda q, qd: 0.5 * viscous * jnp.sum(qd**2))
+
+
+LINEAR = Model(lambda key: jnp.array([0.7, 0.3, 0.2, 4.0, 0.1]), linear_arm)
+
+
 def test_the_regressor_and_its_slope_are_those_of_autodiff():
-    regressor, theta = linear_force(MODEL, PARAMETERS)
+    parameters = LINEAR.init(jax.random.key(0))
+    regressor, theta = linear_force(LINEAR, parameters)
     at = [*map(jnp.array, ([0.3, -1.1], [0.05, -0.8], [2.0, 1.0]))]
     rows = np.random.default_rng(0).normal(size=(2, len(theta)))
 
@@ -153,10 +171,10 @@ def test_the_regressor_and_its_slope_are_those_of_autodiff():
         slopes, Phi = jax.jit(jax.grad(weighted, argnums=(0, 1, 2), has_aux=True))(*at)
         return Phi, np.array(slopes)
 
-    Phi, slopes = with_slopes(lambda *at: linearised(MODEL, PARAMETERS, *at)[0])
+    Phi, slopes = with_slopes(lambda *at: linearised(LINEAR, parameters, *at)[0])
     ours, our_slopes = with_slopes(regressor)
     assert np.allclose(ours, Phi, atol=1e-12) and np.allclose(our_slopes, slopes, atol=1e-10)
-    tau = jax.jit(dynamics(MODEL.energies(PARAMETERS)).inverse_dynamics)(*at)
+    tau = jax.jit(dynamics(linear_arm(parameters)).inverse_dynamics)(*at)
     assert np.allclose(Phi @ theta, tau, atol=1e-12)
 
 
@@ -233,9 +251,9 @@ def test_bad_input_is_one_line(message):
     assert "\n" not in str(error.value)
 
 
-def test_limits_that_no_motion_keeps_are_refused(task):
+def test_limits_that_no_motion_keeps_are_refused():
     weak = LIMITS._replace(force=np.array([[-0.1, 0.1], [-0.1, 0.1]]))
-    impossible = make_task(MODEL, PARAMETERS, weak, period=6.0, harmonics=3)
+    impossible = make_task(LINEAR, LINEAR.init(jax.random.key(0)), weak, period=6.0, harmonics=3)
     with pytest.raises(InputError, match="force by"):
         random_designs(impossible, 1)
 
