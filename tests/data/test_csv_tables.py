@@ -51,8 +51,8 @@ def test_columns_come_in_any_order_with_others_beside_them(load):
 )
 def test_units_in_titles_are_converted_to_si(load, titles, factors):
     data = load("\ufeff" + titles + "\r\n1,2,3,4,5\r\n\r\n2,4,6,8,10\r\n")
-    found = [data.t, *(getattr(data, key)[:, 0] for key in ("q", "qd", "qdd", "tau"))]
-    np.testing.assert_allclose(found, np.outer(factors, [1, 2]) * np.arange(1, 6)[:, None], rtol=1e-15)
+    columns = [data.t, *(getattr(data, key)[:, 0] for key in ("q", "qd", "qdd", "tau"))]
+    np.testing.assert_allclose(columns, np.outer(factors, [1, 2]) * np.arange(1, 6)[:, None], rtol=1e-15)
 
 
 def test_units_that_no_title_states_are_asked_for(load):

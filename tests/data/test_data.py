@@ -78,10 +78,10 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("given", "message"), REFUSED, ids=[message for _, message in REFUSED])
-def test_what_breaks_the_schema_is_named(tmp_path, given, message):
+@pytest.mark.parametrize(("content", "message"), REFUSED, ids=[message for _, message in REFUSED])
+def test_what_breaks_the_schema_is_named(tmp_path, content, message):
     path = tmp_path / "data.npz"
-    np.savez(path, **given)
+    np.savez(path, **content)
     with pytest.raises(InputError, match=message) as caught:
         schema.load(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)

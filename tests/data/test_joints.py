@@ -20,10 +20,10 @@ NAMED = from_arrays({**ARRAYS, "joint_names": np.array(["elbow", "slide"])})
 def test_columns_take_the_robots_order(tmp_path):
     save(tmp_path / "log.npz", NAMED)
     data = load(tmp_path / "log.npz")
-    found = with_joints(data, ("slide", "elbow"))
+    ordered = with_joints(data, ("slide", "elbow"))
     for key in ("q", "qd", "qdd", "tau"):
-        np.testing.assert_array_equal(getattr(found, key), getattr(data, key)[:, ::-1])
-    assert found.joint_names.tolist() == ["slide", "elbow"] and found.needs.joints == ("prismatic", "revolute")
+        np.testing.assert_array_equal(getattr(ordered, key), getattr(data, key)[:, ::-1])
+    assert ordered.joint_names.tolist() == ["slide", "elbow"] and ordered.needs.joints == ("prismatic", "revolute")
     unnamed = from_arrays(ARRAYS)
     assert with_joints(unnamed, ("a", "b")) is unnamed
 

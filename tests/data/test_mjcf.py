@@ -29,12 +29,12 @@ def robot(mass=1.3):
 def test_a_robot_survives_its_file(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(mjcf(robot()))
-    found = read_robot(path)
-    assert (found.tree.names, found.tree.parents, found.tree.joints) == (robot().tree[-1], *robot().tree[:2])
-    for numbers, expected in zip(found[1:], robot()[1:], strict=True):
+    again = read_robot(path)
+    assert (again.tree.names, again.tree.parents, again.tree.joints) == (robot().tree[-1], *robot().tree[:2])
+    for numbers, expected in zip(again[1:], robot()[1:], strict=True):
         np.testing.assert_array_equal(numbers, expected)
     state = np.random.default_rng(0).normal(size=(3, 4))
-    forces = (jax.jit(dynamics(tree_system(each.tree)).inverse_dynamics)(*state) for each in (found, robot()))
+    forces = (jax.jit(dynamics(tree_system(each.tree)).inverse_dynamics)(*state) for each in (again, robot()))
     np.testing.assert_allclose(*forces, rtol=1e-12, atol=1e-12)
 
 

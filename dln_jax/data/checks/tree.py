@@ -1,24 +1,30 @@
 """Checks a log against a robot's description: signs, gravity, gears, excitation, and the order of the joints."""
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.data.checks import energies
 from dln_jax.data.checks.derivatives import away_from_ends
 from dln_jax.data.checks.energies import Build, States
 from dln_jax.data.checks.evidence import Prior
 from dln_jax.data.checks.findings import Finding, on_joints
 from dln_jax.data.checks.hypotheses import Log, Torques, examine_torques
-from dln_jax.data.checks.joints import better_order, limits, named_order, parameters_of, regressor_of
-from dln_jax.data.checks.torques import check_torques
+from dln_jax.data.checks.joints import better_order, check_torques, limits, named_order
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.trees import Tree, regressor
 from dln_jax.solvers import least_squares
+from dln_jax.types import JointKind
 
 MOST = 800
 """Number of samples used."""
+PADDED = 200
+"""Batches are padded to a multiple of this number of samples."""
 RELATED = 0.5
 """Correlation with the tree's torque, without friction, above which a measured torque belongs to the same joint."""
 GEAR = 5.0
@@ -75,7 +81,8 @@ def against_tree(
     farthest, inside = (farthest, inside) if len(inside) else (0, np.arange(len(data.t)))
     chosen = inside[:: -(-len(inside) // MOST)]
     q, qd, qdd, tau = samples = tuple(getattr(data, key)[chosen] for key in ("q", "qd", "qdd", "tau"))
-    phi, theta, down = regressor_of(robot.tree), parameters_of(robot.tree), np.asarray(robot.tree.gravity, float)
+    tree, down = robot.tree, np.asarray(robot.tree.gravity, float)
+    phi, theta = regressor_of(tree), np.concatenate([np.ravel(tree.inertias), np.ravel(tree.armature)])
     friction = _friction(qd)
     varies = np.ptp(tau, axis=0) > 0
     sizes = np.where(varies, tau.std(axis=0), 1.0)
@@ -103,6 +110,34 @@ def against_tree(
         # A column order that differs from the robot's changes the size of torques too, so it is tested before gears.
         findings += better_order(phi, theta, down, samples, friction) or _gears(scale, correlation)
     return OnTree(findings, scale, correlation, estimate, rank, parameters, condition, torques)
+
+
+def regressor_of(tree: Tree) -> Callable[..., np.ndarray]:
+    """(q, qd, qdd [n, d], gravity [3]) -> Phi [n, d, 11 d] of a tree; trees of one structure share a program."""
+    program = _program(tree.parents, tree.joints, tuple(map(tuple, np.asarray(tree.axes).tolist())))
+    frames = np.asarray(tree.rotations, float), np.asarray(tree.positions, float)
+
+    def phi(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        # Padding limits the number of shapes, and thus of compiled programs.
+        missing = -len(q) % PADDED
+        states = [np.pad(values, ((0, missing), (0, 0)), mode="edge") for values in (q, qd, qdd)]
+        with jax.enable_x64(True):
+            return np.asarray(program(*frames, np.asarray(gravity, float), *states))[: len(q)]
+
+    return phi
+
+
+@functools.cache
+def _program(parents: tuple[int, ...], joints: tuple[JointKind, ...], axes: tuple[tuple[float, ...], ...]) -> Any:
+    d = len(parents)
+
+    def one(rotations, positions, gravity, q, qd, qdd):
+        inertias, armature = np.zeros((d, 10)), np.zeros(d)
+        tree = Tree(parents, joints, rotations, positions, np.array(axes), inertias, armature, gravity)
+        return regressor(tree, q, qd, qdd)
+
+    batch = jax.vmap(one, in_axes=(None, None, None, 0, 0, 0))
+    return jax.jit(batch, compiler_options=quick_compilation())
 
 
 def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray) -> Build:

@@ -11,7 +11,7 @@ from dln_jax.data.checks.derivatives import check_derivatives
 from dln_jax.data.checks.energies import any_energy
 from dln_jax.data.checks.findings import Finding, by_severity
 from dln_jax.data.checks.hypotheses import Torques, examine_torques
-from dln_jax.data.checks.torques import check_degrees, check_torques
+from dln_jax.data.checks.joints import check_degrees, check_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.encoders.sampling import step_of, timing

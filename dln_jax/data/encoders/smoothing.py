@@ -12,7 +12,6 @@ friction belong to no state, see `filters`. On a simulated seven-axis arm filter
 (`scripts.reports.encoder_data`).
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -121,12 +120,10 @@ def smooth(
             f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
-    filter_ = functools.partial(low_pass, rate=rate, cutoff=cutoff)
     columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
-    for index in kept:
-        t, x = even[index]
-        q, tau = filter_(x[:, :d]), filter_(x[:, d:]) if filtered else x[:, d:]
-        for key, array in zip(columns, (t, q, *derivatives(q, rate=rate), tau), strict=True):
+    for t, x in (even[index] for index in kept):
+        arrays = t, *_filtered(x[:, :d], x[:, d:], rate, cutoff, filter_torque=filtered)
+        for key, array in zip(columns, arrays, strict=True):
             columns[key].append(array[ends : len(t) - ends : decimate])
     smoothed = data._replace(
         **{key: np.concatenate(parts) for key, parts in columns.items()},
@@ -141,6 +138,14 @@ def smooth(
         bridged=len(segments(data.t, data.trajectory)) - len(pieces), parts=len(kept),
         left_out=len(pieces) - len(kept), repeats=repeats,
     )  # fmt: skip
+
+
+def _filtered(
+    q: np.ndarray, tau: np.ndarray, rate: float, cutoff: float, *, filter_torque: bool
+) -> tuple[np.ndarray, ...]:
+    """q, qd, qdd and tau of one segment."""
+    q = low_pass(q, rate=rate, cutoff=cutoff)
+    return q, *derivatives(q, rate=rate), low_pass(tau, rate=rate, cutoff=cutoff) if filter_torque else tau
 
 
 def _labels(data: Trajectories, sources: list[int]) -> np.ndarray:

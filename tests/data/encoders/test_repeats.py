@@ -40,9 +40,9 @@ def repeated_every(arrays, step, keys=("q", "tau")):
     return {**arrays, **changed}, rows
 
 
-def error(found, qdd, rate):
-    inside = np.round(found.data.t * rate).astype(int)
-    return np.sqrt(np.mean((found.data.qdd - qdd[inside]) ** 2))
+def error(smoothed, qdd, rate):
+    inside = np.round(smoothed.data.t * rate).astype(int)
+    return np.sqrt(np.mean((smoothed.data.qdd - qdd[inside]) ** 2))
 
 
 @pytest.mark.parametrize("rate", [30.0, 125.0])
@@ -51,10 +51,10 @@ def error(found, qdd, rate):
 def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff(rate, noise, keys):
     arrays, qdd = log(rate=rate, noise=noise, seconds=30.0)
     repeated, rows = repeated_every(arrays, 101, keys)
-    clean, found = smooth(schema.from_arrays(arrays), trim=1.0), smooth(schema.from_arrays(repeated), trim=1.0)
-    assert np.array_equal(np.flatnonzero(found.repeats.q), rows)
-    assert found.cutoff == pytest.approx(clean.cutoff, rel=0.05)
-    assert error(found, qdd, rate) < 1.3 * error(clean, qdd, rate)
+    clean, smoothed = smooth(schema.from_arrays(arrays), trim=1.0), smooth(schema.from_arrays(repeated), trim=1.0)
+    assert np.array_equal(np.flatnonzero(smoothed.repeats.q), rows)
+    assert smoothed.cutoff == pytest.approx(clean.cutoff, rel=0.05)
+    assert error(smoothed, qdd, rate) < 1.3 * error(clean, qdd, rate)
 
 
 def test_inserted_rows_give_their_time_back():
@@ -67,8 +67,8 @@ def test_inserted_rows_give_their_time_back():
     assert np.array_equal(data.q, arrays["q"])
     steps = np.diff(data.t)
     assert steps == pytest.approx(np.full(len(steps), steps[0])) and steps[0] > 1 / 30.0
-    found = smooth(schema.from_arrays({**longer, "t": np.arange(len(order)) / 30.0}))
-    assert found.cutoff == pytest.approx(smooth(schema.from_arrays(arrays)).cutoff, rel=0.05)
+    smoothed = smooth(schema.from_arrays({**longer, "t": np.arange(len(order)) / 30.0}))
+    assert smoothed.cutoff == pytest.approx(smooth(schema.from_arrays(arrays)).cutoff, rel=0.05)
 
 
 def test_rest_and_turning_points_are_no_repeats():
@@ -86,7 +86,7 @@ def test_noise_is_filtered_in_spite_of_jumps():
     arrays, _ = log(noise=1e-4)
     jumping = arrays["q"].copy()
     jumping[50::97, 0] += 0.05
-    found = smooth(schema.from_arrays({**arrays, "q": jumping}))
+    smoothed = smooth(schema.from_arrays({**arrays, "q": jumping}))
     clean = smooth(schema.from_arrays(arrays))
-    assert np.isfinite(found.cutoff)
-    assert found.noise_q == pytest.approx(clean.noise_q, rel=0.1)
+    assert np.isfinite(smoothed.cutoff)
+    assert smoothed.noise_q == pytest.approx(clean.noise_q, rel=0.1)

@@ -115,23 +115,23 @@ def test_the_cut_off_is_nearly_the_best_there_is(noise, rate):
     data = schema.from_arrays(arrays)
 
     def error(cutoff):
-        found = smooth(data, cutoff, trim=0.5)
-        return rms(found.data.qdd - qdd[within(data, round(0.5 * rate))]), found
+        smoothed = smooth(data, cutoff, trim=0.5)
+        return rms(smoothed.data.qdd - qdd[within(data, round(0.5 * rate))]), smoothed
 
-    chosen, found = error(None)
+    chosen, smoothed = error(None)
     best = min(error(cutoff)[0] for cutoff in np.geomspace(1.0, 0.4 * rate, 25))
     assert chosen < 1.25 * best
-    assert found.noise_q == pytest.approx([noise, noise], rel=0.15)
-    assert found.noise_tau == pytest.approx([NOISE_TAU, NOISE_TAU], rel=0.15)
+    assert smoothed.noise_q == pytest.approx([noise, noise], rel=0.15)
+    assert smoothed.noise_tau == pytest.approx([NOISE_TAU, NOISE_TAU], rel=0.15)
 
 
 def test_rates_of_filtered_encoders_are_far_better_than_differences():
     arrays, qd, qdd = log()
     data = schema.from_arrays(arrays)
-    found = smooth(data)
-    inside = within(data, round(found.trim * RATE))
-    assert rms(found.data.qdd - qdd[inside]) < 0.02 * rms((data.qdd - qdd)[inside])
-    assert rms(found.data.qd - qd[inside]) < 0.1 * rms((data.qd - qd)[inside])
+    smoothed = smooth(data)
+    inside = within(data, round(smoothed.trim * RATE))
+    assert rms(smoothed.data.qdd - qdd[inside]) < 0.02 * rms((data.qdd - qdd)[inside])
+    assert rms(smoothed.data.qd - qd[inside]) < 0.1 * rms((data.qd - qd)[inside])
 
 
 def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
@@ -139,8 +139,8 @@ def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
     for seed in range(6):
         arrays, _, qdd = log(seed=seed, trajectories=4)
         data = schema.from_arrays(arrays)
-        found = smooth(data, 5.0)
-        errors.append((found.data.qdd - qdd[within(data, round(found.trim * RATE))]).reshape(4, -1, 2))
+        smoothed = smooth(data, 5.0)
+        errors.append((smoothed.data.qdd - qdd[within(data, round(smoothed.trim * RATE))]).reshape(4, -1, 2))
     at = np.sqrt(np.mean(np.square(errors), axis=(0, 1, 3)))
     assert max(rms(at[:12]), rms(at[-12:])) < 2 * rms(at[400:600])
 
@@ -152,11 +152,11 @@ def within(data, ends):
 
 def test_clean_data_are_not_filtered():
     arrays, qd, qdd = log(noise=0.0)
-    found = smooth(schema.from_arrays(arrays))
-    assert np.isinf(found.cutoff)
-    assert np.array_equal(found.data.q, arrays["q"])
-    assert found.data.qd == pytest.approx(qd, abs=1e-6)
-    assert rms(found.data.qdd - qdd) < 1e-3 * rms(qdd)
+    smoothed = smooth(schema.from_arrays(arrays))
+    assert np.isinf(smoothed.cutoff)
+    assert np.array_equal(smoothed.data.q, arrays["q"])
+    assert smoothed.data.qd == pytest.approx(qd, abs=1e-6)
+    assert rms(smoothed.data.qdd - qdd) < 1e-3 * rms(qdd)
 
 
 def test_uneven_samples_come_to_equal_steps():
@@ -165,15 +165,15 @@ def test_uneven_samples_come_to_equal_steps():
     arrays, _, _ = log(t=t, noise=1e-5)
     data = schema.from_arrays(arrays)
     assert sampling.timing(data.t, data.trajectory).jitter > 0.1
-    found = smooth(data, trim=0.5)
-    steps = np.diff(found.data.t)[np.diff(found.data.trajectory) == 0]
-    assert steps == pytest.approx(np.full(len(steps), 1 / found.rate), rel=1e-9)
+    smoothed = smooth(data, trim=0.5)
+    steps = np.diff(smoothed.data.t)[np.diff(smoothed.data.trajectory) == 0]
+    assert steps == pytest.approx(np.full(len(steps), 1 / smoothed.rate), rel=1e-9)
     for k in range(3):
-        here = found.data.trajectory == k
+        here = smoothed.data.trajectory == k
         for joint in range(2):
-            _, qd, qdd = motion(found.data.t[here] + SECONDS * k, joint)
-            assert rms(found.data.qd[here, joint] - qd) < 2e-3 * rms(qd)
-            assert rms(found.data.qdd[here, joint] - qdd) < 0.03 * rms(qdd)
+            _, qd, qdd = motion(smoothed.data.t[here] + SECONDS * k, joint)
+            assert rms(smoothed.data.qd[here, joint] - qd) < 2e-3 * rms(qd)
+            assert rms(smoothed.data.qdd[here, joint] - qdd) < 0.03 * rms(qdd)
 
 
 def test_long_gaps_cut_and_short_ones_are_bridged():
@@ -182,14 +182,14 @@ def test_long_gaps_cut_and_short_ones_are_bridged():
     lost[200:202] = True  # two samples of run0
     lost[1250 + 500 : 1250 + 700] = True  # 1.6 s of run1
     data = schema.from_arrays({key: x if key == "label" else x[~lost] for key, x in arrays.items()})
-    found = smooth(data, 8.0)
-    assert (found.bridged, found.parts, found.left_out) == (1, 4, 0)
-    assert list(found.data.label) == ["run0", "run1/1", "run1/2", "run2"]
-    assert labels_of_parts(found.data, ["run1", "run2", "other"]) == ["run1/1", "run1/2", "run2", "other"]
-    steps = np.diff(found.data.t)[np.diff(found.data.trajectory) == 0]
-    assert steps.max() < 1.01 / found.rate
-    first = found.data.trajectory == 0
-    assert np.sum(first) == 1250 - 2 * round(found.trim * found.rate)
+    smoothed = smooth(data, 8.0)
+    assert (smoothed.bridged, smoothed.parts, smoothed.left_out) == (1, 4, 0)
+    assert list(smoothed.data.label) == ["run0", "run1/1", "run1/2", "run2"]
+    assert labels_of_parts(smoothed.data, ["run1", "run2", "other"]) == ["run1/1", "run1/2", "run2", "other"]
+    steps = np.diff(smoothed.data.t)[np.diff(smoothed.data.trajectory) == 0]
+    assert steps.max() < 1.01 / smoothed.rate
+    first = smoothed.data.trajectory == 0
+    assert np.sum(first) == 1250 - 2 * round(smoothed.trim * smoothed.rate)
 
 
 def test_decimated_torques_are_filtered_and_others_are_not():
