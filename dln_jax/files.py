@@ -95,17 +95,13 @@ def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
     return values
 
 
-def matches(value: Any, hint: Any) -> bool:
-    """Whether a JSON value has a type: bool, int, float (finite), str, Path (a str), None, Literal or a union."""
-    if get_origin(hint) is Literal:
-        return any(type(value) is type(option) and value == option for option in get_args(hint))
-    if options := get_args(hint):
-        return any(matches(value, option) for option in options)
-    if isinstance(value, int) and not isinstance(value, bool):
-        return hint in (int, float) and abs(value) < 2**63
-    if isinstance(value, float):
-        return hint is float and math.isfinite(value)
-    return isinstance(value, str) if hint is Path else type(value) is (NoneType if hint is None else hint)
+def matches(value: Any, kind: Any) -> bool:
+    """Whether a JSON value has a type."""
+    try:
+        as_type(value, kind, name="", remedy="")
+    except InputError:
+        return False
+    return not (isinstance(value, float) and not math.isfinite(value))
 
 
 def as_type(values: Any, kind: Any, *, name: str, remedy: str) -> Any:
