@@ -196,8 +196,9 @@ def test_definiteness_is_computed_on_request_only():
     def size_and_info(**options):
         init, step = make_step(held_body(), DT, **options)
         program = jax.jit(lambda params, state: step(params, state, None))
+        shape = jax.eval_shape(program, held_body().params, init())[1]
         size = equations(jax.make_jaxpr(program)(held_body().params, init()).jaxpr)
-        return size, program(held_body().params, init())[1]
+        return size, shape if shape.definite is None else program(held_body().params, init())[1]
 
     (plain, info), (asked, info_asked) = size_and_info(), size_and_info(definite=True)
     assert info.definite is None and info_asked.definite
@@ -239,7 +240,7 @@ def test_a_motion_whose_energy_explodes_is_not_converged():
 
 
 def test_elements_inverted_by_an_impact_are_not_converged_and_have_no_derivatives():
-    mesh = beam(1.0, 1.0, 3, 3)
+    mesh = beam(1.0, 1.0, 2, 2)
     shifted = mesh._replace(vertices=mesh.vertices + np.array([0.0, 0.05]))
     ground = plane_contact(range(len(mesh.vertices)), normal=(0, 1), stiffness=1e8, width=1e-3)
     solid = elastic(shifted, stable_neo_hookean, youngs_modulus=1e6)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import slow_among
 from scipy.linalg import hilbert
 
 from dln_jax.locomotion.task import creature_named, make_task, run_episode
@@ -247,7 +248,7 @@ PROGRAMS = {
 CALL = re.compile(r"custom_call @lapack_\w+\(.*-> \(?tensor<((?:\d+x)+)f")
 
 
-@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("program", slow_among(PROGRAMS, lambda name: name.startswith("a creature")))
 def test_no_batch_is_given_to_lapack(program):
     one, at = PROGRAMS[program]()
     text = jax.jit(jax.vmap(one)).lower(np.broadcast_to(at, (4, *at.shape))).as_text()

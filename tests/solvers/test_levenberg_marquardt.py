@@ -279,10 +279,14 @@ def test_a_run_in_parts_equals_a_whole_one_bit_for_bit():
     assert trees_equal(run(network, parts, NETWORK_DATA, 5), whole)
 
 
+STOPPING = 0.05
+"""Improvement at which seeds stop at different iterations."""
+
+
 def test_seeds_vmapped_equal_seeds_looped():
     """Repeatedly and against the clock: batched LAPACK would wedge here."""
     parameters = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(network_parameters, range(4)))
-    several = compiled(network)
+    several = compiled(network, STOPPING)
     together = {}
 
     def train():
@@ -296,19 +300,18 @@ def test_seeds_vmapped_equal_seeds_looped():
     thread.join(timeout=60)
     assert not thread.is_alive(), "the program of several seeds has not come to an end"
     for seed in range(4):
-        state = solve(network, network_parameters(seed), NETWORK_DATA, 8)
+        state = solve(network, network_parameters(seed), NETWORK_DATA, 8, improvement=STOPPING)
         for of_seeds in together.values():
             for left, right in zip(jax.tree.leaves(of_seeds), jax.tree.leaves(state), strict=True):
                 np.testing.assert_allclose(left[seed], right, rtol=1e-6)
 
 
 def test_a_seed_that_has_stopped_holds_still_while_others_go_on():
-    parameters = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(network_parameters, range(3)))
-    improvement = 0.05
-    state = run(network, jax.vmap(init)(parameters), NETWORK_DATA, 12, improvement=improvement)
+    parameters = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(network_parameters, range(4)))
+    state = run(network, jax.vmap(init)(parameters), NETWORK_DATA, 12, improvement=STOPPING)
     assert len(set(state.iteration.tolist())) > 1
-    for seed in range(3):
-        alone = solve(network, network_parameters(seed), NETWORK_DATA, 12, improvement=improvement)
+    for seed in range(4):
+        alone = solve(network, network_parameters(seed), NETWORK_DATA, 12, improvement=STOPPING)
         assert (state.iteration[seed], state.status[seed]) == (alone.iteration, alone.status)
 
 

@@ -225,7 +225,8 @@ def test_a_function_of_all_unknowns_is_minimised_from_where_its_hessian_is_indef
 
 def test_a_saddle_is_not_definite():
     # x² - y² has no minimum; its only stationary point is where the search starts.
-    _, info = minimise(lambda x, _: jnp.sum(x[0] ** 2) - jnp.sum(x[1] ** 2), jnp.zeros((2, 1)), 0.0, definite=True)
+    saddle = lambda x, _: jnp.sum(x[0] ** 2) - jnp.sum(x[1] ** 2)  # noqa: E731
+    _, info = jax.jit(lambda x: minimise(saddle, x, 0.0, definite=True))(jnp.zeros((2, 1)))
     assert info.converged and not info.definite
 
 
@@ -250,11 +251,17 @@ def test_assembly_agrees_with_differentiating_the_sum():
     data = ({"k": jnp.linspace(1, 2, CHAIN - 1), "length": jnp.full(CHAIN - 1, 0.2)}, jnp.arange(float(CHAIN)))
     at = pattern(ENERGIES, CHAIN, 2)
     x = jnp.asarray(START) + 0.1 * jax.random.normal(jax.random.key(0), START.shape)
-    total = jax.jit(lambda x: value(ENERGIES, x, data))
-    np.testing.assert_allclose(gradient(ENERGIES, at, x, data), jax.grad(total)(x), atol=1e-13)
+
+    @jax.jit
+    def both(x):
+        total = lambda x: value(ENERGIES, x, data)  # noqa: E731
+        assembled = gradient(ENERGIES, at, x, data), entries(at, element_hessians(ENERGIES, x, data))
+        return assembled, (jax.grad(total)(x), jax.hessian(total)(x).reshape(at.unknowns, at.unknowns))
+
+    (slope, values), (expected_slope, expected) = both(x)
+    np.testing.assert_allclose(slope, expected_slope, atol=1e-13)
     whole = np.zeros((at.unknowns, at.unknowns))
-    whole[at.rows, at.columns] = entries(at, element_hessians(ENERGIES, x, data))
-    expected = jax.hessian(total)(x).reshape(at.unknowns, at.unknowns)
+    whole[at.rows, at.columns] = values
     np.testing.assert_allclose(whole, np.tril(expected), atol=1e-12)
 
 
