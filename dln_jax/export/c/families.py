@@ -225,10 +225,7 @@ def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
     functions = _with_derivatives("rates", _named(system.rates, "qd", "pd"))
     if isinstance(system, Flow):
         functions |= _with_derivatives("hamiltonian", _named(system.energy, "H"))
-    rk4, implicit = (
-        discrete.phase_rk4(system.rates),
-        discrete.phase_implicit_midpoint(system.rates, iterations=iterations),
-    )
+    implicit = discrete.phase_implicit_midpoint(system.rates, iterations=iterations)
     slopes = ("q_next_q", "q_next_p", "p_next_q", "p_next_p")
     return functions | _steps("phase_step", discrete.phase_rk4(system.rates), implicit, ("q_next", "p_next"), slopes)
 
