@@ -121,7 +121,8 @@ static PyObject *results_of(const function *f, PyObject *self, PyObject *const *
     return result;
 }
 
-/* A call; `self` holds a function that converts arguments and calls again, the class of results, and their makers */
+/* A call; `self` holds a function that converts arguments and calls again, the class of results, and functions that
+   return new result arrays */
 static PyObject *called(
     const function *f, PyObject *self, PyObject *const *arguments, Py_ssize_t count, PyObject *names)
 {

@@ -30,11 +30,10 @@ import numpy as np
 from jax import Array, lax
 
 from dln_jax.export.c.body import Body, Source
-from dln_jax.export.c.emit import region, result_writers
+from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
 from dln_jax.export.c.jaxprs import traced
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.plan import plan_of
 from dln_jax.export.c.templates import CASADI_DECLARATIONS, CASADI_FUNCTION
 from dln_jax.types import InputError
 
@@ -239,15 +238,10 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
     closed, _ = traced(evaluate, [np.zeros(inputs[k].size) for k in dense])
     program, arguments, results = program_of(closed)
     names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
-    body = Body(source, program, plan_of(program, results), names)
-    for k, node in zip(dense, arguments, strict=True):
-        if body.uses(node):
-            body.line(f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;")
-    body.line("(void)arg; (void)integers; (void)reals; (void)memory;")
-    region(body, ())
-    writers = result_writers(body, results, apart=False)
-    for j, write in zip((j for j, output in enumerate(outputs) if output.dense), writers, strict=True):
-        with body.block(f"if (res[{j}])"):
-            write(f"res[{j}]")
-    body.line("return 0;")
+    targets = [f"res[{j}]" for j, output in enumerate(outputs) if output.dense]
+    body = body_of(source, program, results, names, targets, optional=True)
+    used = [k for k, node in zip(dense, arguments, strict=True) if body.uses(node)]
+    lines = [f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;" for k in used]
+    lines.append("(void)arg; (void)integers; (void)reals; (void)memory;")
+    body.lines = [*(f"    {line}" for line in lines), *body.lines, "    return 0;"]
     return body

@@ -1,7 +1,7 @@
 """Writes a planned program as the body of a C function, region by region."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from contextlib import nullcontext
 
 import numpy as np
 
@@ -16,43 +16,44 @@ from dln_jax.export.c.text import C_TYPES
 
 
 def body_of(
-    source: Source, program: Program, results: Sequence[Node], inputs, targets: Sequence[str | None], *, apart=False
-) -> Body:
-    """Returns the body of a function that writes its results to targets; for [None], that returns its only result.
+    source: Source, program: Program, results: Sequence[Node], inputs: dict[int, tuple[str, bool]],
+    targets: Sequence[str], *, apart: bool = False, optional: bool = False,
+) -> Body:  # fmt: skip
+    """Returns the body of a function that writes its results to targets; without targets, that returns its only result.
 
-    Results may overlap arguments unless `apart` is set.
+    Args:
+        source: tables and helper functions of the file.
+        program: the program.
+        results: its results.
+        inputs: name of every argument, and whether it is passed by value.
+        targets: names of the arrays for the results.
+        apart: results do not overlap arguments.
+        optional: a target may be a null pointer.
     """
     body = Body(source, program, plan_of(program, results), inputs)
     region(body, ())
-    if targets == [None]:
+    if results and not targets:
         body.line(f"return {body.read(results[0], np.array(0))};")
-    else:
-        for target, write in zip(targets, result_writers(body, results, apart=apart), strict=True):
-            write(str(target))
+    # Targets that may overlap arguments must not be written before all arguments are read: results that only move
+    # elements of arguments are therefore copied to arrays first.
+    moved = {k for k, _ in enumerate(targets) if not apart and results[k].size and _is_moved(body, results[k])}
+    for k in sorted(moved):
+        body.declared(f"r{k}_", results[k].dtype, results[k].size)
+        copied(body, results[k], f"r{k}_")
+    for k, target in enumerate(targets):
+        with body.block(f"if ({target})") if optional else nullcontext():
+            if k in moved:
+                _from_array(body, f"r{k}_", results[k].size, target)
+            else:
+                copied(body, results[k], target)
     body.bytes += max((source.parts[key].bytes for key in body.calls), default=0)
     return body
 
 
-def result_writers(body: Body, results: Sequence[Node], *, apart: bool) -> list[Callable[[str], None]]:
-    """Returns functions that write the results to targets.
-
-    Targets that may overlap arguments must not be written before all arguments are read: results that only move
-    elements of arguments are therefore copied to arrays first.
-    """
-    writers = []
-    for k, node in enumerate(results):
-        if apart or node.size == 0 or not _moved_from_argument(body, node):
-            writers.append(partial(copied, body, node))
-            continue
-        body.declared(f"r{k}_", node.dtype, max(node.size, 1))
-        copied(body, node, f"r{k}_")
-        writers.append(partial(_from_array, body, f"r{k}_", node.size))
-    return writers
-
-
-def _moved_from_argument(body: Body, node: Node) -> bool:
+def _is_moved(body: Body, node: Node) -> bool:
+    """Returns whether a node only moves elements of an argument."""
     if node.op == "gather" and node not in body.plan.arrays:
-        return any(_moved_from_argument(body, arg) for arg in node.args)
+        return any(_is_moved(body, arg) for arg in node.args)
     return node.op == "input" and not body.inputs[node.attribute][1]
 
 

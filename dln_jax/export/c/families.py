@@ -210,10 +210,9 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
         functions |= _with_derivatives("mass_matrix", _named(mass_matrix, "M"))
         if getattr(system, "dissipation", None) is not None:
             functions |= _with_derivatives("friction", _named(motion.friction, "tau_friction"))
+    rk4 = discrete.rk4(forward, actuation=actuation)
     implicit = discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations)
-    for name, step in {"rk4": discrete.rk4(forward, actuation=actuation), "implicit_midpoint": implicit}.items():
-        functions |= _linearised(f"step_{name}", step, ("x_next",), ("A", "B"))
-    return functions
+    return functions | _steps("step", rk4, implicit, ("x_next",), ("A", "B"))
 
 
 def _of_uncertainty(model: Model, parameters: Any, known: Uncertainty) -> Named:
@@ -228,9 +227,7 @@ def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
         functions |= _with_derivatives("hamiltonian", _named(system.energy, "H"))
     implicit = discrete.phase_implicit_midpoint(system.rates, iterations=iterations)
     slopes = ("q_next_q", "q_next_p", "p_next_q", "p_next_p")
-    for name, step in {"rk4": discrete.phase_rk4(system.rates), "implicit_midpoint": implicit}.items():
-        functions |= _linearised(f"phase_step_{name}", step, ("q_next", "p_next"), slopes)
-    return functions
+    return functions | _steps("phase_step", discrete.phase_rk4(system.rates), implicit, ("q_next", "p_next"), slopes)
 
 
 def _of_images(system: LatentPhase, iterations: int) -> Named:
@@ -266,11 +263,14 @@ def _named(function: Callable[..., Any], *results: str) -> Function:
     return call
 
 
-def _linearised(name: str, step: Callable[..., Any], results: Sequence[str], slopes: Sequence[str]) -> Named:
-    return {
-        name: _named(step, *results),
-        f"{name}_jacobian": _named(discrete.linearised(step), *results, *slopes),
-    }
+def _steps(
+    prefix: str, rk4: Callable[..., Any], implicit: Callable[..., Any], results: Sequence[str], slopes: Sequence[str]
+) -> Named:
+    functions: Named = {}
+    for name, step in ((f"{prefix}_rk4", rk4), (f"{prefix}_implicit_midpoint", implicit)):
+        functions[name] = _named(step, *results)
+        functions[f"{name}_jacobian"] = _named(discrete.linearised(step), *results, *slopes)
+    return functions
 
 
 def _with_derivatives(name: str, function: Function) -> Named:

@@ -137,4 +137,5 @@ def _signature(stated: Any) -> Signature:
             raise InputError(f"{name} is {leaf}")
         return leaf
 
-    return Signature(*(tuple(checked(*leaf) for leaf in stated[key]) for key in ("arguments", "results")))
+    arguments, results = (tuple(checked(*leaf) for leaf in stated[key]) for key in ("arguments", "results"))
+    return Signature(arguments, results)

@@ -186,7 +186,7 @@ def _function(
 ) -> tuple[Signature, str, int]:
     """Returns the signature with costs, the C text, and the number of lines, callees included, of a function."""
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(signature.arguments)}
-    targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
+    targets = [] if signature.returns else [leaf.name for leaf in signature.results]
     try:
         program, _, results = program_of(closed, repeated, precision=source.precision)
         body = body_of(source, program, results, named, targets)

@@ -40,7 +40,8 @@ def in_c(
     results = {}
     for name in functions:
         call = getattr(loaded, name)
-        rows = [call(*jax.tree.leaves(at_precision(state, precision))) for state in states[name]]
+        columns = zip(*map(jax.tree.leaves, states[name]), strict=True)
+        rows = [call(*state) for state in zip(*(at_precision(np.stack(c), precision) for c in columns), strict=True)]
         rows = [row if isinstance(row, tuple) else (row,) for row in rows]
         results[name] = [np.stack([np.asarray(result) for result in column]) for column in zip(*rows, strict=True)]
     return results
