@@ -2,7 +2,7 @@
 
     tau = O L + Phi c + noise,   cov = K + Phi S² Phiᵀ + diag(noise²),   weights = cov⁻¹ tau,   c = S² Phiᵀ weights
 
-O is the Euler-Lagrange operator and K the `own_covariance` of the samples. Phi is the friction with coefficients c,
+O is the Euler-Lagrange operator and K the `torque_covariance` of the samples. Phi is the friction with coefficients c,
 whose prior is normal with deviations S. The noise of the joints is the only regulariser. Scales and noises maximise the
 marginal likelihood of the torques on a subset of the samples (L-BFGS with the exact gradient); the weights solve N d
 equations (Cholesky).

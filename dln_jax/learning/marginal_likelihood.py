@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.models.torque_covariance import States, own_covariance
+from dln_jax.models.torque_covariance import States, torque_covariance
 from dln_jax.models.trigonometric_kernel import KernelScales
 from dln_jax.types import JointKind, Needs
 
@@ -55,14 +56,7 @@ def likeliest(
     """Returns the scales and noise that maximise the marginal likelihood."""
     from scipy.optimize import minimize
 
-    start = Unknowns(start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit))
-    leaves, structure = jax.tree.flatten(start)
-    ends = np.cumsum([leaf.size for leaf in leaves])
-
-    def unknowns_of(x: np.ndarray) -> Unknowns:
-        parts = [part.reshape(leaf.shape) for part, leaf in zip(np.split(x, ends[:-1]), leaves, strict=True)]
-        return jax.tree.unflatten(structure, parts)
-
+    start, unknowns_of = ravel_pytree(Unknowns(start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit)))
     evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -72,10 +66,10 @@ def likeliest(
             return _REFUSED, np.zeros_like(x)
         return float(value), slope
 
-    lowest = [(None, None)] * (ends[-1] - unit.size) + [(lower, None) for lower in np.log(least_noise * unit)]
-    first = np.concatenate([leaf.ravel() for leaf in leaves])
+    bounds = [(None, None)] * (start.size - unit.size) + [(lower, None) for lower in np.log(least_noise * unit)]
     options = {"maxiter": iterations, "maxcor": 30}
-    return unknowns_of(minimize(objective, first, jac=True, method="L-BFGS-B", bounds=lowest, options=options).x)
+    solution = minimize(objective, np.asarray(start), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return unknowns_of(solution.x)
 
 
 def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknowns, TorqueEquations], Any]:
@@ -86,7 +80,7 @@ def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknown
         count = tau.size
 
         def covariance(scales: KernelScales) -> Any:
-            return own_covariance(joints, serial, jax.tree.map(jnp.exp, scales), states)
+            return torque_covariance(joints, serial, jax.tree.map(jnp.exp, scales), states)
 
         variance = jnp.exp(2 * unknowns.noise)
         noise = jnp.tile(variance, len(tau))
@@ -133,8 +127,8 @@ def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.nd
 
 @functools.lru_cache(maxsize=4)
 def compiled_covariance(joints: tuple[JointKind, ...], serial: bool) -> Callable[..., Any]:
-    """(scales, states) -> `own_covariance`."""
+    """(scales, states) -> `torque_covariance`."""
     return jax.jit(
-        lambda scales, states: own_covariance(joints, serial, scales, states),
+        lambda scales, states: torque_covariance(joints, serial, scales, states),
         compiler_options=quick_compilation(),
     )

@@ -8,7 +8,6 @@ A covariance of torques is a sum of products of two inner products, <P_i, P_j'> 
 along the joints gives all of them, since P, Q, v and dv/dt of a body are linear in those of the body before.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -46,68 +45,37 @@ class Products(NamedTuple):
 
 
 def torque_covariance(
-    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States, others: States
-) -> Float[Array, "Nd Md"]:
-    """cov(tau(state), tau(other)) of N and M states, with the joints of a state adjacent; (N m)²."""
-    N, d = np.shape(states.q)
-    states, others = _on_device(states), _on_device(others)
-    columns = _joints_first(States(*(array[None] for array in others)))
-
-    def block(rows: Array) -> Array:
-        return _block(
-            joints, serial, scales, _joints_first(States(*(array[rows][:, None] for array in states))), columns
-        )
-
-    return _by_rows(block, N, len(others.q)).transpose(0, 2, 1, 3).reshape(N * d, -1)
-
-
-def own_covariance(
     joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States
 ) -> Float[Array, "Nd Nd"]:
-    """The `torque_covariance` of states among each other, at half the work.
+    """cov(tau(state), tau(other)) of N states among each other, with the joints of a state adjacent; (N m)².
 
-    Every state is paired with the N/2 that follow it, cyclically; the other pairs are transposes of these.
+    Every state is paired with the N/2 that follow it, cyclically; the other pairs are transposes of these. Some rows
+    are computed at a time; derivatives recompute them, because their intermediate values do not fit into caches.
     """
     N, d = np.shape(states.q)
-    states = _on_device(states)
-    following = (np.arange(N)[:, None] + np.arange(N // 2 + 1)) % N
+    states, width = States(*map(jnp.asarray, states)), N // 2 + 1
+    following = jnp.asarray((np.arange(N)[:, None] + np.arange(width)) % N)
 
     def block(rows: Array) -> Array:
-        x, y = (States(*(array[at] for array in states)) for at in (rows[:, None], jnp.asarray(following)[rows]))
-        return _block(joints, serial, scales, _joints_first(x), _joints_first(y))
+        x, y = (States(*(jnp.moveaxis(array[at], 2, 0) for array in states)) for at in (rows[:, None], following[rows]))
+        return _block(joints, serial, scales, x, y)
 
-    pairs = _by_rows(block, N, N // 2 + 1)
-    row, column = np.indices((N, N))
-    ahead = (column - row) % N
-    follows = ahead <= N // 2
-    blocks = pairs[np.where(follows, row, column), np.where(follows, ahead, (row - column) % N)]
-    blocks = jnp.where(follows[..., None, None], blocks, blocks.swapaxes(2, 3))
-    return blocks.transpose(0, 2, 1, 3).reshape(N * d, N * d)
-
-
-def _on_device(states: States) -> States:
-    return States(*map(jnp.asarray, states))
-
-
-def _joints_first(states: States) -> States:
-    return States(*(jnp.moveaxis(array, 2, 0) for array in states))
-
-
-def _by_rows(block: Callable[[Array], Array], N: int, width: int) -> Float[Array, "N K d d"]:
-    """Pairs of N states with `width` others, from a function of the indices of some rows.
-
-    Derivatives recompute the blocks, because their intermediate values do not fit into caches.
-    """
     rows = max(1, min(N, PAIRS // width))
     places = np.arange(-(-N // rows) * rows) % N
     blocks = lax.map(jax.checkpoint(block), jnp.asarray(places.reshape(-1, rows)))
-    return blocks.transpose(0, 3, 4, 1, 2).reshape(len(places), width, *blocks.shape[1:3])[:N]
+    pairs = blocks.transpose(0, 3, 4, 1, 2).reshape(len(places), width, d, d)[:N]
+    row, column = np.indices((N, N))
+    ahead = (column - row) % N
+    follows = ahead < width
+    whole = pairs[np.where(follows, row, column), np.where(follows, ahead, (row - column) % N)]
+    whole = jnp.where(follows[..., None, None], whole, whole.swapaxes(2, 3))
+    return whole.transpose(0, 2, 1, 3).reshape(N * d, N * d)
 
 
 def _block(
     joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, x: States, y: States
 ) -> Float[Array, "d d R K"]:
-    """Covariance of states x [d, R, 1] with y [d, 1, K] or [d, R, K]; pairs are the last axes, for long inner loops."""
+    """Covariance of states x [d, R, 1] with y [d, R, K]; pairs are the last axes, for long inner loops."""
     d = len(joints)
     pairs = jnp.zeros(np.broadcast_shapes(x.q.shape[1:], y.q.shape[1:]), x.q.dtype)
     turns = _factors(turn_factor, joints, scales.turns, x.q, y.q)

@@ -7,7 +7,7 @@ import pytest
 
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.torque_covariance import States, own_covariance, torque_covariance
+from dln_jax.models.torque_covariance import States, torque_covariance
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.types import Needs
 
@@ -57,11 +57,13 @@ def test_covariance_is_that_of_explicit_features_and_of_the_energies(joints, ser
     size = features(joints, serial, parameters.scales, *jnp.ones((2, len(joints)))).size
     columns = jax.jit(jax.vmap(jax.jacrev(torque), (None, 0, 0, 0)))(jnp.zeros(size), *map(jnp.asarray, states))
     columns = columns.reshape(-1, size)
-    covariance = own_covariance(joints, serial, parameters.scales, states)
+    every = States(*map(np.concatenate, zip(states, parameters[:3], strict=True)))  # with the samples of the model
+    whole = np.asarray(torque_covariance(joints, serial, parameters.scales, every))
+    count = states.q.size
+    covariance = whole[:count, :count]
     np.testing.assert_allclose(covariance, columns @ columns.T, rtol=0, atol=1e-12 * float(abs(covariance).max()))
 
-    others = States(parameters.q, parameters.qd, parameters.qdd)
-    predicted = torque_covariance(joints, serial, parameters.scales, states, others) @ parameters.weights.ravel()
+    predicted = whole[:count, count:] @ np.ravel(parameters.weights)
     tau = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))(*states)
     np.testing.assert_allclose(tau.ravel(), predicted, rtol=0, atol=1e-12 * float(abs(predicted).max()))
 
