@@ -52,6 +52,7 @@ html_theme = "furo"
 html_title = f"dln_jax {version}"
 html_static_path = ["_static"]
 html_css_files = ["style.css"]
+html_search_scorer = str(HERE / "_static" / "scorer.js")  # the search for a public name finds it first
 html_show_sphinx = False
 
 

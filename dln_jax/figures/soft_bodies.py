@@ -160,11 +160,10 @@ def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
             corner = points[skin][room.argmax()]
             side = (corner - points.mean(axis=0)) / np.linalg.norm(np.ptp(points, axis=0))
             side[0] -= 0.5 * (panel.ground or 0.0)  # away from sloping ground
-        ha, va = (names[int(np.sign(np.round(3 * s)))] for names, s in zip(_SIDES, side, strict=True))
-        axis.annotate(
-            f"{t:.2f} s", corner, 4.0 * np.sign(np.round(3 * side)), textcoords="offset points", ha=ha, va=va,
-            fontsize=7.5, color="0.25", zorder=100,
-        )  # fmt: skip
+        (x, y), (i, j) = corner.tolist(), np.sign(np.round(3 * side)).astype(int).tolist()
+        align = {"ha": ("center", "left", "right")[i], "va": ("center", "bottom", "top")[j]}
+        look = {"fontsize": 7.5, "color": "0.25", "zorder": 100, **align}
+        axis.annotate(f"{t:.2f} s", (x, y), (4.0 * i, 4.0 * j), textcoords="offset points", **look)
     axis.grid(False)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="m")
     style.title(axis, panel.title)
@@ -175,10 +174,6 @@ def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
     else:
         axis.locator_params(axis="y", nbins=5)
         axis.set_ylabel("m")
-
-
-_SIDES = ("center", "left", "right"), ("center", "bottom", "top")
-"""Alignment of a text beside its point, by the sign of its direction from it."""
 
 
 def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> Callable[..., None]:

@@ -220,8 +220,8 @@ def inject_energy(
     start, t = start - ground, np.arange(float(times))
     before = predict(model.field, parameters["field"], q[:1], p[:1], t)
     ascend = jax.jit(functools.partial(raise_energy, H))
-    raised = ascend(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), ground + factor * start)
-    after = predict(model.field, parameters["field"], *(np.asarray(state)[None] for state in raised), t)
+    q_raised, p_raised = ascend(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), ground + factor * start)
+    after = predict(model.field, parameters["field"], np.asarray(q_raised)[None], np.asarray(p_raised)[None], t)
     q, p = (np.concatenate(halves, axis=1) for halves in ((before.q, after.q), (before.p, after.p)))
     latent = Motions(np.concatenate([t, t[-1] + t]), q, p)
     pairs = decoded(model, parameters, latent)[0]

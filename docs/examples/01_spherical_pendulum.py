@@ -6,8 +6,6 @@ Nothing is learned here: write a Lagrangian as a function of one state, and get 
 A mass hangs on a rod and swings in all directions; q = (polar angle from the downward vertical, azimuth).
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt

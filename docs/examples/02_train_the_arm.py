@@ -6,8 +6,6 @@ A two-link arm writes letters. A structured Lagrangian network sees angles, rate
 nothing of the arm's masses, lengths or equations. Its inertial, Coriolis and gravity forces follow without being shown.
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt

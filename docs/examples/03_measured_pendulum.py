@@ -7,8 +7,6 @@ A camera measures times and noisy angles of a swinging pendulum, but no rates an
 friction.
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import tempfile
 from pathlib import Path
 

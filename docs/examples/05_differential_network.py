@@ -6,8 +6,6 @@ A differential network gives value, Jacobian and Hessian in one pass, by exact l
 of your own from values and gradients. Its Hessian is right as well, although the data contain none.
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt

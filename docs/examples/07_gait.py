@@ -6,8 +6,6 @@ A soft creature with 24 muscles learns to crawl. Gradients go back through the s
 contact. Two thousand environment steps are enough for a body length, and most of the time is compilation.
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import jax
 import matplotlib.pyplot as plt
 import numpy as np

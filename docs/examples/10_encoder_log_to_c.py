@@ -6,8 +6,6 @@ The log of a three-axis arm with known frames has noisy encoders, noisy torques,
 filtering, identification with friction, uncertainty of the torques, and C for the control loop.
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import tempfile
 from pathlib import Path
 

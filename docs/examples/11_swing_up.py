@@ -6,8 +6,6 @@ A motor turns an arm, and a free pole hangs at its end. The energy of the machin
 pole up, a regulator that holds it there, and the set of states from which the regulator may take over.
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import tempfile
 from pathlib import Path
 

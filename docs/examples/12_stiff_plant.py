@@ -7,8 +7,6 @@ explicit integrator has to follow the spring: it needs 200 steps or more where t
 through an implicit integrator, from a guess that is not a motion.
 """
 
-# sphinx_gallery_thumbnail_number = 1
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
