@@ -139,26 +139,21 @@ def nominal_model(plant: DesktopPlant) -> Dynamics:
     return dynamics(plant.nominal(**plant.sizes).closed_form)
 
 
-def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, numbers: SwingUpNumbers | None = None) -> SwingUp:
-    """Returns the plant's swing-up by a model, with the plant's own numbers by default. Raises as `swing_up`."""
+def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics) -> SwingUp:
+    """Returns the plant's swing-up by a model; raises as `swing_up`."""
     angle = np.linspace(-np.pi, np.pi, POSTURES)
     needs, hardware = plant.scene.needs, plant.hardware
     return swing_up(
-        model, needs.actuation, needs.joints, np.zeros(2), plant.numbers if numbers is None else numbers,
+        model, needs.actuation, needs.joints, np.zeros(2), plant.numbers,
         postures=np.stack([np.zeros(POSTURES), angle], axis=1), lower=hardware.lower, upper=hardware.upper,
     )  # fmt: skip
 
 
 def motion_of(
-    plant: DesktopPlant,
-    model: Dynamics | PlainDynamics,
-    numbers: SwingUpNumbers | None = None,
-    *,
-    seconds: float = SECONDS,
+    plant: DesktopPlant, model: Dynamics | PlainDynamics, *, seconds: float = SECONDS
 ) -> Callable[[Array, Array], ClosedLoopRun]:
     """(initial state [4], key of the noise) -> a run of the true plant with the model's law."""
-    law = law_of(plant, model, numbers).law
-    controller = with_differences(law, 2, rate=plant.rate, cutoff=CUTOFF)
+    controller = with_differences(law_of(plant, model).law, 2, rate=plant.rate, cutoff=CUTOFF)
     B = np.asarray(plant.scene.needs.actuation)
     field = field_of(model_of_plant(plant), B)
 
@@ -174,14 +169,13 @@ def motion_of(
 def try_starts(
     plant: DesktopPlant,
     model: Dynamics | PlainDynamics,
-    numbers: SwingUpNumbers | None = None,
     *,
     starts: int = 1000,
     seed: int = 0,
     seconds: float = SECONDS,
 ) -> Tried:
     """Runs swing-ups from random states near hanging, with independent noise."""
-    run = motion_of(plant, model, numbers, seconds=seconds)
+    run = motion_of(plant, model, seconds=seconds)
 
     def extremes(x: Array, key: Array) -> tuple[Array, Array]:
         states = run(x, key).x

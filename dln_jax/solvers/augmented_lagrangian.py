@@ -11,8 +11,8 @@ Wright 2006, "Numerical Optimization", section 17.4). The penalty grows after a 
 by four. The solution may violate a constraint by about `tolerance`, which the caller must check.
 
 SciPy has constrained methods of its own. On the excitation problems of two arms (10 and 14 unknowns, 480 and 720
-constraints) SLSQP takes a tenth of the time, but it ended in poorer minima from four of seven starts: once at a condition
-of 25 in place of 9. `trust-constr` took more than a hundred times as long and ended in poorer minima still.
+constraints) SLSQP takes a tenth of the time, but it ended in poorer minima from four of seven starts: once at a
+condition of 25 in place of 9. `trust-constr` took more than a hundred times as long and ended in poorer minima still.
 """
 
 from collections.abc import Callable

@@ -81,7 +81,7 @@ def _of_model(
     keys = jax.random.split(jax.random.key(seed), starts)
 
     def one(gains: EnergyGains, level: Array, x: Array, key: Array) -> tuple[Array, Array]:
-        run = motion_of(plant, model, plant.numbers._replace(gains=gains, level=level))(x, key)
+        run = motion_of(plant._replace(numbers=plant.numbers._replace(gains=gains, level=level)), model)(x, key)
         return run.x[:, 1], jnp.max(jnp.abs(run.x[:, 0]))
 
     of_starts = jax.vmap(one, in_axes=(None, None, 0, 0))
