@@ -86,7 +86,8 @@ def following(law: Tracker, reference: Reference, *, rate: float) -> Controller:
 
     def act(reference: Reference, t: Array, y: Array) -> tuple[Reference, Array]:
         number = jnp.clip(jnp.round(t * rate).astype(int), 0, len(reference.q) - 1)
-        return reference, law(*jnp.split(y, 2), Reference(*(jnp.asarray(column)[number] for column in reference)))
+        q, qd = jnp.split(y, 2)
+        return reference, law(q, qd, Reference(*(jnp.asarray(column)[number] for column in reference)))
 
     return Controller(reference, act)
 

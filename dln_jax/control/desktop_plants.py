@@ -1,17 +1,9 @@
 """Two desktop plants with friction, limits, encoders, noise and delay, and swing-ups on them by any model.
 
-| | cart-pole | rotary pendulum |
-|---|---|---|
-| sizes | Quanser's (Lutter, Listmann and Peters 2019) | those of `scenes.poles`, QUBE-like |
-| limit | 10 N | 0.05 N m |
-| dry friction of the driven joint | 0.3 N, 3 % of the limit, 0.4 N at rest | 1.5 mN m, 3 %, 2 mN m at rest |
-| viscous friction of it | 0.1 N s/m | 0.1 mN m s |
-| dry friction of the pole's hinge | 0.5 mN m, 0.2 % of its weight's torque | 0.05 mN m, 0.3 % |
-| viscous friction of it | 1 mN m s | 0.01 mN m s |
-| encoders | 23 µm; 2048 a turn | 2048 a turn |
-| noise of the force | 0.05 N | 0.25 mN m |
-
-Both run at 500 Hz, with forces delayed by one sample. Stiction is dry friction below 5 mm/s or 10 mrad/s.
+The sizes are Quanser's (Lutter, Listmann and Peters 2019) and those of `scenes.rotary_pendulum`, similar to a QUBE. Dry
+friction of the driven joint is 3 % of the limit, and a third more at rest; that of the pole's hinge is 0.2 %
+(cart-pole) or 0.3 % of its weight's torque. Both plants run at 500 Hz, with forces delayed by one sample. Stiction is
+dry friction below 5 mm/s or 10 mrad/s.
 """
 
 from collections.abc import Callable, Mapping
@@ -80,14 +72,8 @@ def desktop_cart_pole() -> DesktopPlant:
     hardware = Hardware(
         -10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False
     )
-    numbers = SwingUpNumbers(
-        EnergyGains(1100.0, 21.0, 4.7),
-        np.diag([10.0, 10.0, 1.0, 0.1]),
-        np.array([[0.1]]),
-        3.8,
-        smoothing=0.05,
-        kick=5.0,
-    )
+    gains, Q, R = EnergyGains(1100.0, 21.0, 4.7), np.diag([10.0, 10.0, 1.0, 0.1]), np.array([[0.1]])
+    numbers = SwingUpNumbers(gains, Q, R, level=3.8, smoothing=0.05, kick=5.0)
     scene = with_friction(cart_pole(**sizes), friction, shape)
     return DesktopPlant(scene, cart_pole, sizes, hardware, 500.0, 2, numbers, 0.02)
 
@@ -100,14 +86,8 @@ def desktop_rotary_pendulum() -> DesktopPlant:
     hardware = Hardware(
         -0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False
     )
-    numbers = SwingUpNumbers(
-        EnergyGains(4.3e7, 32.0, 11.0),
-        np.diag([1.0, 1.0, 0.01, 0.01]),
-        np.array([[50.0]]),
-        0.07,
-        smoothing=1.0,
-        kick=0.025,
-    )
+    gains, Q, R = EnergyGains(4.3e7, 32.0, 11.0), np.diag([1.0, 1.0, 0.01, 0.01]), np.array([[50.0]])
+    numbers = SwingUpNumbers(gains, Q, R, level=0.07, smoothing=1.0, kick=0.025)
     scene = with_friction(rotary_pendulum(**sizes), friction, shape)
     return DesktopPlant(scene, rotary_pendulum, sizes, hardware, 500.0, 2, numbers, 0.1)
 
@@ -137,26 +117,21 @@ def nominal_model(plant: DesktopPlant) -> Dynamics:
     return dynamics(plant.nominal(**plant.sizes).closed_form)
 
 
-def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, numbers: SwingUpNumbers | None = None) -> SwingUp:
-    """Returns the plant's swing-up by a model, with the plant's own numbers by default. Raises as `swing_up`."""
+def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics) -> SwingUp:
+    """Returns the plant's swing-up by a model; raises as `swing_up`."""
     angle = np.linspace(-np.pi, np.pi, POSTURES)
     needs, hardware = plant.scene.needs, plant.hardware
     return swing_up(
-        model, needs.actuation, needs.joints, np.zeros(2), plant.numbers if numbers is None else numbers,
+        model, needs.actuation, needs.joints, np.zeros(2), plant.numbers,
         postures=np.stack([np.zeros(POSTURES), angle], axis=1), lower=hardware.lower, upper=hardware.upper,
     )  # fmt: skip
 
 
 def motion_of(
-    plant: DesktopPlant,
-    model: Dynamics | PlainDynamics,
-    numbers: SwingUpNumbers | None = None,
-    *,
-    seconds: float = SECONDS,
+    plant: DesktopPlant, model: Dynamics | PlainDynamics, *, seconds: float = SECONDS
 ) -> Callable[[Array, Array], ClosedLoopRun]:
     """(initial state [4], key of the noise) -> a run of the true plant with the model's law."""
-    law = law_of(plant, model, numbers).law
-    controller = with_differences(law, 2, rate=plant.rate, cutoff=CUTOFF)
+    controller = with_differences(law_of(plant, model).law, 2, rate=plant.rate, cutoff=CUTOFF)
     B = np.asarray(plant.scene.needs.actuation)
     field = field_of(model_of_plant(plant), B)
 
@@ -172,14 +147,13 @@ def motion_of(
 def try_starts(
     plant: DesktopPlant,
     model: Dynamics | PlainDynamics,
-    numbers: SwingUpNumbers | None = None,
     *,
     starts: int = 1000,
     seed: int = 0,
     seconds: float = SECONDS,
 ) -> Tried:
     """Runs swing-ups from random states near hanging, with independent noise."""
-    run = motion_of(plant, model, numbers, seconds=seconds)
+    run = motion_of(plant, model, seconds=seconds)
 
     def extremes(x: Array, key: Array) -> tuple[Array, Array]:
         states = run(x, key).x

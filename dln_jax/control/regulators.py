@@ -94,8 +94,8 @@ def held(A: Any, B: Any, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """F and G in x(t + dt) = F x + G u with held controls."""
     from scipy.signal import cont2discrete
 
-    F, G, *_ = cont2discrete((A, B, np.eye(len(A)), np.zeros_like(B)), dt)
-    return F, G
+    system: Any = cont2discrete((A, B, np.eye(len(A)), np.zeros_like(B)), dt)
+    return system[0], system[1]
 
 
 def time_varying_lqr(F: Any, G: Any, Q: Any, R: Any, S_end: Any) -> SampledRegulators:

@@ -21,6 +21,7 @@ from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at
 from dln_jax.control.optimal.residual import ResidualStage, discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.state_space import Law
+from dln_jax.files import as_type
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
@@ -136,7 +137,7 @@ def by_iteration(
     """Fits value functions by fitted value iteration, one per seed; devices share the states."""
     done, total = itertools.count(1), len(seeds) * numbers.iterations
 
-    def told(at: ValueProgress) -> None:
+    def report_progress(at: ValueProgress) -> None:
         report(next(done), total, f"cost and misfit {at.validation:.4g}")
 
     fits = fit_values(
@@ -167,7 +168,7 @@ def by_equation(
         of_parameters, of_samples = jax.random.split(jax.random.key(seed))
         done, began = itertools.count(1 + place * stages), time.perf_counter()
 
-        def told(stage: ResidualStage, done: Iterator[int] = done) -> None:
+        def report_progress(stage: ResidualStage, done: Iterator[int] = done) -> None:
             text = f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}"
             report(next(done), len(seeds) * stages, text)
 

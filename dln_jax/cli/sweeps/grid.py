@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from dln_jax.cli.arguments import arguments_for, parse
-from dln_jax.cli.options import CompilationCache
 from dln_jax.cli.sweeps.job import Job
 from dln_jax.errors import InputError
 

@@ -19,6 +19,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Progress, Training, one_after_the_other
 from dln_jax.learning.functions import WIDTHS, Network, grow_width
+from dln_jax.learning.functions import train as train_network
 from dln_jax.learning.model_selection import Trial
 from dln_jax.learning.standardisation import layers_in_own_units, to_units
 from dln_jax.metrics.functions import Prediction, errors, predictions, typical_spread

@@ -11,7 +11,7 @@ from dln_jax.cli.optimisers import name_of, optimiser_named
 from dln_jax.cli.progress import progress
 from dln_jax.data.splits import Split, drawn, merged, select
 from dln_jax.learning import dynamics
-from dln_jax.learning.dynamics import MANY_JOINTS, suited_network
+from dln_jax.learning.dynamics import MANY_JOINTS, Suited, suited_network
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit as train_problem
 from dln_jax.learning.engine.problem import Problem, Training, require_finite_start
