@@ -1,5 +1,6 @@
 """Data that break programs: constant torque channels, no samples or a single one, NaN and infinity."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -58,8 +59,7 @@ def torque_channels() -> Findings:
 def batches() -> Findings:
     """No sample and one sample, through every kind of model, and through the schema."""
     rows = []
-    for name, system in _systems().items():
-        answer = _answers(system)
+    for name, (system, answer) in _systems().items():
         empty, one = answer(*np.zeros((3, 0, 2))), answer(*np.full((3, 1, 2), 0.3))
         wrong = float(sum(leaf.shape[0] != 0 or leaf.dtype != np.float64 for leaf in empty))
         text = "no samples in, no samples out: arrays of length 0, of the same type"
@@ -91,8 +91,7 @@ def not_finite() -> Findings:
             accepted += not _refuses(lambda arrays=arrays: schema.from_arrays(arrays), f"{key} has", "sample 4")
         text = "each key that holds one is refused with its name and the sample"
         rows.append(expect(f"not-finite/{label}-in-file", "keys_accepted", text, float(accepted), 0.0))
-    for name, system in _systems().items():
-        answer = _answers(system)
+    for name, (_, answer) in _systems().items():
         for label, value in (("nan", np.nan), ("infinity", np.inf)):
             # Row 2 i + j has it in coordinate j of argument i.
             states = np.full((3, 6, 2), 0.3)
@@ -104,7 +103,9 @@ def not_finite() -> Findings:
     return Findings(rows)
 
 
-def _systems() -> dict[str, Dynamics | PlainDynamics]:
+@functools.cache
+def _systems() -> dict[str, tuple[Dynamics | PlainDynamics, Callable[..., list[np.ndarray]]]]:
+    """Systems by name, and functions that compute tau and qdd of a batch, compiled once for all cases."""
     arm, cart = Needs(joints=("revolute", "revolute")), Needs(joints=("prismatic", "revolute"))
     models = {
         "structured-delan": (make_delan, arm),
@@ -114,11 +115,11 @@ def _systems() -> dict[str, Dynamics | PlainDynamics]:
     }
     built = {name: make(needs, width=WIDTH, dtype=jnp.float64) for name, (make, needs) in models.items()}
     systems = {name: untrained(model) for name, model in built.items()}
-    return {**systems, "double-pendulum": dynamics(double_pendulum().energies)}
+    systems["double-pendulum"] = dynamics(double_pendulum().energies)
+    return {name: (system, _answers(system)) for name, system in systems.items()}
 
 
 def _answers(system: Dynamics | PlainDynamics) -> Callable[..., list[np.ndarray]]:
-    """A function that computes tau and qdd of a batch."""
     compiled = jax.jit(jax.vmap(lambda *state: (system.inverse_dynamics(*state), system.forward_dynamics(*state))))
     return lambda *states: [np.asarray(leaf) for leaf in compiled(*states)]
 
