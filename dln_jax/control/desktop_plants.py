@@ -1,6 +1,6 @@
 """Two desktop plants with friction, limits, encoders, noise and delay, and swing-ups on them by any model.
 
-The sizes are Quanser's (Lutter, Listmann and Peters 2019) and those of `scenes.rotary_pendulum`, similar to a QUBE. Dry
+The sizes are Quanser's (Lutter, Listmann and Peters 2019) and those of `scenes.poles`, similar to a QUBE. Dry
 friction of the driven joint is 3 % of the limit, and a third more at rest; that of the pole's hinge is 0.2 %
 (cart-pole) or 0.3 % of its weight's torque. Both plants run at 500 Hz, with forces delayed by one sample. Stiction is
 dry friction below 5 mm/s or 10 mrad/s.

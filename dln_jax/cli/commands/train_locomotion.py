@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from dln_jax.cli.options import Drawn, Resumable, Scaled
 from dln_jax.cli.scaled import mesh_of
+from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.locomotion.gradient import settings_of
 from dln_jax.training.locomotion import LocomotionOptions, announce, prepare, trained, write_run
 from dln_jax.training.results import print_numbers

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from dln_jax.cli.arguments import arguments_for, parse
+from dln_jax.cli.options import CompilationCache
 from dln_jax.cli.sweeps.job import Job
 from dln_jax.errors import InputError
 
@@ -117,13 +118,13 @@ def jobs_of(
             raise InputError(f"{source}: {command} has no option {name}{closest(name, known)} (see {command} --help)")
         words[name] = {text: _word(whole, source, name, text) for text in texts}
     first = {name: next(iter(by_text.values())) for name, by_text in words.items()}
-    prog, whole = f"python -m dln_jax {command}", with_compilation_cache(arguments)
+    prog = f"python -m dln_jax {command}"
     for name, (source, texts) in options.items():
         # Parsing takes milliseconds, so that one whole number is checked for all.
         for text in {"0" if text.isdecimal() and len(text) < 10 else text: text for text in texts}.values():
             line = [*(first | {name: words[name][text]}).values()]
             try:
-                parsed = parse(whole, prog=prog, description=None, line=line)
+                parsed = parse(arguments, prog=prog, description=None, line=line, common=CompilationCache)
             except InputError as error:
                 raise InputError(f"{source}: {error}") from None
             value = getattr(parsed.own, name, None)

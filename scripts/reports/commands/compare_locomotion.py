@@ -17,7 +17,6 @@ from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.gradient import settings_of
 from dln_jax.locomotion.task import FALLEN
-from scripts.reports.rows import conditions, print_report, write_report
 from dln_jax.training.locomotion import (
     GOAL,
     LocomotionOptions,
@@ -30,6 +29,7 @@ from dln_jax.training.locomotion import (
 )
 from scripts.reports.locomotion import comparison, evolution, ppo
 from scripts.reports.locomotion.comparison import comparison_rows
+from scripts.reports.rows import conditions, print_report, write_report
 
 
 @dataclass(frozen=True)
