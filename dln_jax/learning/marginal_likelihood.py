@@ -60,7 +60,7 @@ def likeliest(
     evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slopes = evaluate(unknowns_of(x), equations)
+        value, slopes = evaluate(unknowns_of(jnp.asarray(x)), equations)
         slope = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(slopes)])
         if not (np.isfinite(value) and np.isfinite(slope).all()):
             return _REFUSED, np.zeros_like(x)

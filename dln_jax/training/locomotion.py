@@ -2,25 +2,25 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
-from dln_jax.cli.arguments import Unstated, require_positive_if_given
+from dln_jax.cli.arguments import require_positive_if_given
 from dln_jax.cli.progress import progress
 from dln_jax.figures import style
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.gradient import Report, TrainedPolicies, settings_of, shown_walk, train
-from dln_jax.locomotion.learning import LANES, WIDTH, Goal, Record
-from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, UPRIGHT, LocomotionTask, Walk, creature_named, make_task
+from dln_jax.locomotion.learning import LANES, Goal, Record
+from dln_jax.locomotion.task import LocomotionTask, Walk, creature_named, make_task
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
+from dln_jax.training.locomotion_options import LocomotionOptions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.parameter_files import save_tree
 from dln_jax.zoo.run import MODEL
@@ -29,34 +29,6 @@ GOAL = 1.0
 """Distance in body lengths at which the effort of learning is measured."""
 STEPS = 40_000
 """Default number of environment steps."""
-
-
-@dataclass(frozen=True)
-class LocomotionOptions:
-    """What is to be learned."""
-
-    creature: Literal["crawler", "biped", "quadruped"] = "crawler"
-    """Which body."""
-    seed: int = 0
-    """The first seed, 0 to 4294967295."""
-    seeds: int = 1
-    """How many seeds, one after the other."""
-    steps: Unstated[int] = None
-    """Environment steps of each seed (default: 40000)."""
-    until: Unstated[float] = None
-    """Body lengths at which a seed ends (default: no limit)."""
-    upright: float = UPRIGHT
-    """Weight of the posture in the reward, body lengths per episode."""
-    clock_period: float = CLOCK_PERIOD
-    """Steps of 0.033 s of one turn of the policy's clock."""
-    episode: int = EPISODE
-    """Steps of 0.033 s."""
-    window: Unstated[int] = None
-    """Steps that gradients go back; divides the episode (default: 40, for the biped 80)."""
-    width: int = WIDTH
-    """Hidden units of the policy."""
-    lanes: Unstated[int] = None
-    """Creatures side by side, in pairs, which devices share (default: 2)."""
 
 
 def prepare(options: LocomotionOptions, mesh: Mesh | None) -> LocomotionTask:

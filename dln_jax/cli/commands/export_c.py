@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Literal
 
 from dln_jax.cli.arguments import Unstated
-from dln_jax.export.c.run import export_run
-from dln_jax.mechanics.discrete import ITERATIONS
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,7 @@ class Arguments:
     """float or double (default: the precision of the training)."""
     name: str = "model"
     """C name with which files and functions start."""
-    iterations: int = ITERATIONS
+    iterations: int = 3
     """Newton steps of the implicit midpoint rule."""
     libm: bool = False
     """Call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones."""
@@ -43,6 +41,8 @@ class Arguments:
 
 def main(options: Arguments) -> None:
     """Exports the model, and prints the files and the functions left out."""
+    from dln_jax.export.c.run import export_run
+
     paths = export_run(
         options.run, options.out, functions=options.functions, name=options.name, precision=options.precision,
         iterations=options.iterations, libm=options.libm, casadi=options.casadi, overwrite=options.overwrite,

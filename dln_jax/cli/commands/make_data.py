@@ -6,15 +6,11 @@ Kinds: `characters` (the two-link arm writes 20 letters), `uniform` (independent
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from dln_jax.cli.arguments import Unstated, refuse_given
 from dln_jax.cli.options import SceneName
-from dln_jax.data import schema
-from dln_jax.data.schema import Trajectories
-from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.registry import scene_named
-from dln_jax.types import InputError
+from dln_jax.errors import InputError
 
 OF_KIND = {
     "characters": ("dt",),
@@ -58,14 +54,19 @@ class Arguments:
 
 def main(options: Arguments) -> None:
     """Generates the trajectories, writes them and prints a summary."""
+    from dln_jax.data import schema
+
     data = generate(options)
     schema.save(options.out, data, overwrite=options.overwrite)
     count = len(set(data.trajectory.tolist()))
     print(f"{options.out}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} degrees of freedom")
 
 
-def generate(options: Arguments) -> Trajectories:
+def generate(options: Arguments) -> Any:
     """Generates the requested trajectories; `InputError` for options that the kind or the scene does not use."""
+    from dln_jax.scenes.datasets import generators
+    from dln_jax.scenes.registry import scene_named
+
     scene = scene_named(options.scene)
     unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[options.kind])
     refuse_given(options, sorted(unused), f"not used for --kind {options.kind}")

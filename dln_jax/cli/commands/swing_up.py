@@ -12,19 +12,15 @@ from typing import Annotated
 
 from dln_jax.cli.arguments import choice
 from dln_jax.cli.options import Drawn, Folder
-from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.control.desktop_plants import NAMES
-from dln_jax.training.swing_ups.learned import MODELS
-from dln_jax.training.swing_ups.run import asked, swing_up
 
 
 @dataclass(frozen=True)
 class Arguments(Folder, Drawn):
     """Plant, model, and where the results go."""
 
-    plant: Annotated[str, choice(NAMES)] = "rotary-pendulum"
+    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta"))] = "rotary-pendulum"
     """The plant; furuta is another name of the rotary pendulum."""
-    model: Annotated[str, choice(MODELS)] = "delan"
+    model: Annotated[str, choice(("delan", "identified", "analytic", "known"))] = "delan"
     """The model from which the controller is designed."""
     seconds_of_data: float = 30.0
     """Seconds of motion to learn from, at 500 Hz, including an episode for validation."""
@@ -36,6 +32,9 @@ class Arguments(Folder, Drawn):
 
 def main(options: Arguments) -> None:
     """Explores the plant, learns the model, swings up and writes the run folder."""
+    from dln_jax.cli.stored_arguments import command_folder
+    from dln_jax.training.swing_ups.run import asked, swing_up
+
     task = asked(options.plant, options.model, options.seconds_of_data, options.starts, options.seed)
     with command_folder(options, "swing_up") as folder:
         swing_up(task, folder, figures=options.figures)

@@ -9,11 +9,7 @@ metrics.json, the model of the best seed, a figure of the learning, and a GIF of
 from dataclasses import dataclass
 
 from dln_jax.cli.options import Drawn, Resumable, Scaled
-from dln_jax.cli.scaled import mesh_of
-from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.locomotion.gradient import settings_of
-from dln_jax.training.locomotion import LocomotionOptions, announce, prepare, trained, write_run
-from dln_jax.training.results import print_numbers
+from dln_jax.training.locomotion_options import LocomotionOptions
 
 
 @dataclass(frozen=True)
@@ -23,6 +19,12 @@ class Arguments(LocomotionOptions, Resumable, Drawn, Scaled):
 
 def main(options: Arguments) -> None:
     """Trains and evaluates the policy, and writes the run folder."""
+    from dln_jax.cli.scaled import mesh_of
+    from dln_jax.cli.stored_arguments import command_folder
+    from dln_jax.locomotion.gradient import settings_of
+    from dln_jax.training.locomotion import announce, prepare, trained, write_run
+    from dln_jax.training.results import print_numbers
+
     mesh = mesh_of(options)
     task = prepare(options, mesh)
     with command_folder(options, "train_locomotion") as folder:

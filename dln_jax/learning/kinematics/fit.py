@@ -184,7 +184,7 @@ def _refined(
 
 def _solved(
     columns: Callable, state: Descent, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
-) -> least_squares.Solution:
+) -> least_squares.LeastSquaresSolution:
     """Solves for the linear parameters of known frames on all data, by singular values."""
 
     def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -1,0 +1,47 @@
+"""Validates a log, and writes the findings into a folder."""
+
+from typing import Any
+
+import numpy as np
+
+from dln_jax.cli.arguments import names_listed, refuse_given
+from dln_jax.cli.stored_arguments import command_folder
+from dln_jax.data.checks import Examination, examine, read, report
+from dln_jax.data.robots import read_robot
+from dln_jax.figures.logs import log_figure
+from dln_jax.files import write_bytes, write_figure, write_json
+
+
+def validate(options: Any) -> None:
+    """Examines the log, prints and writes the findings; exits with status 1 if there is an error among them."""
+    recording = read(options.data, rate=options.rate, units=options.units)
+    if options.robot is None:
+        refuse_given(options, ["lock"], "for joints of --robot")
+    robot = None if options.robot is None else read_robot(options.robot, lock=names_listed(options.lock))
+    examined = examine(recording, robot)
+    lines = report(examined, str(options.data))
+    with command_folder(options, "check_data") as folder:
+        print("\n".join(lines))
+        write_bytes(folder / "report.txt", ("\n".join(lines) + "\n").encode())
+        write_json(folder / "findings.json", {"findings": [finding._asdict() for finding in examined.findings]})
+        write_json(folder / "metrics.json", metrics(examined))
+        if options.figures:
+            write_figure(folder / "log.png", log_figure(examined))
+        print(f"folder: {folder}")
+    if any(finding.severity == "error" for finding in examined.findings):
+        raise SystemExit(1)
+
+
+def metrics(examined: Examination) -> dict[str, Any]:
+    """Metrics of the examination, for metrics.json."""
+    severities = [finding.severity for finding in examined.findings]
+    numbers: dict[str, Any] = {f"{kind}s": severities.count(kind) for kind in ("error", "warning")}
+    smoothed, on_tree, torques = examined.smoothed, examined.on_tree, examined.torques
+    if smoothed is not None:
+        numbers |= {"rate_hz": smoothed.rate, "noise_q_max": float(np.max(smoothed.noise_q))}
+        numbers |= {"cutoff_hz": smoothed.cutoff} if np.isfinite(smoothed.cutoff) else {}
+    if on_tree is not None:
+        numbers |= {"rank": on_tree.rank, "condition": on_tree.condition}
+    if torques is not None:
+        numbers |= {"delay_samples": torques.likely_delay, "unexplained": float(1 - torques.explained.mean())}
+    return numbers
