@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from comparison import BOUND, in_c, in_jax
+from conftest import slow_among
 from jax import lax
 from test_families import MODELS, run_of
 
@@ -115,7 +116,9 @@ BY_HAND = {lagrangian.__name__: (lagrangian, d) for lagrangian, d in LAGRANGIANS
 CASES = [*MODELS, *SCENES, *BY_HAND]
 DEFAULT = {"structured-delan", "black-box-hnn", "trigonometric", "feed-forward", "differential-network", "latent-phase"}
 DEFAULT |= {*BY_HAND, "pendulum", "three-body"}
-"""Others repeat what is in these."""
+"""The other cases repeat what is in these."""
+SLOW = {"black-box-hnn", "latent-phase", "three-body", "spherical_pendulum", "relativistic_particle", "kepler"}
+"""Those of `DEFAULT` whose primitives occur in another, too."""
 BRIEFLY = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian", "mass_matrix")
 BRIEFLY += ("rates", "hamiltonian", "encode", "decode")
 HAMILTONIANS = ("black-box-hnn",)
@@ -200,7 +203,7 @@ def differently_finite(got, expected):
 
 
 @needs_compiler
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_among(CASES, SLOW.__contains__))
 def test_c_equals_jax(case, tmp_path, pytestconfig):
     every = pytestconfig.getoption("--every-export")
     if not every and case not in DEFAULT:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import slow_among
 
 from dln_jax.export.c.families import functions_of_run, functions_of_system
 from dln_jax.mechanics import integrators
@@ -191,7 +192,7 @@ LACKING = {
 """Functions that some systems of the kind have."""
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_among(CASES, HAMILTONIANS.__contains__))
 def test_functions_and_their_derivatives_are_those_of_the_mechanics(case, pytestconfig):
     if case not in DEFAULT and not pytestconfig.getoption("--every-export"):
         pytest.skip("is tried with --every-export")
