@@ -56,7 +56,8 @@ def likeliest(
     """Returns the scales and noise that maximise the marginal likelihood."""
     from scipy.optimize import minimize
 
-    start, unknowns_of = ravel_pytree(Unknowns(start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit)))
+    unknowns = Unknowns(start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit))
+    start, unknowns_of = ravel_pytree(unknowns)
     evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -69,7 +70,7 @@ def likeliest(
     bounds = [(None, None)] * (start.size - unit.size) + [(lower, None) for lower in np.log(least_noise * unit)]
     options = {"maxiter": iterations, "maxcor": 30}
     solution = minimize(objective, np.asarray(start), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return unknowns_of(solution.x)
+    return unknowns_of(jnp.asarray(solution.x))
 
 
 def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknowns, TorqueEquations], Any]:

@@ -91,11 +91,12 @@ def test_what_cannot_be_fitted_is_refused(candidates, seconds, message):
 
 
 SHARED_NOISE = np.random.default_rng(1).normal(size=400) ** 2
+OWN = np.random.default_rng(2).uniform(0.5, 1.5, 400)
 
 
 def errors_of(level):
     """Squared errors of a model at a level of its own above the noise that all models share."""
-    return SHARED_NOISE + level * RANDOM.uniform(0.5, 1.5, 400)
+    return SHARED_NOISE + level * OWN
 
 
 def test_better_means_beyond_the_paired_standard_error():
