@@ -77,7 +77,7 @@ def uncertainty_metrics(
     metrics = {
         "coverage_95_share": float(shares.mean()),
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
-        "outside_share": float(out_of_distribution.mean()),
+        "out_of_distribution_share": float(out_of_distribution.mean()),
     }
     return metrics, {"uncertainty.png": png(torque_bands, test, predicted, std, out_of_distribution, model=name)}
 

@@ -16,7 +16,8 @@ from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.uncertainty import Uncertainty, out_of_distribution, predictive
+from dln_jax.models import uncertainty as uncertainties
+from dln_jax.models.uncertainty import Uncertainty, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo.descriptions import OWN, Description, build
@@ -89,17 +90,18 @@ class Run:
         return _jitted(predictive(self._of("torque_std", Model), self.parameters, factor, noise, inflation), self.dtype)
 
     @functools.cached_property
-    def outside(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
+    def out_of_distribution(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
         """(q, qd, qdd) -> whether the state is out of distribution. Raises InputError for a run without uncertainty."""
         uncertainty = self._known_uncertainty
-        return _jitted(out_of_distribution(self._of("outside", Model), self.parameters, uncertainty), self.dtype)
+        model = self._of("out_of_distribution", Model)
+        return _jitted(uncertainties.out_of_distribution(model, self.parameters, uncertainty), self.dtype)
 
     @property
     def _known_uncertainty(self) -> Uncertainty:
         if self.uncertainty is None:
             raise InputError(
-                "the run does not say what its model does not know: train it anew by train_delan, or store an "
-                "estimate of learning.uncertainty by save_uncertainty"
+                "the run has no uncertainty: train it again by train_delan, or store an estimate of learning.uncertainty "
+                "by save_uncertainty"
             )
         return self.uncertainty
 

@@ -49,13 +49,13 @@ def test_it_comes_back_with_the_run(folder, undetermined):
     flag = jax.jit(out_of_distribution(MODEL, PARAMETERS, stored))
     for state in STATES[:3]:
         np.testing.assert_allclose(run.torque_std(*state), std(*state), rtol=1e-12)
-        assert run.outside(*state.tolist()) == flag(*state)
+        assert run.out_of_distribution(*state.tolist()) == flag(*state)
 
 
 def test_a_run_without_it_says_so(folder):
     run = load(folder)
-    for name in ("torque_std", "outside"):
-        with pytest.raises(InputError, match="does not say what its model does not know") as caught:
+    for name in ("torque_std", "out_of_distribution"):
+        with pytest.raises(InputError, match="the run has no uncertainty") as caught:
             getattr(run, name)
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="has no torque_std"):
@@ -96,14 +96,14 @@ def test_what_is_damaged_or_does_not_fit_is_refused(folder):
 )
 def test_c_is_equal(folder, tmp_path, precision, tolerance, undetermined, expected):
     save_uncertainty(folder, known(undetermined))
-    export_run(folder, tmp_path / "c", functions=["torque_std", "outside"], precision=precision)
+    export_run(folder, tmp_path / "c", functions=["torque_std", "out_of_distribution"], precision=precision)
     in_c, run = load_c(tmp_path / "c"), load(folder)
     flags = set()
     for state in STATES:
         arguments = state.astype(np.float64 if precision == "f64" else np.float32)
         np.testing.assert_allclose(in_c.torque_std(*arguments), run.torque_std(*state), rtol=tolerance)
-        flags.add(bool(in_c.outside(*arguments)))
-        assert bool(in_c.outside(*arguments)) == bool(run.outside(*state))
+        flags.add(bool(in_c.out_of_distribution(*arguments)))
+        assert bool(in_c.out_of_distribution(*arguments)) == bool(run.out_of_distribution(*state))
     assert flags == expected
 
 
@@ -124,7 +124,7 @@ def test_a_state_out_of_range_is_outside_only_where_the_deviation_matters(folder
     expected = [
         np.abs(state).max() > 0.9 and (each >= level).any() for state, each in zip(STATES, deviations, strict=True)
     ]
-    assert [bool(run.outside(*state.tolist())) for state in STATES] == expected
+    assert [bool(run.out_of_distribution(*state.tolist())) for state in STATES] == expected
     assert {True, False} == set(expected) and sum(expected) < sum(np.abs(state).max() > 0.9 for state in STATES)
 
 

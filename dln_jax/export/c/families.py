@@ -9,7 +9,7 @@ For a system with forces, in coordinates and velocities, x = (q, qd):
 | `energy` | q, qd | energy |
 | `mass_matrix` | q, and qd where M depends on it | M |
 | `gravity`, `coriolis`, `friction` | q; q, qd; q, qd | g; c; tau_friction |
-| `torque_std`, `outside` | q, qd, qdd | tau_std; outside |
+| `torque_std`, `out_of_distribution` | q, qd, qdd | tau_std; out_of_distribution |
 | `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
 
 For a phase space without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p, and `phase_step_rk4`,
@@ -217,8 +217,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
 
 def _of_uncertainty(model: Model, parameters: Any, known: Uncertainty) -> Named:
     std = predictive(model, parameters, known.factor, known.noise, known.inflation)
-    outside = out_of_distribution(model, parameters, known)
-    return {"torque_std": _named(std, "tau_std"), "outside": _named(outside, "outside")}
+    flag = out_of_distribution(model, parameters, known)
+    return {"torque_std": _named(std, "tau_std"), "out_of_distribution": _named(flag, "out_of_distribution")}
 
 
 def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:

@@ -58,7 +58,7 @@ MEANINGS = {
     "verdict": "verdict: 0 good, 1 doubtful, 2 refused",
     "coverage_95_share": "torques within the 95 % band",
     "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
-    "outside_share": "states outside the training data",
+    "out_of_distribution_share": "states out of distribution",
     "vpt_seconds": "valid prediction time, torque held",
     "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
     "rollout_seconds": "duration of a test motion",

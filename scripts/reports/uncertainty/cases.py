@@ -103,7 +103,7 @@ def rows_of(name: str, splits: Sequence[HeldOut]) -> list[Row]:
         Row(name, "coverage_95_highest_joint", float(medians.max()), bound=HIGHEST, expected=expected),
         Row(name, "coverage_95_lowest_split", float(shares.min())),
         Row(name, "coverage_95_highest_split", float(shares.max())),
-        Row(name, "outside_share", float(np.median([split.flagged for split in splits]))),
+        Row(name, "out_of_distribution_share", float(np.median([split.flagged for split in splits]))),
     ]
     if np.isfinite(splits[0].far_flagged):
         rows.append(Row(name, "far_outside_share", float(np.median([split.far_flagged for split in splits]))))

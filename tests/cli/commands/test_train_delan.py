@@ -45,7 +45,7 @@ FILES = {
 METRICS = {
     *(f"{name}_mse" for name in ("torque", "inertial", "coriolis", "gravity", "power", "forward")),
     *("parameters", "compile_seconds", "train_seconds", "one_step_p50_us", "one_step_p99_us"),
-    *("coverage_95_share", "coverage_95_worst_joint_share", "outside_share"),
+    *("coverage_95_share", "coverage_95_worst_joint_share", "out_of_distribution_share"),
 }
 
 
