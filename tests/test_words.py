@@ -1,5 +1,6 @@
 """Terms of the field are used throughout; words that they replaced do not come back."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -26,6 +27,7 @@ REPLACED = {
     r"(?:rooms|house|walls) (?:of|in) the (?:library|package|code)": "packages and layers",
     r"bodies that exist": "physically consistent",
     r"written_out|written out by hand": "unrolled; closed form",
+    r"outside_share|run\.outside": "out of distribution",
 }
 
 
@@ -39,6 +41,19 @@ def test_a_replaced_word_is_not_used(word, term):
         if pattern.search(line)
     ]
     assert not found, f"say {term}"
+
+
+def test_variables_are_named_by_nouns():
+    """What `each`, `given` or `found` is has a name: joint, options, solution."""
+    named = []
+    for path in FILES:
+        if path.suffix != ".py" or "examples" in path.parts:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            for field in ("id", "arg", "attr"):
+                if getattr(node, field, None) in {"each", "given", "found", "said", "told"}:
+                    named.append(f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', '')}: {getattr(node, field)}")
+    assert not named
 
 
 def test_the_pattern_finds_a_word():

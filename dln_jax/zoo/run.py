@@ -14,9 +14,9 @@ from jax import Array
 from dln_jax.files import is_file
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
+from dln_jax.models import uncertainty as uncertainties
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models import uncertainty as uncertainties
 from dln_jax.models.uncertainty import Uncertainty, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike

@@ -72,16 +72,16 @@ def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: in
 def errors_along(plant: DesktopPlant, model: Dynamics, runs: ClosedLoopRun) -> Errors:
     """Errors of a model's inverse and forward dynamics along true runs [E, N], at the plant's own states and forces."""
     B = np.asarray(plant.scene.needs.actuation)
-    x, u = (jnp.asarray(each.reshape(-1, each.shape[-1])) for each in (runs.x[:, :-1], runs.u))
+    x, u = (jnp.asarray(array.reshape(-1, array.shape[-1])) for array in (runs.x[:, :-1], runs.u))
     truth = field_of(model_of_plant(plant), B)
 
     def squares(x: Any, u: Any) -> tuple[Any, ...]:
         q, qd = jnp.split(x, 2)
         tau, qdd = jnp.asarray(B) @ u, truth(x, u)[2:]
         off = model.inverse_dynamics(q, qd, qdd) - tau, model.forward_dynamics(q, qd, tau) - qdd
-        return tuple(jnp.sum(each**2) for each in (*off, tau, qdd))
+        return tuple(jnp.sum(array**2) for array in (*off, tau, qdd))
 
-    torque, acceleration, of_torque, of_acceleration = (np.sum(each) for each in jax.jit(jax.vmap(squares))(x, u))
+    torque, acceleration, of_torque, of_acceleration = (np.sum(array) for array in jax.jit(jax.vmap(squares))(x, u))
     return Errors(float(torque / of_torque), float(acceleration / of_acceleration))
 
 

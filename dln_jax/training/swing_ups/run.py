@@ -43,7 +43,7 @@ FILMED = 4.0
 """Duration of the animation, s."""
 
 
-class Asked(NamedTuple):
+class SwingUpTask(NamedTuple):
     """The checked arguments of a swing-up."""
 
     plant: DesktopPlant
@@ -54,9 +54,9 @@ class Asked(NamedTuple):
     seed: int
 
 
-def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int) -> Asked:
+def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int) -> SwingUpTask:
     """Checks the arguments of a command before anything is written; errors are one line."""
-    found = desktop_plant(plant)
+    chosen = desktop_plant(plant)
     if model not in MODELS:
         raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
     require_positive(starts=starts)
@@ -68,24 +68,26 @@ def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int
         )
     require_memory(f"{seconds_of_data:.3g} s of motion at 500 Hz", 1000.0 * 500 * seconds_of_data)
     episodes = max(2, round(seconds_of_data / EPISODE))
-    return Asked(found, NAMES[plant], model, Excitation(seconds=seconds_of_data, episodes=episodes), starts, seed)
+    return SwingUpTask(
+        chosen, NAMES[plant], model, Excitation(seconds=seconds_of_data, episodes=episodes), starts, seed
+    )
 
 
-def swing_up(given: Asked, folder: Path, *, figures: bool) -> dict[str, float]:
+def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, float]:
     """Explores, learns, swings up and writes the results; returns the metrics."""
-    plant = given.plant
-    recording, _ = explore(plant, plant.numbers.gains, given.excitation, seed=given.seed)
+    plant = task.plant
+    recording, _ = explore(plant, plant.numbers.gains, task.excitation, seed=task.seed)
     schema.save(folder / "data.npz", recording)
-    print(f"{given.name}: {given.excitation.seconds:g} s of q and torques in {given.excitation.episodes} episodes")
+    print(f"{task.name}: {task.excitation.seconds:g} s of q and torques in {task.excitation.episodes} episodes")
     with progress(STEPS) as show:
         got = obtain(
-            plant, given.model, recording, seed=given.seed,
+            plant, task.model, recording, seed=task.seed,
             report=lambda at: show(min(int(at.step), STEPS), f"loss {float(at.loss):.3g}"),
         )  # fmt: skip
     store(folder, got)
-    errors = errors_along(plant, got.dynamics, test_motions(plant, seed=given.seed))
+    errors = errors_along(plant, got.dynamics, test_motions(plant, seed=task.seed))
     law = law_of(plant, got.dynamics)
-    tried = try_starts(plant, got.dynamics, starts=given.starts, seed=given.seed)
+    tried = try_starts(plant, got.dynamics, starts=task.starts, seed=task.seed)
     metrics = {
         "learning_seconds": got.seconds,
         "torque_nmse": errors.torque_nmse,
@@ -94,20 +96,20 @@ def swing_up(given: Asked, folder: Path, *, figures: bool) -> dict[str, float]:
         **metrics_of(tried),
     }
     write_json(folder / "metrics.json", metrics)
-    say(given, got, metrics)
+    summarise(task, got, metrics)
     if figures:
-        draw(given, got.dynamics, folder)
+        draw(task, got.dynamics, folder)
     return metrics
 
 
 def metrics_of(tried: Tried) -> dict[str, float]:
     """Metrics of swing-ups from many starts."""
-    found = tried.outcomes
+    outcomes = tried.outcomes
     return {
-        "success_share": found.share,
-        "not_finite": float(found.failed.sum()),
-        "median_seconds": found.median,
-        "worst_seconds": found.worst,
+        "success_share": outcomes.share,
+        "not_finite": float(outcomes.failed.sum()),
+        "median_seconds": outcomes.median,
+        "worst_seconds": outcomes.worst,
         "farthest": float(np.max(tried.farthest)),
     }
 
@@ -118,11 +120,11 @@ def store(folder: Path, got: Obtained) -> None:
         save(folder, *got.fitted)
 
 
-def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
+def summarise(task: SwingUpTask, got: Obtained, metrics: dict[str, float]) -> None:
     """Prints the results."""
     if got.prepared is not None:
         late = f"torques {got.prepared.delay} sample(s) late, q filtered at {got.prepared.cutoff:.0f} Hz"
-        print(f"{given.model}: learned in {got.seconds:.0f} s; {late}")
+        print(f"{task.model}: learned in {got.seconds:.0f} s; {late}")
     print(
         f"nMSE of motions not seen: torque {metrics['torque_nmse']:.2e}, acceleration "
         f"{metrics['acceleration_nmse']:.2e}; the model's equilibrium is "
@@ -130,16 +132,16 @@ def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
     )
     failed = f", {metrics['not_finite']:.0f} not finite" if metrics["not_finite"] else ""
     print(
-        f"{metrics['success_share']:.1%} of {given.starts} starts up after {SECONDS:g} s{failed}: median "
+        f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s{failed}: median "
         f"{metrics['median_seconds']:.2f} s, worst {metrics['worst_seconds']:.2f} s"
     )
 
 
-def draw(given: Asked, model: Dynamics, folder: Path) -> None:
+def draw(task: SwingUpTask, model: Dynamics, folder: Path) -> None:
     """Writes a figure of some runs, and an animation of the first."""
-    plant, lab = given.plant, given.plant.hardware
-    runs = some_runs(plant, model, min(given.starts, MOST_SHOWN), given.seed)
-    unit, limits = UNITS[given.name], (lab.lower, lab.upper)
+    plant, lab = task.plant, task.plant.hardware
+    runs = some_runs(plant, model, min(task.starts, MOST_SHOWN), task.seed)
+    unit, limits = UNITS[task.name], (lab.lower, lab.upper)
     energy = passive_energy(without_friction(model), parts_of(plant.scene.needs.actuation), np.zeros(2))
     of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
     traces = closed_loop_traces(
@@ -162,5 +164,5 @@ def draw(given: Asked, model: Dynamics, folder: Path) -> None:
 def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> ClosedLoopRun:
     """The first `count` of the runs that were tried, [count, N]."""
     run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0)))
-    found = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))
-    return jax.tree.map(np.asarray, found)
+    runs = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))
+    return jax.tree.map(np.asarray, runs)
