@@ -100,8 +100,8 @@ class Run:
     def _known_uncertainty(self) -> Uncertainty:
         if self.uncertainty is None:
             raise InputError(
-                "the run has no uncertainty: train it again by train_delan, or store an estimate of learning.uncertainty "
-                "by save_uncertainty"
+                "the run has no uncertainty: train it again by train_delan, or store an estimate of "
+                "learning.uncertainty by save_uncertainty"
             )
         return self.uncertainty
 
