@@ -12,12 +12,13 @@ from typing import NamedTuple, get_type_hints
 
 import numpy as np
 import pytest
-import tyro
 from calls import command
 from conftest import PROGRAMS, SHORTEST_COMPILATION, slow_among
 from interpreters import Program, interpreters
 
+from dln_jax.cli.arguments import parse
 from dln_jax.cli.commands import COMMANDS
+from dln_jax.cli.options import CompilationCache
 from dln_jax.data import schema
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
@@ -118,12 +119,12 @@ def test_a_command_of_a_block_runs(words, workplace):
 @pytest.mark.parametrize("text", sorted(INLINE))
 def test_a_command_in_the_text_parses(text):
     script, words = script_and_arguments(shlex.split(text))
-    given = tyro.cli(script.Arguments, args=words)
-    for name, hint in get_type_hints(script.Arguments, include_extras=True).items():
-        for shown in (getattr(each, "metavar", None) for each in getattr(hint, "__metadata__", ())):
+    options = parse(script.Arguments, prog=script.__name__, description=None, line=words, common=CompilationCache).own
+    for name, hint in get_type_hints(type(options), include_extras=True).items():
+        for shown in (getattr(mark, "metavar", None) for mark in getattr(hint, "__metadata__", ())):
             if shown and shown.startswith("{"):
                 known = re.match(r"{(.*?)}", shown)[1].split(",")
-                named = [each for each in str(getattr(given, name)).split(",") if not each.endswith(".npz")]
+                named = [word for word in str(getattr(options, name)).split(",") if not word.endswith(".npz")]
                 assert set(named) <= {*known, "None"}, name
 
 

@@ -111,6 +111,8 @@ def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) ->
         # An argument of another release that was left unset does not affect the result.
         if key not in expected and value not in (None, False):
             raise InputError(f"{path}: {key!r:.40} is no argument of this release; {REMEDY}")
+        if isinstance(value, int) and abs(value) >= 2**63:
+            raise InputError(f"{path}: {key} is too large; {REMEDY}")
     return as_type({key: values[key] for key in expected}, whole, name=str(path), remedy=REMEDY)
 
 

@@ -215,7 +215,7 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
     return Trajectories(t, q, qd, qdd, tau, trajectory, label, p, pd, *parts, needs=scene.needs)
 
 
-def _require(**numbers: float) -> None:
+def _require(**numbers: int | float) -> None:
     require_positive(**numbers)
     for name, value in numbers.items():
         if not np.isfinite(value):

@@ -8,9 +8,9 @@ import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from dln_jax.cli.arguments import Unstated, Variants, choice
+from dln_jax.cli.arguments import Unstated, Variants
 from dln_jax.cli.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled, SingleCalls
 
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
@@ -29,7 +29,7 @@ class Plant:
     """Trajectories, npz or CSV (default: the embedded letters, or states of --scene)."""
     test: Unstated[str] = None
     """Labels of test trajectories, comma separated (default: e,q,v, else every sixth, else blocks of time)."""
-    scene: Annotated[str | None, choice(("NAME",), unstated=True)] = None
+    scene: Unstated[str] = None
     """Textbook scene whose needs the data have, such as cart-pole or chain-3; without --data, the scene to sample."""
     needs: Unstated[str] = None
     """What the plant needs, such as '{"joints": ["revolute"], "friction": true}' (default: as scene or file, else
