@@ -10,6 +10,8 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 
+from dln_jax.figures import style
+from dln_jax.figures.soft_body_animations import soft_body_frame
 from dln_jax.locomotion import Goal, creature_named, make_task, shown_walk, train
 
 jax.config.update("jax_enable_x64", True)

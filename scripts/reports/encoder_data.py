@@ -8,13 +8,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.weak_forms import fit_momentum
+from dln_jax.learning.weak_forms import Form, WeakFit, fit_form, fit_momentum
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.models.model import Model
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.types import Vector
 from scripts.reports.case import Findings, spread
 from scripts.reports.robots.arm import ENCODER_NOISE, TORQUE_NOISE, arm, error_of, logs, torque_of
 from scripts.reports.robots.known_kinematics import FULL, QUICK

@@ -15,6 +15,7 @@ from dln_jax.data.splits import Split
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import errors, predictions
+from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 from dln_jax.zoo.run import compiled
 from scripts.reports.arm.models import by_published_protocol, latency

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import identify, train_delan
 from dln_jax.cli.options import Folder
 from dln_jax.cli.stored_arguments import command_folder
@@ -67,7 +68,8 @@ def measured() -> dict[str, Walk]:
         trajectory = np.repeat([0, 1], len(t))
         np.savez(place / "swings.npz", t=np.tile(t, 2), trajectory=trajectory, **swings)  # type: ignore[arg-type]
         (place / "robot.urdf").write_text(PENDULUM)
-        train = train_delan.Arguments(
+        train = arguments_of(
+            train_delan.Arguments,
             data=place / "log.npz",
             model="structured-delan",
             steps=3,

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.control import Reference, Tracker, where_finite
+from dln_jax.control.state_space import saturated
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.friction import joint_dissipation
 from scripts.reports.robots.arm import STEP, D, Motion, simulator
@@ -67,7 +68,7 @@ def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, sampl
     def asked(q: Any, qd: Any, now: Reference) -> Any:
         answer = law(q, qd, now)
         tau, usable = answer if isinstance(answer, tuple) else (answer, jnp.asarray(True))
-        return limited(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
+        return saturated(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
 
     q, step = plant(wanted)
     count = len(wanted.q) if samples is None else samples

@@ -13,12 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import Controller, Hardware, Linearisation, field_of, holding_controls, linearise, simulate
+from dln_jax.control import (
+    ClosedLoopRun,
+    Controller,
+    Hardware,
+    Linearisation,
+    field_of,
+    holding_controls,
+    linearise,
+    simulate,
+)
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from dln_jax.scenes.scene import Scene
-from dln_jax.zoo.run import Run
 from scripts.reports.rows import Row
 
 RATE, SECONDS = 500.0, 10.0
@@ -56,14 +64,14 @@ def plant(motor: Motor) -> tuple[Scene, Array]:
     return scene, jnp.asarray(scene.needs.actuation)
 
 
-def closed_loop(motor: Motor, controller: Controller) -> Run:
+def closed_loop(motor: Motor, controller: Controller) -> ClosedLoopRun:
     """A run with the board's settings, not compiled."""
     scene, B = plant(motor)
     field, lab = field_of(dynamics(scene.energies), B), Hardware(-LIMIT, LIMIT)
     return simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, hardware=lab)
 
 
-def play(motor: Motor, controller: Controller) -> Run:
+def play(motor: Motor, controller: Controller) -> ClosedLoopRun:
     """Runs the closed loop with the board's settings."""
     return jax.jit(lambda: closed_loop(motor, controller))()
 

@@ -62,7 +62,7 @@ PLANNED = {"acrobot": 0.66, "pendubot": None}
 """Score to reach; the best acrobot on the board has 0.655."""
 
 
-def problem(motor: Motor, weights: Weights) -> Problem:
+def problem(motor: Motor, weights: Weights) -> TrajectoryProblem:
     """The optimal control problem on (q, qd, tau), in steps of `EVERY` samples with a constant slope of the torque."""
     scene, B = plant(motor)
     field, dt = field_of(dynamics(scene.energies), B), 1.0 / RATE

@@ -86,7 +86,7 @@ def by_angles(motor: Motor, controller: Controller) -> Controller:
     scene, B = plant(motor)
     field = field_of(dynamics(scene.closed_form), B)
     step = lambda x, u: runge_kutta(MIDPOINT, lambda t, x: field(x, u))(0.0, x, 1 / RATE)  # noqa: E731
-    predicting = with_prediction(controller, step, states=4, controls=1, most=LONGEST)
+    predicting = with_prediction(controller, step, states=4, controls=1, max_delay=LONGEST)
     seeing = with_differences(predicting, 2, rate=RATE, cutoff=CUTOFF, order=2)
     return Controller(seeing.start, lambda memory, t, y: seeing.act(memory, t, y[:2]))
 

@@ -10,6 +10,7 @@ from jax import Array
 from matplotlib.figure import Figure
 
 from dln_jax.control import (
+    ClosedLoopRun,
     EnergyGains,
     Hardware,
     energy_shaping,
@@ -30,7 +31,6 @@ from dln_jax.figures.closed_loops import closed_loop_traces
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from dln_jax.scenes.scene import Scene
-from dln_jax.zoo.run import Run
 from scripts.reports.case import Findings
 from scripts.reports.figures.starts import success_over_starts
 from scripts.reports.rows import Row
@@ -109,7 +109,7 @@ def law_of(case: SwingUp) -> Callable[[Array], Array]:
     return switched(far, near, cost, case.level)
 
 
-def closed_loop(case: SwingUp, *, seconds: float = SECONDS) -> Callable[[Array], Run]:
+def closed_loop(case: SwingUp, *, seconds: float = SECONDS) -> Callable[[Array], ClosedLoopRun]:
     """Start [4] -> run on simulated hardware: only encoders are read, rates are their differences, and torques act one
     sample late."""
     field = field_of(dynamics(case.scene.energies), np.asarray(case.scene.needs.actuation))

@@ -17,7 +17,7 @@ from dln_jax.data.encoders import smooth
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import Split, drawn, every, hold_out, select
-from dln_jax.learning.dynamics import problem
+from dln_jax.learning.dynamics import problem, suited_network
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.friction import fit_friction
@@ -99,23 +99,23 @@ def within(data: Trajectories) -> Callable[..., Any]:
     states = np.concatenate([data.q, data.qd], axis=1)
     low, high = states.min(axis=0), states.max(axis=0)
 
-    def outside(q: Any, qd: Any, qdd: Any) -> Any:
+    def out_of_distribution(q: Any, qd: Any, qdd: Any) -> Any:
         x = jnp.concatenate([q, qd])
         return jnp.any((x < low) | (x > high))
 
-    return outside
+    return out_of_distribution
 
 
 def laws(known: dict[str, tuple[Dynamics, Any]], held_out: Trajectories) -> dict[str, Any]:
     """Control laws by name, feedback alone first. `judged` also requires that the model explains held-out motions."""
     by_name: dict[str, Any] = {"feedback-alone": lambda q, qd, now: feedback(AHEAD, q, qd, now)}
-    for name, (model, outside) in known.items():
+    for name, (model, flag) in known.items():
         ahead, computed = feed_forward(model, AHEAD), computed_torque(model, COMPUTED)
         by_name |= {f"feed-forward/{name}": ahead, f"computed-torque/{name}": computed}
-        if outside is not None:
-            by_name[f"trusted/{name}"] = trusted(model, computed, ahead, outside=outside)
+        if flag is not None:
+            by_name[f"trusted/{name}"] = trusted(model, computed, ahead, out_of_distribution=flag)
             usable = judged(model, held_out).usable
-            by_name[f"judged/{name}"] = trusted(model, computed, ahead, outside=outside, usable=usable)
+            by_name[f"judged/{name}"] = trusted(model, computed, ahead, out_of_distribution=flag, usable=usable)
     return by_name
 
 

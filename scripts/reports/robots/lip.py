@@ -24,6 +24,7 @@ from dln_jax.precision import in_float64
 from dln_jax.types import FrictionLaw
 from dln_jax.zoo.catalogue import CATALOGUE
 from scripts.reports.case import Findings
+from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm
 from scripts.reports.rows import Row
 
 ARMS: dict[str, Callable[[], Arm]] = {
@@ -126,7 +127,7 @@ def known(arm: Arm, *, friction: bool, every: int = 10, tests: Sequence[int] = T
     fit = fit_linear(model, train, negligible=1e-12)
     system = model.energies(fit.parameters)
     nmse = unseen_errors(arm, system, friction=friction, tests=tests)
-    return Outcome(nmse, np.mean((_torques(system, train) - train.tau) ** 2, axis=0), 0, fit.seconds)
+    return Outcome(nmse, np.mean((torques_of(system, train) - train.tau) ** 2, axis=0), 0, fit.seconds)
 
 
 def unseen_errors(

@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.examples import creature_scene
+from dln_jax.softbody.mesh import shapes
 from dln_jax.softbody.scene import SoftScene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.creature import TIME_STEP

@@ -21,7 +21,7 @@ from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.solvers.elements import linear_solvers
+from dln_jax.solvers.elements import linear_solvers, selection
 from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.energies import ElementEnergy
 from dln_jax.solvers.elements.selection import search_takes_at_most
@@ -168,7 +168,7 @@ def _choice(scene: SoftScene, dt: float) -> linear_solvers.LinearSolverFactory:
     takes = functools.partial(
         search_takes_at_most, energies=energies, at=at, x=rest, data=data, residual=linear_solvers.SEARCH_RESIDUAL
     )
-    return linear_solvers.least_work(energies, at, takes)
+    return selection.least_work(energies, at, takes)
 
 
 def timed(function: Any, *arguments: Any) -> tuple[float, float, Any]:

@@ -19,14 +19,14 @@ from dln_jax.control import field_of, linearise, lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.plants import PLANTS, evaluate, starts
 from dln_jax.control.optimal.problem import ControlProblem, hjb_policy
-from dln_jax.control.optimal.residual import discounts_down_to
+from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.control.state_space import Law
-from dln_jax.identification.residual import fit_residual
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import flexible_cart_pole
 from scripts.reports.case import Findings
+from scripts.reports.control.values.fits import PUBLISHED
 from scripts.reports.rows import Row, expect, largest, unit_of
 
 EXACT = 1e-8
@@ -44,11 +44,11 @@ FACTORS = {"model": (1.0, 1.0), "heavy_and_long": (1.15, 1.15), "far": (1.3, 1.1
 
 
 def fitted(problem: ControlProblem, network: ValueNetwork, seed: int, **options: Any) -> tuple[Any, float]:
-    """Fits a network to the equation; returns the fit and its time, s. Options as for `fit_residual`."""
+    """Fits a network to the equation; returns the fit and its time, s. Options as for `fit_hjb`."""
     of_parameters, of_samples = jax.random.split(jax.random.key(seed))
     began = time.perf_counter()
     start = network.init(of_parameters)
-    fit = fit_residual(problem, network.value_and_gradient, start, of_samples, **options)
+    fit = fit_hjb(problem, network.value_and_gradient, start, of_samples, **options)
     return fit, time.perf_counter() - began
 
 
@@ -61,9 +61,7 @@ def line(quick: bool) -> Findings:
         ("continued", discounts_down_to(0.0, first=100.0), THETA[0]),
         ("not_continued", [0.0], THETA[1]),
     ):
-        fit = fit_residual(
-            LINE, form, jnp.asarray(-3.0), jax.random.key(0), discounts=discounts, samples=64, validation=64
-        )
+        fit = fit_hjb(LINE, form, jnp.asarray(-3.0), jax.random.key(0), discounts=discounts, samples=64, validation=64)
         words = "the cost to go, from a start that is nearer to the other solution"
         error = abs(float(fit.parameters) / aim - 1)
         rows.append(
@@ -160,7 +158,7 @@ def published(quick: bool) -> Findings:
         runs = evaluate(plant, law, starts(plant, "down"))
         returns.append(float(np.mean(runs.returns)))
         up.append(float(np.mean(np.isfinite(runs.settled))))
-    reference = plant.reference["down"]
+    reference = PUBLISHED["pendulum"]
     return Findings(
         [
             Row(case, "down_return_median", float(np.median(returns)), reference=reference),

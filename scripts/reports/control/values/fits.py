@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from dln_jax.control.optimal.fitted import fit_values
 from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import interpolated
-from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant
+from dln_jax.control.optimal.plants import FITS, PLANTS, SECONDS, ValuePlant, ValueSettings, evaluate, starts
 from dln_jax.control.optimal.problem import ValueAndGradient, hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.solvers.ending import reason
@@ -83,7 +83,7 @@ def pendulum(quick: bool) -> Findings:
     counted, ridge = truth > LEAST * truth.max(), beside_ridge(fine, nodes, plant.limit)
     training = trained(plant, fit, seeds)
     of_all = [np.asarray(_V(value)(nodes.reshape(-1, 2))).reshape(truth.shape) for value in training.values]
-    case, by_grid = "value/pendulum", lookahead(plant.problem, fine, most=plant.limit)
+    case, by_grid = "value/pendulum", lookahead(plant.problem, fine, limit=plant.limit)
     rows = [
         *_returns(case, plant, training),
         *_errors(case, of_all, truth, counted),
@@ -155,7 +155,8 @@ def _returns(case: str, plant: ValuePlant, training: Trained) -> list[Row]:
         up = float(min(np.mean(np.isfinite(run.settled[part])) for run in runs))
         words = f"mean of {half} starts, the median of {len(means)} seeds"
         down = where == "down"
-        bound, reference = (TO_REACH[case.split("/")[1]], plant.reference[where]) if down else (None, None)
+        name = case.split("/")[1]
+        bound, reference = (TO_REACH[name], PUBLISHED[name]) if down else (None, None)
         median = float(np.median(means))
         rows += [
             Row(case, f"{where}_return", median, "1", reference, bound, at_least=True, expected=words),
