@@ -16,6 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_hnn_task
 from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout
@@ -62,7 +63,8 @@ np.savez(
 # A revolute joint enters as cosine and sine. `"friction": true` adds a dissipation to the model.
 
 train_hnn_task.main(
-    train_hnn_task.Arguments(
+    arguments_of(
+        train_hnn_task.Arguments,
         task="measured",
         data=folder / "pendulum.npz",
         needs='{"joints": ["revolute"], "friction": true}',

@@ -17,6 +17,7 @@ import optax
 
 import dln_jax
 from dln_jax import dynamics
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout, second_order
@@ -34,7 +35,8 @@ ITERATIONS, FINE_STEPS = 20, 400
 # A run of the command line, whose folder holds everything that is needed to rebuild the model.
 
 folder = Path(tempfile.mkdtemp()) / "run"
-train_delan.main(train_delan.Arguments(steps=ITERATIONS, out=folder, figures=False, low_latency=False))
+options = arguments_of(train_delan.Arguments, steps=ITERATIONS, out=folder, figures=False, low_latency=False)
+train_delan.main(options)
 run = dln_jax.load(folder)
 count = sum(leaf.size for leaf in jax.tree.leaves(run.parameters))
 print(f"{run.description['name']} with {count} parameters")

@@ -128,7 +128,7 @@ def known(arm: Arm, *, friction: bool, every: int = 10, tests: Sequence[int] = T
     fit = fit_linear(model, train, negligible=1e-12)
     system = model.energies(fit.parameters)
     nmse = unseen_errors(arm, system, friction=friction, tests=tests)
-    return Outcome(nmse, np.mean((_torques(system, train) - train.tau) ** 2, axis=0), 0, fit.seconds)
+    return Outcome(nmse, np.mean((torques_of(system, train) - train.tau) ** 2, axis=0), 0, fit.seconds)
 
 
 def unseen_errors(

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.cli.commands import train_delan
+from dln_jax.cli.arguments import arguments_of
+from dln_jax.cli.commands import identify, train_delan
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.errors import FitRefused
@@ -23,8 +24,6 @@ from dln_jax.files import read_json
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.verdict import LEVELS
 from dln_jax.precision import in_float64
-from dln_jax.training.dynamics.run import run
-from dln_jax.training.identification.task import Options
 from dln_jax.types import InputError
 from scripts.reports.case import Case, Findings
 from scripts.reports.robots.simulated_arms import Arm, arm_torques
@@ -178,7 +177,7 @@ def identified_arm(seed: int, fault: Fault | None) -> str:
 
     def fit(folder: Path, **options: Any) -> None:
         (folder / "arm.xml").write_text(mjcf(rough_file(arm, seed)))
-        run(Options(robot=folder / "arm.xml", **options), "identify")
+        identify.main(arguments_of(identify.Arguments, robot=folder / "arm.xml", **options))
 
     return _verdict(log, fit, accepted=fault is not None)
 
@@ -188,7 +187,7 @@ def learned_tree(seed: int, fault: Fault | None) -> str:
     _, log = log_of(seed, LEARNED_JOINTS, fault)
 
     def fit(folder: Path, **options: Any) -> None:
-        train_delan.main(train_delan.Arguments(model="learned-tree", low_latency=False, **options))
+        train_delan.main(arguments_of(train_delan.Arguments, model="learned-tree", low_latency=False, **options))
 
     return _verdict(log, fit, accepted=fault is not None)
 
