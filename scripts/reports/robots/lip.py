@@ -24,7 +24,6 @@ from dln_jax.precision import in_float64
 from dln_jax.types import FrictionLaw
 from dln_jax.zoo.catalogue import CATALOGUE
 from scripts.reports.case import Findings
-from scripts.reports.robots.arm import _torques
 from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm
 from scripts.reports.rows import Row
 
