@@ -101,7 +101,9 @@ def matches(value: Any, kind: Any) -> bool:
         as_type(value, kind, name="", remedy="")
     except InputError:
         return False
-    return not (isinstance(value, float) and not math.isfinite(value))
+    if isinstance(value, int):
+        return abs(value) < 2**63
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def as_type(values: Any, kind: Any, *, name: str, remedy: str) -> Any:
