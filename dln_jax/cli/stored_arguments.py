@@ -103,30 +103,22 @@ def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) ->
         InputError: the file is damaged, or a release with other arguments wrote it.
     """
     values = {key: value for key, value in values.items() if key not in (CHOSEN, FILES)}
+    _checked(path, values, arguments)  # the choices, on which the other options depend
     whole = arguments_for(arguments, values)
     expected = stored_arguments(whole())
-    if absent := [key for key in expected if key not in values]:
-        raise InputError(f"{path}: {absent[0]} is missing; {REMEDY}")
     for key, value in values.items():
         # An argument of another release that was left unset does not affect the result.
         if key not in expected and value not in (None, False):
             raise InputError(f"{path}: {key!r:.40} is no argument of this release; {REMEDY}")
-        if isinstance(value, int) and abs(value) >= 2**63:
+    return _checked(path, values, whole)
+
+
+def _checked(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
+    """The stored arguments of a dataclass."""
+    expected = stored_arguments(arguments())
+    if absent := [key for key in expected if key not in values]:
+        raise InputError(f"{path}: {absent[0]} is missing; {REMEDY}")
+    for key in expected:
+        if isinstance(values[key], int) and abs(values[key]) >= 2**63:
             raise InputError(f"{path}: {key} is too large; {REMEDY}")
-    return as_type({key: values[key] for key in expected}, whole, name=str(path), remedy=REMEDY)
-
-
-@contextlib.contextmanager
-def command_folder(options: Any, command: str, **chosen: Any) -> Iterator[Path]:
-    """Yields the run folder of a command. config.json gets the arguments, and the values `chosen` from them."""
-    resume = getattr(options, "resume", False)
-    folder_of_run = (
-        run_folder(options.out, command, resume=resume, resumable=hasattr(options, "resume"))
-        if is_first(options)
-        else copied_folder(options, resume)
-    )
-    with folder_of_run as folder:
-        if resume:
-            wait_for_all(options)
-        write_config(folder, options, **chosen)
-        yield folder
+    return as_type({key: values[key] for key in expected}, arguments, name=str(path), remedy=REMEDY)

@@ -13,7 +13,7 @@ from dln_jax.learning.kinematics import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
 from dln_jax.scenes.scene import Scene
 from dln_jax.time_limit import seconds_left
-from dln_jax.training.dynamics.options import FITS
+from dln_jax.training.dynamics.options import AUTO, FITS
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build
@@ -102,11 +102,12 @@ def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:
         InputError: data that the model cannot be fitted to.
     """
     asked = getattr(options, "objective", None)
-    objective = objective_of(kind, recorded.sets.train, asked)
+    objective = SCALED_TORQUE if kind == AUTO else objective_of(kind, recorded.sets.train, asked)
     if objective is TORQUE and getattr(options, "target", None) is None:
         objective = SCALED_TORQUE
     description, solver = method_of(kind).plan(options, kind, recorded, objective)
-    build(description)  # refuses what no model can be made of
+    if description:
+        build(description)  # refuses what no model can be made of
     return Task(recorded, kind, description, objective, solver, seeds_of(options), until)
 
 
