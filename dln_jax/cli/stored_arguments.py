@@ -122,3 +122,19 @@ def _checked(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
         if isinstance(values[key], int) and abs(values[key]) >= 2**63:
             raise InputError(f"{path}: {key} is too large; {REMEDY}")
     return as_type({key: values[key] for key in expected}, arguments, name=str(path), remedy=REMEDY)
+
+
+@contextlib.contextmanager
+def command_folder(options: Any, command: str, **chosen: Any) -> Iterator[Path]:
+    """Yields the run folder of a command. config.json gets the arguments, and the values `chosen` from them."""
+    resume = getattr(options, "resume", False)
+    folder_of_run = (
+        run_folder(options.out, command, resume=resume, resumable=hasattr(options, "resume"))
+        if is_first(options)
+        else copied_folder(options, resume)
+    )
+    with folder_of_run as folder:
+        if resume:
+            wait_for_all(options)
+        write_config(folder, options, **chosen)
+        yield folder
