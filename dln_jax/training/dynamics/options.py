@@ -186,7 +186,7 @@ def options_of(stated: Mapping[str, Any]) -> tuple[type, ...]:
     own = () if fit is None else fit.options
     if NetworkOptions not in own:
         return own
-    optimiser = {"adam": (AdamOptions,), "gauss-newton": (GaussNewtonOptions,)}.get(stated.get("optimizer", "auto"), ())
+    optimiser = {"adam": (AdamOptions,), "gauss-newton": (GaussNewtonOptions,)}.get(str(stated.get("optimizer")), ())
     return (*optimiser, *own)
 
 
