@@ -49,5 +49,13 @@ def test_what_is_no_json_object_is_refused_in_one_line(text):
 
 def test_json_values_are_told_apart_by_type():
     assert matches(1, int) and matches(1, float) and matches(None, float | None) and matches("a", Path | None)
-    wrong = ((True, int), (1.0, int), (math.inf, float), ("1", float), (2**80, float), (None, float), (["1"], list[int]))
+    wrong = (
+        (True, int),
+        (1.0, int),
+        (math.inf, float),
+        ("1", float),
+        (2**80, float),
+        (None, float),
+        (["1"], list[int]),
+    )
     assert not any(matches(value, hint) for value, hint in wrong)

@@ -134,7 +134,7 @@ def choose_kernel(
     for serial in (True, False):
         fit = fit_kernel(needs, train, samples=samples, serial=serial)
         with jax.enable_x64(True):
-            model = CATALOGUE["trigonometric-kernel"].factory(needs, samples=fit.samples, serial=serial)
+            model = CATALOGUE["trigonometric-kernel"].make(needs=needs, samples=fit.samples, serial=serial)
             scale = np.asarray(torque_scale(train))
         errors = squared_torque_errors(model, fit.parameters, validation, scale)
         trials.append(Trial(serial, fit, np.sum(errors, axis=1)))

@@ -4,6 +4,7 @@ A name is the same on command lines, in files, in tables and beside published nu
 `Properties`, never on the spelling of a name.
 """
 
+import inspect
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -65,6 +66,21 @@ class Entry(NamedTuple):
     additions: tuple[Callable[..., Model], ...] = ()
     """Terms that are added to the factory's model, the last one first. Each is a function of `make`, which makes the
     model for other needs, of `needs`, and of keywords of its own."""
+
+    def make(self, **keywords: Any) -> Any:
+        """Makes the model, additions included, from their keywords; without `dtype` in that of the factory."""
+        default = inspect.signature(self.factory).parameters.get("dtype")
+        own = {} if default is None else {"dtype": default.default}
+        return assembled((*self.additions, self.factory), {**own, **keywords})
+
+
+def assembled(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, Any]) -> Any:
+    """Calls a factory, the last of the functions, and the additions around it, each with its own keywords."""
+    first, *rest = functions
+    own = {key: keywords[key] for key in inspect.signature(first).parameters if key in keywords}
+    if not rest:
+        return first(**own)
+    return first(lambda needs: assembled(tuple(rest), {**keywords, "needs": needs}), **own)
 
 
 def friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:

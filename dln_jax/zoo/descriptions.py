@@ -22,7 +22,7 @@ from dln_jax.nn.activations import Activation, activation
 from dln_jax.precision import data_type, require_precision
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.catalogue import entry_of
+from dln_jax.zoo.catalogue import assembled, entry_of
 from dln_jax.zoo.parameter_files import REMEDY
 
 Description = dict[str, Any]
@@ -122,7 +122,7 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
     if "width" in keywords and "depth" in keywords:
         require_network(width=keywords["width"], depth=keywords["depth"])
     try:
-        return _made(functions, keywords)
+        return assembled(functions, keywords)
     except InputError:
         raise
     except (KeyError, TypeError, ValueError) as error:
@@ -159,15 +159,6 @@ def functions_of(
     if not callable(imported):
         raise InputError(f"{name[:200]} is no function; expected a factory of models")
     return (imported,)
-
-
-def _made(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, Any]) -> Any:
-    """Calls the factory, and the additions around it."""
-    first, *rest = functions
-    own = {key: keywords[key] for key in inspect.signature(first).parameters if key in keywords}
-    if not rest:
-        return first(**own)
-    return first(lambda needs: _made(tuple(rest), {**keywords, "needs": needs}), **own)
 
 
 def _parameters(functions: tuple[Callable[..., Any], ...]) -> dict[str, inspect.Parameter]:

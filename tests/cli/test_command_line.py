@@ -161,7 +161,7 @@ def test_an_interrupt_during_imports_is_one_word(tmp_path, way):
     heard = "import signal, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
     (tmp_path / "jax.py").write_text(f"{heard}print('importing', flush=True)\ntime.sleep(60)\n")
     with subprocess.Popen(
-        [sys.executable, *ways(tmp_path)[way]],
+        [sys.executable, *ways(tmp_path)[way], "--out", str(tmp_path / "data.npz")],
         cwd=ROOT,
         env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
         stdout=subprocess.PIPE,

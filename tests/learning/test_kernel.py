@@ -35,9 +35,9 @@ def arm():
 def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
     train, test = arm
     fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-6)
-    make = CATALOGUE["trigonometric-kernel"].factory
-    kernel = make(train.needs, samples=fit.samples).energies(fit.parameters)
-    fewer = CATALOGUE["trigonometric"].factory(train.needs, degree=1)
+    make = CATALOGUE["trigonometric-kernel"].make
+    kernel = make(needs=train.needs, samples=fit.samples).energies(fit.parameters)
+    fewer = CATALOGUE["trigonometric"].make(needs=train.needs, degree=1)
     reference = fewer.energies(fit_linear(fewer, train).parameters)
     ask = jax.jit(
         lambda system_of: [
@@ -83,4 +83,4 @@ def test_what_makes_no_kernel_is_refused(arm):
     with pytest.raises(InputError, match="least_noise is 0"):
         fit_kernel(train.needs, train, least_noise=0.0)
     with pytest.raises(InputError, match="samples is 0; expected a positive whole number"):
-        CATALOGUE["trigonometric-kernel"].factory(train.needs, samples=0)
+        CATALOGUE["trigonometric-kernel"].make(needs=train.needs, samples=0)

@@ -24,7 +24,7 @@ class Arguments(Folder, Drawn, Logged):
     """URDF or MJCF of the robot (needs MuJoCo)."""
     lock: Unstated[str] = None
     """Joints of the robot to lock, such as those of a gripper, separated by commas; "*finger*" stands for all names
-    that contain finger (default: none)."""
+    that contain finger (default: all move)."""
 
 
 def main(options: Arguments) -> None:

@@ -161,7 +161,7 @@ def kernel_rows(
     train = lip_trajectories(arm, friction=friction, every=every)
     needs = arm.tree.needs._replace(joint_friction=FRICTION if friction else (), velocity_scale=VELOCITY_SCALE)
     fit = fit_kernel(needs, train, serial=serial)
-    model = CATALOGUE["trigonometric-kernel"].factory(needs, samples=fit.samples, serial=serial)
+    model = CATALOGUE["trigonometric-kernel"].make(needs=needs, samples=fit.samples, serial=serial)
     nmse = unseen_errors(arm, model.energies(fit.parameters), friction=friction, tests=tests, every=TEST_EVERY)
     means = nmse.mean(axis=1)
     reference = PUBLISHED.get(name) if serial and every == 10 and not friction else None

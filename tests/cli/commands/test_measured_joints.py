@@ -92,9 +92,9 @@ def test_mistakes_are_one_line(double, capsys):
     cases = [
         ((*MEASURE, "--noise", "small"), "--noise is 'small'"),
         ((*MEASURE, "--noise", "0"), "finite positive numbers"),
-        ((*MEASURE, "--coordinates", "absolute"), "--coordinates is for planar-chain"),
-        ((*MEASURE, "--model", "trigonometric", "--width", "3"), "--width is for networks"),
-        (("--task", "spring", "--test", "a"), "--test is for measured"),
+        ((*MEASURE, "--coordinates", "absolute"), "--coordinates is an option of --model planar-chain"),
+        ((*MEASURE, "--model", "trigonometric", "--width", "3"), "--width is an option of networks"),
+        (("--task", "spring", "--test", "a"), "--test is an option of --task measured"),
         (("--task", "spring", "--model", "trigonometric"), "is of no phase space"),
     ]
     for number, (options, message) in enumerate(cases):

@@ -23,7 +23,7 @@ from dln_jax.softbody.mesh.shapes import body_length, crawler
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
 from dln_jax.softbody.verdict import Info
-from dln_jax.training.simulation_results import finite_moments, warn
+from dln_jax.training.simulation_results import SimulatedMotion, finite_moments, warn
 from dln_jax.types import InputError
 
 
@@ -213,7 +213,7 @@ def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys)
         "dt is -0.1": ("--dt", "-0.1"),
         "--seconds is 0.01 and --dt 0.1": ("--dt", "0.1", "--seconds", "0.01"),
         "poisson_ratio is 0.6": ("--poisson-ratio", "0.6"),
-        "invalid choice 'nonsense' for argument '--scene'. Expected one of ('beam', ": ("--scene", "nonsense"),
+        "--scene is 'nonsense'; choose from beam, ": ("--scene", "nonsense"),
         "invalid choice 'wood'": ("--material", "wood"),
         "invalid choice 'half'": ("--precision", "half"),
         "invalid choice 'leapfrog'": ("--integrator", "leapfrog"),

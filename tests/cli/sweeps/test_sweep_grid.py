@@ -73,7 +73,7 @@ def test_jobs_are_command_lines(tmp_path):
 
 
 def test_a_job_continues_where_its_command_can(tmp_path):
-    jobs = plan("train_locomotion", train_locomotion.Arguments, grid_of("creature=crawler,biped"), {}, tmp_path)
+    jobs = jobs_of("train_locomotion", train_locomotion.Arguments, grid_of("creature=crawler,biped"), {}, tmp_path)
     assert [job.resumes for job in jobs] == [True, True]
     # An option without a default accompanies every option that is checked.
     (tmp_path / "log.npz").touch()
