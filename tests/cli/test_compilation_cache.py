@@ -25,7 +25,7 @@ class Arguments:
 def main(given):
     before = compilation_cache.compilation()
     jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones(given.size))
-    print("found", compilation_cache.compilation().found - before.found)
+    print("found", compilation_cache.compilation().cached - before.cached)
 
 running.run(main, Arguments, prog="tiny", from_shell=True)
 '''

@@ -4,7 +4,7 @@ import jax
 import pytest
 from calls import refused
 
-from dln_jax.cli.arguments import arguments_of
+from dln_jax.cli.arguments import arguments_for, arguments_of
 from dln_jax.cli.commands import train_delan, train_diffnet, train_hnn, train_locomotion, train_value
 from dln_jax.cli.options import Scaled
 from dln_jax.cli.scaled import mesh_of
@@ -17,7 +17,7 @@ TOGETHER = ("--processes", "2", "--coordinator", "127.0.0.1:61440", "--process-i
 def test_several_processes_need_a_folder_that_all_see(capsys):
     assert "by --out" in refused(capsys, train_diffnet, *TOGETHER)
     commands = (train_delan, train_hnn, train_diffnet, train_locomotion, train_value)
-    assert all(issubclass(command.Arguments, Scaled) for command in commands)
+    assert all(issubclass(arguments_for(command.Arguments, {}), Scaled) for command in commands)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import pytest
 from calls import command, refused
 
 from dln_jax.cli.commands import sweep
+from dln_jax.cli.sweeps import command as sweep_command
 from dln_jax.cli.sweeps.executors import here
 from dln_jax.cli.sweeps.job import Job, Status, run_job, status_of
 from dln_jax.data import schema
@@ -59,7 +60,7 @@ def trained(job, resumed):
 
 def use(monkeypatch, submit):
     """Lets the command submit its jobs to this function in place of processes."""
-    monkeypatch.setattr(sweep, "here", lambda *_: contextlib.nullcontext((submit, contextlib.nullcontext)))
+    monkeypatch.setattr(sweep_command, "here", lambda *_: contextlib.nullcontext((submit, contextlib.nullcontext)))
 
 
 @pytest.fixture
