@@ -214,7 +214,7 @@ def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys)
         "--seconds is 0.01 and --dt 0.1": ("--dt", "0.1", "--seconds", "0.01"),
         "poisson_ratio is 0.6": ("--poisson-ratio", "0.6"),
         "--scene is 'nonsense'; choose from beam, ": ("--scene", "nonsense"),
-        "invalid choice 'wood'": ("--material", "wood"),
+        "--material is 'wood'": ("--material", "wood"),
         "invalid choice 'half'": ("--precision", "half"),
         "invalid choice 'leapfrog'": ("--integrator", "leapfrog"),
         "the beam scene has no --friction": ("--friction", "0.1"),

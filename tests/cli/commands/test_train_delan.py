@@ -236,7 +236,7 @@ MISTAKES = {
         "--degree is an option of --model trigonometric",
     ),
     "no torques": (arrays(tau=None), [], "python -m scripts.train_hnn_task --task measured --data"),
-    "no times": (arrays(t=None), [], "say --rate HZ"),
+    "no times": (arrays(t=None), [], "give --rate HZ"),
     "rate beside times": (arrays(), ["--rate", "100"], "leave --rate out"),
     "units of an npz file": (arrays(), ["--units", "degrees"], "units are for CSV"),
     "one side of no energy": (
