@@ -6,7 +6,7 @@ from scripts.reports.uncertainty import cases
 def test_a_simulated_arm_is_covered_and_its_far_motions_are_flagged():
     rows = {row.quantity: row for row in cases.simulated_arm("arm", 2, noise=0.3, unmodelled=False, splits=2).rows}
     assert rows["coverage_95_lowest_joint"].passed and rows["coverage_95_highest_joint"].passed
-    assert rows["far_out_of_distribution_share"].value > 0.9 > 0.5 > rows["outside_share"].value
+    assert rows["far_out_of_distribution_share"].value > 0.9 > 0.5 > rows["out_of_distribution_share"].value
     assert rows["far_coverage_95"].value > 0.9
 
 
