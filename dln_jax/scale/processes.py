@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from dln_jax.types import InputError
+from dln_jax.errors import InputError, ProcessLost
 
 HEARTBEAT = 10
 """Seconds without a heartbeat after which JAX treats a process as lost and ends the others."""
@@ -31,10 +31,6 @@ _TASKS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 """Environment variables in which `srun` and `mpirun` state the number of their processes."""
 _ADDRESS = re.compile(r"(\[[0-9a-fA-F:.%\w]+\]|[^\s:\[\]/]+):(\d{1,5})")
 _OF_PEERS = re.compile(r"gloo|nccl|coordination|unavailable|deadline_exceeded", re.IGNORECASE)
-
-
-class ProcessLost(Exception):
-    """Another process of the program ended, or the connection to it was lost."""
 
 
 class Membership(NamedTuple):
