@@ -106,7 +106,9 @@ def rows_of(name: str, splits: Sequence[HeldOut]) -> list[Row]:
         Row(name, "out_of_distribution_share", float(np.median([split.flagged for split in splits]))),
     ]
     if np.isfinite(splits[0].far_flagged):
-        rows.append(Row(name, "far_out_of_distribution_share", float(np.median([split.far_flagged for split in splits]))))
+        rows.append(
+            Row(name, "far_out_of_distribution_share", float(np.median([split.far_flagged for split in splits])))
+        )
         rows.append(Row(name, "far_coverage_95", float(np.median([split.far_coverage for split in splits]))))
     return rows
 
