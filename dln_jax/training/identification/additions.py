@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
+from dln_jax.errors import InputError
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.residual import Candidate, ResidualFit, fit_residual
 from dln_jax.mechanics.equations import dynamics
@@ -104,5 +105,10 @@ def store_bands(folder: Path, case: Case, solution: Identification, added: Resid
     if added is not None and added.settings:
         model, parameters, ridge = added.model, added.parameters, None
     options = {"ridge": ridge, "unit": solution.fit.noise, "negligible": 1e-12}
-    store_uncertainty(folder, model, parameters, *for_residual(case.sets.train), case.torque, **options)
+    try:
+        parts = for_residual(case.sets.train)
+    except InputError:
+        print("no uncertainty is stored: two trajectories or blocks to fit are the least that it takes")
+        return model
+    store_uncertainty(folder, model, parameters, *parts, case.torque, **options)
     return model
