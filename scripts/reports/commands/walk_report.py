@@ -5,6 +5,7 @@ that are entered, and the pairs of calling and called file. Prints both with the
 """
 
 import contextlib
+import importlib
 import io
 import tempfile
 from dataclasses import dataclass
@@ -53,8 +54,17 @@ def main(options: Arguments) -> None:
         print(f"run folder: {folder}")
 
 
+LIBRARY = (
+    *("dln_jax.public", "dln_jax.cli.compilation_cache", "dln_jax.training.dynamics.methods.network"),
+    *("dln_jax.training.dynamics.run", "dln_jax.training.identification.run"),
+)
+"""Modules of the library that commands import when they run; imports are no part of a walk."""
+
+
 def measured() -> dict[str, Walk]:
     """The walks of both commands on small generated files."""
+    for name in LIBRARY:
+        importlib.import_module(name)
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         schema.save(place / "log.npz", generators.uniform(cart_pole(friction=0.1), samples=60))
