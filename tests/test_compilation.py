@@ -28,12 +28,9 @@ AS_USERS_COMPILE = (
     ),
     *(
         f"nn/test_differential_mlp.py::test_parameter_gradients_equal_those_through_autodiff[{case}]"
-        for case in ("silu-sizes1", "gelu-sizes2")
+        for case in ("silu-sizes0", "gelu-sizes1")
     ),
-    *(
-        f"cli/commands/test_stability.py::test_hard_cases_meet_their_bounds[{name}]"
-        for name in ("float32", "activations")
-    ),
+    "cli/commands/test_stability.py::test_hard_cases_meet_their_bounds[float32]",
     "cli/commands/test_train_models.py::test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes",
 )
 """What fusion, fast approximations and reordering could break, cheap enough to compile with them."""
