@@ -68,16 +68,17 @@ def fit(case: Case, options: ImageOptions, folder: Path, mesh: Mesh | None) -> F
 def judge(case: Case, fitted: Fitted, options: ImageOptions, folder: Path) -> Judged:
     """The test errors, and figures of the predicted films."""
     numbers, seen = fitted.outcome
-    best = min(seen.history, key=lambda at: at.validation).step
+    figures = {}
+    if options.figures:
+        best = min(seen.history, key=lambda at: at.validation).step
+        curve = png(training_curve, seen.history, best_step=best, unit="loss", **OF_LOSSES)
+        figures = {**figures_of({case.kind: seen}, case.data), "training.png": curve}
     return Judged(
         metrics={key: value for key, value in numbers.items() if np.isfinite(value)},
         rows=lambda _: [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
         title=f"test films, {case.kind}",
         columns=("quantity", "value"),
-        figures={
-            **figures_of({case.kind: seen}, case.data),
-            "training.png": png(training_curve, seen.history, best_step=best, unit="loss", **OF_LOSSES),
-        },
+        figures=figures,
     )
 
 

@@ -96,7 +96,7 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     torques = {name: prediction.torque for name, prediction in predicted.items()}
     verdict, of_verdict = judged(case, solution, predict, torques, kept, robust=options.robust)
     metrics |= of_verdict
-    figures = figures_of(case, solution, predict, predicted[KEPT])
+    figures = figures_of(case, solution, predict, predicted[KEPT]) if options.figures else {}
     if options.uncertainty:
         model = store_bands(folder, case, solution, residual)
         of_bands, bands = uncertainty_metrics(folder, model, case.sets.test, torques[kept], case.description["name"])

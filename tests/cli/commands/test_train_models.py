@@ -163,7 +163,7 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     best = min(candidates, key=lambda each: each["validation_error"])
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]
     line = refused(capsys, train_delan, "--target", "1e-8", "--model", "black-box-delan", "--out", "no")
-    assert "--target grows one structured network" in line
+    assert "--target is an option of --model structured-delan" in line
 
 
 @pytest.mark.slow
