@@ -10,7 +10,7 @@ import pytest
 from dln_jax import load
 from dln_jax.cli.commands import train_hnn, train_hnn_task
 from dln_jax.mechanics.equations import flow
-from dln_jax.training.hamiltonian import options as phase_space_options
+from dln_jax.training import pipeline
 from dln_jax.training.hamiltonian import recipes, training
 from dln_jax.training.hamiltonian import run as phase_space
 from dln_jax.training.hamiltonian.model_selection import description_of
@@ -198,10 +198,11 @@ def test_seconds_count_from_the_start_of_the_command_to_the_stored_model(files, 
     """Reading takes 20 s, choosing 10 s and each dispatch 4 s: the model is stored before 60 s and a dispatch."""
     clock, stored = Clock(), []
     monkeypatch.setattr(time, "perf_counter", clock)
-    monkeypatch.setattr(phase_space_options, "problem_of", clock.passing(20.0, problem_of))
-    monkeypatch.setattr(phase_space_options, "choose_model", clock.passing(10.0, phase_space_options.choose_model))
+    monkeypatch.setattr(phase_space, "problem_of", clock.passing(20.0, problem_of))
+    monkeypatch.setattr(phase_space, "choose_model", clock.passing(10.0, phase_space.choose_model))
     monkeypatch.setattr(phase_space, "losses", clock.passing(4.0, lambda at: ""))  # reported after each dispatch
-    monkeypatch.setattr(phase_space, "save", lambda *_: stored.append(clock.now - 1000.0))
+    for module in (phase_space, pipeline):
+        monkeypatch.setattr(module, "save", lambda *_: stored.append(clock.now - 1000.0))
     monkeypatch.setattr(phase_space, "evaluate", lambda *_, **__: (_ for _ in ()).throw(InputError("enough")))
     with pytest.raises(SystemExit):
         command(train_hnn_task, *TASK, "spring.npz", "--seconds", "60", "--out", "limited")
