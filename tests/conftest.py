@@ -21,11 +21,11 @@ ROOT = Path(__file__).resolve().parent.parent
 UNCHECKED = "dln_jax.export.c"
 """Its arrays have no shapes in their types, and an export calls it half a million times."""
 FILES = [*ROOT.glob("dln_jax/**/*.py"), *ROOT.glob("scripts/reports/**/*.py")]
-ROOMS = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES]
-ROOMS = [name.removesuffix(".__init__") for name in ROOMS if not name.startswith(UNCHECKED)]
+CHECKED = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES]
+CHECKED = [name.removesuffix(".__init__") for name in CHECKED if not name.startswith(UNCHECKED)]
 # A name stands for all below it.
-ROOMS = [name for name in ROOMS if not UNCHECKED.startswith(f"{name}.")]
-install_import_hook(ROOMS, "typechecking.checked")
+CHECKED = [name for name in CHECKED if not UNCHECKED.startswith(f"{name}.")]
+install_import_hook(CHECKED, "typechecking.checked")
 
 PROGRAMS = "DLN_JAX_TEST_PROGRAMS"
 """Environment variable: folder of compiled programs, shared by the test processes and the commands that they start."""
@@ -54,6 +54,8 @@ jax.config.update("jax_compilation_cache_dir", os.environ[PROGRAMS])
 SHORTEST_COMPILATION = "0.02"
 """Seconds; reading a program takes about 0.01 s, so that one that compiles faster is not worth a file."""
 jax.config.update("jax_persistent_cache_min_compile_time_secs", float(SHORTEST_COMPILATION))
+# Locations of operations take a twentieth of the time of tracing and lowering, and no test reads them.
+jax.config.update("jax_traceback_in_locations_limit", 0)
 
 # Tracing makes many small objects that live on: collecting among them in vain costs a tenth of the time.
 gc.set_threshold(200_000, 20, 100)

@@ -104,12 +104,8 @@ def test_every_command_of_a_block_is_known():
     assert all(any(tuple(words[: len(known)]) == known for known in NOT_RUN) for words in others)
 
 
-def elsewhere(words):
-    """Whether a command is in none of the README's blocks."""
-    return all(words not in commands(block.text) for block in blocks("bash") if block.page == "README.md")
-
-
-@pytest.mark.parametrize("words", slow_among(SCRIPTS[1:], elsewhere), ids=shlex.join)
+@pytest.mark.slow
+@pytest.mark.parametrize("words", SCRIPTS[1:], ids=shlex.join)
 def test_a_command_of_a_block_runs(words, workplace):
     before = len(list(workplace.glob("*"))) + len(list((workplace / "runs").iterdir()))
     run(words)

@@ -73,6 +73,7 @@ def test_growing_networks_share_one_limit(arm, clock, monkeypatch):
     assert left == [30.0, 10.0]
 
 
+@pytest.mark.slow
 def test_folds_share_the_limit_with_the_training(arm, clock, monkeypatch):
     """Three folds and the training of all have a quarter each of the 30 s."""
     limits = []

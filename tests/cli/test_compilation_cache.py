@@ -71,6 +71,7 @@ def test_a_second_run_finds_its_programs(lines_of, tmp_path):
     assert lines_of(())[0][0] == found and all(Path(each).stat().st_size for pair in (torn, other) for each in pair)
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_one_line_at_most(lines_of, tmp_path):
     (tmp_path / "file").touch()
     ((first, *rest),) = lines_of((), XDG_CACHE_HOME=str(tmp_path / "file"))

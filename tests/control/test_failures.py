@@ -80,6 +80,7 @@ def laws():
 TRACKERS = (gravity_compensation, feed_forward, computed_torque)
 
 
+@pytest.mark.slow
 def test_no_law_answers_where_its_state_is_no_number():
     # One coordinate after another, and a state that is sound.
     bad = np.tile([0.01, 0.02, 0.03, 0.04], (9, 1))

@@ -24,6 +24,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import rotary_pendulum
 
 
+@pytest.mark.slow
 def test_laws_are_the_same_in_c(tmp_path):
     scene = rotary_pendulum(friction=1e-5)
     plant, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints

@@ -72,6 +72,7 @@ def test_a_guess_that_is_no_motion_comes_to_the_optimum_of_single_shooting():
     np.testing.assert_allclose(moved.u[:-1], found.plan.u[1:], atol=2e-2)
 
 
+@pytest.mark.slow
 def test_gains_are_derivatives_of_the_optimum_and_convergence_is_quadratic():
     limit = 1e3  # where none is reached, u is a smooth function of the start
     first = shooter(True)(DOWN, from_a_straight_line().plan.x, from_a_straight_line().plan.u, limit)

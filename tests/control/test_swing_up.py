@@ -73,6 +73,7 @@ def swing_up(scene, gains, Q, R, level):
     return law, field, goal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "gains", "Q", "R", "most", "level"),
     [

@@ -33,6 +33,7 @@ def test_dry_friction_holds_no_pole_down():
     assert float(jnp.abs(law(jnp.array([0.0, np.pi, 0.0, 0.0]))[0])) == pytest.approx(PLANT.numbers.kick)
 
 
+@pytest.mark.slow
 def test_a_state_that_is_no_number_has_no_control():
     law = jax.jit(law_of(PLANT, NOMINAL).law)
     for place in range(4):

@@ -61,6 +61,7 @@ def test_limits_hold_and_the_rest_is_stationary(limit):
     assert (slope[u == limit] < 0).all() and (slope[u == -limit] > 0).all()
 
 
+@pytest.mark.slow
 def test_a_plan_says_why_it_ended():
     u, solve = np.zeros((N, 2)), functools.partial(solver(1e-9), np.inf)
     plan = solve(START, u)

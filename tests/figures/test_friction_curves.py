@@ -1,6 +1,7 @@
 """Friction curves: a panel for each joint, every curve and the measured points in it."""
 
 import numpy as np
+import pytest
 
 from dln_jax.figures import friction_curves
 from scripts.reports.figures.friction import friction_laws
@@ -17,6 +18,7 @@ def test_each_joint_has_its_curves_in_the_order_of_its_rates():
     np.testing.assert_array_equal(plant.get_ydata(), np.sort(rates[:, 4]))
 
 
+@pytest.mark.slow
 def test_the_laws_are_drawn_with_the_force_that_they_have():
     (axis,) = friction_laws().axes
     curves = {line.get_label(): np.asarray(line.get_ydata()) for line in axis.lines}

@@ -59,6 +59,7 @@ def log_of(case, seed, noise):
     return from_arrays({"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": np.zeros(SAMPLES, int)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_shapes_and_coefficients_are_found_within_their_errors(case):
     friction, share = CASES[case]

@@ -56,6 +56,7 @@ def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
     assert fit.torque_mse < 1e-4 and fit.samples == 60 and fit.parameter_count == 120 + 6
 
 
+@pytest.mark.slow
 def test_slope_of_the_likelihood_is_that_of_its_differences():
     scene = pendulum(friction=0.2)
     data = uniform(scene, samples=20, rate_bound=3.0, acceleration_bound=5.0)

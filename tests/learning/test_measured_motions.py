@@ -24,6 +24,8 @@ from dln_jax.types import InputError, Needs
 from scripts.reports.robots.double_pendulum import cut_segments
 from tests.standard_errors import SURE, statistics
 
+pytestmark = pytest.mark.slow
+
 NEEDS = Needs(joints=("revolute", "revolute"), friction=True)
 CHAIN = make_planar_chain(NEEDS, coordinates="absolute")
 # Rods of 1 m with 1 kg at their ends, and friction in the joints.

@@ -73,6 +73,7 @@ def test_each_side_is_measured_in_its_standard_deviation_and_gradients_are_exact
     np.testing.assert_allclose(difference, gradient @ along, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", STATED)
 def test_exact_data_have_the_same_optimum_by_every_objective(objective):
     scene = pendulum(friction=0.2)
@@ -86,6 +87,7 @@ def test_exact_data_have_the_same_optimum_by_every_objective(objective):
         np.testing.assert_allclose(ours.inverse_dynamics(*state), plant.inverse_dynamics(*state), atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "optimiser", [GaussNewton(steps=10), Adam(steps=200, batch=64, learning_rate=1e-3, steps_per_dispatch=20)]
 )

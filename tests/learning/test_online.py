@@ -58,6 +58,7 @@ def refit(network):
     return make_refit(network, rounds=3, iterations=4)
 
 
+@pytest.mark.slow
 def test_growing_data_share_one_program_and_improve_the_model(network, refit):
     first, second, third, test = recordings(4)
     parameters = jax.jit(network.init)(jax.random.key(0))
@@ -80,6 +81,7 @@ def test_contents_of_empty_places_have_no_effect(network, refit):
         np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_refit_returns_the_iterate_with_the_lowest_held_out_error(chain):
     """Where held-out torques contradict the fitted ones, more rounds never make the held-out error larger."""
     replay = grown(100, recordings(3, samples=10))

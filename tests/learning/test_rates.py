@@ -99,6 +99,7 @@ def test_the_polynomial_recovers_the_pendulum(swing):
     assert len(coefficients) == 2 + 2 + 1 + 1 + 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("optimiser", "below"), [(GaussNewton(20), 1e-3), (Adam(400, batch=32), 0.7)])
 def test_networks_learn_the_field(swing, optimiser, below):
     model = make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL)

@@ -27,6 +27,7 @@ def prepared(recording):
     return prepare(recording)
 
 
+@pytest.mark.slow
 def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
     assert prepared.delay == PLANT.hardware.delay
     assert len(np.unique(prepared.train.trajectory)) == 2 and len(np.unique(prepared.validation.trajectory)) == 1

@@ -185,6 +185,7 @@ def test_a_network_is_uncertain_where_it_has_seen_nothing():
     assert np.mean(flag(far.q, far.qd, far.qdd)) > 0.95 and np.mean(flag(near.q, near.qd, near.qdd)) < 0.05
 
 
+@pytest.mark.slow
 def test_leading_directions_are_those_of_the_singular_value_decomposition():
     random = np.random.default_rng(0)
     Phi = random.normal(size=(60, 1, 12)) * 10.0 ** -np.arange(12) @ np.linalg.qr(random.normal(size=(12, 12)))[0]

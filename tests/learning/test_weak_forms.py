@@ -115,6 +115,7 @@ def test_a_clean_motion_is_identified_without_accelerations(fit_form):
     assert fit.equations > 3 * fit.parameter_count > 3 * fit.rank
 
 
+@pytest.mark.slow
 def test_it_does_not_mind_a_cut_off_that_ruins_accelerations():
     found = smooth(schema.from_arrays(log(0, noise_q=NOISE_Q, noise_tau=NOISE_TAU)[0]), 25.0)
     momentum = error(fit_momentum(MODEL, found.data, noise=found.noise_tau, **TOLERANCES).parameters)

@@ -99,6 +99,7 @@ def test_actuation_of_commands():
     np.testing.assert_allclose(actuation_of(np.array([-3.0, -1.0, 0.0, 1.0, 2.0])), [0.25, 0.25, 0.625, 1.0, 1.0])
 
 
+@pytest.mark.slow
 def test_gradients_increase_the_distance_and_the_same_seed_gives_the_same(compiled):
     first = learn(compiled, seed=0, goal=Goal(20 * compiled.learner.steps))
     assert first.distance > max(0.01, 4 * first.records[0].distance)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import slow_among
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -57,7 +58,11 @@ def natural_twin(scene: Scene) -> Dynamics:
     return dynamics(natural.NaturalSystem(cholesky, scene.potential, scene.dissipation))
 
 
-@pytest.fixture(scope="module", params=SCENES, ids=lambda scene: scene.name + scene.needs.friction * "-friction")
+@pytest.fixture(
+    scope="module",
+    params=slow_among(SCENES, lambda scene: scene.name in ("chain-4", "two-link-arm")),
+    ids=lambda scene: scene.name + scene.needs.friction * "-friction",
+)
 def answers(request):
     """A scene, 50 random states, and the answers of both paths to them."""
     scene = request.param

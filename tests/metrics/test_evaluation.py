@@ -39,6 +39,7 @@ def test_errors_are_sums_over_joints_and_means_over_samples(data):
     assert "gravity_mse" not in without_truth and "coriolis_mse" in without_truth
 
 
+@pytest.mark.slow
 def test_torques_from_momenta_are_as_wrong_as_recorded_rates():
     """The true plant, damped: exact momenta give exact torques, and difference quotients their own error."""
     scene = pendulum(friction=0.3)

@@ -28,6 +28,7 @@ def jacobian(rates, x):
     return jax.jacfwd(lambda x: jnp.concatenate(rates(x[:2], x[2:])))(x)
 
 
+@pytest.mark.slow
 def test_each_part_lacks_what_it_must():
     x = jnp.array([0.3, -0.8, 0.5, 1.1])
     solenoidal, conservative, both = (random_field(each) for each in ("solenoidal", "conservative", "both"))
@@ -54,6 +55,7 @@ def learned(field, data):
     return model, fit(rates.problem(model, *hold_out(data, 0.2, 0)), GaussNewton(steps=30))
 
 
+@pytest.mark.slow
 def test_a_damped_spring_takes_both_parts():
     data = damped_spring()
     model, both = learned("both", data)

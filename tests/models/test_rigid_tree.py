@@ -38,7 +38,7 @@ def data(seed, noise, *, friction, samples=300):
     )
 
 
-@pytest.mark.parametrize("friction", [False, True])
+@pytest.mark.parametrize("friction", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_fit_is_exact_and_knows_what_it_cannot_know(friction):
     model = make_rigid_tree(ARM, friction=friction)
     train, test = (data(seed, 0.0, friction=friction) for seed in range(2))
@@ -75,6 +75,7 @@ def test_it_starts_from_the_tree():
     assert parameters.viscous is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [law for law in LAWS if law not in ("viscous", "coulomb", "offset", "load")])
 def test_coefficients_of_other_laws_are_found_with_the_inertias(law):
     names = coefficients_of([law])

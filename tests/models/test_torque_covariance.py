@@ -45,6 +45,7 @@ def features(joints, serial, scales, q, qd):
     return jnp.concatenate(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("joints", "serial"), CASES)
 def test_covariance_is_that_of_explicit_features_and_of_the_energies(joints, serial):
     model, parameters, states = drawn(joints, serial)

@@ -317,6 +317,7 @@ def spherical_pendulum() -> Scene:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_validation_gives_each_joint_the_degree_that_it_needs(noise):
     """sin² has degree 2, and nothing depends on the yaw."""

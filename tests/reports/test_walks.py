@@ -2,12 +2,14 @@
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from dln_jax import dynamics
 from dln_jax.scenes.pendulums import pendulum
 from scripts.reports.walks import walk_of
 
 
+@pytest.mark.slow
 def test_files_are_in_the_order_of_their_first_call_and_arrows_join_them():
     scene = pendulum()
     plant = dynamics(scene.energies)

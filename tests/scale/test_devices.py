@@ -60,6 +60,7 @@ def test_nothing_is_printed_on_a_cpu_and_the_cost_is_a_ratio():
     assert 0 < devices.double_precision_cost(64) < 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ["rocm", pytest.param("nonsense", marks=pytest.mark.slow)])
 def test_an_unusable_platform_is_one_line(platform, tmp_path):
     environment = {"JAX_PLATFORMS": platform, "PATH": "", "PYTHONPATH": ":".join(sys.path)}

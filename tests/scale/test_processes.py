@@ -182,6 +182,7 @@ def assert_is_one_program(result, alone, devices):
     assert first.startswith("2 processes, ") and "I am the first" in first and "Gloo" not in first and not second
 
 
+@pytest.mark.slow
 def test_two_processes_give_what_one_gives_and_the_first_alone_prints(trained):
     assert_is_one_program(trained["two"], trained["alone"], devices=2)
 
@@ -271,6 +272,7 @@ def assert_refused(run_tiny, *reasons):
         assert not list(result.folder.iterdir()), f"{reason}: something is left"
 
 
+@pytest.mark.slow
 def test_different_options_and_absent_processes_are_one_line(run_tiny):
     assert_refused(run_tiny, "arguments", "absent")
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import slow_among
 
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms import creature
@@ -143,7 +144,14 @@ class Answers(NamedTuple):
     rotation: np.ndarray
 
 
-@pytest.fixture(scope="module", params=list(cases()), ids=lambda case: f"{case.name}-{case.dimension}d")
+LONG = ("corotated", "neo_hookean", "st_venant_kirchhoff")
+
+
+@pytest.fixture(
+    scope="module",
+    params=slow_among(cases(), lambda case: case.dimension == 3 and case.name in LONG),
+    ids=lambda case: f"{case.name}-{case.dimension}d",
+)
 def answers(request):
     """Energy, gradient and Hessian of a term at named positions, in one program."""
     case = request.param

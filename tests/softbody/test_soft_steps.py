@@ -103,6 +103,7 @@ def test_elements_given_inverted_move_as_those_given_right():
     np.testing.assert_array_equal(mesh.elements, MESH.elements)
 
 
+@pytest.mark.slow
 def test_elements_that_meet_at_one_edge_keep_momentum():
     """Three triangles at an edge: what they do to each other cancels."""
     mesh = make_mesh([*MESH.vertices, [1.4, 1.2]], [[0, 1, 2], [1, 3, 2], [1, 4, 2]])
@@ -133,6 +134,7 @@ def test_a_hanging_weight_stretches_its_spring_by_its_weight_over_the_stiffness(
     np.testing.assert_allclose(x[0, 0], x[2, 0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_segments_change_the_memory_and_not_the_motion_or_its_gradient():
     scene = make_scene(MESH, (springs([[0, 2], [1, 3]], stiffness=200.0),), masses=1.5, held=[0, 1])
     init, step = make_step(scene, DT)
@@ -151,6 +153,7 @@ def test_segments_change_the_memory_and_not_the_motion_or_its_gradient():
     np.testing.assert_allclose(again, gradient, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_mapping_over_parameters_equals_one_at_a_time():
     scene = held_body()
     moduli = jnp.array([1e4, 1e6])
@@ -192,6 +195,7 @@ def equations(jaxpr):
     return len(jaxpr.eqns) + sum(map(equations, inner))
 
 
+@pytest.mark.slow
 def test_definiteness_is_computed_on_request_only():
     def size_and_info(**options):
         init, step = make_step(held_body(), DT, **options)
@@ -217,6 +221,7 @@ def falling(example, dt, steps, integrator):
     return jax.jit(run)(example.scene.params)[1]
 
 
+@pytest.mark.slow
 def test_a_motion_whose_energy_explodes_is_not_converged():
     """The midpoint rule does not resolve this contact: forces are balanced in every step, and energy is created."""
     example = drop(cells=2, youngs_modulus=1e6)
@@ -239,6 +244,7 @@ def test_a_motion_whose_energy_explodes_is_not_converged():
     assert damped.converged.all() and (damped.energy_growth <= 1e-2 * damped.energy_at_hand).all()
 
 
+@pytest.mark.slow
 def test_elements_inverted_by_an_impact_are_not_converged_and_have_no_derivatives():
     mesh = beam(1.0, 1.0, 2, 2)
     shifted = mesh._replace(vertices=mesh.vertices + np.array([0.0, 0.05]))
@@ -267,6 +273,7 @@ def test_elements_inverted_by_an_impact_are_not_converged_and_have_no_derivative
     np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_work_of_held_vertices_is_not_growth():
     """A body that is pulled by its held vertices gains energy; none of it is created."""
     init, step = make_step(held_body(), DT, MIDPOINT)
@@ -288,6 +295,7 @@ def two_blocks(gap):
     return make_scene(mesh, (solid, gravity(mesh)), held=np.arange(n))
 
 
+@pytest.mark.slow
 def test_bodies_that_pass_through_each_other_are_counted():
     scene = two_blocks(gap=0.1)
     init, step = make_step(scene, DT)

@@ -203,8 +203,8 @@ CHAINS = (jnp.array([30.0, 50.0, 3.0, 40.0]), jnp.array([0.18, 0.25, 0.2, 0.19])
     ("way", "derived"),
     [
         (dense, lambda one: jax.jacfwd(jax.value_and_grad(one))),
-        (block_tridiagonal, lambda one: jax.value_and_grad(one, (0, 1))),
-        (matrix_free, lambda one: one),
+        pytest.param(block_tridiagonal, lambda one: jax.value_and_grad(one, (0, 1)), marks=pytest.mark.slow),
+        pytest.param(matrix_free, lambda one: one, marks=pytest.mark.slow),
     ],
     ids=["dense, second", "blocks, first", "no matrix, none"],
 )
@@ -218,6 +218,7 @@ def test_minima_and_their_derivatives_in_batches(way, derived):
             np.testing.assert_allclose(left[lane], right, rtol=1e-7, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_batches_of_batches_of_minima():
     one = lambda stiffness, length: sag(stiffness, length, dense)  # noqa: E731
     nested = jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(*CHAINS)

@@ -283,6 +283,7 @@ STOPPING = 0.05
 """Improvement at which seeds stop at different iterations."""
 
 
+@pytest.mark.slow
 def test_seeds_vmapped_equal_seeds_looped():
     """Repeatedly and against the clock: batched LAPACK would wedge here."""
     parameters = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(network_parameters, range(4)))

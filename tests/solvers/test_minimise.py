@@ -111,6 +111,7 @@ def chosen(scene, dt):
     return seen[0]
 
 
+@pytest.mark.slow
 def test_the_choice_of_the_solver_follows_the_stiffness():
     soft, stiff = unordered_body(1e4, 0.3), unordered_body(1e9, 0.49)
     assert chosen(soft, 1e-3) == "matrix_free"
@@ -183,12 +184,14 @@ def test_derivatives_are_those_of_the_minimum(sag, mode):
         np.testing.assert_allclose(slopes[2][axis], difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_second_derivatives_nest(sag):
     curvature = jax.jit(jax.hessian(lambda length: hanging_chain(50.0, length, ARGUMENTS[2])[0][:, 1].mean()))(0.11)
     slope = jax.jit(jax.grad(lambda length: hanging_chain(50.0, length, ARGUMENTS[2])[0][:, 1].mean()))
     np.testing.assert_allclose(curvature, (slope(0.11 + 1e-5) - slope(0.11 - 1e-5)) / 2e-5, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_mapping_equals_one_at_a_time():
     stiffness = jnp.array([5.0, 50.0, 5e4])
     together, info = jax.jit(jax.vmap(lambda k: hanging_chain(k, *ARGUMENTS[1:])))(stiffness)

@@ -22,6 +22,7 @@ def run_folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_loaded_run_answers_as_the_model_does(run_folder):
     model = build(DESCRIPTION)
     system = dynamics(model.energies(model.init(jax.random.key(0))))

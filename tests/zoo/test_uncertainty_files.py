@@ -90,6 +90,7 @@ def test_what_is_damaged_or_does_not_fit_is_refused(folder):
         load(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH")
 @pytest.mark.parametrize(
     "precision, tolerance, undetermined, expected", [("f64", 1e-11, 0, {True, False}), ("f32", 1e-4, 3, {True})]

@@ -117,6 +117,7 @@ def small_run(tmp_path_factory):
     return run_of("structured-delan", tmp_path_factory.mktemp("runs"))
 
 
+@pytest.mark.slow
 def test_low_latency_is_timed_in_a_process_of_its_own(small_run):
     said = []
     states = (np.zeros((7, 2)), np.ones((7, 2)), np.ones((7, 2)))
@@ -150,6 +151,7 @@ def test_a_process_that_fails_leaves_the_row_out_with_a_reason(case, tmp_path, m
     assert len(said) == 1 and reason in said[0] and "\n" not in said[0]
 
 
+@pytest.mark.slow
 def test_call_paths_are_timed(small_run, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark_one_step, "enable_low_latency", lambda: None)  # a process of its own would be needed
     plain = run_of("feed-forward", tmp_path)

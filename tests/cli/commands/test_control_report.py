@@ -1,5 +1,6 @@
 """The report of control: its cases, and what it refuses."""
 
+import pytest
 from calls import refused
 
 from dln_jax.control.closed_loop import hanging_starts
@@ -18,6 +19,7 @@ def test_every_subject_has_cases():
     assert len(set(names)) == len(names) and {name.split("/")[0] for name in names} == set(control_report.SUBJECTS)
 
 
+@pytest.mark.slow
 def test_poles_come_up_on_hardware_from_encoders_alone():
     case = SWING_UPS["rotary-pendulum"]
     assert tried(case, hanging_starts(8, 0, position=case.position), seconds=3.0).share == 1

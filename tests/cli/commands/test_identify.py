@@ -124,6 +124,7 @@ def test_sound_log_is_good(identified):
     assert metrics["noise_nmse"] < metrics["nmse"] < 0.05 < metrics["file_nmse"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -149,6 +150,7 @@ def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys, spoil, s
     assert json.loads((workplace / name / "metrics.json").read_text())["verdict"] == 2
 
 
+@pytest.mark.slow
 def test_spikes_ask_for_a_robust_fit(workplace, capsys):
     log, random = dict(np.load(workplace / "log.npz")), np.random.default_rng(2)
     hit = random.random(log["tau"].shape) < 0.01

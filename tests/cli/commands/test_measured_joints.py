@@ -88,6 +88,7 @@ def test_tests_and_noise_may_be_stated(double):
             problem_of(MEASURED, data=data, stated=stated)
 
 
+@pytest.mark.slow
 def test_mistakes_are_one_line(double, capsys):
     cases = [
         ((*MEASURE, "--noise", "small"), "--noise is 'small'"),

@@ -157,6 +157,7 @@ def test_a_file_without_torques_names_the_command_for_it(files, capsys):
     assert "spring.npz has no tau" in line and "train_hnn_task --task measured --data spring.npz" in line
 
 
+@pytest.mark.slow
 def test_a_model_whose_motions_explode_is_refused(files, capsys):
     """The file's forces point away from rest: its rates are fitted exactly, and every predicted motion grows."""
     arrays = published_arrays("spring", 11, trajectories=8)

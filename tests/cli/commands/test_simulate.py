@@ -41,6 +41,7 @@ def played(example, dt, steps, integrator=BACKWARD_EULER):
     return jax.jit(run)
 
 
+@pytest.mark.slow
 def test_the_beam_falls_and_its_energies_add_up():
     example = beam(cells=1)
     scene = example.scene

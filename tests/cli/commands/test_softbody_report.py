@@ -12,7 +12,8 @@ from scripts.reports.commands import softbody_report
 from scripts.reports.commands.softbody_report import cases
 
 CASES = [case.name for case in cases() if not case.name.startswith("speed/")]
-LONG = ("gradients/crawler", "references/orders", "references/elastica")
+LONG = ("gradients/crawler", "hard/chain", "hard/materials", "references/orders", "references/elastica")
+LONG += ("references/invariants", "references/uniaxial", "references/cantilever", "references/patch-test")
 
 
 @pytest.mark.parametrize("name", slow_among(CASES, LONG.__contains__))

@@ -16,6 +16,7 @@ from scripts.reports.commands.stability import NAMES, cases
 from scripts.reports.rows import expect
 
 LONG = ("sizes", "float32", "lyapunov-time", "close-encounters", "batches")
+LONG += ("mass-conditions", "not-finite", "turned-angles", "noise")
 STEPS = {"separatrix": 5_000, "lyapunov-time": 20_000}
 
 

@@ -74,6 +74,7 @@ def workplace(tmp_path_factory):
         yield folder
 
 
+@pytest.mark.slow
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
     pytest.importorskip("mujoco")
     options = {"data": Path("rigid.npz"), "robot": Path("arm.xml"), "velocity_scale": 0.01}

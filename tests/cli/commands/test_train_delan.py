@@ -295,6 +295,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(workplace, capsys, mist
     assert not (workplace / "refused").exists()
 
 
+@pytest.mark.slow
 def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(workplace, capsys):
     """One CSV file without t, trajectory and needs: two coupled joints, viscous and dry friction, springs."""
     random, T = np.random.default_rng(0), 400
@@ -346,6 +347,7 @@ def test_a_cart_that_is_driven_alone_is_trained(workplace, capsys):
     assert json.loads((workplace / "cart" / "metrics.json").read_text())["torque_mse"] < 1e-16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scene, options",
     [

@@ -123,6 +123,7 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
     assert metrics_of(workplace / "run")["hessian_mse"] == pytest.approx(np.mean(functions.sine_grid().d2y ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimizer", ["gauss-newton", "adam"])
 def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys, optimizer):
     """Stopped after a few reports, and continued; Gauss-Newton chooses its width again."""

@@ -63,6 +63,7 @@ def test_targets_are_weighted_returns_and_their_slopes():
     np.testing.assert_allclose(found(0.05).x[0], x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.2])
 def test_the_value_of_a_line_and_of_the_worst_of_lines(share):
     """dx/dt = p x + u with p off by a share: the worst is always the larger p."""

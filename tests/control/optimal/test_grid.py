@@ -132,6 +132,7 @@ def test_no_policy_costs_less_than_the_value(of_weak_pendulum):
     assert np.all(held + 5e-3 * np.max(found.V) >= V)
 
 
+@pytest.mark.slow
 def test_policy_of_the_value_costs_what_the_value_says(of_weak_pendulum):
     problem, found = of_weak_pendulum
     x = np.random.default_rng(4).uniform([-math.pi, -8], [math.pi, 8], (60, 2))

@@ -118,6 +118,7 @@ DEFAULT = {"structured-delan", "black-box-hnn", "trigonometric", "feed-forward",
 DEFAULT |= {*BY_HAND, "pendulum", "three-body"}
 """The other cases repeat what is in these."""
 SLOW = {"black-box-hnn", "latent-phase", "three-body", "spherical_pendulum", "relativistic_particle", "kepler"}
+SLOW |= {"structured-delan", "double_pendulum"}
 """Those of `DEFAULT` whose primitives occur in another, too."""
 BRIEFLY = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian", "mass_matrix")
 BRIEFLY += ("rates", "hamiltonian", "encode", "decode")

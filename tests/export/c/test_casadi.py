@@ -72,6 +72,7 @@ def columns(matrices):
     return casadi.veccat(*(matrices if isinstance(matrices, list | tuple) else [matrices]))
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_values_and_derivatives_equal_jax(name, library):

@@ -192,7 +192,7 @@ LACKING = {
 """Functions that some systems of the kind have."""
 
 
-@pytest.mark.parametrize("case", slow_among(CASES, HAMILTONIANS.__contains__))
+@pytest.mark.parametrize("case", slow_among(CASES, (*HAMILTONIANS, "cart-pole", "phase-network").__contains__))
 def test_functions_and_their_derivatives_are_those_of_the_mechanics(case, pytestconfig):
     if case not in DEFAULT and not pytestconfig.getoption("--every-export"):
         pytest.skip("is tried with --every-export")

@@ -18,6 +18,7 @@ LAST = {"inverse_dynamics": [1.0, -2.0], "forward_dynamics": [2.0, -30.0], "fric
 """Names of the functions, and their argument after q and qd: qdd, tau, or none."""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH")
 def test_c_has_the_friction_of_jax(tmp_path):
     functions, states = {}, {}

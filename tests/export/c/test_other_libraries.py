@@ -64,6 +64,7 @@ def test_derivative_of_a_root(tmp_path):
     check_agreement(jax.jacobian(root), tmp_path)
 
 
+@pytest.mark.slow
 def test_tsit5_of_diffrax_with_constant_steps(tmp_path):
     ours = check_agreement(rollout, tmp_path)
     energy = 0.5 * (0.7 * ours[..., 1]) ** 2 - 9.81 * 0.7 * np.cos(ours[..., 0])

@@ -55,6 +55,7 @@ def test_the_design_has_all_that_a_tree_shows():
     np.testing.assert_allclose(flat @ solution, tau.ravel(), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_true_frames_leave_nothing():
     _, _, linear = problem()
     at = projected(jnp.zeros(18))
@@ -63,6 +64,7 @@ def test_true_frames_leave_nothing():
     assert inertias.shape == (3, 10) and np.count_nonzero(inertias) == 18
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_finite_differences():
     places = free_directions(STRUCTURE.parents, KINDS)
     start = np.zeros(18)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import slow_among
 
 from dln_jax.mechanics import jacobians
 from dln_jax.mechanics.equations import dynamics, flow
@@ -76,7 +77,7 @@ class Case(NamedTuple):
     energy: np.ndarray
 
 
-@pytest.fixture(scope="module", params=TREES)
+@pytest.fixture(scope="module", params=slow_among(TREES, ("about x", "arm").__contains__))
 def case(request):
     tree = TREES[request.param]
     state = tuple(np.random.default_rng(9).normal(size=(3, tree.degrees_of_freedom)))

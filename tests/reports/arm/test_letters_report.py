@@ -71,6 +71,7 @@ def test_splits_have_the_given_test_letters_first_and_none_twice(letters):
     assert len({letter for part in others for letter in part}) == sum(map(len, others))
 
 
+@pytest.mark.slow
 def test_an_arm_that_identifies_itself_writes_its_second_letter_as_the_exact_model_does(letters, identified):
     under = Condition()
     motions = drawn_letters(letters, 2, 0, 1.0)

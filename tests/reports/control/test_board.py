@@ -43,6 +43,7 @@ def test_a_plan_is_followed_up_and_held():
     assert found.energy > rise
 
 
+@pytest.mark.slow
 def test_a_law_by_energy_comes_up():
     numbers = Law(jnp.array([2.02, 8.59, 13.5]), jnp.array(2.08), jnp.array(0.476), jnp.array(1.93))
     assert score(criteria("elbow", runs_by_energy("elbow")(numbers))) > 0.4

@@ -37,6 +37,7 @@ def logs():
     return fits.Logs(data, data)
 
 
+@pytest.mark.slow
 def test_torques_tell_all_parameters_and_the_velocity_scale(logs):
     assert fits.choose_scale(logs) == SCALE
     low_passed, off = fits.fit_low_passed(logs, SCALE)

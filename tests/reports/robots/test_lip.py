@@ -15,6 +15,7 @@ def test_three_joints_are_at_the_floor():
     assert rows[f"{case}/learned-tree", "nmse_mean_median"].reference == pytest.approx(known)
 
 
+@pytest.mark.slow
 def test_a_kernel_is_near_without_knowing_of_trees():
     rows = {row.quantity: row for row in lip.kernel_rows("panda-3", friction=False, every=125, tests=(101,))}
     assert rows["nmse_mean_median"].value < 1e-3

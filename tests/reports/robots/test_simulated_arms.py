@@ -29,6 +29,7 @@ def test_motions_stay_within_limits_and_rates_are_derivatives(make):
         assert np.abs(estimate - rate[1:-1]).max() < 2e-3 * np.abs(rate).max()
 
 
+@pytest.mark.slow
 def test_held_joints_are_those_that_do_not_move():
     whole, part = panda(7), panda(3)
     q, qd, qdd = np.random.default_rng(0).normal(size=(3, 5, 3))

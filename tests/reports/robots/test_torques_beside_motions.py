@@ -14,6 +14,7 @@ from tests.learning.test_measured_motions import CHAIN, TRUE
 COUNT, WINDOW = 3, 4
 
 
+@pytest.mark.slow
 def test_torques_beside_motions_add_their_squares():
     q, qd, qdd, tau = np.random.default_rng(0).normal(size=(4, COUNT, WINDOW, 2))
     torques = TorqueWindows(q, qd, qdd, tau, np.ones((COUNT, WINDOW)))

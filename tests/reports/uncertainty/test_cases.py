@@ -1,8 +1,11 @@
 """What the report of uncertainties draws and reads is what it says, and its cases give their rows."""
 
+import pytest
+
 from scripts.reports.uncertainty import cases
 
 
+@pytest.mark.slow
 def test_a_simulated_arm_is_covered_and_its_far_motions_are_flagged():
     rows = {row.quantity: row for row in cases.simulated_arm("arm", 2, noise=0.3, unmodelled=False, splits=2).rows}
     assert rows["coverage_95_lowest_joint"].passed and rows["coverage_95_highest_joint"].passed
