@@ -93,7 +93,9 @@ def test_random_programs_agree_with_jax(seeds, tmp_path):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", batches(ALL_SUPPORTED, EVERY), ids=str)
-def test_more_random_programs_agree_with_jax(seeds, tmp_path):
+def test_more_random_programs_agree_with_jax(seeds, tmp_path, pytestconfig):
+    if not pytestconfig.getoption("--every-export"):
+        pytest.skip("takes minutes: for --every-export")
     assert compared(seeds, tmp_path) <= MOST_REFUSED
 
 
@@ -119,7 +121,9 @@ def test_the_text_is_the_same_in_every_process():
 
 
 @pytest.mark.slow
-def test_the_text_of_more_programs_is_the_same_in_every_process():
+def test_the_text_of_more_programs_is_the_same_in_every_process(pytestconfig):
+    if not pytestconfig.getoption("--every-export"):
+        pytest.skip("takes minutes: for --every-export")
     check_text(0, EVERY)
 
 
