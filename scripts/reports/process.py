@@ -1,7 +1,7 @@
 """Calls of functions in processes of their own: JAX fixes its mode of dispatch and its threads when it starts."""
 
+import json
 import os
-import pickle
 import subprocess
 import sys
 import tempfile
@@ -15,12 +15,13 @@ from dln_jax.types import InputError
 ROOT = Path(__file__).parents[2]
 """Folder of the packages that a process imports."""
 PROGRAM = """
-import pickle, sys
+import importlib, json, sys
 from pathlib import Path
 import jax
 jax.config.update("jax_enable_x64", True)
-function, arguments = pickle.loads(Path("call").read_bytes())
-Path("answer").write_bytes(pickle.dumps(function(*arguments)))
+module, name, arguments = json.loads(sys.argv[1])
+answer = getattr(importlib.import_module(module), name)(*arguments)
+Path("answer.json").write_text(json.dumps(answer, default=float))
 """
 
 
@@ -28,8 +29,8 @@ def called(function: Callable[..., Any], *arguments: Any, limit: float | None = 
     """The answer of a function of a module, in float64, computed by a new process on the CPU.
 
     Args:
-        function: function of the repository.
-        arguments: its arguments.
+        function: function at the top level of a module; JSON holds its answer, so that tuples come back as lists.
+        arguments: its arguments: numbers, strings, lists of these, and paths, which arrive as strings.
         limit: time limit, s.
         environment: more environment variables of the process.
 
@@ -37,11 +38,9 @@ def called(function: Callable[..., Any], *arguments: Any, limit: float | None = 
         InputError: the process failed; the message has the last line that it printed.
     """
     with tempfile.TemporaryDirectory() as place:
-        (Path(place) / "call").write_bytes(pickle.dumps((function, arguments)))
-        command, settings = (
-            [sys.executable, "-c", PROGRAM],
-            {"JAX_PLATFORMS": "cpu", "PYTHONPATH": search_path(), **environment},
-        )
+        call = json.dumps((function.__module__, function.__qualname__, arguments), default=str)
+        command = [sys.executable, "-c", PROGRAM, call]
+        settings = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": search_path(), **environment}
         try:
             done = subprocess.run(
                 command, capture_output=True, cwd=place, env={**os.environ, **settings}, timeout=limit
@@ -50,7 +49,7 @@ def called(function: Callable[..., Any], *arguments: Any, limit: float | None = 
             raise InputError(f"a measurement in a process of its own did not end in {limit:g} s") from None
         if done.returncode:
             raise InputError(f"a measurement in a process of its own failed: {last_line(done.stderr)}")
-        return pickle.loads((Path(place) / "answer").read_bytes())
+        return json.loads((Path(place) / "answer.json").read_text())
 
 
 def search_path() -> str:

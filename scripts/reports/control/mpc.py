@@ -203,7 +203,8 @@ def cart_pole_report(quick: bool) -> Findings:
     # Only the longest horizon is timed: its calls take the most time.
     steps, case = round(HORIZONS[0] * RATE), f"mpc/{HORIZONS[0]:g}-s"
     flags = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD}".strip(), "OMP_NUM_THREADS": "1"}
-    for way, calls in called(timed_calls, steps, 1 if quick else LOOPS, limit=PROCESS_LIMIT, **flags).items():
+    for way, numbers in called(timed_calls, steps, 1 if quick else LOOPS, limit=PROCESS_LIMIT, **flags).items():
+        calls = Calls(*numbers)
         rows.append(Row(f"{case}/{way}", "compile_seconds", calls.compile_seconds, "s"))
         rows.append(Row(f"{case}/{way}", "p50_ms", calls.p50_ms, "ms"))
         rows.append(expect(f"{case}/{way}", "p99_ms", f"of {calls.calls} calls", calls.p99_ms, WITHIN, "ms"))

@@ -120,7 +120,7 @@ def rows_of(case: str, numbers: dict[str, float]) -> list[Row]:
     return [Row(case, key, value, unit_of(key), bound=BOUNDS.get((case, key))) for key, value in shown.items()]
 
 
-def times_of_runs(folders: Sequence[Path], dispatch: str, calls: int) -> dict[str, Any]:
+def times_of_runs(folders: Sequence[str], dispatch: str, calls: int) -> dict[str, Any]:
     """Times of inverse dynamics by run and call path, for a process of its own.
 
     The dispatch "default" leaves jitted functions as they are; "low-latency" calls them without a change of threads,
@@ -130,7 +130,7 @@ def times_of_runs(folders: Sequence[Path], dispatch: str, calls: int) -> dict[st
         enable_low_latency()
     test = published_split(letters(None)).test
     states = [array[:STATES] for array in (test.q, test.qd, test.qdd)]
-    return {folder.name: times_of(folder, states, dispatch, calls) for folder in folders}
+    return {folder.name: times_of(folder, states, dispatch, calls) for folder in map(Path, folders)}
 
 
 def times_of(folder: Path, states: Sequence[np.ndarray], dispatch: str, calls: int) -> dict[str, Any]:

@@ -154,8 +154,8 @@ def test_a_process_that_fails_leaves_the_row_out_with_a_reason(case, tmp_path, m
 @pytest.mark.slow
 def test_call_paths_are_timed(small_run, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark_one_step, "enable_low_latency", lambda: None)  # a process of its own would be needed
-    plain = run_of("feed-forward", tmp_path)
-    times = [benchmark_one_step.times_of_runs([small_run, plain], way, 10) for way in ("default", "low-latency")]
+    folders = list(map(str, (small_run, run_of("feed-forward", tmp_path))))
+    times = [benchmark_one_step.times_of_runs(folders, way, 10) for way in ("default", "low-latency")]
     first, second = (turn["structured-delan"] for turn in times)
     assert set(first) == {"default-jit"}
     assert {"low-latency-jit", "low-latency-numpy", "c-from-python", "c-loop"} == set(second)
