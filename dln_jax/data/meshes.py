@@ -1,4 +1,7 @@
-"""Mesh files: npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], fixed vertices."""
+"""Mesh files: npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], fixed vertices.
+
+The formats of meshing programs are those of `softbody.mesh.files`.
+"""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -7,8 +10,9 @@ import numpy as np
 from jaxtyping import Int
 
 from dln_jax.data.arrays import load_file
+from dln_jax.softbody.mesh.files import SUFFIXES, read_mesh
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_positive
 
 KEYS = ("vertices", "elements", "held")
 
@@ -19,15 +23,27 @@ class StoredMesh(NamedTuple):
     mesh: Mesh
     held: Int[np.ndarray, " k"] | None
     """Indices of fixed vertices; `None` if the file has none."""
+    statements: tuple[str, ...] = ()
+    """What was left out or repaired; an npz file is never repaired."""
 
 
-def load(path: str | Path) -> StoredMesh:
+def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
     """Reads and checks a file; never unpickles.
 
+    Args:
+        path: of an npz file, or of one that `read_mesh` reads.
+        scale: length of the file's unit in m, such as 0.001 for millimetres.
+
     Raises:
-        InputError: the file is missing or not an npz, its arrays do not form a mesh, or `held` is malformed.
+        InputError: the file is missing or of another format, its arrays do not form a mesh, `held` is malformed, or as
+            `read_mesh`.
     """
-    return load_file(path, from_arrays, KEYS)
+    if Path(path).suffix.lower() in SUFFIXES:
+        mesh, statements = read_mesh(path, scale=scale)
+        return StoredMesh(mesh, None, statements)
+    require_positive(scale=scale)
+    stored = load_file(path, from_arrays, KEYS)
+    return stored._replace(mesh=stored.mesh._replace(vertices=scale * stored.mesh.vertices))
 
 
 def from_arrays(arrays: dict[str, Any]) -> StoredMesh:

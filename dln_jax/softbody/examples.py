@@ -29,7 +29,7 @@ from dln_jax.softbody.terms.creature import MASS, TIME_STEP, creature_terms
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import StrainEnergy, stable_neo_hookean
-from dln_jax.softbody.terms.term import Term
+from dln_jax.softbody.terms.term import Numbers, Term
 from dln_jax.types import InputError
 
 GRAVITY = 9.81
@@ -58,7 +58,7 @@ def beam(
     held: ArrayLike | None = None,
     dimension: int = 2,
     cells: int = 4,
-    youngs_modulus: float = 2e6,
+    youngs_modulus: Numbers = 2e6,
     poisson_ratio: float = 0.3,
     strain_energy: StrainEnergy = stable_neo_hookean,
 ) -> Example:
@@ -128,7 +128,7 @@ def drop(
     dimension: int = 2,
     cells: int = 5,
     friction: float = 0.5,
-    youngs_modulus: float = 3e5,
+    youngs_modulus: Numbers = 3e5,
     poisson_ratio: float = 0.3,
     strain_energy: StrainEnergy = stable_neo_hookean,
     seed: int = 0,
@@ -180,7 +180,7 @@ EXAMPLES: dict[str, Callable[..., Example]] = {scene.__name__: scene for scene i
 """Examples by name; their keyword arguments are their options."""
 
 
-def _solid(mesh: Mesh, law: tuple[StrainEnergy, float, float], *others: Term, held: ArrayLike = ()) -> SoftScene:
+def _solid(mesh: Mesh, law: tuple[StrainEnergy, Numbers, float], *others: Term, held: ArrayLike = ()) -> SoftScene:
     """Returns the scene of an elastic body from its strain energy, E and nu, and its other terms."""
     material = elastic(mesh, law[0], youngs_modulus=law[1], poisson_ratio=law[2])
     return make_scene(mesh, [material, *others], density=DENSITY, held=held)

@@ -15,7 +15,6 @@ import numpy as np
 from dln_jax.cli.arguments import resolved
 from dln_jax.cli.progress import progress
 from dln_jax.cli.stored_arguments import stored_arguments
-from dln_jax.data import meshes
 from dln_jax.figures.soft_bodies import Moments, moments_figure
 from dln_jax.files import write_figure, write_json
 from dln_jax.metrics.report import conditions, write_report
@@ -24,13 +23,15 @@ from dln_jax.rollout import rollout
 from dln_jax.sizes import require_memory, require_within
 from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
+from dln_jax.softbody.mesh.files import require_meshio, write_motion
 from dln_jax.softbody.mesh.mesh import components, overlaps
 from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import INTEGRATORS, Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.verdict import Info
 from dln_jax.training.results import print_numbers
-from dln_jax.training.simulation_results import SimulatedMotion, draw, line, results, warn
+from dln_jax.training.simulation_meshes import listed, own_mesh
+from dln_jax.training.simulation_results import SimulatedMotion, draw, finite_moments, line, results, stride, warn
 from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
@@ -57,6 +58,8 @@ class PreparedScene(NamedTuple):
     dt: float
     """Time step, s."""
     steps: int
+    statements: tuple[str, ...]
+    """What the reader of the mesh left out or repaired."""
 
 
 def simulate_all(options: Any) -> None:
@@ -79,7 +82,9 @@ def simulate_all(options: Any) -> None:
 
 def prepare(options: Any) -> PreparedScene:
     """Builds the scene and its stepper; checks the whole command line before anything is written."""
-    example = example_of(options)
+    example, statements = example_of(options)
+    if options.vtu:
+        require_meshio("--vtu")
     dt, seconds = resolved(options, {"dt": example.dt, "seconds": example.seconds}).values()
     require_positive(dt=dt, seconds=seconds)
     if not dt <= seconds < math.inf:
@@ -89,12 +94,12 @@ def prepare(options: Any) -> PreparedScene:
     # Positions and velocities of every step in float64, held twice while chunks are concatenated.
     require_memory(f"a motion of {steps:,} steps", 32.0 * steps * example.scene.mesh.vertices.size)
     stepper = driven_step(example, dt, INTEGRATORS[options.integrator])
-    return PreparedScene(options, example, stepper, dt, steps)
+    return PreparedScene(options, example, stepper, dt, steps, statements)
 
 
 def simulate(prepared: PreparedScene, folder: Path) -> Moments:
     """Simulates one scene, writes its folder and returns its picture."""
-    options, example, _, dt, steps = prepared
+    options, example, _, dt, steps, statements = prepared
     write_json(folder / CONFIG, {**stored_arguments(options), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh
     pieces, size = int(components(mesh).max()) + 1, np.ptp(mesh.vertices, axis=0)
@@ -103,6 +108,10 @@ def simulate(prepared: PreparedScene, folder: Path) -> Moments:
         f"component{'s' * (pieces > 1)}, {' x '.join(f'{length:.4g}' for length in size)} m, "
         f"{int(example.scene.free.sum())} unknowns; {options.integrator}, dt {dt:.4g} s, {options.precision}"
     )
+    for statement in statements:
+        print(statement)
+    if mesh.sets:
+        print(f"named sets: {listed(mesh)}")
     if pieces > 1:
         loose = "no two elements share a vertex" if pieces == len(mesh.elements) else f"{pieces} parts share no vertex"
         print(
@@ -112,7 +121,7 @@ def simulate(prepared: PreparedScene, folder: Path) -> Moments:
     if size.max() > LARGEST_SIZE:
         print(
             f"warning: the body is {size.max():.4g} m long; expected lengths in metres: if the mesh is in millimetres, "
-            "divide its vertices by 1000"
+            "add --scale 0.001"
         )
     if mesh.turned:
         print(f"{mesh.turned} of {len(mesh.elements)} elements were inverted and have been turned")
@@ -126,12 +135,17 @@ def simulate(prepared: PreparedScene, folder: Path) -> Moments:
     write_report(folder / "report.json", rows, facts)
     print_numbers(map(line, rows))
     warn(motion)
+    if options.vtu:
+        shown = slice(finite_moments(motion))
+        write_motion(
+            folder / "motion.pvd", mesh, motion.t[shown], motion.x[shown], motion.v[shown], stride=stride(motion)
+        )
     title = f"{options.scene}: {options.integrator}, dt = {dt:.4g} s"
     return draw(options.scene, example, motion, folder, title=title, figures=options.figures)
 
 
-def example_of(options: Any) -> Example:
-    """Builds the scene with the options set on the command line.
+def example_of(options: Any) -> tuple[Example, tuple[str, ...]]:
+    """Builds the scene with the options set on the command line; also returns statements about the mesh of a file.
 
     Raises:
         InputError: an option that the scene does not have, options that exclude each other, or an invalid value.
@@ -142,26 +156,24 @@ def example_of(options: Any) -> Example:
     choices["strain_energy"] = None if options.material is None else MATERIALS[options.material]
     choices = {name: value for name, value in choices.items() if value is not None}
     known = inspect.signature(scene).parameters
+    if options.pin is not None and "held" not in known:
+        raise InputError(f"the {options.scene} scene has no --pin; leave it out")
     for name in choices:
         if name not in known:
             option = "material" if name == "strain_energy" else name.replace("_", "-")
             raise InputError(f"the {options.scene} scene has no --{option}; leave it out")
-    if options.mesh is not None:
-        if beside := [name for name in ("cells", "dimension") if name in choices]:
-            raise InputError(f"--{beside[0]} sets the scene's own mesh; leave out either it or --mesh")
-        try:
-            choices["mesh"], held = meshes.load(options.mesh)
-        except InputError as error:
-            raise InputError(f"--mesh {error}") from None
-        if held is not None and "held" in known:
-            choices["held"] = held
+    if options.mesh is not None and (beside := [name for name in ("cells", "dimension") if name in choices]):
+        raise InputError(f"--{beside[0]} sets the scene's own mesh; leave out either it or --mesh")
+    modulus = choices.get("youngs_modulus", getattr(known.get("youngs_modulus"), "default", 0.0))
+    from_file, statements = own_mesh(options, modulus)
+    choices |= {name: value for name, value in from_file.items() if name in known}
     if options.seed < 0:
         raise InputError(f"--seed is {options.seed}; expected 0 or a positive integer")
     if "seed" in known:
         choices["seed"] = options.seed
     example = scene(**choices)
     params = in_precision(example.scene.params, data_type(options.precision))
-    return example._replace(scene=example.scene._replace(params=params))
+    return example._replace(scene=example.scene._replace(params=params)), statements
 
 
 def in_precision(tree: Any, precision: Any) -> Any:
@@ -171,7 +183,7 @@ def in_precision(tree: Any, precision: Any) -> Any:
 
 def run_motion(prepared: PreparedScene) -> SimulatedMotion:
     """Runs the motion in chunks of one compiled program; times compilation separately and waits for the results."""
-    options, example, (init, step), dt, steps = prepared
+    options, example, (init, step), dt, steps, _ = prepared
     count = max(1, steps // CHUNKS)
     params = example.scene.params
     start = state = in_precision(init(), data_type(options.precision))

@@ -109,6 +109,11 @@ def finite_moments(motion: SimulatedMotion) -> int:
     return int(np.argmax(bad)) if bad.any() else len(bad)
 
 
+def stride(motion: SimulatedMotion) -> int:
+    """Steps per frame of the GIF, and per file for ParaView."""
+    return max(round(1 / (FRAMES_PER_SECOND * motion.t[1])), math.ceil(finite_moments(motion) / MOST_FRAMES), 1)
+
+
 def draw(scene: str, example: Example, motion: SimulatedMotion, folder: Path, *, title: str, figures: bool) -> Moments:
     """Writes the figures and the GIF; returns the moments drawn."""
     shown = finite_moments(motion)
@@ -126,7 +131,7 @@ def draw(scene: str, example: Example, motion: SimulatedMotion, folder: Path, *,
     figure = energies_against_time(t, energies, taken=what_takes(example), title=title)
     write_figure(folder / "energy.png", figure)
     write_figure(folder / "moments.png", moments_figure([picture], columns=1))
-    stride = max(round(1 / (FRAMES_PER_SECOND * dt)), math.ceil(shown / MOST_FRAMES), 1)
+    every = stride(motion)
     write_soft_body_gif(
         folder / "motion.gif",
         example.scene.mesh,
@@ -137,8 +142,8 @@ def draw(scene: str, example: Example, motion: SimulatedMotion, folder: Path, *,
         ground=None if example.ground is None else 0.0,
         slope=example.ground or 0.0,
         title=scene,
-        stride=stride,
-        frames_per_second=max(1 / (stride * dt), 1.0),
+        stride=every,
+        frames_per_second=max(1 / (every * dt), 1.0),
     )
     return picture
 

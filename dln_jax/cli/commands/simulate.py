@@ -4,9 +4,11 @@ Prints the speed and how well the steps were solved, and writes a run folder: mo
 time, which show what the implicit step damps), moments.png, metrics.json, report.json and config.json. Bodies have
 1000 kg/m³; in the plane they are 1 m thick.
 
-Your own mesh: --mesh FILE.npz for the scenes beam and drop, with `vertices` [n, 2 or 3] in m, the last axis up,
-`elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the beam, optionally `held` [k] (vertices;
-by default those of the smallest x). The command reorients inverted elements and prints their number.
+Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1) and,
+with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra are a body in space, triangles in a plane z = const
+one in the plane; physical groups are named sets, which --pin holds. The command prints what it left out or repaired. An
+.npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the beam,
+optionally `held` [k] (vertices; by default those of the smallest x).
 """
 
 from dataclasses import dataclass
@@ -45,6 +47,14 @@ class Arguments(Folder, Drawn):
     """Not for the creature (default: stable-neo-hookean)."""
     mesh: Unstated[Path] = None
     """beam, drop: your own mesh, as described above."""
+    scale: Unstated[float] = None
+    """--mesh: length of the file's unit in m, such as 0.001 for millimetres (default: 1)."""
+    pin: Unstated[str] = None
+    """beam with --mesh: named sets that are held, separated by commas."""
+    youngs_modulus_of: Unstated[str] = None
+    """--mesh: E in Pa of named sets of elements, as tip=1e6,core=5e6."""
+    vtu: bool = False
+    """Also write motion.pvd and its .vtu files, for ParaView (extra [mesh])."""
     precision: Literal["f32", "f64"] = "f64"
     """Floating-point type."""
     seed: int = 0

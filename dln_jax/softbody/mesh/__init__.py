@@ -1,7 +1,9 @@
 """Meshes of simplices: generation, validation and measurement."""
 
+from dln_jax.softbody.mesh.files import read_mesh, write_mesh, write_motion
 from dln_jax.softbody.mesh.mesh import (
     Mesh,
+    NamedSet,
     boundary,
     boundary_vertices,
     edges,
@@ -11,6 +13,7 @@ from dln_jax.softbody.mesh.mesh import (
     vertices_where,
     volumes,
 )
+from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
 from dln_jax.softbody.mesh.shapes import (
     Creature,
     beam,
@@ -27,6 +30,7 @@ from dln_jax.softbody.mesh.simplices import simplex_volumes
 __all__ = [
     "Creature",
     "Mesh",
+    "NamedSet",
     "beam",
     "biped",
     "body_length",
@@ -41,7 +45,12 @@ __all__ = [
     "make_mesh",
     "overlaps",
     "quadruped",
+    "read_mesh",
     "simplex_volumes",
+    "values_by_set",
+    "vertices_in",
     "vertices_where",
     "volumes",
+    "write_mesh",
+    "write_motion",
 ]

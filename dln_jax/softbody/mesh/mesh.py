@@ -5,7 +5,8 @@ areas in m² count as volumes in m³. `mesh/simplices.py` has volumes that are d
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,15 @@ FLAT = 1e-12
 WORDS = {2: ("triangle", "area"), 3: ("tetrahedron", "volume")}
 
 
+class NamedSet(NamedTuple):
+    """Part of a body with a name, such as a physical group of Gmsh."""
+
+    vertices: Int[np.ndarray, " k"]
+    """In ascending order."""
+    elements: Int[np.ndarray, " j"]
+    """In ascending order; none if the set is a surface, a curve or points."""
+
+
 class Mesh(NamedTuple):
     """Vertices and simplices of a body; `make_mesh` validates them."""
 
@@ -31,6 +41,8 @@ class Mesh(NamedTuple):
     """Corners of the triangles (dim 2) or tetrahedra (dim 3), positively oriented."""
     turned: int = 0
     """Number of inverted elements (clockwise, in the plane) that `make_mesh` has reoriented."""
+    sets: Mapping[str, NamedSet] = MappingProxyType({})
+    """Named parts, from a mesh file."""
 
     @property
     def dimension(self) -> int:

@@ -1,0 +1,216 @@
+"""Reads .msh files of Gmsh, versions 2.2 and 4.1, ASCII and binary, with all their physical groups.
+
+The format is described in https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format. meshio 5 refuses files in which some
+elements belong to no physical group (`Mesh.SaveAll`) and nodes with parametric coordinates, and keeps one group of an
+element that is in several; this reader takes all of them.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.softbody.mesh.solids import DIMENSIONS, FileMesh, base
+from dln_jax.types import InputError
+
+Take = Callable[[str, Any], np.ndarray]
+"""(type, count) -> the next numbers of a section."""
+
+KINDS = {
+    **{1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8), 6: ("wedge", 6)},
+    **{7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 10: ("quad9", 9), 11: ("tetra10", 10)},
+    **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
+    **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13), 21: ("triangle10", 10)},
+    **{23: ("triangle15", 15), 25: ("triangle21", 21), 26: ("line4", 4), 27: ("line5", 5), 28: ("line6", 6)},
+    **{29: ("tetra20", 20), 30: ("tetra35", 35), 31: ("tetra56", 56), 36: ("quad16", 16), 37: ("quad25", 25)},
+}
+"""Kind of cell and number of nodes by Gmsh's number; corners come first in all of them."""
+GEOMETRY = ("point", "curve", "surface", "volume")
+"""Physical groups without a name are called by these and their number, such as surface-3."""
+
+
+class _Block(NamedTuple):
+    """Cells of one kind that are in the same physical groups."""
+
+    kind: str
+    nodes: np.ndarray
+    groups: tuple[str, ...]
+
+
+def read_gmsh(data: bytes) -> FileMesh:
+    """Reads the content of a .msh file.
+
+    Raises:
+        InputError: another version, a partitioned mesh, an unknown kind of element, or a section that is cut off.
+        ValueError: the numbers of a section do not fit its header.
+    """
+    sections = dict(_sections(data))
+    form = sections.get("MeshFormat", b"").split(maxsplit=3)
+    if len(form) < 3 or (version := form[0].decode(errors="replace")) not in ("2", "2.2", "4.1"):
+        found_version = "no version" if len(form) < 3 else f"version {form[0].decode(errors='replace'):.10}"
+        raise InputError(f"{found_version} of the MSH format; expected 2.2 or 4.1: save it by gmsh -format msh41")
+    if "PartitionedEntities" in sections:
+        raise InputError("a partitioned mesh; save it without partitions")
+    if missing := [name for name in ("Nodes", "Elements") if name not in sections]:
+        raise InputError(f"it has no section ${missing[0]}; mesh the model and save it again")
+    binary = form[1] == b"1"
+    order = ">" if binary and form[3][:4] == b"\0\0\0\1" else "<"
+    types = {"i": f"{order}i4", "d": f"{order}f8", "n": f"{order}u{int(form[2])}"}
+    names = {
+        (int(dimension), int(tag)): name.decode(errors="replace")
+        for dimension, tag, name in re.findall(rb'(\d+)\s+(\d+)\s+"(.*)"', sections.get("PhysicalNames", b""))
+    }
+
+    def reader(name: str) -> Take:
+        return _binary(sections[name], types) if binary else _ascii(sections[name])
+
+    if version == "4.1":
+        tags, points = _nodes(reader("Nodes"))
+        blocks = list(_elements(reader("Elements"), _groups(reader, sections, names)))
+    else:
+        tags, points = _nodes_2(sections["Nodes"], binary, order)
+        blocks = list(_elements_2(sections["Elements"], binary, types, names))
+    return _gathered(tags, points, blocks)
+
+
+def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block]) -> FileMesh:
+    """Joins the blocks of a kind, and numbers nodes by their place in the file instead of their tags."""
+    order = np.argsort(tags, kind="stable")
+    cells: dict[str, np.ndarray] = {}
+    sets: dict[str, dict[str, list[np.ndarray]]] = {}
+    for kind in dict.fromkeys(block.kind for block in blocks):
+        own = [block for block in blocks if block.kind == kind]
+        nodes = np.concatenate([block.nodes for block in own]).astype(np.int64)
+        place = np.searchsorted(tags[order], nodes).clip(max=len(tags) - 1)
+        if len(unknown := np.argwhere(tags[order][place] != nodes)):
+            raise InputError(
+                f"{kind} {unknown[0][0]} has node {nodes[tuple(unknown[0])]}, which the file does not list"
+            )
+        cells[kind], start = order[place], 0
+        for block in own:
+            for name in block.groups:
+                sets.setdefault(name, {}).setdefault(kind, []).append(start + np.arange(len(block.nodes)))
+            start += len(block.nodes)
+    joined = {name: {kind: np.concatenate(parts) for kind, parts in kinds.items()} for name, kinds in sets.items()}
+    return FileMesh(points, cells, {}, joined)
+
+
+def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the sections between $Name and $EndName."""
+    at = 0
+    while (start := data.find(b"$", at)) >= 0:
+        content = data.find(b"\n", start) + 1 or len(data)
+        name = data[start + 1 : content].strip()
+        end = data.find(b"$End" + name, content)
+        if end < 0:
+            raise InputError(f"section ${name.decode(errors='replace'):.40} does not end; the file is cut off")
+        yield name.decode(errors="replace"), data[content:end]
+        at = end + len(name) + 4
+
+
+def _ascii(section: bytes) -> Take:
+    numbers, at = np.array(section.split(), dtype=bytes).astype(np.float64), 0
+
+    def take(kind: str, count: Any) -> np.ndarray:
+        nonlocal at
+        part, at = numbers[at : at + int(count)], at + int(count)
+        if len(part) < count:
+            raise ValueError("a section has fewer numbers than its header states")
+        return part if kind == "d" else part.astype(np.int64)
+
+    return take
+
+
+def _binary(section: bytes, types: dict[str, str]) -> Take:
+    at = 0
+
+    def take(kind: str, count: Any) -> np.ndarray:
+        nonlocal at
+        part = np.frombuffer(section, types[kind], int(count), at)
+        at += part.nbytes
+        return part if kind == "d" else part.astype(np.int64)
+
+    return take
+
+
+def _groups(
+    reader: Callable[[str], Take], sections: dict[str, bytes], names: dict[tuple[int, int], str]
+) -> dict[tuple[int, int], tuple[str, ...]]:
+    """Physical groups by dimension and tag of the entities; files without entities have no groups."""
+    groups: dict[tuple[int, int], tuple[str, ...]] = {}
+    if "Entities" not in sections:
+        return groups
+    take = reader("Entities")
+    for dimension, count in enumerate(take("n", 4)):
+        for _ in range(count):
+            tag = int(take("i", 1)[0])
+            take("d", 6 if dimension else 3)  # bounding box
+            physical = take("i", take("n", 1)[0])
+            groups[dimension, tag] = tuple(_name(names, dimension, abs(int(group))) for group in physical)
+            if dimension:
+                take("i", take("n", 1)[0])  # entities of its boundary
+    return groups
+
+
+def _nodes(take: Take) -> tuple[np.ndarray, np.ndarray]:
+    """Tags and positions of the nodes, version 4.1."""
+    tags, points = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+    for _ in range(take("n", 4)[0]):
+        dimension, _, parametric = take("i", 3)
+        count = take("n", 1)[0]
+        tags.append(take("n", count))
+        points.append(take("d", count * (columns := 3 + dimension * bool(parametric))).reshape(count, columns)[:, :3])
+    return np.concatenate(tags), np.concatenate(points)
+
+
+def _elements(take: Take, groups: dict[tuple[int, int], tuple[str, ...]]) -> Iterator[_Block]:
+    """Elements of version 4.1, whose groups are those of their entity."""
+    for _ in range(take("n", 4)[0]):
+        dimension, tag, number = take("i", 3)
+        kind, nodes = _kind(number)
+        count = take("n", 1)[0]
+        rows = take("n", count * (1 + nodes)).reshape(count, 1 + nodes)
+        yield _Block(kind, rows[:, 1:], groups.get((int(dimension), int(tag)), ()))
+
+
+def _nodes_2(section: bytes, binary: bool, order: str) -> tuple[np.ndarray, np.ndarray]:
+    """Tags and positions of the nodes, version 2.2."""
+    count, _, content = section.partition(b"\n")
+    if binary:
+        rows = np.frombuffer(content, [("tag", f"{order}i4"), ("x", f"{order}f8", 3)], int(count))
+        return rows["tag"].astype(np.int64), rows["x"].astype(np.float64)
+    table = _ascii(content)("d", 4 * int(count)).reshape(-1, 4)
+    return table[:, 0].astype(np.int64), table[:, 1:]
+
+
+def _elements_2(
+    section: bytes, binary: bool, types: dict[str, str], names: dict[tuple[int, int], str]
+) -> Iterator[_Block]:
+    """Elements of version 2.2: an element's first tag is its group, and it is listed once in every group."""
+    count, _, content = section.partition(b"\n")
+    take = _binary(content, types) if binary else _ascii(content)
+    tables: dict[tuple[int, int], list[np.ndarray]] = {}
+    read = 0
+    while read < int(count):
+        # ASCII states kind and number of tags for every element (number, kind, tags), binary for a block of them.
+        number, block, tags = map(int, take("i", 3)[slice(None) if binary else [1, 0, 2]])
+        columns, block = int(binary) + tags + _kind(number)[1], block if binary else 1
+        tables.setdefault((number, tags), []).append(take("i", block * columns).reshape(block, columns))
+        read += max(block, 1)
+    for (number, tags), parts in tables.items():
+        table, kind = np.concatenate(parts)[:, int(binary) :], _kind(number)[0]
+        groups = table[:, 0] if tags else np.zeros(len(table), np.int64)
+        for group in np.unique(groups).tolist():
+            name = (_name(names, DIMENSIONS[base(kind)], group),) if group else ()
+            yield _Block(kind, table[groups == group][:, tags:], name)
+
+
+def _kind(number: Any) -> tuple[str, int]:
+    if (kind := KINDS.get(int(number))) is None:
+        raise InputError(f"it has elements of Gmsh's type {number}; expected linear triangles or tetrahedra")
+    return kind
+
+
+def _name(names: dict[tuple[int, int], str], dimension: int, tag: int) -> str:
+    return names.get((dimension, tag), f"{GEOMETRY[dimension]}-{tag}")

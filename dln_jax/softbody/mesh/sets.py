@@ -1,0 +1,41 @@
+"""Named sets of a mesh: held vertices and materials by the names of parts."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dln_jax.softbody.mesh.mesh import WORDS, Mesh, NamedSet
+from dln_jax.types import InputError
+
+
+def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
+    """Vertices that are in any of these sets, in ascending order, as for `held`.
+
+    Raises:
+        InputError: a set that does not exist; the message lists those that do.
+    """
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *(_named(mesh, name).vertices for name in names)]))
+
+
+def values_by_set(mesh: Mesh, default: float, values: Mapping[str, float]) -> Float[np.ndarray, " m"]:
+    """One value per element, such as Young's modulus: that of its set or, outside of these sets, the default.
+
+    An element in several of these sets gets the value of the last one.
+
+    Raises:
+        InputError: a set that does not exist, or has no elements.
+    """
+    result = np.full(len(mesh.elements), float(default))
+    for name, value in values.items():
+        if not len(elements := _named(mesh, name).elements):
+            raise InputError(f"the set '{name}' has no elements; expected a set of {WORDS[mesh.dimension][0]} elements")
+        result[elements] = value
+    return result
+
+
+def _named(mesh: Mesh, name: str) -> NamedSet:
+    if name not in mesh.sets:
+        known = f"the sets are {', '.join(sorted(mesh.sets))}" if mesh.sets else "it has no named sets"
+        raise InputError(f"the mesh has no set '{name}'; {known}")
+    return mesh.sets[name]

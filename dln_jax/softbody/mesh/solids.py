@@ -1,0 +1,202 @@
+"""From the content of a mesh file to a body: selects its triangles or tetrahedra, repairs them, and keeps named sets.
+
+Every change is stated. A set of surfaces, curves or points becomes a set of vertices; one of the body's own elements
+becomes a set of elements and of their corners.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from dln_jax.softbody.mesh.mesh import FLAT, WORDS, Mesh, NamedSet, make_mesh
+from dln_jax.softbody.mesh.simplices import regularity
+from dln_jax.types import InputError, require_positive
+
+MERGE = 1e-7
+"""Vertices closer than this fraction of the largest extent are merged; single precision rounds to 6e-8."""
+CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
+"""Number of corners of cells that a body may have beside its elements; these nodes come first in all formats."""
+DIMENSIONS = {
+    "vertex": 0,
+    "line": 1,
+    "triangle": 2,
+    "quad": 2,
+    "polygon": 2,
+    "tetra": 3,
+    "hexahedron": 3,
+    "wedge": 3,
+    "pyramid": 3,
+}
+ELEMENTS = {2: "triangle", 3: "tetra"}
+
+
+class FileMesh(NamedTuple):
+    """The content of a mesh file, before anything is selected or repaired."""
+
+    points: Float[np.ndarray, "n 3"]
+    cells: dict[str, Int[np.ndarray, "m k"]]
+    """Nodes of the cells by kind, in meshio's names: triangle, tetra10, ..."""
+    vertex_sets: dict[str, Int[np.ndarray, " k"]]
+    cell_sets: dict[str, dict[str, Int[np.ndarray, " k"]]]
+    """Indices of cells by name of the set and kind of cell."""
+
+
+class ReadMesh(NamedTuple):
+    """A body from a mesh file."""
+
+    mesh: Mesh
+    statements: tuple[str, ...]
+    """What was left out, simplified or repaired, in sentences. `Mesh.turned` counts reoriented elements."""
+
+
+def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -> ReadMesh:
+    """Builds the body in a mesh file.
+
+    The body is its tetrahedra or, without any, its triangles in a plane z = const. Cells of higher order are reduced to
+    their corners. Vertices closer than `merge` times the largest extent become one; loose vertices and repeated
+    elements are removed.
+
+    Args:
+        content: of the file.
+        scale: length of the file's unit in m, such as 0.001 for millimetres.
+        merge: fraction of the largest extent; 0 merges nothing.
+
+    Raises:
+        InputError: a surface without volume, hexahedra or other cells that are no simplices, an element without
+            volume, or positions that are not finite.
+    """
+    require_positive(scale=scale)
+    of_dimension = {
+        d: {kind: nodes for kind, nodes in content.cells.items() if DIMENSIONS.get(base(kind), 3) == d and len(nodes)}
+        for d in (2, 3)
+    }
+    if not any(of_dimension.values()):
+        raise InputError("it has no triangles or tetrahedra; mesh the body, and save its elements")
+    dimension = 3 if of_dimension[3] else 2
+    points = scale * content.points
+    if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
+        raise InputError(f"vertex {bad[0]} is at {points[bad[0]].tolist()}; expected finite numbers")
+    for kind, nodes in content.cells.items():
+        if len(bad := np.argwhere((nodes < 0) | (nodes >= len(points)))):
+            vertex = nodes[tuple(bad[0])]
+            raise InputError(f"{kind} {bad[0][0]} has vertex {vertex}; expected 0 to {len(points) - 1}")
+    if dimension == 2:
+        points = _in_plane(points, np.concatenate([nodes.ravel() for nodes in of_dimension[2].values()]))
+    for kind, nodes in of_dimension[dimension].items():
+        if base(kind) != ELEMENTS[dimension]:
+            simplices = _plural(ELEMENTS[dimension])
+            raise InputError(f"it has {len(nodes)} {_plural(base(kind))}; mesh the body with {simplices} only")
+    cells, cell_sets, statements = _corners(content, ELEMENTS[dimension])
+    elements = cells.pop(ELEMENTS[dimension])
+    if others := [f"{len(nodes)} {_plural(kind)}" for kind, nodes in cells.items() if len(nodes)]:
+        kept = f"{len(elements)} {_plural(ELEMENTS[dimension])}"
+        statements.append(f"the body is its {kept}; {', '.join(others)} are left out, and name vertices only")
+    sets = {name: (vertices, np.zeros(0, np.int64)) for name, vertices in content.vertex_sets.items()}
+    for name, members in cell_sets.items():
+        own = members.pop(ELEMENTS[dimension], np.zeros(0, np.int64))
+        corners = [elements[own].ravel(), *(cells[kind][indices].ravel() for kind, indices in members.items())]
+        sets[name] = np.concatenate([*(sets[name][:1] if name in sets else ()), *corners]), own
+    return _repaired(points, elements, sets, merge, statements)
+
+
+def base(kind: str) -> str:
+    """The kind of cell of first order: triangle for triangle6."""
+    return kind.rstrip("0123456789")
+
+
+def _plural(kind: str) -> str:
+    return {"vertex": "points", "tetra": "tetrahedra", "hexahedron": "hexahedra"}.get(kind, f"{kind}s")
+
+
+def _corners(
+    content: FileMesh, element: str
+) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]], list[str]]:
+    """Corners of the cells by kind of first order, the sets of these cells, and a statement about curved elements."""
+    cells: dict[str, np.ndarray] = {}
+    sets: dict[str, dict[str, np.ndarray]] = {name: {} for name in content.cell_sets}
+    curved = 0
+    for kind, nodes in content.cells.items():
+        first, corners = base(kind), nodes[:, : CORNERS.get(base(kind))]
+        start = len(cells.get(first, ()))
+        cells[first] = np.concatenate([cells[first], corners]) if start else corners
+        curved += len(nodes) * (kind != first == element)
+        for name, members in content.cell_sets.items():
+            if kind in members:
+                before = sets[name].get(first, np.zeros(0, np.int64))
+                sets[name][first] = np.concatenate([before, start + members[kind]])
+    text = f"{curved} elements of higher order are reduced to their corners, which makes their edges straight"
+    return cells, sets, [text] * bool(curved)
+
+
+def _in_plane(points: Float[np.ndarray, "n 3"], corners: Int[np.ndarray, " k"]) -> Float[np.ndarray, "n 2"]:
+    """The x and y of points if these corners lie in a plane z = const."""
+    extents = np.ptp(points[corners], axis=0)
+    flat = np.flatnonzero(extents <= MERGE * extents.max())
+    if 2 in flat:
+        return points[:, :2]
+    if flat.size:
+        raise InputError(f"it lies in a plane {'xyz'[flat[0]]} = const; turn it into z = const, with y upwards")
+    raise InputError(
+        "it is a surface without volume; fill it with tetrahedra first, for example by Gmsh, TetGen or fTetWild"
+    )
+
+
+def _repaired(
+    points: Float[np.ndarray, "n dim"],
+    elements: Int[np.ndarray, "m corners"],
+    sets: dict[str, tuple[np.ndarray, np.ndarray]],
+    merge: float,
+    statements: list[str],
+) -> ReadMesh:
+    """Merges and removes vertices and elements, renumbers the sets, and states what was done."""
+    extent = float(np.ptp(points[elements.ravel()], axis=0).max())
+    same = _first_of_same(points, merge * extent)
+    shape = regularity(points[same], elements)
+    if len(bad := np.flatnonzero(np.abs(shape) <= FLAT)):
+        kind, measure = WORDS[points.shape[1]]
+        where = np.round(points[elements[bad[0]]].mean(axis=0), 9).tolist()
+        raise InputError(
+            f"{kind} {bad[0]} of {len(elements)} (near {where} m) has no {measure} once vertices closer than "
+            f"{merge * extent:.1e} m are merged; repair the mesh ({len(bad)} of this kind)"
+        )
+    merged = same[elements]
+    _, first, new_element = np.unique(np.sort(merged, axis=1), axis=0, return_index=True, return_inverse=True)
+    # Elements stay in the order of the file.
+    rank = np.argsort(np.argsort(first))
+    kept, new_element = merged[np.sort(first)], rank[new_element.reshape(-1)]
+    used, corners = np.unique(kept, return_inverse=True)
+    loose = len(np.unique(same)) - len(used)
+    counts = (
+        (
+            len(points) - len(np.unique(same)),
+            f"duplicate vertices are merged (closer than {merge:.0e} of the extent, {merge * extent:.1e} m)",
+        ),
+        (loose, "loose vertices, which belong to no element, are removed"),
+        (len(elements) - len(kept), "elements are listed more than once and count once"),
+    )
+    statements += [f"{count} {what}" for count, what in counts if count]
+    new_vertex = np.full(len(points), -1)
+    new_vertex[used] = np.arange(len(used))
+    named = {}
+    for name, (vertices, own) in sets.items():
+        members = np.unique(new_vertex[same[vertices]])
+        if len(members := members[members >= 0]):
+            named[name] = NamedSet(members, np.unique(new_element[own]))
+        else:
+            statements.append(f"the set '{name}' has no vertex of the body and is left out")
+    mesh = make_mesh(points[used], corners.reshape(kept.shape))
+    return ReadMesh(mesh._replace(sets=named), tuple(statements))
+
+
+def _first_of_same(points: Float[np.ndarray, "n dim"], distance: float) -> Int[np.ndarray, " n"]:
+    """The smallest index among the points that are closer than this to each other."""
+    if not distance > 0:
+        return np.arange(len(points))
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    _, labels = connected_components(graph, directed=False)
+    return np.unique(labels, return_index=True)[1][labels]
