@@ -28,7 +28,9 @@ def own_mesh(options: Any, youngs_modulus: float) -> tuple[dict[str, Any], tuple
     try:
         mesh, held, statements = meshes.load(options.mesh, 1.0 if options.scale is None else options.scale)
         if options.pin is not None:
-            held = vertices_in(mesh, names_listed(options.pin))
+            if not (names := names_listed(options.pin)):
+                raise InputError("--pin names no set; name one, or leave it out")
+            held = vertices_in(mesh, names)
         choices = {"mesh": mesh, "held": held}
         if options.youngs_modulus_of is not None:
             choices["youngs_modulus"] = values_by_set(mesh, youngs_modulus, _moduli(options.youngs_modulus_of))

@@ -4,11 +4,11 @@ Prints the speed and how well the steps were solved, and writes a run folder: mo
 time, which show what the implicit step damps), moments.png, metrics.json, report.json and config.json. Bodies have
 1000 kg/m³; in the plane they are 1 m thick.
 
-Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1) and,
-with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra are a body in space, triangles in a plane z = const
-one in the plane; physical groups are named sets, which --pin holds. The command prints what it left out or repaired. An
-.npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the beam,
-optionally `held` [k] (vertices; by default those of the smallest x).
+Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1)
+and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra are a body in space, triangles in a plane
+z = const one in the plane; physical groups are named sets, which --pin holds. The command prints what it left out or
+repaired. An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0)
+and, for the beam, optionally `held` [k] (vertices; by default those of the smallest x).
 """
 
 from dataclasses import dataclass

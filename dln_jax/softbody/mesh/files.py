@@ -8,6 +8,7 @@ conversion of its sets, whose names are joined by hyphens.
 import contextlib
 import importlib
 import io
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def write_mesh(
         name: _flags(n, part.vertices)
         for name, part in mesh.sets.items()
         # The corners of its elements follow from them.
-        if not np.array_equal(part.vertices, np.unique(mesh.elements[part.elements]))
+        if not len(part.elements) or not np.array_equal(part.vertices, np.unique(mesh.elements[part.elements]))
     }
     elements = {name: _flags(m, part.elements) for name, part in mesh.sets.items() if len(part.elements)}
     vertices |= {name: _in_space(values) for name, values in (vertex_data or {}).items()}
@@ -145,6 +146,8 @@ def require_meshio(purpose: str) -> Any:
 def _read_gmsh(path: Path) -> FileMesh:
     try:
         return read_gmsh(path.read_bytes())
+    except InputError:
+        raise
     except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"not a readable .msh file ({error}); save it again") from None
 
@@ -182,8 +185,8 @@ def _sets(key: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Names and members of the sets in an array of a VTK file; none if it holds no integers."""
     if values.dtype.kind not in "iu" or values.ndim != 1 or not len(values):
         return
-    numbers, names = np.unique(values), key.split("-")
-    flags = set(numbers.tolist()) <= {0, 1}
+    numbers, names = np.unique(values), _joined_names(key)
+    flags = set(numbers.tolist()) <= {0, 1} and (values.dtype.itemsize == 1 or 1 in numbers)
     joined = numbers[0] >= -1 and numbers[-1] < len(names) and (len(names) > 1 or numbers[0] < 0)
     if flags and (values.dtype.itemsize == 1 or not joined):
         yield key, values == 1
@@ -191,6 +194,14 @@ def _sets(key: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
         yield from ((name, values == number) for number, name in enumerate(names))
     elif len(numbers) <= MOST_REGIONS:
         yield from ((f"{key}-{number}", values == number) for number in numbers)
+
+
+def _joined_names(key: str) -> list[str]:
+    """Names of meshio's sets from the name of their array: joined by hyphens or, for points, by the joined names."""
+    parts = key.split("-")
+    count = math.isqrt(len(parts) - 1) + 1
+    names = [parts[0][: len(parts[0]) // 2], *parts[1 : count - 1], parts[-1][: len(parts[-1]) // 2]]
+    return names if "-".join(names).join(names) == key else parts
 
 
 def _flags(count: int, members: np.ndarray) -> np.ndarray:

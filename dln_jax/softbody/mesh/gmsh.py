@@ -71,14 +71,17 @@ def read_gmsh(data: bytes) -> FileMesh:
     else:
         tags, points = _nodes_2(sections["Nodes"], binary, order)
         blocks = list(_elements_2(sections["Elements"], binary, types, names))
-    return _gathered(tags, points, blocks)
+    return _gathered(tags, points, blocks, list(names.values()))
 
 
-def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block]) -> FileMesh:
-    """Joins the blocks of a kind, and numbers nodes by their place in the file instead of their tags."""
+def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block], names: list[str]) -> FileMesh:
+    """Joins the blocks of a kind, and numbers nodes by their place in the file instead of their tags.
+
+    A named group without elements becomes an empty set: MSH 2.2 with `Mesh.SaveAll` keeps only the names.
+    """
     order = np.argsort(tags, kind="stable")
     cells: dict[str, np.ndarray] = {}
-    sets: dict[str, dict[str, list[np.ndarray]]] = {}
+    sets: dict[str, dict[str, list[np.ndarray]]] = {name: {} for name in names}
     for kind in dict.fromkeys(block.kind for block in blocks):
         own = [block for block in blocks if block.kind == kind]
         nodes = np.concatenate([block.nodes for block in own]).astype(np.int64)
@@ -110,12 +113,12 @@ def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def _ascii(section: bytes) -> Take:
-    numbers, at = np.array(section.split(), dtype=bytes).astype(np.float64), 0
+    numbers, at = np.fromiter(map(float, section.split()), np.float64), 0
 
     def take(kind: str, count: Any) -> np.ndarray:
         nonlocal at
         part, at = numbers[at : at + int(count)], at + int(count)
-        if len(part) < count:
+        if len(part) != count:
             raise ValueError("a section has fewer numbers than its header states")
         return part if kind == "d" else part.astype(np.int64)
 
@@ -127,9 +130,11 @@ def _binary(section: bytes, types: dict[str, str]) -> Take:
 
     def take(kind: str, count: Any) -> np.ndarray:
         nonlocal at
-        part = np.frombuffer(section, types[kind], int(count), at)
+        part = np.frombuffer(section, types[kind], int(count), at) if count else np.zeros(0)
+        if len(part) != count:  # a negative count takes all
+            raise ValueError("a section has fewer numbers than its header states")
         at += part.nbytes
-        return part if kind == "d" else part.astype(np.int64)
+        return part.astype(np.float64 if kind == "d" else np.int64)
 
     return take
 

@@ -13,9 +13,16 @@ def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
     """Vertices that are in any of these sets, in ascending order, as for `held`.
 
     Raises:
-        InputError: a set that does not exist; the message lists those that do.
+        InputError: a set that does not exist, and the message lists those that do, or one without vertices.
     """
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *(_named(mesh, name).vertices for name in names)]))
+    members = [np.zeros(0, np.int64)]
+    for name in names:
+        if not len(vertices := _named(mesh, name).vertices):
+            raise InputError(
+                f"no vertex of the body is in the set '{name}' (MSH 2.2 with SaveAll keeps only names; use 4.1)"
+            )
+        members.append(vertices)
+    return np.unique(np.concatenate(members))
 
 
 def values_by_set(mesh: Mesh, default: float, values: Mapping[str, float]) -> Float[np.ndarray, " m"]:

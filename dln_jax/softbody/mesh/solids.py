@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from dln_jax.sizes import LARGEST
 from dln_jax.softbody.mesh.mesh import FLAT, WORDS, Mesh, NamedSet, make_mesh
 from dln_jax.softbody.mesh.simplices import regularity
 from dln_jax.types import InputError, require_positive
@@ -78,8 +79,8 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
         raise InputError("it has no triangles or tetrahedra; mesh the body, and save its elements")
     dimension = 3 if of_dimension[3] else 2
     points = scale * content.points
-    if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
-        raise InputError(f"vertex {bad[0]} is at {points[bad[0]].tolist()}; expected finite numbers")
+    if len(bad := np.flatnonzero(~(np.abs(points) <= LARGEST).all(axis=1))):
+        raise InputError(f"vertex {bad[0]} is at {points[bad[0]].tolist()} m; expected finite positions")
     for kind, nodes in content.cells.items():
         if len(bad := np.argwhere((nodes < 0) | (nodes >= len(points)))):
             vertex = nodes[tuple(bad[0])]
@@ -184,10 +185,7 @@ def _repaired(
     named = {}
     for name, (vertices, own) in sets.items():
         members = np.unique(new_vertex[same[vertices]])
-        if len(members := members[members >= 0]):
-            named[name] = NamedSet(members, np.unique(new_element[own]))
-        else:
-            statements.append(f"the set '{name}' has no vertex of the body and is left out")
+        named[name] = NamedSet(members[members >= 0], np.unique(new_element[own]))
     mesh = make_mesh(points[used], corners.reshape(kept.shape))
     return ReadMesh(mesh._replace(sets=named), tuple(statements))
 

@@ -194,7 +194,7 @@ def test_components_and_size_are_printed_and_millimetres_are_warned_of(tmp_path,
     shown = capsys.readouterr().out
     assert "12 vertices, 8 elements in 2 components, 30 x 30 m" in shown
     assert "warning: 2 parts share no vertex" in shown
-    assert "warning: the body is 30 m long" in shown and "divide its vertices by 1000" in shown
+    assert "warning: the body is 30 m long" in shown and "add --scale 0.001" in shown
 
 
 def test_a_mesh_of_loose_elements_is_warned_of(tmp_path, capsys):
@@ -205,7 +205,7 @@ def test_a_mesh_of_loose_elements_is_warned_of(tmp_path, capsys):
     options = ("--mesh", tmp_path / "mesh.npz", "--seconds", "0.02", "--dt", "0.01", "--no-figures")
     command(simulate, "--scene", "beam", *options, "--out", tmp_path / "run")
     shown = capsys.readouterr().out
-    assert "4 elements in 4 components, 0.043 x 0.01 m" in shown and "divide its vertices" not in shown
+    assert "4 elements in 4 components, 0.043 x 0.01 m" in shown and "--scale" not in shown
     assert "warning: no two elements share a vertex" in shown
 
 
