@@ -21,6 +21,7 @@ REDUCED = {
     "10_encoder_log_to_c": {},
     "11_swing_up": {"STARTS": 2, "FRAMES_PER_SECOND": 1.0},
     "12_stiff_plant": {},
+    "13_own_mesh": {"STEPS": 6, "TURNS": 2},
 }
 """Constants of the examples, and what they are here."""
 
