@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator
 from dln_jax.softbody.scene import Params, SoftScene, State
-from dln_jax.softbody.step import BACKWARD_EULER, Integrator, Stepper, make_step
+from dln_jax.softbody.step import Stepper, make_step
 from dln_jax.softbody.verdict import Info
 
 

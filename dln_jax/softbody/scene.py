@@ -56,6 +56,15 @@ class Previous(NamedTuple):
     """False before the first step, which is then a step of backward Euler."""
 
 
+class Growth(NamedTuple):
+    """Energy that the steps of a motion have created, in J."""
+
+    created: Float[Array, ""]
+    """Since the energy was lowest: max(created + energy_growth, 0), step by step."""
+    at_hand: Float[Array, ""]
+    """Largest energy at hand in a step so far, without that."""
+
+
 class State(NamedTuple):
     """Positions and velocities."""
 
@@ -65,6 +74,8 @@ class State(NamedTuple):
     """In m/s; for held vertices the prescribed velocity."""
     previous: Previous | None = None
     """Previous state, for methods of two steps."""
+    growth: Growth | None = None
+    """Energy created so far, by which `Info.converged` judges slow divergence; `None` judges single steps only."""
 
 
 def make_scene(

@@ -1,15 +1,6 @@
 """Implicit time steps as minimisations of an incremental potential (Rojas, Sifakis, Kavan 2021; Martin et al. 2011).
 
-    x_{n+1} = argmin_x  1/2 sum m |x - y|² / h² + V(x)
-
-| integrator | h | y | after the minimum x |
-|---|---|---|---|
-| backward-euler | dt | x_n + h v_n | v_{n+1} = (x - x_n) / dt |
-| bdf2 | 2/3 dt | (4 x_n - x_{n-1} + h (4 v_n - v_{n-1})) / 3 | v_{n+1} = (3 x - 4 x_n + x_{n-1}) / (2 dt) |
-| midpoint | dt/2 | x_n + h v_n | x is half way: x_{n+1} = 2 x - x_n, v_{n+1} = 2 (x - x_n) / h - v_n |
-
-Backward Euler is of first order and damps; bdf2 is of second order and damps little; the midpoint rule is of second
-order and does not damp: use it for smooth motions.
+The potential is that of `integrators`.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,9 +13,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data
 from dln_jax.softbody.mesh.intersections import count_overlaps
-from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
-from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, energy_balance, least_J, trusted
+from dln_jax.softbody.scene import Growth, Params, Previous, SoftScene, State, element_energies, prepare
+from dln_jax.softbody.verdict import Info, energy_balance, least_J, trusted, with_energies, work_of_held
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
@@ -35,53 +27,6 @@ from dln_jax.types import InputError, require_positive
 
 Step = Callable[[Params, State, Any], tuple[State, Info]]
 
-
-class Integrator(NamedTuple):
-    """An integrator: one line of the table."""
-
-    span: float
-    """Time from the state to the minimum, in units of dt."""
-    target: Callable[[State, Any], tuple[Any, Array]]
-    """(state, dt) -> h, y."""
-    finish: Callable[[State, Array, Any], tuple[Array, Array]]
-    """(state, x of the minimum, dt) -> x_{n+1}, v_{n+1}."""
-    two_steps: bool = False
-    """Whether it needs the previous state."""
-
-
-def _previous(state: State) -> Previous:
-    if state.previous is None:
-        raise InputError("the state has no room for the state before; make it by the `init` beside this step")
-    return state.previous
-
-
-def _bdf2_target(state: State, dt: Any) -> tuple[Array, Array]:
-    x, v, _ = state
-    previous = _previous(state)
-    h = jnp.where(previous.known, 2 / 3 * dt, dt).astype(x.dtype)
-    y = (4 * x - previous.x + h * (4 * v - previous.v)) / 3
-    return h, jnp.where(previous.known, y, x + dt * v)
-
-
-def _bdf2_finish(state: State, x: Array, dt: Any) -> tuple[Array, Array]:
-    previous = _previous(state)
-    v = (3 * x - 4 * state.x + previous.x) / (2 * dt)
-    return x, jnp.where(previous.known, v, (x - state.x) / dt)
-
-
-BACKWARD_EULER = Integrator(
-    span=1.0,
-    target=lambda state, dt: (dt, state.x + dt * state.v),
-    finish=lambda state, x, dt: (x, (x - state.x) / dt),
-)
-BDF2 = Integrator(span=1.0, target=_bdf2_target, finish=_bdf2_finish, two_steps=True)
-MIDPOINT = Integrator(
-    span=0.5,
-    target=lambda state, dt: (dt / 2, state.x + dt / 2 * state.v),
-    finish=lambda state, x, dt: (2 * x - state.x, 4 / dt * (x - state.x) - state.v),
-)
-INTEGRATORS = {"backward-euler": BACKWARD_EULER, "bdf2": BDF2, "midpoint": MIDPOINT}
-"""Integrators by the names in command lines and tables."""
 
 TOLERANCE = 1e-6
 """Default largest residual force per mass, in m/s²; Newton's last step usually reduces it far below."""
@@ -127,13 +72,23 @@ def make_step(
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
     free = scene.free
-    energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *element_energies(scene))
+    terms = stored = element_energies(scene)
+    if integrator.averaged:
+        terms = tuple(averaged(element, scene.mesh.dimension) for element in stored)
+    energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *terms)
     at = pattern(energies, free.shape[0], free.shape[1], free)
     overlaps = count_overlaps(scene.mesh)
     rest, masses = scene.params.rest, scene.params.masses
+
+    def along(start: Array, data: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Data of the terms for forces that are averages along the step."""
+        if not integrator.averaged:
+            return data
+        return tuple(averaged_data(element, start, of) for element, of in zip(stored, data, strict=True))
+
     known = _known(
         (scene.params, dt),
-        lambda: ((masses / (integrator.span * dt) ** 2, rest), *prepare(scene, scene.params, rest, dt=dt)),
+        lambda: ((masses / (integrator.span * dt) ** 2, rest), *along(rest, prepare(scene, scene.params, rest, dt=dt))),
     )
     chosen = _linear_solver(linear_solver, energies, at, rest, known)
     solve = partial(
@@ -147,13 +102,17 @@ def make_step(
             if known and len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), free.shape)))):
                 raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
         x, v = (jnp.broadcast_to(jnp.asarray(values, float), free.shape) for values in (x, v))
-        return State(x, v, Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None)
+        previous = Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None
+        return State(x, v, previous, Growth(jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)))
 
     def step(params: Params, state: State, control: Any = None) -> tuple[State, Info]:
         h, target = integrator.target(state, dt)
         span = jnp.asarray(integrator.span * dt, state.x.dtype)
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
-        data = ((weights, target), *prepare(scene, params, state.x, dt=span, control=control))
+        # Averaged along the step, a linear force of half of its time is that of the mean velocity.
+        elapsed = span / 2 if integrator.averaged else span
+        at_start = prepare(scene, params, state.x, dt=elapsed, control=control)
+        data = ((weights, target), *along(state.x, at_start))
         carried = state.x + span * state.v
         # The better of two starts: the present positions, or those of motion without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
@@ -161,23 +120,20 @@ def make_step(
         balanced, outcome = solve(energies, start, data, scale=params.masses, at=at)
         x, v = integrator.finish(state, balanced, dt)
         x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
-        info = judged(params, state, x, v, (balanced, outcome, data[1:]))
+        info, growth = judged(params, state, x, v, (balanced, outcome, at_start, data[1:]))
         x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
-        return State(x, v, before), info
+        return State(x, v, before, growth), info
 
-    def judged(params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any]) -> Info:
+    def judged(
+        params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any, Any]
+    ) -> tuple[Info, Growth | None]:
         # The verdict has no derivatives.
-        params, state, x, v, (balanced, outcome, data) = jax.lax.stop_gradient((params, state, x, v, solution))
-        growth, at_hand = energy_balance(
-            scene, energies[1:], params.masses, data, (state.x, x), (state.v, v), balanced, outcome
-        )
-        info = _of_positions(scene, params, x, outcome, overlaps)
-        return info._replace(
-            converged=info.converged & (growth <= LARGEST_GROWTH * at_hand),
-            energy_growth=growth,
-            energy_at_hand=at_hand,
-        )
+        params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
+        balanced, outcome, at_start, data = solution
+        work = work_of_held(scene.held, terms, data, balanced, x - state.x)
+        balance = energy_balance(scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome)
+        return with_energies(_of_positions(scene, params, x, outcome, overlaps), balance, state.growth)
 
     return Stepper(init, step)
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.softbody.scene import Params, SoftScene
+from dln_jax.softbody.scene import Growth, Params, SoftScene, element_energies
 from dln_jax.solvers.elements.energies import ElementEnergy, value
 from dln_jax.solvers.newton import SolverInfo
 
@@ -52,48 +52,70 @@ class Info(NamedTuple):
     for a mesh of one component. It does not affect `converged`."""
 
 
+class Balance(NamedTuple):
+    """Energies of one step, in J."""
+
+    growth: Float[Array, ""]
+    at_hand: Float[Array, ""]
+    unclear: Float[Array, ""]
+    """Part of the energy at hand that is rounding and work of the residual forces."""
+
+
 def energy_balance(
     scene: SoftScene,
-    energies: Sequence[ElementEnergy],
     masses: Float[Array, " n"],
     data: Sequence[Any],
     x: tuple[Array, Array],
     v: tuple[Array, Array],
-    balanced: Array,
+    work: Float[Array, ""],
     outcome: SolverInfo,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(growth, energy at hand) of a step, in J.
+) -> Balance:
+    """Returns the energies of a step.
 
     Args:
-        scene: its held vertices do work.
-        energies, data: its terms and the data of their elements in this step.
+        scene: its terms and free vertices.
         masses: in kg.
+        data: of the terms' elements in this step.
         x, v: positions and velocities at the start and the end of the step.
-        balanced: the positions at which forces were balanced.
+        work: of the held vertices, in J.
         outcome: of the minimisation.
     """
     free = jnp.asarray(scene.free)
     kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * velocity**2, 0)) for velocity in v)
-    stored, stored_after = (value(energies, position, data) for position in x)
-    moved = x[1] - x[0]
-    work = _work(scene.held, energies, data, balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
-    # Residual forces do work, and rounding hides some of the energy.
+    stored, stored_after = (value(element_energies(scene), position, data) for position in x)
     noise = 0.0 if outcome.energy_noise is None else outcome.energy_noise
-    unclear = noise + outcome.residual * jnp.sum(masses[:, None] * jnp.abs(moved))
+    unclear = noise + outcome.residual * jnp.sum(masses[:, None] * jnp.abs(x[1] - x[0]))
     growth = after - kinetic + (stored_after - stored) - work
-    return growth, kinetic + jnp.maximum(stored - stored_after, 0) + jnp.abs(work) + unclear
+    return Balance(growth, kinetic + jnp.maximum(stored - stored_after, 0) + jnp.abs(work) + unclear, unclear)
 
 
-def _work(
+def with_energies(info: Info, balance: Balance, before: Growth | None) -> tuple[Info, Growth | None]:
+    """Adds the judgement of the energies to that of the forces and positions.
+
+    Returns the outcome, and the energy created so far, if the state before the step has one.
+    """
+    growth, at_hand, unclear = balance
+    sound, so_far = growth <= LARGEST_GROWTH * at_hand, None
+    if before is not None:
+        created = jnp.maximum(before.created + growth - unclear, 0)
+        so_far = Growth(created, jnp.maximum(before.at_hand, at_hand - created))
+        sound &= created <= LARGEST_GROWTH * so_far.at_hand
+    info = info._replace(converged=info.converged & sound, energy_growth=growth, energy_at_hand=at_hand)
+    return info, so_far
+
+
+def work_of_held(
     held: Int[np.ndarray, " k"], energies: Sequence[ElementEnergy], data: Sequence[Any], x: Array, moved: Array
 ) -> Float[Array, ""]:
-    """Work of held vertices against the forces at x, from the elements at these vertices."""
+    """Work of held vertices against the forces at x, in J, from the elements at these vertices."""
     near, their_data = [], []
     for energy, of in zip(energies, data, strict=True):
         touched = np.flatnonzero(np.isin(energy.indices, held).any(axis=1))
         if len(touched):
             near.append(energy._replace(indices=energy.indices[touched]))
             their_data.append(jax.tree.map(lambda leaf, touched=touched: leaf[touched], of))
+    if not near:
+        return jnp.zeros((), x.dtype)
     along = jnp.zeros_like(moved).at[held].set(moved[held])
     return jax.jvp(lambda x: value(near, x, their_data), (x,), (along,))[1]
 

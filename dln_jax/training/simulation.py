@@ -23,10 +23,11 @@ from dln_jax.rollout import rollout
 from dln_jax.sizes import require_memory, require_within
 from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
+from dln_jax.softbody.integrators import INTEGRATORS
 from dln_jax.softbody.mesh.files import require_meshio, write_motion
 from dln_jax.softbody.mesh.mesh import components, overlaps
 from dln_jax.softbody.scene import Params, State
-from dln_jax.softbody.step import INTEGRATORS, Stepper
+from dln_jax.softbody.step import Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.verdict import Info
 from dln_jax.training.results import print_numbers

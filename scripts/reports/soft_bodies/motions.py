@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.softbody.integrators import INTEGRATORS, Integrator
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import SoftScene, make_scene, potential, with_parameters
-from dln_jax.softbody.step import INTEGRATORS, Integrator, make_step
+from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs

@@ -18,10 +18,10 @@ from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.rollout import rollout
 from dln_jax.softbody.driven import drive, driven_step
 from dln_jax.softbody.examples import beam, creature, drop, slope, twist
+from dln_jax.softbody.integrators import BACKWARD_EULER, BDF2
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.mesh.shapes import body_length, crawler
 from dln_jax.softbody.scene import potential, with_parameters
-from dln_jax.softbody.step import BACKWARD_EULER, BDF2
 from dln_jax.softbody.verdict import Info
 from dln_jax.training.simulation_results import SimulatedMotion, finite_moments, warn
 from dln_jax.types import InputError
