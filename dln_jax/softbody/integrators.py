@@ -10,20 +10,21 @@
 | average-vector-field | dt/sqrt(2) | x_n + dt v_n | v_{n+1} = 2 (x - x_n) / dt - v_n |
 
 Backward Euler is of first order and damps; bdf2 is of second order and damps little. The midpoint rule is of second
-order and keeps momentum and angular momentum, but not energy: use it for smooth motions. The average-vector-field method
-is of second order and keeps momentum and energy (Quispel and McLaren 2008), and angular momentum to second order. Its
+order and keeps momentum and angular momentum, but not energy: use it for smooth motions. The average-vector-field
+method (Quispel and McLaren 2008) is of second order and keeps momentum and energy, but not angular momentum. Its
 force is the average along the step,
 
     F = -∫ grad V(x_n + s (x - x_n)) ds over 0 <= s <= 1,    so that    F·(x - x_n) = V(x_n) - V(x),
 
-and V is replaced by W(x) = ∫ V(x_n + s (x - x_n)) / s ds, whose gradient is -F. Gauss-Legendre quadrature with as many
-points as the body has dimensions is exact for the polynomials `stable_neo_hookean` and `st_venant_kirchhoff`, for
-springs without rest length, for gravity, and for linear damping.
+and V is replaced by W(x) = ∫ V(x_n + s (x - x_n)) / s ds, whose gradient is -F. Gauss-Legendre quadrature with 2
+points in the plane and 3 in space is exact for the polynomials `stable_neo_hookean` and `st_venant_kirchhoff`; with
+`CONTACT_POINTS` it is nearly so for contact, friction and springs.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -46,6 +47,11 @@ class Integrator(NamedTuple):
     """Whether it needs the previous state."""
     averaged: bool = False
     """Whether forces are averages along the step, instead of those at x."""
+
+
+CONTACT_POINTS = 8
+"""Quadrature points of elements with fewer vertices than a simplex (contact, springs), which are cheap and have kinks:
+in the example scenes a step creates up to 2 % of the energy at hand with 4 points, 0.2 % with 8 and 0.01 % with 16."""
 
 
 def _previous(state: State) -> Previous:
@@ -93,21 +99,23 @@ INTEGRATORS = {
 """Integrators by the names in command lines and tables."""
 
 
-def averaged(element: ElementEnergy, points: int) -> ElementEnergy:
-    """Returns the element energy W, by Gauss-Legendre quadrature; its data are those of `averaged_data`."""
-    nodes, weights = np.polynomial.legendre.leggauss(points)
-    quadrature = list(zip(((1 + nodes) / 2).tolist(), (weights / 2).tolist(), strict=True))
+def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
+    """Returns the element energy W of a body in 2 or 3 dimensions; its data are those of `averaged_data`."""
+    solid = element.indices.shape[1] > dimension
+    nodes, weights = np.polynomial.legendre.leggauss(dimension if solid else CONTACT_POINTS)
+    nodes, weights = (1 + nodes) / 2, weights / 2
 
     def energy(x: Corners, start_and_data: tuple[Any, Any]) -> Float[Array, ""]:
         start, data = start_and_data
 
-        def between(s: float) -> list[list[Array]]:
-            return [[(1 - s) * a + s * b for a, b in zip(*pair, strict=True)] for pair in zip(start, x, strict=True)]
+        def at(s: Any) -> Array:
+            between = [[(1 - s) * a + s * b for a, b in zip(*pair, strict=True)] for pair in zip(start, x, strict=True)]
+            return element.energy(between, data)
 
-        values = [
-            w / s * element.energy(between(s), data) for s, w in zip(nodes.tolist(), weights.tolist(), strict=True)
-        ]
-        return sum(values[1:], values[0])
+        if solid:
+            # Written out: the few points fuse with the arithmetic of the element.
+            return jnp.asarray(sum(w / s * at(s) for s, w in zip(nodes.tolist(), weights.tolist(), strict=True)))
+        return jnp.sum(weights / nodes * jax.vmap(at)(jnp.asarray(nodes, x[0][0].dtype)))
 
     return element._replace(energy=energy)
 

@@ -1,7 +1,8 @@
 """Energy terms of soft bodies, with their material and friction laws."""
 
-from dln_jax.softbody.terms.contact import distance_contact, plane_contact
+from dln_jax.softbody.terms.contact import damping_of_restitution, distance_contact, plane_contact
 from dln_jax.softbody.terms.creature import creature_terms
+from dln_jax.softbody.terms.damping import mass_damping, stiffness_damping
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import muscles, springs
@@ -13,13 +14,16 @@ __all__ = [
     "Term",
     "corotated",
     "creature_terms",
+    "damping_of_restitution",
     "distance_contact",
     "elastic",
     "gravity",
+    "mass_damping",
     "muscles",
     "neo_hookean",
     "plane_contact",
     "springs",
     "st_venant_kirchhoff",
     "stable_neo_hookean",
+    "stiffness_damping",
 ]

@@ -14,8 +14,18 @@ normals n and normal forces lambda_n at the start of the step. The force is mu l
 threshold speed e/dt on, and falls smoothly to zero below it: a block that "sticks" on a slope creeps at less than the
 threshold. f is twice continuously differentiable. The slip e must be well above the rounding of the positions: in
 float32, 1e-4 m for a body of a metre.
+
+Contact damping adds the force c lambda (-d') to the normal force lambda = -k phi'(d), with c in s/m (Hunt and Crossley
+1975). It comes from the dissipation
+
+    c k/dt ∫ -phi'(t) (t - d_n) dt over d_n <= t <= d  =  c k/dt (Phi(d) - Phi(d_n) - phi(d) (d - d_n)),  Phi' = phi
+
+A point mass that hits at speed u rebounds at e u, whatever its mass, k and phi (`damping_of_restitution`):
+
+    c u (1 + e) = ln((1 + c u) / (1 - c e u))
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,6 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.optimize import brentq
 
 from dln_jax.softbody.terms.term import (
     NOT_NEGATIVE,
@@ -36,7 +47,7 @@ from dln_jax.softbody.terms.term import (
     vector,
     vertex_list,
 )
-from dln_jax.types import Scalar, require_positive
+from dln_jax.types import InputError, Scalar, require_positive
 
 # Ratio of squared slip to squared threshold below which the cubic part of f is rounding and its derivatives overflow.
 _NO_SLIP = 1e-16
@@ -53,6 +64,8 @@ class PlaneContact(NamedTuple):
     """k in N/m."""
     friction: Float[Array, "..."] | None
     """Coefficient of friction, or `None`."""
+    damping: Float[Array, "..."] | None = None
+    """c in s/m, or `None`."""
 
 
 class DistanceContact(NamedTuple):
@@ -62,6 +75,8 @@ class DistanceContact(NamedTuple):
     """k in N/m."""
     friction: Float[Array, "..."] | None
     """Coefficient of friction, or `None`."""
+    damping: Float[Array, "..."] | None = None
+    """c in s/m, or `None`."""
 
 
 class Slip(NamedTuple):
@@ -85,19 +100,21 @@ def plane_contact(
     stiffness: Numbers,
     width: float,
     friction: Numbers | None = None,
+    damping: Numbers | None = None,
     threshold_speed: float = 1e-3,
     name: str = "ground",
 ) -> Term:
     """Contact with the half-space n·x < offset, for the unit normal n.
 
     Stiffness k in N/m; width w in m. A width of 0 means ½ k d² below the plane, which is only once continuously
-    differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s.
+    differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s. `damping` c in s/m
+    dissipates in the normal direction (`damping_of_restitution`).
     """
     indices = vertex_list("vertices in contact", vertices)
     parameters = PlaneContact(
         vector("the normal of a plane", normal, zero_allowed=False),
         jnp.asarray(offset, dtype=float),
-        *_contact_parameters(stiffness, friction, len(indices)),
+        *_contact_parameters(stiffness, friction, damping, len(indices)),
     )
 
     def surface(parameters: PlaneContact, x: Array) -> tuple[Array, Array]:
@@ -122,6 +139,7 @@ def distance_contact(
     stiffness: Numbers,
     width: float,
     friction: Numbers | None = None,
+    damping: Numbers | None = None,
     threshold_speed: float = 1e-3,
     name: str = "obstacle",
 ) -> Term:
@@ -131,7 +149,7 @@ def distance_contact(
     gradient at the start of the step; where the gradient vanishes (the centre of a ball), there is no friction.
     """
     indices = vertex_list("vertices in contact", vertices)
-    parameters = DistanceContact(*_contact_parameters(stiffness, friction, len(indices)))
+    parameters = DistanceContact(*_contact_parameters(stiffness, friction, damping, len(indices)))
 
     def touched(x: Array, _: None) -> tuple[Array, Array, Array]:
         depth, slope = jax.vmap(jax.value_and_grad(distance))(x)
@@ -161,10 +179,42 @@ def penalty_force(distance: Float[Array, "*m"], width: float) -> Float[Array, "*
     return jnp.where(distance < -width, -distance - 0.5 * width, ramp)
 
 
-def _contact_parameters(stiffness: Numbers, friction: Numbers | None, count: int):
+def penalty_integral(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
+    """Phi(d) in m³, the integral of phi from 0."""
+    if width == 0.0:
+        return jnp.where(distance < 0, distance**3 / 6.0, 0.0)
+    ramp = jnp.where(distance < 0, -(distance**4) / (24.0 * width), 0.0)
+    deep = distance**3 / 6.0 + width * distance**2 / 4.0 + width**2 * distance / 6.0 + width**3 / 24.0
+    return jnp.where(distance < -width, deep, ramp)
+
+
+def damping_of_restitution(restitution: float, speed: float) -> float:
+    """Returns the damping c in s/m with which a point mass rebounds at `restitution` times its speed, in m/s.
+
+    c is that of one speed: slower impacts rebound better, at 1 - 2/3 c u for small c u. A body also turns some of the
+    energy into its own vibrations, which is no loss of the contact.
+
+    Raises:
+        InputError: a speed that is not positive, or a coefficient that is not between 0.05 and 1.
+    """
+    require_positive(speed=speed)
+    if not 0.05 <= restitution <= 1.0:
+        raise InputError(f"restitution is {restitution}; expected a coefficient from 0.05 to 1")
+    if restitution == 1.0:
+        return 0.0
+
+    def excess(z: float) -> float:
+        return math.log1p(z) - math.log1p(-restitution * z) - z * (1 + restitution)
+
+    return brentq(excess, 0.1 * (1 - restitution), (1 - 1e-15) / restitution) / speed
+
+
+def _contact_parameters(stiffness: Numbers, friction: Numbers | None, damping: Numbers | None, count: int):
     if friction is not None:
         friction = material("friction", friction, count, "vertex", NOT_NEGATIVE)
-    return material("stiffness", stiffness, count, "vertex"), friction
+    if damping is not None:
+        damping = material("damping", damping, count, "vertex", NOT_NEGATIVE)
+    return material("stiffness", stiffness, count, "vertex"), friction, damping
 
 
 def _contact(
@@ -182,22 +232,29 @@ def _contact(
     if width != 0.0:
         require_positive(width=width)
 
-    def prepare(parameters: Any, context: Context) -> tuple[Any, Array, Slip | None]:
+    def prepare(parameters: Any, context: Context) -> tuple[Any, Array, Slip | None, tuple[Array, Array] | None]:
         x = context.x[indices[:, 0]]
         near, stiffness = surface(parameters, x), jnp.broadcast_to(parameters.stiffness, len(x))
-        if parameters.friction is None:
-            return near, stiffness, None
-        depth, normal, steepness = touched(x, near)
-        force = parameters.friction * (stiffness * penalty_force(depth, width) * steepness)
-        # A static solve (dt infinite) has no velocities, hence no friction.
-        moving = jnp.isfinite(context.dt)
-        threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
-        slip = Slip(x, normal, jnp.where(moving, force, 0.0), jnp.broadcast_to(threshold, len(x)))
-        return near, stiffness, slip
+        braked = slip = None
+        if parameters.damping is not None:
+            braked = jax.vmap(distance)(tuple(x.T), near), parameters.damping * stiffness / context.dt
+        if parameters.friction is not None:
+            depth, normal, steepness = touched(x, near)
+            force = parameters.friction * (stiffness * penalty_force(depth, width) * steepness)
+            # A static solve (dt infinite) has no velocities, hence no friction.
+            moving = jnp.isfinite(context.dt)
+            threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
+            slip = Slip(x, normal, jnp.where(moving, force, 0.0), jnp.broadcast_to(threshold, len(x)))
+        return near, stiffness, slip, braked
 
-    def energy(x: Corners, vertex: tuple[Any, Array, Slip | None]) -> Scalar:
-        near, stiffness, slip = vertex
-        contact = stiffness * penalty(distance(x[0], near), width)
+    def energy(x: Corners, vertex: tuple[Any, Array, Slip | None, tuple[Array, Array] | None]) -> Scalar:
+        near, stiffness, slip, braked = vertex
+        depth = distance(x[0], near)
+        contact = stiffness * penalty(depth, width)
+        if braked is not None:
+            start, weight = braked
+            lost = penalty_integral(depth, width) - penalty_integral(start, width)
+            contact += weight * (lost - penalty(depth, width) * (depth - start))
         return contact if slip is None else contact + _friction_energy(x[0], slip)
 
     return Term(name, indices, energy, parameters, prepare)

@@ -18,7 +18,7 @@ from dln_jax.softbody.terms.strain_energies import StrainEnergy
 from dln_jax.softbody.terms.term import Bound, Context, Corners, Numbers, Term, material
 from dln_jax.types import Scalar
 
-_POISSON_BOUND = Bound(
+POISSON_BOUND = Bound(
     lambda ratio: (ratio > -1.0) & (ratio < 0.5),
     "more than -1 and less than 0.5 (0.49 or 0.4999 for a nearly incompressible material)",
 )
@@ -50,13 +50,11 @@ def elastic(
     count = len(mesh.elements)
     parameters = Material(
         material("youngs_modulus", youngs_modulus, count, "element"),
-        material("poisson_ratio", poisson_ratio, count, "element", _POISSON_BOUND),
+        material("poisson_ratio", poisson_ratio, count, "element", POISSON_BOUND),
     )
 
     def prepare(parameters: Material, context: Context) -> tuple[Array, ...]:
-        youngs_modulus, poisson_ratio = parameters
-        mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
-        lam = 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
+        mu, lam = lame_parameters(*parameters)
         geometry = jax.vmap(rest_geometry)(context.rest[mesh.elements])
         return *geometry, jnp.broadcast_to(mu, count), jnp.broadcast_to(lam, count)
 
@@ -65,6 +63,12 @@ def elastic(
         return volume * density(deformation_gradient(x, gradients), mu, lam)
 
     return Term(name, mesh.elements, energy, parameters, prepare)
+
+
+def lame_parameters(youngs_modulus: Array, poisson_ratio: Array) -> tuple[Array, Array]:
+    """(mu, lambda) in Pa from E in Pa and nu."""
+    mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
+    return mu, 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
 
 
 def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "corners dim"], Scalar]:

@@ -52,10 +52,20 @@ def st_venant_kirchhoff(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scal
 
     Smooth everywhere, but softens under compression: uniaxial stress vanishes again as the element collapses.
     """
+    return linear_energy(green_strain(F), mu, lam)
+
+
+def green_strain(F: DeformationGradient) -> list[list[Array]]:
+    """Rows of the lower triangle of E = (FᵀF - I)/2."""
     axes = range(len(F))
-    strain = [
+    return [
         [0.5 * (sum(F[k][i] * F[k][j] for k in axes) - (1.0 if i == j else 0.0)) for j in axes if j <= i] for i in axes
     ]
+
+
+def linear_energy(strain: Sequence[Sequence[Array]], mu: Scalar, lam: Scalar) -> Scalar:
+    """mu |E|² + lambda/2 tr(E)² of a symmetric E, from the rows of its lower triangle."""
+    axes = range(len(strain))
     trace = sum(strain[i][i] for i in axes)
     squared = sum((1.0 if i == j else 2.0) * strain[i][j] ** 2 for i in axes for j in range(i + 1))
     return mu * squared + 0.5 * lam * trace**2
