@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data
 from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import Growth, Params, Previous, SoftScene, State, element_energies, prepare
+from dln_jax.softbody.substeps import with_shorter_steps
 from dln_jax.softbody.verdict import Info, energy_balance, least_J, trusted, with_energies, work_of_held
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
@@ -51,6 +52,7 @@ def make_step(
     iterations: int = 100,
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
+    halvings: int = 0,
 ) -> Stepper:
     """Returns (init, step) of a scene.
 
@@ -65,10 +67,16 @@ def make_step(
             `scene.params` and this time step (`by_size` if either is traced, or the preparation of a term needs a
             control). Other parameters passed to the step later do not change the choice.
         definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
+        halvings: take a step that does not converge again in parts, of dt/2^halvings at the shortest; `Info.substeps`
+            reports their number. The step is compiled a second time for them.
 
     Raises:
-        InputError: a number that is not positive.
+        InputError: a number that is not positive, or halvings of a method of two steps.
     """
+    if halvings:
+        require_positive(halvings=halvings)
+        if integrator.two_steps:
+            raise InputError("halvings got a method of two steps, which have one length; use another integrator")
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
     free = scene.free
@@ -105,7 +113,9 @@ def make_step(
         previous = Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None
         return State(x, v, previous, Growth(jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)))
 
-    def step(params: Params, state: State, control: Any = None) -> tuple[State, Info]:
+    def advance(
+        params: Params, state: State, control: Any = None, dt: Any = dt, x_after: Array | None = None
+    ) -> tuple[State, Info]:
         h, target = integrator.target(state, dt)
         span = jnp.asarray(integrator.span * dt, state.x.dtype)
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
@@ -114,9 +124,12 @@ def make_step(
         at_start = prepare(scene, params, state.x, dt=elapsed, control=control)
         data = ((weights, target), *along(state.x, at_start))
         carried = state.x + span * state.v
-        # The better of two starts: the present positions, or those of motion without forces.
-        stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
-        start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
+        if x_after is None:
+            # The better of two starts: the present positions, or those of motion without forces.
+            stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
+            start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
+        else:
+            start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
         balanced, outcome = solve(energies, start, data, scale=params.masses, at=at)
         x, v = integrator.finish(state, balanced, dt)
         x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
@@ -135,7 +148,9 @@ def make_step(
         balance = energy_balance(scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome)
         return with_energies(_of_positions(scene, params, x, outcome, overlaps), balance, state.growth)
 
-    return Stepper(init, step)
+    if halvings:
+        return Stepper(init, with_shorter_steps(advance, dt, halvings))
+    return Stepper(init, lambda params, state, control=None: advance(params, state, control))
 
 
 def positions_and_convergence(state: State, info: Info) -> tuple[Array, Array]:

@@ -50,6 +50,8 @@ class Info(NamedTuple):
     overlaps: Int[Array, ""] | None = None
     """Number of pairs of overlapping mesh components: bodies have no contact with each other and pass through. `None`
     for a mesh of one component. It does not affect `converged`."""
+    substeps: Int[Array, ""] | None = None
+    """Number of parts that the step was divided into, 1 for a whole step; `None` without `halvings`."""
 
 
 class Balance(NamedTuple):

@@ -123,6 +123,8 @@ def shared_or_batched(
 
     @solve.def_vmap
     def solve_many(size: int, batched: Sequence[bool], matrix: Array, b: Array) -> tuple[Array, bool]:
+        if not any(batched):
+            return one(matrix, b), False
         if batched[0]:
             return many(matrix, b if batched[1] else jnp.broadcast_to(b, (size, *b.shape))), True
         columns = jnp.moveaxis(b, 0, side)

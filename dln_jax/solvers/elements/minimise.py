@@ -107,17 +107,19 @@ def minimise(
         x, info = minimum(*primals)
         x_dot = _implicit_derivative(total, x, primals[1], *tangents[:2])
         x_dot = x_dot * jnp.where(info.converged, 1.0, jnp.nan).astype(x.dtype)
-        return (x, info), (x_dot, jax.tree.map(_no_tangent, info))
+        return (x, info), (x_dot, jax.tree.map(no_tangent, info))
 
     minimum.defjvp(derivative, symbolic_zeros=True)
     return minimum(x0, tuple(data), scale)
 
 
-def _is_constant(tangent: Any) -> bool:
+def is_constant(tangent: Any) -> bool:
+    """Whether a tangent of a rule with symbolic zeros is known to be zero."""
     return isinstance(tangent, SymbolicZero) or getattr(tangent, "dtype", None) == jax.dtypes.float0
 
 
-def _no_tangent(leaf: Array) -> Any:
+def no_tangent(leaf: Array) -> Any:
+    """Returns the zero tangent of a value."""
     floating = jnp.issubdtype(leaf.dtype, jnp.floating)
     return jnp.zeros_like(leaf) if floating else np.zeros(leaf.shape, jax.dtypes.float0)
 
@@ -126,9 +128,9 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
     energies, at, solver = total
     # Constant data are left out: their derivatives would only be multiplied by zero.
     leaves, structure = jax.tree.flatten(data)
-    dots = jax.tree.leaves(data_dot, is_leaf=_is_constant)
-    varying = [i for i, dot in enumerate(dots) if not _is_constant(dot)]
-    moving = not (at.free.all() or _is_constant(x0_dot))
+    dots = jax.tree.leaves(data_dot, is_leaf=is_constant)
+    varying = [i for i, dot in enumerate(dots) if not is_constant(dot)]
+    moving = not (at.free.all() or is_constant(x0_dot))
 
     # Reverse mode saves only the arguments: recomputing takes less time than reading saved intermediates.
     @functools.partial(jax.checkpoint, prevent_cse=False)

@@ -1,0 +1,202 @@
+"""Time steps that shorten themselves where they do not converge.
+
+A step of dt that does not converge is taken again from its start in parts of dt/2, dt/4, ..., dt/2^halvings: a part
+that does not converge is halved, and those after it have the same length. The parts are a loop, which runs zero times
+for a step that converges.
+
+The derivative of the step is the product of the derivatives of its parts: loops over the parts that were taken,
+forwards for tangents and backwards for cotangents, which evaluate every part again from its known solution.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from dln_jax.softbody.scene import Params, State
+from dln_jax.softbody.verdict import Info
+from dln_jax.solvers.elements.minimise import is_constant, no_tangent
+
+Advance = Callable[..., tuple[State, Info]]
+"""(params, state, control, dt, x_after=None) -> (state, Info); x_after starts the search."""
+
+
+class Parts(NamedTuple):
+    """Parts of a step that converged; those from `count` on are empty."""
+
+    x: Float[Array, "parts n dim"]
+    """Positions at their starts, in m."""
+    v: Float[Array, "parts n dim"]
+    x_after: Float[Array, "parts n dim"]
+    """Positions at their ends, in m."""
+    length: Int[Array, " parts"]
+    """In units of dt/2^halvings."""
+    count: Int[Array, ""]
+
+
+class _Progress(NamedTuple):
+    state: State
+    info: Info
+    parts: Parts
+    done: Int[Array, ""]
+    length: Int[Array, ""]
+
+
+def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[..., tuple[State, Info]]:
+    """Returns the step (params, state, control=None) -> (state, Info) that shortens itself.
+
+    Where the shortest parts do not converge either, the result is that of the whole step, which did not converge.
+
+    Args:
+        advance: a step of one-step integrators, of any length.
+        dt: length of the whole step, in s.
+        halvings: the shortest part is dt/2^halvings.
+    """
+    most = 2**halvings
+
+    def part_of(params: Params, state: State, control: Any, length: Array, **start: Array) -> tuple[State, Info]:
+        return advance(params, state, control, jnp.asarray(dt, state.x.dtype) * length / most, **start)
+
+    @jax.custom_jvp
+    def whole(params: Params, state: State, control: Any) -> tuple[State, Info, Parts]:
+        first, info = part_of(params, state, control, jnp.asarray(most))
+        blank = jnp.zeros((most, *state.x.shape), state.x.dtype)
+        parts = Parts(blank, blank, blank, jnp.zeros(most, int), jnp.asarray(0))
+        start = _Progress(
+            _where(info.converged, first, state),
+            info,
+            _with_part(parts, state, first.x, jnp.asarray(most), info.converged),
+            jnp.where(info.converged, most, 0),
+            jnp.asarray(most // 2),
+        )
+
+        def unfinished(progress: _Progress) -> Array:
+            return (progress.done < most) & (progress.length > 0)
+
+        def attempt(progress: _Progress) -> _Progress:
+            state, so_far, parts, done, length = progress
+            after, outcome = part_of(params, state, control, length)
+            accepted = outcome.converged
+            merged = _where(parts.count > 0, _together(so_far, outcome), outcome)
+            return _Progress(
+                _where(accepted, after, state),
+                _where(accepted, merged, so_far)._replace(iterations=so_far.iterations + outcome.iterations),
+                _with_part(parts, state, after.x, length, accepted),
+                jnp.where(accepted, done + length, done),
+                jnp.where(accepted, length, length // 2),
+            )
+
+        last = jax.lax.while_loop(unfinished, attempt, start)
+        complete = last.done == most
+        info = _where(complete, last.info, info._replace(iterations=last.info.iterations))
+        return _where(complete, last.state, first), info._replace(substeps=last.parts.count), last.parts
+
+    def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        state, info, parts = whole(*primals)
+        inputs, structure = jax.tree.flatten((primals[0], primals[2]))
+        dots = jax.tree.leaves((tangents[0], tangents[2]), is_leaf=is_constant)
+        varying = [i for i, dot in enumerate(dots) if not is_constant(dot)]
+        varied = [inputs[i] for i in varying]
+        start_dot = tuple(
+            jnp.zeros_like(state.x) if is_constant(dot) else dot for dot in (tangents[1].x, tangents[1].v)
+        )
+
+        def part(number: Array, varied: list[Array], x: Array, v: Array) -> tuple[Array, Array]:
+            replaced = dict(zip(varying, varied, strict=True))
+            params, control = structure.unflatten([replaced.get(i, leaf) for i, leaf in enumerate(inputs)])
+            known = {"x_after": parts.x_after[number]}
+            after, _ = part_of(params, State(x, v), control, parts.length[number], **known)
+            return after.x, after.v
+
+        def at(number: Array) -> tuple[list[Array], Array, Array]:
+            return varied, parts.x[number], parts.v[number]
+
+        def tangent(number: Array, dots: list[Array], moved: tuple[Array, Array]) -> tuple[Array, Array]:
+            return jax.jvp(lambda *values: part(number, *values), at(number), (dots, *moved))[1]
+
+        def cotangent(number: Array, bars: Any) -> tuple[list[Array], Array, Array]:
+            return jax.vjp(lambda *values: part(number, *values), *at(number))[1](bars)
+
+        moved = _chain(most, parts.count, tangent, cotangent, ([dots[i] for i in varying], start_dot))
+        factor = jnp.where(info.converged, 1.0, jnp.nan).astype(state.x.dtype)
+        state_dot = jax.tree.map(no_tangent, state)._replace(x=factor * moved[0], v=factor * moved[1])
+        return (state, info, parts), (state_dot, jax.tree.map(no_tangent, info), jax.tree.map(no_tangent, parts))
+
+    whole.defjvp(derivative, symbolic_zeros=True)
+
+    def step(params: Params, state: State, control: Any = None) -> tuple[State, Info]:
+        return whole(params, state, control)[:2]
+
+    return step
+
+
+def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inputs: Any) -> tuple[Array, Array]:
+    """Returns G (dots, start): the tangent after all parts, from those of their inputs and of the start.
+
+    It is the second half of the solution of [[1, 0], [-G, 1]] (inputs, out) = (inputs, 0), because JAX lets callers
+    define the transpose of a linear solve, and a loop of unknown length has no other.
+    """
+
+    def forwards(inputs: Any) -> tuple[Array, Array]:
+        dots, start = inputs
+        return jax.lax.fori_loop(0, count, lambda number, moved: tangent(number, dots, moved), start)
+
+    def backwards(bars: Any) -> Any:
+        def back(place: Array, carry: Any) -> Any:
+            collected, bars = carry
+            of_dots, *bars = cotangent(count - 1 - place, bars)
+            return jax.tree.map(jnp.add, collected, of_dots), tuple(bars)
+
+        return jax.lax.fori_loop(0, count, back, (jax.tree.map(jnp.zeros_like, inputs[0]), bars))
+
+    # One vector: a solve is transposed only if every part of its right-hand side has a tangent.
+    right, parts = ravel_pytree((inputs, jax.tree.map(jnp.zeros_like, inputs[1])))
+
+    def product(both: Array) -> Array:
+        # A loop of fixed length, which can be transposed and is evaluated for second derivatives only.
+        inputs, out = parts(both)
+
+        def one(moved: Any, number: Array) -> tuple[Any, None]:
+            # Empty parts would divide by their length.
+            return _where(number < count, tangent(jnp.minimum(number, count - 1), inputs[0], moved), moved), None
+
+        moved, _ = jax.lax.scan(one, inputs[1], np.arange(most))
+        return ravel_pytree((inputs, jax.tree.map(jnp.subtract, out, moved)))[0]
+
+    def solve(_: Callable, both: Array) -> Array:
+        inputs, out = parts(both)
+        return ravel_pytree((inputs, jax.tree.map(jnp.add, out, forwards(inputs))))[0]
+
+    def solve_transposed(_: Callable, both: Array) -> Array:
+        inputs, out = parts(both)
+        return ravel_pytree((jax.tree.map(jnp.add, inputs, backwards(out)), out))[0]
+
+    return parts(jax.lax.custom_linear_solve(product, right, solve, transpose_solve=solve_transposed))[1]
+
+
+def _with_part(parts: Parts, state: State, x_after: Array, length: Array, accepted: Array) -> Parts:
+    """Appends a part, if it is accepted."""
+    place = jnp.where(accepted, parts.count, len(parts.length))
+    values = (state.x, state.v, x_after, length)
+    lists = (of.at[place].set(value, mode="drop") for of, value in zip(parts[:-1], values, strict=True))
+    return Parts(*lists, parts.count + accepted)
+
+
+def _together(first: Info, second: Info) -> Info:
+    """Outcome of two parts, in order, the iterations apart."""
+    merged = second._replace(
+        residual=jnp.maximum(first.residual, second.residual),
+        energy_growth=first.energy_growth + second.energy_growth,
+        energy_at_hand=jnp.maximum(first.energy_at_hand, second.energy_at_hand),
+    )
+    if second.least_J is not None:
+        merged = merged._replace(least_J=jnp.minimum(first.least_J, second.least_J))
+    return merged if second.definite is None else merged._replace(definite=first.definite & second.definite)
+
+
+def _where(condition: Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
