@@ -64,9 +64,9 @@ def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
     return Drive(jnp.asarray(t[1:], dtype), control, velocity)
 
 
-def driven_step(example: Example, dt: float, integrator: Integrator = BACKWARD_EULER) -> Stepper:
+def driven_step(example: Example, dt: float, integrator: Integrator = BACKWARD_EULER, *, halvings: int = 0) -> Stepper:
     """(init, step) of an example: init() is its initial state, and step(params, state, Drive) -> (state, Info)."""
-    init, step = make_step(example.scene, dt, integrator)
+    init, step = make_step(example.scene, dt, integrator, halvings=halvings)
 
     def advance(params: Params, state: State, driven: Drive) -> tuple[State, Info]:
         if driven.held_velocity is not None:

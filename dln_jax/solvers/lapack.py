@@ -27,6 +27,10 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @of_one.def_vmap
     def of_many(_: int, batched: Sequence[bool], *arguments: Array) -> tuple[Any, Any]:
+        if not any(batched):
+            result = function(*arguments)
+            return result, jax.tree.map(lambda _: False, result)
+
         def merged(call: Callable[..., Any], members: Sequence[Array]) -> Any:
             rest = iter(members)
             return call(

@@ -94,7 +94,9 @@ def prepare(options: Any) -> PreparedScene:
     require_within({"steps (--seconds / --dt)": steps})
     # Positions and velocities of every step in float64, held twice while chunks are concatenated.
     require_memory(f"a motion of {steps:,} steps", 32.0 * steps * example.scene.mesh.vertices.size)
-    stepper = driven_step(example, dt, INTEGRATORS[options.integrator])
+    if options.halvings < 0:
+        raise InputError(f"--halvings is {options.halvings}; expected 0 or a positive integer")
+    stepper = driven_step(example, dt, INTEGRATORS[options.integrator], halvings=options.halvings)
     return PreparedScene(options, example, stepper, dt, steps, statements)
 
 

@@ -15,7 +15,7 @@ from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.softbody.driven import Example, drive
 from dln_jax.softbody.mesh.mesh import Mesh, volumes
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.softbody.verdict import LARGEST_GROWTH, Info
+from dln_jax.softbody.verdict import Info
 
 TITLES = {
     "beam": "beam: falls under its weight",
@@ -55,6 +55,8 @@ def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
         ("smallest_volume_ratio", float(ratios.min()), "1", None),
         ("energy_created_J", float(np.sum(np.asarray(info.energy_growth))), "J", None),
     )
+    if info.substeps is not None:
+        numbers += (("steps_shortened", float((info.substeps > 1).sum()), "1", None),)
     if info.overlaps is not None:
         numbers += (("overlapping_components_max", float(info.overlaps.max()), "1", None),)
     return [Row(scene, name, value, unit, bound=bound) for name, value, unit, bound in numbers]
@@ -77,13 +79,12 @@ def line(row: Row) -> tuple[str, str, str]:
 def warn(motion: SimulatedMotion) -> None:
     """Warns about steps that failed, overlapping components and non-finite motions."""
     info, steps = motion.info, len(motion.t) - 1
-    growth, at_hand = np.asarray(info.energy_growth), np.asarray(info.energy_at_hand)
-    diverged = ~(growth <= LARGEST_GROWTH * at_hand)
+    diverged = np.asarray(info.diverged)
     inverted = np.zeros_like(diverged) if info.least_J is None else ~(np.asarray(info.least_J) > 0)
     unbalanced = ~np.asarray(info.converged) & ~diverged & ~inverted
     reasons = (
         (unbalanced, "did not converge", "try a shorter --dt"),
-        (diverged, "diverged: they created energy", "try a shorter --dt or --integrator backward-euler"),
+        (diverged, "diverged: they created energy", "try a shorter --dt or another --integrator"),
         (inverted, "turned elements inside out", "try a shorter --dt, a stiffer material or a slower motion"),
     )
     for missed, what, remedy in reasons:

@@ -25,8 +25,11 @@ class Arguments(Folder, Drawn):
 
     scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
     """The scene to simulate; all: every scene in its own subfolder, and one figure of all."""
-    integrator: Literal["backward-euler", "bdf2", "midpoint"] = "backward-euler"
-    """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp."""
+    integrator: Literal["backward-euler", "bdf2", "midpoint", "average-vector-field"] = "backward-euler"
+    """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp,
+    average-vector-field (second order) keeps the energy."""
+    halvings: int = 0
+    """Take steps that do not converge again in parts, of --dt / 2^halvings at the shortest; not with bdf2."""
     dt: Unstated[float] = None
     """Time step in s."""
     seconds: Unstated[float] = None

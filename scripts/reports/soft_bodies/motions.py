@@ -28,7 +28,7 @@ from scripts.reports.soft_bodies.common import GRAVITY, converges, motion, solid
 
 TOLERANCE = 1e-9
 """Tolerance of the steps, m/s²: exact properties of the method then hold to rounding."""
-ORDERS = {"backward-euler": 1, "bdf2": 2, "midpoint": 2}
+ORDERS = {"backward-euler": 1, "bdf2": 2, "midpoint": 2, "average-vector-field": 2}
 DURATION = 1.0
 """Length of the swing for measuring orders, s."""
 SWING = np.array([[0.0, 0.0], [0.0, 1.0], [0.5, -1.0]])
