@@ -7,9 +7,9 @@ forces of every step are balanced. Over one step,
 
 with the kinetic energy T of the free vertices, the potential V (both values with the actuation and the lagged contact
 of this step) and the work W done by held vertices. The exact motion has growth <= 0. A step that creates more than
-`LARGEST_GROWTH` of the energy at hand has diverged. Slow growth, of a percent in every step, has no such step: the state
-carries the energy that was created since the energy was lowest (a cumulative sum, max(created + growth, 0)), which may
-not exceed the same share of the largest energy at hand so far.
+`LARGEST_GROWTH` of the energy at hand has diverged. Slow growth, of a percent in every step, has no such step.
+Therefore the state carries the energy created since the energy was lowest, max(created + growth, 0), which may not
+exceed the same share of the largest energy at hand so far.
 """
 
 from collections.abc import Sequence

@@ -17,7 +17,6 @@ from dln_jax.softbody.scene import make_scene, potential
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.types import InputError
 
@@ -71,7 +70,7 @@ def test_a_spinning_disc_keeps_its_energy(rate, noise, turned):
 
 @pytest.mark.parametrize("rate", [2.0, 5.0])
 def test_slow_growth_of_the_midpoint_rule_is_divergence(rate):
-    """From the same start the midpoint rule creates energy, by less than 4 % of the energy at hand in any step at 5 rad/s."""
+    """At 5 rad/s no step creates 10 % of the energy at hand, and 1,000 steps create 60 % of the energy."""
     energy, _, info = thousand_steps(MIDPOINT)(spinning(rate, 2.0))
     # The energy was lowest near the start: growth by a tenth of the energy at hand is noticed.
     wrong = np.asarray(energy[1:] > 1.2 * energy[0])
@@ -82,45 +81,48 @@ def test_slow_growth_of_the_midpoint_rule_is_divergence(rate):
 
 
 def test_the_average_vector_field_method_has_order_two():
+    """Against steps of an eighth of the length, from a rotation that also stretches."""
     scene = free_disc()
+    start = spinning(5.0, 0.0) + np.array([2.0, 0.0]) * scene.mesh.vertices
 
     @jax.jit
     def end(count):
         init, step = make_step(scene, 0.05 / count, AVERAGE_VECTOR_FIELD, tolerance=1e-9)
-        state = init(v=spinning(5.0, 0.5))
+        state = init(v=start)
         return jax.lax.fori_loop(0, count, lambda _, state: step(scene.params, state)[0], state).x
 
     exact = end(800)
-    coarse, fine = (np.abs(end(count) - exact).max() for count in (25, 50))
+    coarse, fine = (np.abs(end(count) - exact).max() for count in (50, 100))
     assert np.log2(coarse / fine) == pytest.approx(2, abs=0.1)
 
 
 def impact(integrator, halvings, **options):
-    """speed -> a number, and the outcomes, of two masses on a spring that hit a stiff and rough ground."""
-    mesh = Mesh(np.array([[0.0, 0.01], [1.0, 0.02]]), np.zeros((0, 3), int))
-    ground = plane_contact([0, 1], normal=(0, 1), stiffness=1e5, width=1e-3, friction=0.3)
-    scene = make_scene(mesh, [springs([[0, 1]], stiffness=1e3), ground], masses=[1.0, 2.0])
+    """speed -> height and velocity at the end, added, and the outcomes, of a mass that hits a stiff ground."""
+    mesh = Mesh(np.array([[0.0, 0.01]]), np.zeros((0, 3), int))
+    ground = plane_contact([0], normal=(0, 1), stiffness=1e5, width=1e-3)
+    scene = make_scene(mesh, [ground], masses=1.0)
     init, step = make_step(scene, 0.02, integrator, halvings=halvings, **options)
 
     def run(speed):
-        start = init(v=speed * jnp.array([0.3, -1.0]))
+        start = init(v=speed * jnp.array([0.0, -1.0]))
         advance, observe = functools.partial(step, scene.params), lambda _, info: info
         last, info = rollout(advance, start, steps=4, observe=observe)
-        return last.x[:, 1].mean() + last.v[0, 0], info
+        return last.x[0, 1] + last.v[0, 1], info
 
     return run
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_is_taken_in_parts_and_has_its_derivatives():
     """The midpoint rule creates energy in the first step of 20 ms, and little in steps of 2.5 ms."""
     _, whole = jax.jit(impact(MIDPOINT, 0))(4.0)
     assert not whole.converged.all() and whole.substeps is None
-    run = impact(MIDPOINT, 4)
+    run = impact(MIDPOINT, 4, tolerance=1e-10)
     gradient = jax.jit(jax.value_and_grad(run, has_aux=True))
     (_, info), slope = gradient(4.0)
     assert info.converged.all() and info.substeps[0] > 1 and (info.substeps[1:] == 1).all()
-    ahead, behind = (gradient(4.0 + change)[0][0] for change in (1e-6, -1e-6))
-    np.testing.assert_allclose(slope, (ahead - behind) / 2e-6, rtol=1e-6)
+    ahead, behind = (gradient(4.0 + change)[0][0] for change in (1e-5, -1e-5))
+    np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-6)
     _, tangent = jax.jit(lambda speed: jax.jvp(lambda speed: run(speed)[0], (speed,), (1.0,)))(4.0)
     np.testing.assert_allclose(tangent, slope, rtol=1e-12)
 
@@ -148,10 +150,6 @@ def test_a_bouncing_body_raises_no_false_alarm(integrator):
     example = drop()
     init, step = driven_step(example, example.dt, integrator)
     observe = lambda _, info: info  # noqa: E731
-    run = jax.jit(
-        lambda params: rollout(
-            functools.partial(step, params), init(), drive(example, example.dt, 500), observe=observe
-        )
-    )
-    _, info = run(example.scene.params)
-    assert info.converged.all()
+    driven = drive(example, example.dt, 500)
+    run = jax.jit(lambda params: rollout(functools.partial(step, params), init(), driven, observe=observe)[1])
+    assert run(example.scene.params).converged.all()
