@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
@@ -26,7 +25,7 @@ Advance = Callable[..., tuple[State, Info]]
 
 
 class Parts(NamedTuple):
-    """Parts of a step that converged; those from `count` on are empty."""
+    """Parts of a step that converged; those from `taken` on are empty."""
 
     x: Float[Array, "parts n dim"]
     """Positions at their starts, in m."""
@@ -35,7 +34,8 @@ class Parts(NamedTuple):
     """Positions at their ends, in m."""
     length: Int[Array, " parts"]
     """In units of dt/2^halvings."""
-    count: Int[Array, ""]
+    taken: Int[Array, ""]
+    """Their number."""
 
 
 class _Progress(NamedTuple):
@@ -81,7 +81,7 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
             state, so_far, parts, done, length = progress
             after, outcome = part_of(params, state, control, length)
             accepted = outcome.converged
-            merged = _where(parts.count > 0, _together(so_far, outcome), outcome)
+            merged = _where(parts.taken > 0, _together(so_far, outcome), outcome)
             return _Progress(
                 _where(accepted, after, state),
                 _where(accepted, merged, so_far)._replace(iterations=so_far.iterations + outcome.iterations),
@@ -93,7 +93,7 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
         last = jax.lax.while_loop(unfinished, attempt, start)
         complete = last.done == most
         info = _where(complete, last.info, info._replace(iterations=last.info.iterations))
-        return _where(complete, last.state, first), info._replace(substeps=last.parts.count), last.parts
+        return _where(complete, last.state, first), info._replace(substeps=last.parts.taken), last.parts
 
     def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         state, info, parts = whole(*primals)
@@ -121,7 +121,7 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
         def cotangent(number: Array, bars: Any) -> tuple[list[Array], Array, Array]:
             return jax.vjp(lambda *values: part(number, *values), *at(number))[1](bars)
 
-        moved = _chain(most, parts.count, tangent, cotangent, ([dots[i] for i in varying], start_dot))
+        moved = _chain(most, parts.taken, tangent, cotangent, ([dots[i] for i in varying], start_dot))
         factor = jnp.where(info.converged, 1.0, jnp.nan).astype(state.x.dtype)
         state_dot = jax.tree.map(no_tangent, state)._replace(x=factor * moved[0], v=factor * moved[1])
         return (state, info, parts), (state_dot, jax.tree.map(no_tangent, info), jax.tree.map(no_tangent, parts))
@@ -164,7 +164,7 @@ def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inpu
             # Empty parts would divide by their length.
             return _where(number < count, tangent(jnp.minimum(number, count - 1), inputs[0], moved), moved), None
 
-        moved, _ = jax.lax.scan(one, inputs[1], np.arange(most))
+        moved, _ = jax.lax.scan(one, inputs[1], jnp.arange(most))
         return ravel_pytree((inputs, jax.tree.map(jnp.subtract, out, moved)))[0]
 
     def solve(_: Callable, both: Array) -> Array:
@@ -180,22 +180,34 @@ def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inpu
 
 def _with_part(parts: Parts, state: State, x_after: Array, length: Array, accepted: Array) -> Parts:
     """Appends a part, if it is accepted."""
-    place = jnp.where(accepted, parts.count, len(parts.length))
-    values = (state.x, state.v, x_after, length)
-    lists = (of.at[place].set(value, mode="drop") for of, value in zip(parts[:-1], values, strict=True))
-    return Parts(*lists, parts.count + accepted)
+    place = jnp.where(accepted, parts.taken, len(parts.length))
+
+    def appended(column: Array, value: Array) -> Array:
+        return column.at[place].set(value, mode="drop")
+
+    return Parts(
+        x=appended(parts.x, state.x),
+        v=appended(parts.v, state.v),
+        x_after=appended(parts.x_after, x_after),
+        length=appended(parts.length, length),
+        taken=parts.taken + accepted,
+    )
 
 
 def _together(first: Info, second: Info) -> Info:
     """Outcome of two parts, in order, the iterations apart."""
-    merged = second._replace(
+
+    def merged(combine: Callable[[Any, Any], Array], name: str) -> Any:
+        values = getattr(first, name), getattr(second, name)
+        return None if any(value is None for value in values) else combine(*values)
+
+    return second._replace(
         residual=jnp.maximum(first.residual, second.residual),
-        energy_growth=first.energy_growth + second.energy_growth,
-        energy_at_hand=jnp.maximum(first.energy_at_hand, second.energy_at_hand),
+        definite=merged(jnp.logical_and, "definite"),
+        energy_growth=merged(jnp.add, "energy_growth"),
+        energy_at_hand=merged(jnp.maximum, "energy_at_hand"),
+        least_J=merged(jnp.minimum, "least_J"),
     )
-    if second.least_J is not None:
-        merged = merged._replace(least_J=jnp.minimum(first.least_J, second.least_J))
-    return merged if second.definite is None else merged._replace(definite=first.definite & second.definite)
 
 
 def _where(condition: Array, new: Any, old: Any) -> Any:

@@ -14,9 +14,10 @@ from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare
 from dln_jax.softbody.step import make_step, static_solve
-from dln_jax.softbody.terms.contact import damping_of_restitution, plane_contact
+from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.damping import mass_damping, stiffness_damping
 from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.penalty import damping_of_restitution
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.energies import value
 from dln_jax.types import InputError
@@ -52,7 +53,9 @@ def decaying(integrator, duration, amplitude=1e-6):
     @jax.jit  # one program for every step length
     def end(count):
         init, step = make_step(scene(), duration / count, integrator, tolerance=1e-12)
-        return jax.lax.fori_loop(0, count, lambda _, state: step(scene().params, state)[0], init(v=amplitude * shape)).x
+        return jax.lax.fori_loop(
+            0, count, lambda _, state: step(scene().params, state, None)[0], init(v=amplitude * shape)
+        ).x
 
     weights = np.asarray(scene().params.masses)[:, None] * shape / amplitude
     return lambda count: np.sum(weights * (np.asarray(end(count)) - MESH.vertices))

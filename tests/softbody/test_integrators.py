@@ -89,7 +89,7 @@ def test_the_average_vector_field_method_has_order_two():
     def end(count):
         init, step = make_step(scene, 0.05 / count, AVERAGE_VECTOR_FIELD, tolerance=1e-9)
         state = init(v=start)
-        return jax.lax.fori_loop(0, count, lambda _, state: step(scene.params, state)[0], state).x
+        return jax.lax.fori_loop(0, count, lambda _, state: step(scene.params, state, None)[0], state).x
 
     exact = end(800)
     coarse, fine = (np.abs(end(count) - exact).max() for count in (50, 100))

@@ -10,9 +10,10 @@ from conftest import slow_among
 
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms import creature
-from dln_jax.softbody.terms.contact import distance_contact, penalty, penalty_force, plane_contact
+from dln_jax.softbody.terms.contact import distance_contact, plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.penalty import penalty, penalty_force
 from dln_jax.softbody.terms.springs import muscles, springs
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.terms.term import Context, Term

@@ -1,10 +1,11 @@
 """Energy terms of soft bodies, with their material and friction laws."""
 
-from dln_jax.softbody.terms.contact import damping_of_restitution, distance_contact, plane_contact
+from dln_jax.softbody.terms.contact import distance_contact, plane_contact
 from dln_jax.softbody.terms.creature import creature_terms
 from dln_jax.softbody.terms.damping import mass_damping, stiffness_damping
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.penalty import damping_of_restitution
 from dln_jax.softbody.terms.springs import muscles, springs
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.terms.term import Context, Term

@@ -6,6 +6,7 @@ operations are on scalars, which fuse under `vmap`.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +56,7 @@ def st_venant_kirchhoff(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scal
     return linear_energy(green_strain(F), mu, lam)
 
 
-def green_strain(F: DeformationGradient) -> list[list[Array]]:
+def green_strain(F: DeformationGradient) -> list[list[Any]]:
     """Rows of the lower triangle of E = (FᵀF - I)/2."""
     axes = range(len(F))
     return [
