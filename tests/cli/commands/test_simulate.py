@@ -142,15 +142,16 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     numbers = np.ones(3)
     x = np.zeros((4, 3, 2))
     x[3, 0, 0] = np.nan
-    info = Info(numbers, numbers, converged, energy_growth=-numbers, energy_at_hand=numbers, least_J=numbers)
+    calm = np.zeros(3, bool)
+    info = Info(
+        numbers, numbers, converged, energy_growth=-numbers, energy_at_hand=numbers, diverged=calm, least_J=numbers
+    )
     motion = SimulatedMotion(np.arange(4.0), x, np.zeros_like(x), info, 1.0, 1.0)
     assert finite_moments(motion) == 3
     warn(motion)
     said = capsys.readouterr().out
     assert "diverged" not in said and "inside out" not in said
-    warn(
-        motion._replace(info=info._replace(energy_growth=np.array([-1.0, 0.5, np.nan]), least_J=np.array([1, -0.1, 1])))
-    )
+    warn(motion._replace(info=info._replace(diverged=np.array([False, True, True]), least_J=np.array([1, -0.1, 1]))))
     worse = capsys.readouterr().out
     assert "2 of 3 steps diverged: they created energy, the first at t = 2 s" in worse
     warn(motion._replace(info=info._replace(overlaps=np.array([0, 2, 1]))))
