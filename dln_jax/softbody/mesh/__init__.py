@@ -13,7 +13,7 @@ from dln_jax.softbody.mesh.mesh import (
     vertices_where,
     volumes,
 )
-from dln_jax.softbody.mesh.quadratic import quadratic, with_midsides
+from dln_jax.softbody.mesh.quadratic import barycentric_split, quadratic, with_midsides
 from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
 from dln_jax.softbody.mesh.shapes import (
     Creature,
@@ -32,6 +32,7 @@ __all__ = [
     "Creature",
     "Mesh",
     "NamedSet",
+    "barycentric_split",
     "beam",
     "biped",
     "body_length",

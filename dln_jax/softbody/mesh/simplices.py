@@ -1,8 +1,8 @@
 """Volumes, shapes and facets of individual simplices, from positions and corners, whether they form a mesh or not.
 
 Quadratic simplices have a mid-side node on each edge after their corners. With barycentric coordinates l, the shape
-functions are l_i (2 l_i - 1) at corner i and 4 l_i l_j between corners i and j. Their quadrature points (3 in a triangle,
-4 in a tetrahedron, equal weights) integrate polynomials of degree 2 exactly (Hughes 2000, tables 3.I.1 and 3.I.2).
+functions are l_i (2 l_i - 1) at corner i and 4 l_i l_j between corners i and j. Their quadrature points (3 in a
+triangle, 4 in a tetrahedron, equal weights) integrate polynomials of degree 2 exactly (Hammer and Stroud 1956).
 """
 
 import itertools

@@ -13,9 +13,12 @@ bending; their displacements converge with order 3 for smooth solutions. As nu a
 Mixed elements are quadratic in displacement with one pressure per element, p = lambda (J - 1), eliminated from
 sum of w_q W(F_q, mu, 0) + volume (p (J - 1) - p²/(2 lambda)) (P2/P0, a perturbed Lagrangian; at small strains the
 selective reduced integration of Malkus and Hughes 1978). What remains is an energy of the positions alone, so that a
-step stays a minimisation. Pressures of order 1 limit displacements to order 2. In the plane the pair satisfies the
-inf-sup condition on any mesh (Fortin 1972; Boffi, Brezzi and Fortin 2013, chapter 8), so that it does not lock. In space
-the proof fails, because no node lies inside a face.
+step stays a minimisation. In the plane the pair satisfies the inf-sup condition (Boffi, Brezzi and Fortin 2013, chapter
+8), so that it does not lock. In space there is no such proof, because no node lies inside a face to control its flux;
+clamped cubes of unordered tetrahedra converge without locking (tests/softbody/test_quadratic_elements.py). A constant
+pressure limits displacements to order 2, and it cannot vary through the thickness of a beam: with one element, the
+pressure that bending needs is missing and the beam is up to 1.6 times too soft. There use quadratic elements, split by
+`mesh.barycentric_split` if nu is close to 1/2.
 """
 
 from typing import NamedTuple
@@ -63,7 +66,7 @@ def elastic(
 
     Mixed elements, for nu near 1/2, need a quadratic mesh. Their volumetric energy is lambda/2 (J - 1)² of the mean J,
     that of the stable neo-Hookean density; other densities differ from their own by third order in J - 1, and those of
-    St. Venant-Kirchhoff and the corotated solid, whose lambda multiplies a trace of strains, by third order in the strain.
+    St. Venant-Kirchhoff and the corotated solid, whose lambda multiplies a trace of strains, by third order in strain.
 
     Raises:
         InputError: a parameter is out of range, `mixed` with a linear mesh, or a quadratic element that its mid-side
@@ -72,8 +75,12 @@ def elastic(
     count = len(mesh.elements)
     if mesh.midsides is None and mixed:
         raise InputError("mixed elements are quadratic; build the term and the scene from quadratic(mesh)")
-    if mesh.midsides is not None and len(bad := np.flatnonzero((jacobians(mesh.vertices, mesh.nodes) <= 0).any(axis=1))):
-        raise InputError(f"element {bad[0]} is inverted at a quadrature point; move its mid-side nodes")
+    if mesh.midsides is not None:
+        inverted = (jacobians(mesh.vertices, mesh.nodes) <= 0).any(axis=1)
+        if inverted.any():
+            raise InputError(
+                f"element {np.argmax(inverted)} is inverted at a quadrature point; move its mid-side nodes"
+            )
     parameters = Material(
         material("youngs_modulus", youngs_modulus, count, "element"),
         material("poisson_ratio", poisson_ratio, count, "element", _POISSON_BOUND),
