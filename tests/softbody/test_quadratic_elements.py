@@ -1,5 +1,6 @@
 """Quadratic and mixed elements: closed forms, orders of convergence, what they reproduce exactly, and derivatives."""
 
+import functools
 import itertools
 
 import jax
@@ -11,6 +12,8 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
+from dln_jax.rollout import rollout
+from dln_jax.softbody import examples
 from dln_jax.softbody.mesh import (
     barycentric_split,
     beam,
@@ -25,7 +28,7 @@ from dln_jax.softbody.mesh import (
 )
 from dln_jax.softbody.mesh.simplices import SIDES, regularity, volume_ratios
 from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare, with_parameters
-from dln_jax.softbody.step import static_solve
+from dln_jax.softbody.step import make_step, static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
@@ -289,6 +292,36 @@ def test_mid_side_nodes_between_held_corners_are_held():
     corners = vertices_where(mesh, lambda x: x[:, 0] == 0)
     linear = corners[corners < 9]
     assert with_midsides(mesh, linear).tolist() == corners.tolist()
+
+
+def test_examples_of_order_2_hold_and_load_their_mid_side_nodes():
+    corners = beam(1.0, 1.0, 1, 1)
+    example = examples.beam(mesh=corners, held=[0, 1], order=2, mixed=True)
+    mesh = example.scene.mesh
+    assert mesh.midsides is not None and example.scene.held.tolist() == [0, 1, *with_midsides(mesh, [0, 1])[2:]]
+    assert example.scene.held.size == 3
+    twisted = examples.twist(cells=1, order=2)
+    assert twisted.held_path is not None and (np.diff(twisted.scene.held) > 0).all()
+    np.testing.assert_allclose(twisted.held_path(np.zeros(1))[0], twisted.scene.mesh.vertices[twisted.scene.held])
+    for scene in (examples.slope(order=2).scene, examples.drop(dimension=3, cells=1, order=2).scene):
+        assert all(set(range(len(scene.mesh.vertices))) == set(term.indices.ravel()) for term in scene.terms)
+
+
+@pytest.mark.slow
+def test_a_mixed_body_falls_and_bounces():
+    example = examples.drop(cells=2, order=2, mixed=True, poisson_ratio=0.499)
+    init, step = make_step(example.scene, example.dt)
+
+    @jax.jit
+    def run(state):
+        observe = lambda state, info: (state.x, info.converged)  # noqa: E731
+        return rollout(functools.partial(step, example.scene.params), state, steps=150, observe=observe)[1]
+
+    x, converged = run(init(v=example.v))
+    assert converged.all() and x[..., 1].min() > -0.01
+    areas = volumes(example.scene.mesh)
+    moved = np.array([volumes(example.scene.mesh._replace(vertices=np.asarray(now))) for now in x])
+    np.testing.assert_allclose(moved / areas, 1.0, atol=0.02)
 
 
 def test_mistakes_are_named():

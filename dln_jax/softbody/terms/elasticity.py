@@ -97,14 +97,17 @@ def elastic(
         gradients, volume, mu, lam = element
         return volume * density(deformation_gradient(x, gradients), mu, lam)
 
-    def quadratic_energy(x: Float[Array, "nodes dim"], element: tuple[Array, ...]) -> Scalar:
+    def quadratic_energy(corners: Corners, element: tuple[Array, ...]) -> Scalar:
+        x = jnp.asarray(corners)
         gradients, weights, mu, lam = element
         # Rows of F at all points at once: products of small matrices compile much faster than unrolled sums.
         axes = range(x.shape[1])
         F = [[gradients[:, :, j] @ x[:, i] for j in axes] for i in axes]
-        at_points = jax.vmap(lambda F: density(F, mu, 0.0 * lam if mixed else lam))(F)
-        energy = jnp.sum(weights * at_points)
-        return energy + 0.5 * lam * jnp.sum(weights * (determinant(F) - 1.0)) ** 2 / weights.sum() if mixed else energy
+        of_points = 0.0 * lam if mixed else lam
+        stored = jnp.sum(weights * jax.vmap(lambda F: density(F, mu, of_points))(F))
+        if not mixed:
+            return stored
+        return stored + 0.5 * lam * jnp.sum(weights * (determinant(F) - 1.0)) ** 2 / weights.sum()
 
     if mesh.midsides is None:
         return Term(name, mesh.elements, energy, parameters, prepare)
