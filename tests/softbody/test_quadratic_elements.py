@@ -15,6 +15,7 @@ from scipy.spatial import Delaunay
 from dln_jax.rollout import rollout
 from dln_jax.softbody import examples
 from dln_jax.softbody.mesh import (
+    NamedSet,
     barycentric_split,
     beam,
     boundary_vertices,
@@ -22,9 +23,11 @@ from dln_jax.softbody.mesh import (
     lumped_masses,
     make_mesh,
     quadratic,
+    read_mesh,
     vertices_where,
     volumes,
     with_midsides,
+    write_mesh,
 )
 from dln_jax.softbody.mesh.simplices import SIDES, regularity, volume_ratios
 from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare, with_parameters
@@ -322,6 +325,25 @@ def test_a_mixed_body_falls_and_bounces():
     areas = volumes(example.scene.mesh)
     moved = np.array([volumes(example.scene.mesh._replace(vertices=np.asarray(now))) for now in x])
     np.testing.assert_allclose(moved / areas, 1.0, atol=0.02)
+
+
+@pytest.mark.parametrize("cells", [(1, 1), (1, 1, 1)], ids=["plane", "space"])
+def test_named_sets_keep_their_parts(cells, tmp_path):
+    mesh = beam(1.0, 1.0, 2, 1) if len(cells) == 2 else box((2.0, 1.0, 1.0), (2, 1, 1))
+    middle = mesh.vertices[:, 0].max() / 2
+    part = np.flatnonzero(mesh.vertices[mesh.elements][..., 0].max(axis=1) <= middle)
+    left = vertices_where(mesh, lambda x: x[:, 0] == 0)
+    sets = {"half": NamedSet(np.unique(mesh.elements[part]), part), "left": NamedSet(left, np.zeros(0, int))}
+    body = quadratic(barycentric_split(mesh._replace(sets=sets)))
+    half = body.sets["half"]
+    assert half.vertices.tolist() == vertices_where(body, lambda x: x[:, 0] <= middle).tolist()
+    assert half.vertices.tolist() == np.unique(body.nodes[half.elements]).tolist()
+    assert volumes(body)[half.elements].sum() == pytest.approx(volumes(mesh).sum() / 2)
+    assert body.sets["left"].vertices.tolist() == vertices_where(body, lambda x: x[:, 0] == 0).tolist()
+    pytest.importorskip("meshio")
+    write_mesh(tmp_path / "body.vtu", body)
+    read = read_mesh(tmp_path / "body.vtu").mesh
+    assert len(read.elements) == len(body.elements) and read.sets["half"].elements.tolist() == half.elements.tolist()
 
 
 def test_mistakes_are_named():
