@@ -9,11 +9,13 @@
 | creature | crawler with muscles | crawls, by a wave that runs from its head to its tail |
 
 The last axis points up. Materials are elastic (E in Pa, Poisson's ratio, a density of `strain_energies`); densities are
-1000 kg/m³. The creature is the published preset of `terms.creature`.
+1000 kg/m³. Elements are linear (`order` 1) or quadratic (2), and those are `mixed` on request, for nu near 1/2. The
+creature is the published preset of `terms.creature`.
 """
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from dln_jax.softbody.driven import Example
 from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses, vertices_where
+from dln_jax.softbody.mesh.quadratic import quadratic, with_midsides
 from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import SoftScene, make_scene
@@ -61,6 +64,8 @@ def beam(
     youngs_modulus: Numbers = 2e6,
     poisson_ratio: float = 0.3,
     strain_energy: StrainEnergy = stable_neo_hookean,
+    order: int = 1,
+    mixed: bool = False,
 ) -> Example:
     """A beam of 4 m x 1 m (x 1 m) with `cells` cells across, or a custom mesh, held on the left.
 
@@ -70,10 +75,13 @@ def beam(
         _require_dimension(dimension)
         flat = dimension == 2
         mesh = beam_mesh(4.0, 1.0, 4 * cells, cells) if flat else box((4.0, 1.0, 1.0), (4 * cells, cells, cells))
+    mesh = _of_order(mesh, order)
+    if held is not None and order == 2:
+        held = with_midsides(mesh, held)
     if held is None:
         left, extent = mesh.vertices[:, 0].min(), np.ptp(mesh.vertices[:, 0])
         held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
-    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), held=held)
+    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), held=held)
     return Example(scene, dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
 
 
@@ -84,15 +92,17 @@ def twist(
     youngs_modulus: float = 1e6,
     poisson_ratio: float = 0.4,
     strain_energy: StrainEnergy = stable_neo_hookean,
+    order: int = 1,
+    mixed: bool = False,
 ) -> Example:
     """A bar of 1 m x 8 m x 1 m whose ends are turned against each other about its axis, half of the turns each.
 
     The turns take 4 s, then the ends are held for 1 s. There is no gravity, and no contact of the
     bar with itself: beyond two turns it buckles, and can pass through itself.
     """
-    mesh = box((1.0, 8.0, 1.0), (cells, 8 * cells, cells))
+    mesh = _of_order(box((1.0, 8.0, 1.0), (cells, 8 * cells, cells)), order)
     held = vertices_where(mesh, lambda x: (x[:, 1] == 0.0) | (x[:, 1] == 8.0))
-    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), held=held)
+    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), held=held)
     x, y, z = (mesh.vertices[held] - [0.5, 0.0, 0.5]).T
 
     def path(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T k dim"]:
@@ -111,14 +121,16 @@ def slope(
     youngs_modulus: float = 1e6,
     poisson_ratio: float = 0.3,
     strain_energy: StrainEnergy = stable_neo_hookean,
+    order: int = 1,
+    mixed: bool = False,
 ) -> Example:
     """A block of 1 m x 0.5 m on a plane of tan 0.5 that rises to the right: it slides if friction < 0.5."""
-    mesh = beam_mesh(1.0, 0.5, 2 * cells, cells)
+    mesh = _of_order(beam_mesh(1.0, 0.5, 2 * cells, cells), order)
     along = np.array([1.0, SLOPE]) / math.hypot(1.0, SLOPE)
     normal = np.array([-along[1], along[0]])
     mesh = mesh._replace(vertices=mesh.vertices[:, :1] * along + mesh.vertices[:, 1:] * normal)
     ground = _ground(mesh, friction, height=0.5, normal=normal)
-    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground)
+    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), ground)
     return Example(scene, dt=1 / 120, seconds=2.0, ground=SLOPE, moments=(0.0, 0.7, 1.2, 1.6, 2.0))
 
 
@@ -131,6 +143,8 @@ def drop(
     youngs_modulus: Numbers = 3e5,
     poisson_ratio: float = 0.3,
     strain_energy: StrainEnergy = stable_neo_hookean,
+    order: int = 1,
+    mixed: bool = False,
     seed: int = 0,
 ) -> Example:
     """A body that falls from its own height with 2 m/s to the right and a random rate of rotation (±1 rad/s).
@@ -142,12 +156,13 @@ def drop(
     if mesh is None:
         _require_dimension(dimension)
         mesh = disc(0.5, cells) if dimension == 2 else _tilted(box((1.0, 1.0, 1.0), (cells, cells, cells)), random)
+    mesh = _of_order(mesh, order)
     height = float(np.ptp(mesh.vertices[:, -1]))
     lift = np.zeros(mesh.dimension)
     lift[-1] = height - mesh.vertices[:, -1].min()
     mesh = mesh._replace(vertices=mesh.vertices + lift)
     ground = _ground(mesh, friction, height=height, normal=np.eye(mesh.dimension)[-1])
-    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground)
+    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), ground)
     arms = mesh.vertices - np.average(mesh.vertices, axis=0, weights=np.asarray(scene.params.masses))
     v = np.zeros_like(arms)
     v[:, 0], v[:, -1] = arms[:, -1], -arms[:, 0]
@@ -180,9 +195,19 @@ EXAMPLES: dict[str, Callable[..., Example]] = {scene.__name__: scene for scene i
 """Examples by name; their keyword arguments are their options."""
 
 
-def _solid(mesh: Mesh, law: tuple[StrainEnergy, Numbers, float], *others: Term, held: ArrayLike = ()) -> SoftScene:
-    """Returns the scene of an elastic body from its strain energy, E and nu, and its other terms."""
-    material = elastic(mesh, law[0], youngs_modulus=law[1], poisson_ratio=law[2])
+class _Law(NamedTuple):
+    """Material and kind of elements."""
+
+    strain_energy: StrainEnergy
+    youngs_modulus: Numbers
+    poisson_ratio: float
+    mixed: bool
+
+
+def _solid(mesh: Mesh, law: _Law, *others: Term, held: ArrayLike = ()) -> SoftScene:
+    """Returns the scene of an elastic body from its material and its other terms."""
+    density, modulus, ratio, mixed = law
+    material = elastic(mesh, density, youngs_modulus=modulus, poisson_ratio=ratio, mixed=mixed)
     return make_scene(mesh, [material, *others], density=DENSITY, held=held)
 
 
@@ -200,6 +225,12 @@ def _tilted(mesh: Mesh, random: np.random.Generator) -> Mesh:
     # Cayley's transform of a skew matrix is a rotation.
     rotation = np.linalg.solve(np.eye(3) - skew / 2, np.eye(3) + skew / 2)
     return mesh._replace(vertices=mesh.vertices @ rotation.T)
+
+
+def _of_order(mesh: Mesh, order: int) -> Mesh:
+    if order not in (1, 2):
+        raise InputError(f"order is {order}; expected 1 (linear elements) or 2 (quadratic elements)")
+    return mesh if order == 1 or mesh.midsides is not None else quadratic(mesh)
 
 
 def _require_dimension(dimension: int) -> None:

@@ -158,7 +158,7 @@ def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
     """Returns the terms in the form of the solver."""
-    return tuple(ElementEnergy(term.energy, term.indices, unrolled=True) for term in scene.terms)
+    return tuple(ElementEnergy(term.energy, term.indices, term.unrolled) for term in scene.terms)
 
 
 def prepare(

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.softbody.mesh.simplices import simplex_volumes
+from dln_jax.softbody.mesh.simplices import volume_ratios
 from dln_jax.softbody.scene import Growth, Params, SoftScene, element_energies
 from dln_jax.solvers.elements.energies import ElementEnergy, value
 from dln_jax.solvers.newton import SolverInfo
@@ -51,7 +51,8 @@ class Info(NamedTuple):
     """Whether the step, or the motion up to it, created more than `LARGEST_GROWTH` of the energy at hand. `None` for a
     static solve."""
     least_J: Float[Array, ""] | None = None
-    """Smallest ratio of an element's volume to its rest volume, over elements that resist deformation, if any."""
+    """Smallest ratio of volume to rest volume, over elements that resist deformation, if any; of quadratic elements at
+    their quadrature points."""
     overlaps: Int[Array, ""] | None = None
     """Number of pairs of overlapping mesh components: bodies have no contact with each other and pass through. `None`
     for a mesh of one component. It does not affect `converged`."""
@@ -129,11 +130,12 @@ def work_of_held(
 
 
 def least_J(scene: SoftScene, params: Params, x: Float[Array, "n dim"]) -> Float[Array, ""] | None:
-    """Smallest ratio of an element's volume to its rest volume; `None` if no term acts on the mesh's elements."""
-    elements = scene.mesh.elements
+    """Smallest volume ratio J, of a quadratic element at its quadrature points; `None` if no term acts on the mesh's
+    elements."""
+    elements = scene.mesh.nodes
     if not len(elements) or not any(np.array_equal(term.indices, elements) for term in scene.terms):
         return None
-    return jnp.min(simplex_volumes(x, elements) / simplex_volumes(params.rest, elements))
+    return jnp.min(volume_ratios(x, params.rest, elements))
 
 
 @jax.custom_jvp

@@ -106,8 +106,9 @@ def simulate(prepared: PreparedScene, folder: Path) -> Moments:
     write_json(folder / CONFIG, {**stored_arguments(options), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh
     pieces, size = int(components(mesh).max()) + 1, np.ptp(mesh.vertices, axis=0)
+    kind = "" if mesh.midsides is None else "mixed quadratic " if options.mixed else "quadratic "
     print(
-        f"{options.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements in {pieces} "
+        f"{options.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} {kind}elements in {pieces} "
         f"component{'s' * (pieces > 1)}, {' x '.join(f'{length:.4g}' for length in size)} m, "
         f"{int(example.scene.free.sum())} unknowns; {options.integrator}, dt {dt:.4g} s, {options.precision}"
     )
@@ -154,9 +155,12 @@ def example_of(options: Any) -> tuple[Example, tuple[str, ...]]:
         InputError: an option that the scene does not have, options that exclude each other, or an invalid value.
     """
     scene = EXAMPLES[options.scene]
-    names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
+    names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "order", "mesh")
     choices: dict[str, Any] = {name: getattr(options, name) for name in names}
     choices["strain_energy"] = None if options.material is None else MATERIALS[options.material]
+    choices["mixed"] = options.mixed or None
+    if options.mixed and options.order != 2:
+        raise InputError("--mixed needs --order 2: mixed elements are quadratic")
     choices = {name: value for name, value in choices.items() if value is not None}
     known = inspect.signature(scene).parameters
     if options.pin is not None and "held" not in known:

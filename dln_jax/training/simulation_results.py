@@ -13,8 +13,8 @@ from dln_jax.files import write_figure
 from dln_jax.metrics.report import Row
 from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.softbody.driven import Example, drive
-from dln_jax.softbody.mesh.mesh import Mesh, volumes
-from dln_jax.softbody.mesh.simplices import simplex_volumes
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.mesh.simplices import volume_ratios
 from dln_jax.softbody.verdict import Info
 
 TITLES = {
@@ -43,7 +43,7 @@ class SimulatedMotion(NamedTuple):
 def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
     """Rows of the table."""
     info, iterations = motion.info, motion.info.iterations
-    ratios = np.stack([simplex_volumes(x.astype(np.float64), mesh.elements) for x in motion.x]) / volumes(mesh)
+    ratios = np.stack([volume_ratios(x.astype(np.float64), mesh.vertices, mesh.nodes) for x in motion.x])
     numbers = (
         ("steps_per_second", motion.steps_per_second, "1/s", None),
         ("compile_seconds", motion.compile_seconds, "s", None),

@@ -48,6 +48,10 @@ class Arguments(Folder, Drawn):
     """twist: turns of one end against the other."""
     material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
     """Not for the creature (default: stable-neo-hookean)."""
+    order: Unstated[int] = None
+    """1: linear elements (default); 2: quadratic elements, which do not lock in bending. Not for the creature."""
+    mixed: bool = False
+    """Quadratic elements with one pressure each, for nearly incompressible bodies (nu near 0.5); needs --order 2."""
     mesh: Unstated[Path] = None
     """beam, drop: your own mesh, as described above."""
     scale: Unstated[float] = None

@@ -13,6 +13,7 @@ from dln_jax.softbody.mesh.mesh import (
     vertices_where,
     volumes,
 )
+from dln_jax.softbody.mesh.quadratic import barycentric_split, quadratic, with_midsides
 from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
 from dln_jax.softbody.mesh.shapes import (
     Creature,
@@ -31,6 +32,7 @@ __all__ = [
     "Creature",
     "Mesh",
     "NamedSet",
+    "barycentric_split",
     "beam",
     "biped",
     "body_length",
@@ -44,6 +46,7 @@ __all__ = [
     "lumped_masses",
     "make_mesh",
     "overlaps",
+    "quadratic",
     "quadruped",
     "read_mesh",
     "simplex_volumes",
@@ -51,6 +54,7 @@ __all__ = [
     "vertices_in",
     "vertices_where",
     "volumes",
+    "with_midsides",
     "write_mesh",
     "write_motion",
 ]

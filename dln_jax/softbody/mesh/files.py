@@ -24,6 +24,8 @@ from dln_jax.softbody.mesh.solids import ELEMENTS, MERGE, FileMesh, ReadMesh, so
 from dln_jax.types import InputError, require_positive
 
 SUFFIXES = (".msh", ".vtk", ".vtu", ".obj", ".ele", ".node")
+QUADRATIC = {2: "triangle6", 3: "tetra10"}
+"""Quadratic cells by dimension, in meshio's names; their nodes have VTK's order, as in `Mesh.nodes`."""
 MOST_REGIONS = 64
 """Integer arrays with more different numbers are numberings, not regions."""
 INSTALL = "pip install 'dln-jax[mesh]'"
@@ -60,7 +62,7 @@ def write_mesh(
     vertex_data: Mapping[str, np.ndarray] | None = None,
     element_data: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Writes a mesh with its named sets as .vtu; `read_mesh` returns the same sets.
+    """Writes a mesh with its named sets as .vtu; `read_mesh` returns the same sets, of quadratic meshes their corners.
 
     Args:
         path: of the file.
@@ -77,15 +79,15 @@ def write_mesh(
     vertices = {
         name: _flags(n, part.vertices)
         for name, part in mesh.sets.items()
-        # The corners of its elements follow from them.
-        if not len(part.elements) or not np.array_equal(part.vertices, np.unique(mesh.elements[part.elements]))
+        # The nodes of its elements follow from them.
+        if not len(part.elements) or not np.array_equal(part.vertices, np.unique(mesh.nodes[part.elements]))
     }
     elements = {name: _flags(m, part.elements) for name, part in mesh.sets.items() if len(part.elements)}
     vertices |= {name: _in_space(values) for name, values in (vertex_data or {}).items()}
     elements |= element_data or {}
     content = meshio.Mesh(
         _in_space(mesh.vertices if x is None else x),
-        [(ELEMENTS[mesh.dimension], mesh.elements)],
+        [((ELEMENTS if mesh.midsides is None else QUADRATIC)[mesh.dimension], mesh.nodes)],
         point_data=vertices,
         cell_data={name: [values] for name, values in elements.items()},
     )
@@ -116,10 +118,10 @@ def write_motion(
     require_positive(stride=stride)
     folder = path.with_suffix("")
     folder.mkdir(exist_ok=True)
-    rest, lines = simplex_volumes(mesh.vertices, mesh.elements), []
+    rest, lines = simplex_volumes(mesh.vertices, mesh.nodes), []
     for number, k in enumerate(range(0, len(t), stride)):
         name, position = f"{number:04d}.vtu", x[k].astype(np.float64)
-        J = simplex_volumes(position, mesh.elements) / rest
+        J = simplex_volumes(position, mesh.nodes) / rest
         data = {"displacement": position - mesh.vertices, "velocity": v[k]}
         write_mesh(
             folder / name,

@@ -1,4 +1,9 @@
-"""Volumes, shapes and facets of individual simplices, from positions and corners, whether they form a mesh or not."""
+"""Volumes, shapes and facets of individual simplices, from positions and corners, whether they form a mesh or not.
+
+Quadratic simplices have a mid-side node on each edge after their corners. With barycentric coordinates l, the shape
+functions are l_i (2 l_i - 1) at corner i and 4 l_i l_j between corners i and j. Their quadrature points (3 in a
+triangle, 4 in a tetrahedron, equal weights) integrate polynomials of degree 2 exactly (Hammer and Stroud 1956).
+"""
 
 import itertools
 import math
@@ -13,16 +18,47 @@ FACETS = {2: ((0, 1), (1, 2), (2, 0)), 3: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 
 """Corners of the facets by dimension, oriented outwards: in the plane the body lies on the left of an edge; in space
 the right-hand normal of a triangle points away from the body."""
 
+SIDES = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}
+"""Corners of the edges by dimension, in the order of the mid-side nodes (that of VTK)."""
+_FRACTION = {2: 1 / 6, 3: (5 - math.sqrt(5)) / 20}
+"""The smallest barycentric coordinate of the quadrature points; the others are permutations."""
 
-def simplex_volumes(
-    vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m corners"]
-) -> Float[AnyArray, " m"]:
+
+def simplex_volumes(vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m nodes"]) -> Float[AnyArray, " m"]:
     """Signed areas in m² or volumes in m³: det[x1 - x0, ..., xdim - x0] / dim!, negative for inverted elements.
 
-    Takes NumPy and JAX arrays, so that it can be differentiated by the rest shape.
+    Takes NumPy and JAX arrays, so that it can be differentiated by the rest shape. The volume of a quadratic
+    tetrahedron with curved edges is that of the quadrature.
     """
+    if elements.shape[1] > vertices.shape[1] + 1:
+        return jacobians(vertices, elements).mean(axis=1) / math.factorial(vertices.shape[1])
     corners = vertices[elements]
     return determinant((corners[:, 1:] - corners[:, :1]).transpose(1, 2, 0)) / math.factorial(vertices.shape[1])
+
+
+def volume_ratios(
+    x: Float[AnyArray, "n dim"], rest: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m nodes"]
+) -> Float[AnyArray, "m points"]:
+    """J = det dx/dX: one number for a linear element, one at each quadrature point of a quadratic element."""
+    if elements.shape[1] > x.shape[1] + 1:
+        return jacobians(x, elements) / jacobians(rest, elements)
+    return (simplex_volumes(x, elements) / simplex_volumes(rest, elements))[:, None]
+
+
+def jacobians(vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m nodes"]) -> Float[AnyArray, "m points"]:
+    """Determinants of dx/dl of quadratic elements at their quadrature points, in m² or m³."""
+    J = vertices[elements].swapaxes(1, 2)[:, None] @ reference_gradients(vertices.shape[1])
+    return determinant(J.transpose(2, 3, 0, 1))
+
+
+def reference_gradients(dimension: int) -> Float[np.ndarray, "points nodes dim"]:
+    """Derivatives of a quadratic element's shape functions by the barycentric coordinates l1, ..., ldim."""
+    fraction, count = _FRACTION[dimension], dimension + 1
+    points = np.full((count, count), fraction) + (1 - count * fraction) * np.eye(count)
+    slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])
+    i, j = np.array(SIDES[dimension]).T
+    corners = (4 * points - 1)[:, :, None] * slopes
+    return np.concatenate([corners, 4 * (points[:, i, None] * slopes[j] + points[:, j, None] * slopes[i])], axis=1)
 
 
 def determinant(F: Any) -> Any:

@@ -1,22 +1,38 @@
-"""Elastic simplices: constant strain triangles (plane strain, thickness 1 m) and tetrahedra.
+"""Elastic simplices: triangles (plane strain, thickness 1 m) and tetrahedra, linear, quadratic or mixed.
 
-    F = [x1 - x0, ..., xd - x0] [X1 - X0, ..., Xd - X0]⁻¹,   energy = volume W(F, mu, lambda)
+    linear:     F = [x1 - x0, ..., xd - x0] [X1 - X0, ..., Xd - X0]⁻¹,   energy = volume W(F, mu, lambda)
+    quadratic:  F_q = sum over nodes of x_k (grad N_k)ᵀ at point q,       energy = sum over q of w_q W(F_q, mu, lambda)
+    mixed:      J = sum of w_q det F_q / volume,   energy = sum of w_q W(F_q, mu, 0) + volume lambda/2 (J - 1)²
 
 with the rest shape X and Lamé parameters mu = E / 2(1 + nu) and lambda = E nu / (1 + nu)(1 - 2 nu). The material is any
 density of `strain_energies`, or a custom one of the same form.
+
+Linear elements lock: they are too stiff in bending, and nearly rigid as nu approaches 1/2. Quadratic elements represent
+bending; their displacements converge with order 3 for smooth solutions. As nu approaches 1/2, they need mixed elements.
+
+Mixed elements are quadratic in displacement with one pressure per element, p = lambda (J - 1), eliminated from
+sum of w_q W(F_q, mu, 0) + volume (p (J - 1) - p²/(2 lambda)) (P2/P0, a perturbed Lagrangian; at small strains the
+selective reduced integration of Malkus and Hughes 1978). What remains is an energy of the positions alone, so that a
+step stays a minimisation. In the plane the pair satisfies the inf-sup condition (Boffi, Brezzi and Fortin 2013, chapter
+8), so that it does not lock. In space there is no such proof, because no node lies inside a face to control its flux;
+clamped cubes of unordered tetrahedra converge without locking (tests/softbody/test_quadratic_elements.py). A constant
+pressure limits displacements to order 2, and it cannot vary through the thickness of a beam: with one element, the
+pressure that bending needs is missing and the beam is up to 1.6 times too soft. There use quadratic elements, split by
+`mesh.barycentric_split` if nu is close to 1/2.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.mesh.simplices import cofactors, determinant
+from dln_jax.softbody.mesh.simplices import cofactors, determinant, jacobians, reference_gradients
 from dln_jax.softbody.terms.strain_energies import StrainEnergy
 from dln_jax.softbody.terms.term import Bound, Context, Corners, Numbers, Term, material
-from dln_jax.types import Scalar
+from dln_jax.types import InputError, Scalar
 
 POISSON_BOUND = Bound(
     lambda ratio: (ratio > -1.0) & (ratio < 0.5),
@@ -39,15 +55,32 @@ def elastic(
     *,
     youngs_modulus: Numbers = 1e5,
     poisson_ratio: Numbers = 0.3,
+    mixed: bool = False,
     name: str = "elastic",
 ) -> Term:
-    """Elastic energy of all elements of a mesh; parameters are a `Material`.
+    """Elastic energy of all elements of a mesh, linear or quadratic; parameters are a `Material`.
 
     Young's modulus in Pa must be positive and Poisson's ratio between -1 and 0.5 (excluded), one for all elements or
     one per element; otherwise `InputError` names the element. In 2-D the strain is plane, so that mu and lambda are
     those of the solid.
+
+    Mixed elements, for nu near 1/2, need a quadratic mesh. Their volumetric energy is lambda/2 (J - 1)² of the mean J,
+    that of the stable neo-Hookean density; other densities differ from their own by third order in J - 1, and those of
+    St. Venant-Kirchhoff and the corotated solid, whose lambda multiplies a trace of strains, by third order in strain.
+
+    Raises:
+        InputError: a parameter is out of range, `mixed` with a linear mesh, or a quadratic element that its mid-side
+            nodes turn inside out.
     """
     count = len(mesh.elements)
+    if mesh.midsides is None and mixed:
+        raise InputError("mixed elements are quadratic; build the term and the scene from quadratic(mesh)")
+    if mesh.midsides is not None:
+        inverted = (jacobians(mesh.vertices, mesh.nodes) <= 0).any(axis=1)
+        if inverted.any():
+            raise InputError(
+                f"element {np.argmax(inverted)} is inverted at a quadrature point; move its mid-side nodes"
+            )
     parameters = Material(
         material("youngs_modulus", youngs_modulus, count, "element"),
         material("poisson_ratio", poisson_ratio, count, "element", POISSON_BOUND),
@@ -55,14 +88,28 @@ def elastic(
 
     def prepare(parameters: Material, context: Context) -> tuple[Array, ...]:
         mu, lam = lame_parameters(*parameters)
-        geometry = jax.vmap(rest_geometry)(context.rest[mesh.elements])
+        geometry = jax.vmap(rest_geometry if mesh.midsides is None else quadratic_geometry)(context.rest[mesh.nodes])
         return *geometry, jnp.broadcast_to(mu, count), jnp.broadcast_to(lam, count)
 
     def energy(x: Corners, element: tuple[Array, ...]) -> Scalar:
         gradients, volume, mu, lam = element
         return volume * density(deformation_gradient(x, gradients), mu, lam)
 
-    return Term(name, mesh.elements, energy, parameters, prepare)
+    def quadratic_energy(corners: Corners, element: tuple[Array, ...]) -> Scalar:
+        x = jnp.asarray(corners)
+        gradients, weights, mu, lam = element
+        # Rows of F at all points at once: products of small matrices compile much faster than unrolled sums.
+        axes = range(x.shape[1])
+        F = [[gradients[:, :, j] @ x[:, i] for j in axes] for i in axes]
+        of_points = 0.0 * lam if mixed else lam
+        stored = jnp.sum(weights * jax.vmap(lambda F: density(F, mu, of_points))(F))
+        if not mixed:
+            return stored
+        return stored + 0.5 * lam * jnp.sum(weights * (determinant(F) - 1.0)) ** 2 / weights.sum()
+
+    if mesh.midsides is None:
+        return Term(name, mesh.elements, energy, parameters, prepare)
+    return Term(name, mesh.nodes, quadratic_energy, parameters, prepare, unrolled=False)
 
 
 def lame_parameters(youngs_modulus: Array, poisson_ratio: Array) -> tuple[Array, Array]:
@@ -83,6 +130,22 @@ def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "c
     inverse = jnp.stack([jnp.stack(row) for row in zip(*cofactors(edges), strict=True)]) / size
     gradients = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
     return gradients, size / (2.0 if len(edges) == 2 else 6.0)
+
+
+def quadratic_geometry(
+    nodes: Float[Array, "nodes dim"],
+) -> tuple[Float[Array, "points nodes dim"], Float[Array, " points"]]:
+    """Gradients of a quadratic simplex's shape functions at its quadrature points, 1/m, and the points' weights.
+
+    The weights are the points' shares of the volume, in m³, or m² in 2-D.
+    """
+    by_reference = jnp.asarray(reference_gradients(nodes.shape[1]))
+    jacobian = nodes.T @ by_reference
+    rows = [[jacobian[:, i, j] for j in range(nodes.shape[1])] for i in range(nodes.shape[1])]
+    size = determinant(rows)
+    # grad N = J⁻ᵀ dN/dl with J⁻ᵀ = cof J / det J.
+    inverse = jnp.stack([jnp.stack(row, axis=-1) for row in cofactors(rows)], axis=-2) / size[:, None, None]
+    return by_reference @ inverse.swapaxes(1, 2), size / (len(size) * (2.0 if len(rows) == 2 else 6.0))
 
 
 def deformation_gradient(x: Corners, shape_gradients: Float[Array, "corners dim"]) -> list[list[Array]]:

@@ -56,6 +56,8 @@ class Term(NamedTuple):
     """Default parameters: a NamedTuple of arrays, SI units."""
     prepare: Callable[[Any, Context], Any]
     """(parameters, context) -> data of the elements: a pytree of arrays with leading axis m."""
+    unrolled: bool = True
+    """False if the energy takes an array [k, dim] instead of scalars: compiles faster beyond a dozen unknowns."""
 
 
 class Bound(NamedTuple):

@@ -12,12 +12,13 @@ from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, in_subjects, report_cases
-from scripts.reports.soft_bodies import gradients, motions, robustness, speed, statics
+from scripts.reports.soft_bodies import elements, gradients, motions, robustness, speed, statics
 
 MEASURES = {
     "references": (
         *(motions.invariants, motions.orders, motions.block, motions.slope),
         *(statics.uniaxial, statics.patch_test, statics.elastica, statics.cantilever),
+        *(elements.locking, elements.slender),
     ),
     "hard": (
         *(robustness.time_steps, robustness.materials, robustness.bad_starts, robustness.mass_ratio, robustness.chain),
@@ -26,6 +27,7 @@ MEASURES = {
     "speed": (speed.creature, speed.beams, speed.backward, speed.solver_choice),
 }
 """Functions quick -> findings, by subject."""
+FIGURES = {elements.locking: elements.locking_figure}
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,11 @@ def main(options: Arguments) -> None:
 def cases(*, quick: bool = False) -> list[Case]:
     """All cases, named SUBJECT/NAME, in float64; quick ones are smaller."""
     return [
-        Case(f"{subject}/{measure.__name__.replace('_', '-')}", in_float64(partial(measure, quick)))
+        Case(
+            f"{subject}/{measure.__name__.replace('_', '-')}",
+            in_float64(partial(measure, quick)),
+            draw=FIGURES.get(measure),
+        )
         for subject, measures in MEASURES.items()
         for measure in measures
     ]

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
@@ -15,6 +16,7 @@ from dln_jax.softbody.step import Step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.terms.term import Term
 from dln_jax.softbody.verdict import Info
 from scripts.reports.rows import Row, expect, largest
 
@@ -35,6 +37,20 @@ def solid(mesh: Mesh, *, modulus: float, poisson_ratio: float = 0.3, **scene: An
     """A stable neo-Hookean body under its weight; Young's modulus in Pa."""
     material = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus, poisson_ratio=poisson_ratio)
     return make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY))], **scene)
+
+
+class Loads(NamedTuple):
+    """Parameters of dead loads."""
+
+    forces: Float[Array, "n dim"]
+    """In N, on each vertex."""
+
+
+def dead_load(mesh: Mesh) -> Term:
+    """-f·x of every vertex: the term "load", whose forces are zero by default."""
+    none, vertices = Loads(jnp.zeros(mesh.vertices.shape)), np.arange(len(mesh.vertices))[:, None]
+    work = lambda x, force: -jnp.asarray(sum(force[i] * c for i, c in enumerate(x[0])))  # noqa: E731
+    return Term("load", vertices, work, none, lambda loads, context: loads.forces)
 
 
 def cantilever_of(mesh: Mesh, modulus: float = 1e6, **others: Any) -> SoftScene:

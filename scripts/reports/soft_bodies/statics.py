@@ -5,12 +5,10 @@ elements are too stiff in bending, by an error of order h²: what counts is the 
 two meshes (Richardson), u = u_h + (u_h - u_2h)/3.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import eigsh, spsolve
 
@@ -20,13 +18,12 @@ from dln_jax.softbody.scene import Params, SoftScene, element_energies, make_sce
 from dln_jax.softbody.step import static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import neo_hookean, st_venant_kirchhoff, stable_neo_hookean
-from dln_jax.softbody.terms.term import Term
 from dln_jax.solvers.elements.assembly import entries, gradient, pattern
 from dln_jax.solvers.elements.energies import element_hessians
 from dln_jax.solvers.elements.minimise import minimise
 from scripts.reports.case import Findings
 from scripts.reports.rows import expect, largest
-from scripts.reports.soft_bodies.common import GRAVITY, cantilever_of
+from scripts.reports.soft_bodies.common import GRAVITY, cantilever_of, dead_load
 
 UNIAXIAL = {2.0: (0.79807754, 646.74466), 0.5: (1.21076739, -935.35206), 10.0: (0.41653193, 3839.4808)}
 """Stretch -> lateral stretch and nominal stress in Pa, for E = 1e3 Pa and nu = 0.3."""
@@ -128,11 +125,7 @@ def _bent(cells: tuple[int, int], loads: list[float]) -> np.ndarray:
     material = elastic(mesh, st_venant_kirchhoff, youngs_modulus=12 / height**3, poisson_ratio=0.0)
     held = vertices_where(mesh, lambda x: x[:, 0] == 0)
     tip = vertices_where(mesh, lambda x: x[:, 0] == 1)
-    # -f·x of every vertex; forces in N, none by default.
-    none, vertices = Loads(jnp.zeros(mesh.vertices.shape)), np.arange(len(mesh.vertices))[:, None]
-    work = lambda x, force: -jnp.asarray(sum(force[i] * c for i, c in enumerate(x[0])))  # noqa: E731
-    load = Term("load", vertices, work, none, lambda loads, context: loads.forces)
-    scene = make_scene(mesh, [material, load], held=held)
+    scene = make_scene(mesh, [material, dead_load(mesh)], held=held)
     shares = np.zeros(mesh.vertices.shape)
     shares[tip, 1] = -1 / len(tip)
     middle = tip[len(tip) // 2] if len(tip) % 2 else tip
@@ -225,10 +218,3 @@ def stiffness_matrix(scene: SoftScene) -> csc_array:
     size = at.unknowns
     lower = coo_array((np.asarray(values(scene.params)), (at.rows, at.columns)), shape=(size, size)).tocsc()
     return lower + lower.T - diags_array(lower.diagonal()).tocsc()
-
-
-class Loads(NamedTuple):
-    """Parameters of dead loads."""
-
-    forces: Float[Array, "n dim"]
-    """In N, on each vertex."""

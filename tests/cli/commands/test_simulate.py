@@ -224,6 +224,9 @@ def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys)
         "seed is -1": ("--seed", "-1"),
         "dimension is 4": ("--dimension", "4"),
         "number of cells along x is 0": ("--cells", "0"),
+        "order is 3; expected 1": ("--order", "3"),
+        "--mixed needs --order 2": ("--mixed",),
+        "the creature scene has no --order": ("--scene", "creature", "--order", "2"),
         "absent.npz: no such file": ("--mesh", tmp_path / "absent.npz"),
     }
     for said, options in mistakes.items():

@@ -13,7 +13,14 @@ from scripts.reports.commands.softbody_report import cases
 
 CASES = [case.name for case in cases() if not case.name.startswith("speed/")]
 LONG = ("gradients/crawler", "hard/chain", "hard/materials", "references/orders", "references/elastica")
-LONG += ("references/invariants", "references/uniaxial", "references/cantilever", "references/patch-test")
+LONG += (
+    "references/invariants",
+    "references/uniaxial",
+    "references/cantilever",
+    "references/patch-test",
+    "references/locking",
+)
+LONG += ("references/slender",)
 
 
 @pytest.mark.parametrize("name", slow_among(CASES, LONG.__contains__))
