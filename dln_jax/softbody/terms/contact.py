@@ -198,12 +198,12 @@ def _contact(
     def energy(x: Corners, vertex: tuple[Any, Array, Slip | None]) -> Scalar:
         near, stiffness, slip = vertex
         contact = stiffness * penalty(distance(x[0], near), width)
-        return contact if slip is None else contact + _friction_energy(x[0], slip)
+        return contact if slip is None else contact + friction_energy(x[0], slip)
 
     return Term(name, indices, energy, parameters, prepare)
 
 
-def _friction_energy(x: Any, slip: Slip) -> Scalar:
+def friction_energy(x: Any, slip: Slip) -> Scalar:
     """D in J of one vertex."""
     axes = range(len(x))
     moved = [x[i] - slip.start[i] for i in axes]

@@ -61,10 +61,10 @@ LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Factorises the whole matrix by Cholesky; under `vmap`, on a CPU, all narrow bands together."""
-    table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
+    table = lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
-        return cholesky(_with_constants(values)[table])
+        return cholesky(with_constants(values)[table])
 
     def substituted(factor: Array, right: Columns) -> Columns:
         return substitute(factor, substitute(factor, right), transposed=True)
@@ -92,10 +92,10 @@ def _one_or_many(
     row, column = places(at.unknowns, band)
     numbers = np.append(order, np.full(max(row.max(), column.max()) + 1 - at.unknowns, at.unknowns))
     beyond = (row == column) & (row >= at.unknowns)
-    table = np.where(beyond, _one(at), _lookup(at)(numbers[row], numbers[column]))
+    table = np.where(beyond, _one(at), lookup(at)(numbers[row], numbers[column]))
 
     def by_bands(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
-        lower = jax.vmap(_with_constants)(values).T[table]
+        lower = jax.vmap(with_constants)(values).T[table]
         x = solve_bands(lower, b.transpose(1, 2, 0)[order])
         return x[np.argsort(order)].transpose(2, 0, 1)
 
@@ -117,7 +117,7 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     numbers = np.full(count * size * at.width, at.unknowns)
     numbers[: at.unknowns] = (order[:, None] * at.width + np.arange(at.width)).ravel()
     numbers = numbers.reshape(count, size * at.width)
-    lookup = _lookup(at)
+    lookup = lookup(at)
     diagonal = np.stack([lookup(rows[:, None], rows[None, :]) for rows in numbers])
     block, row = np.nonzero(numbers == at.unknowns)
     diagonal[block, row, row] = _one(at)
@@ -125,7 +125,7 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     back = np.argsort(numbers.ravel()[: at.unknowns], kind="stable")
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> tuple[Array, Array]:
-        values = _with_constants(values)
+        values = with_constants(values)
         return factorise_blocks(values[diagonal], values[below])
 
     def solve(factor: tuple[Array, Array], b: Blocks) -> Blocks:
@@ -142,10 +142,10 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """
     n, b = at.blocks, at.width
     numbers = np.arange(n * b).reshape(n, b)
-    of_blocks = _lookup(at)(numbers[:, :, None], numbers[:, None, :])
+    of_blocks = lookup(at)(numbers[:, :, None], numbers[:, None, :])
 
     def factorise(hessians: Sequence[Array], values: Float[Array, " entries"]) -> tuple[tuple[Array, ...], Array]:
-        inverse = jax.vmap(partial(eliminate, b=jnp.eye(b, dtype=values.dtype)))(_with_constants(values)[of_blocks])
+        inverse = jax.vmap(partial(eliminate, b=jnp.eye(b, dtype=values.dtype)))(with_constants(values)[of_blocks])
         return tuple(map(square, hessians)), inverse
 
     def run(tolerance: float, factor: tuple[tuple[Array, ...], Array], right: Blocks) -> Blocks:
@@ -167,7 +167,7 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, SEARCH_RESIDUAL))
 
 
-def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Returns (rows, columns) -> index into the entries followed by the constants 0 and 1; 0 beyond the matrix."""
     size = at.unknowns + 1
     key = at.rows * size + at.columns
@@ -189,7 +189,7 @@ def _one(at: Pattern) -> int:
     return len(at.rows) + 1
 
 
-def _with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"]:
+def with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"]:
     return jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
 
 

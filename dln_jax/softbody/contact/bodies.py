@@ -1,0 +1,243 @@
+"""Contact between and within bodies by barriers on the distances of their surfaces (Li et al. 2020).
+
+The energies sum over all pairs of a vertex and an edge in the plane, or of a vertex and a triangle and of two edges in
+space, that share no vertex. Which pairs are near is found anew in every Newton step, in lists of fixed capacity, and
+continuous collision detection bounds the steps, so that no pair ever crosses.
+
+Friction is lagged: normal forces and tangent planes are those at the start of the time step,
+
+    D = mu lambda f(|u|),    u = (1 - n nᵀ) sum_i w_i (x_i - x_i(start)),
+
+with the smooth f of `terms.contact`.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_energy
+from dln_jax.softbody.contact.candidates import Group, PairList, boxes, group, pairs_near, places
+from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
+from dln_jax.softbody.contact.distances import Stencil, edge_edge, point_edge, point_triangle, squared_distance
+from dln_jax.softbody.contact.surface import Surface, areas, surface_of
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.terms.contact import Slip, friction_energy
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, POSITIVE, Context, Numbers, material
+from dln_jax.solvers.elements.moving import Elements, MovingEnergy
+from dln_jax.types import InputError, require_positive
+
+NAME = "contact"
+"""Key of the parameters in `Params.terms`."""
+
+
+class ContactParameters(NamedTuple):
+    """Parameters of the contact between and within bodies."""
+
+    distance: Float[Array, ""]
+    """h in m, within which surfaces repel each other."""
+    stiffness: Float[Array, ""]
+    """kappa in Pa."""
+    friction: Float[Array, ""] | None
+    """Coulomb's coefficient, or `None`."""
+
+
+class Kind(NamedTuple):
+    """Pairs of two kinds of primitives."""
+
+    one: Group
+    other: Group
+    first: np.ndarray
+    """[k], which vertices of a pair belong to the first primitive."""
+    stencil: Callable[[Array], Stencil]
+    """Vertices of a pair -> its closest features."""
+
+
+class BodyContact(NamedTuple):
+    """Contact between and within the bodies of a scene."""
+
+    parameters: ContactParameters
+    energies: tuple[MovingEnergy, ...]
+    """The barrier and, with a coefficient of friction, the friction."""
+    prepare: Callable[[ContactParameters, Context], tuple[Any, ...]]
+    """(parameters, context) -> data of the energies in a step."""
+    least_distance: Callable[[Float[Array, "n dim"], Any], Float[Array, ""]]
+    """(positions, data of the barrier) -> smallest distance in m of two primitives, at most the distance h."""
+
+
+def body_contact(
+    mesh: Mesh,
+    *,
+    distance: float,
+    stiffness: Numbers,
+    friction: Numbers | None = None,
+    threshold_speed: float = 1e-3,
+    capacity: int | None = None,
+) -> BodyContact:
+    """Contact of all bodies of a mesh with each other and with themselves.
+
+    Args:
+        mesh: its boundary is in contact.
+        distance: h in m, within which surfaces repel each other; well below the edges' length.
+        stiffness: kappa in Pa. The gap at which a pressure p is carried depends on p / kappa and h alone: kappa = p
+            keeps about half of h. It has no influence on whether bodies cross: they never do.
+        friction: Coulomb's coefficient, reached at the threshold speed in m/s.
+        capacity: places in the lists of pairs; by default four for every edge, and at least 256. A step that needs
+            more does not converge, and its `Info.overflow` is true.
+
+    Raises:
+        InputError: a number that is not positive.
+    """
+    require_positive(distance=distance, threshold_speed=threshold_speed, **({"capacity": capacity} if capacity else {}))
+    surface = surface_of(mesh)
+    kinds = _kinds(surface, mesh.vertices)
+    capacity = max(256, 4 * len(surface.edges)) if capacity is None else capacity
+    parameters = ContactParameters(
+        jnp.asarray(distance, dtype=float),
+        material("the stiffness of the contact", stiffness, 1, "contact", POSITIVE),
+        None if friction is None else material("friction", friction, 1, "contact", NOT_NEGATIVE),
+    )
+    barrier = MovingEnergy(
+        elements=partial(_near, kinds, capacity),
+        describe=partial(_described, surface, kinds, capacity),
+        energy=pair_energy,
+        longest=partial(_longest, kinds, capacity),
+    )
+    sliding = MovingEnergy(
+        elements=lambda x, step, data: data[0],
+        describe=lambda x, elements, data: data[1],
+        energy=_sliding_energy,
+        longest=lambda x, step, elements, data: jnp.ones((), x.dtype),
+    )
+
+    def prepare(parameters: ContactParameters, context: Context) -> tuple[Any, ...]:
+        data = (parameters, context.rest)
+        if parameters.friction is None:
+            return (data,)
+        return data, _lagged(barrier, parameters, data, context, threshold_speed)
+
+    def least_distance(x: Float[Array, "n dim"], data: Any) -> Float[Array, ""]:
+        elements = barrier.elements(x, jnp.zeros_like(x), data)
+        pairs = barrier.describe(x, elements, data)
+        squares = jax.vmap(squared_distance)(x[elements.indices], pairs.stencil)
+        return jnp.sqrt(jnp.min(jnp.where(pairs.strength > 0, squares, pairs.near), initial=data[0].distance ** 2))
+
+    energies = (barrier,) if friction is None else (barrier, sliding)
+    return BodyContact(parameters, energies, prepare, least_distance)
+
+
+def _kinds(surface: Surface, rest: np.ndarray) -> tuple[Kind, ...]:
+    vertices, edges = group(surface.vertices[:, None], rest), group(surface.edges, rest)
+    if surface.dimension == 2:
+        return (Kind(vertices, edges, np.array([True, False, False]), point_edge),)
+    triangles = group(surface.triangles, rest)
+    return (
+        Kind(vertices, triangles, np.array([True, False, False, False]), point_triangle),
+        Kind(edges, edges, np.array([True, True, False, False]), edge_edge),
+    )
+
+
+def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: Any) -> Elements:
+    """Lists the pairs that come within h of each other between x and x + step."""
+    parameters, _ = data
+    indices, numbers, used, overflow = [], [], [], jnp.asarray(False)
+    for kind in kinds:
+        margin = parameters.distance / 2
+        of_one = boxes(kind.one, x, x + step, margin)
+        of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
+        # Boxes of neighbours in one surface always meet, so that these lists are longer than those of near pairs.
+        wide = 16 * capacity
+        listed = pairs_near(kind.one, kind.other, of_one, of_other, (4 * capacity, wide))
+        near = listed.used & _within_reach(kind, x, step, listed, parameters.distance)
+        chosen, here, too_many = places(near, capacity)
+        pairs = listed.pairs[chosen]
+        corners = _corners(kind, pairs)
+        filler = jnp.arange(corners.shape[1])
+        indices.append(jnp.where(here[:, None], corners, filler))
+        numbers.append(pairs)
+        used.append(here)
+        overflow |= too_many | listed.overflow
+    return Elements(jnp.concatenate(indices), (jnp.concatenate(numbers), jnp.concatenate(used)), overflow)
+
+
+def _corners(kind: Kind, pairs: Int[Array, "m 2"]) -> Int[Array, "m k"]:
+    one, other = jnp.asarray(kind.one.primitives), jnp.asarray(kind.other.primitives)
+    return jnp.concatenate([one[pairs[:, 0]], other[pairs[:, 1]]], axis=1)
+
+
+def _within_reach(kind: Kind, x: Array, step: Array, listed: PairList, distance: Array) -> Array:
+    """Whether pairs can come within h of each other in the step, by their distance and the bound of their speed."""
+    corners = _corners(kind, listed.pairs)
+    at = x[corners]
+    squares = jax.vmap(lambda x: squared_distance(x, kind.stencil(x)))(at)
+    bound = jax.vmap(partial(speed_bound, first=kind.first))(step[corners])
+    return squares < (distance + bound) ** 2
+
+
+def _described(
+    surface: Surface, kinds: tuple[Kind, ...], capacity: int, x: Array, elements: Elements, data: Any
+) -> Pair:
+    """Returns the data of all listed pairs for the barrier at x."""
+    parameters, rest = data
+    of_vertices, of_edges = areas(surface, rest)
+    numbers, used = elements.data
+    scale = parameters.stiffness / parameters.distance**3
+    pairs = []
+    for place, kind in enumerate(kinds):
+        here = slice(place * capacity, (place + 1) * capacity)
+        one, other = numbers[here].T
+        corners = elements.indices[here]
+        stencil = jax.vmap(kind.stencil)(jax.lax.stop_gradient(x[corners]))
+        # A pair of faces is counted by vertices and by edges, from both sides (Li et al. 2023, section 4).
+        if kind.one is kind.other:
+            a, b, c, d = (rest[corner] for corner in corners.T)
+            area = (of_edges[one] + of_edges[other]) / 4
+            parallel = MOLLIFIED * jnp.sum((b - a) ** 2, axis=1) * jnp.sum((d - c) ** 2, axis=1)
+        else:
+            area = of_vertices[one] / (2 if surface.dimension == 2 else 4)
+            parallel = jnp.zeros_like(area)
+        strength = jnp.where(used[here], scale * area, 0)
+        near = jnp.broadcast_to(parameters.distance**2, area.shape)
+        pairs.append(Pair(stencil, strength, near, jnp.where(used[here], parallel, 0)))
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *pairs)
+
+
+def _longest(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, elements: Elements, data: Any) -> Array:
+    """Returns the largest fraction of the step in which no listed pair crosses."""
+    fraction = jnp.ones((), x.dtype)
+    for place, kind in enumerate(kinds):
+        here = slice(place * capacity, (place + 1) * capacity)
+        at, moved = x[elements.indices[here]], step[elements.indices[here]]
+        bound = jax.vmap(partial(speed_bound, first=kind.first))(moved)
+
+        def distances(t: Array, at: Array = at, moved: Array = moved, kind: Kind = kind) -> Array:
+            now = at + t[:, None, None] * moved
+            return jnp.sqrt(jax.vmap(lambda x: squared_distance(x, kind.stencil(x)))(now))
+
+        fraction = jnp.minimum(fraction, longest_step(distances, jnp.where(elements.data[1][here], bound, 0)))
+    return fraction
+
+
+def _lagged(
+    barrier: MovingEnergy, parameters: ContactParameters, data: Any, context: Context, threshold_speed: float
+) -> tuple[Elements, tuple[Slip, Array]]:
+    """Returns the pairs that rub, with their normal forces at the start of the step."""
+    x = context.x
+    elements = jax.lax.stop_gradient(barrier.elements(x, jnp.zeros_like(x), data))
+    corners = x[elements.indices]
+    force, normal, weights = jax.vmap(normal_force)(corners, barrier.describe(x, elements, data))
+    # A static solve (dt infinite) has no velocities, hence no friction.
+    moving = jnp.isfinite(context.dt)
+    threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
+    start = jnp.einsum("mk,mki->mi", weights, corners)
+    largest = jnp.where(moving, parameters.friction * force, 0.0)
+    return elements, (Slip(start, normal, largest, jnp.broadcast_to(threshold, force.shape)), weights)
+
+
+def _sliding_energy(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, ""]:
+    slip, weights = data
+    return friction_energy(weights @ x, slip)
