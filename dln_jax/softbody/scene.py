@@ -12,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dln_jax.softbody.contact.bodies import NAME, BodyContact
+from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses
 from dln_jax.softbody.terms.term import Context, Term
 from dln_jax.solvers.elements.energies import ElementEnergy, value
+from dln_jax.solvers.elements.moving import MovingEnergy, lists_between, moving_value
 from dln_jax.types import InputError
 
 
@@ -38,6 +41,8 @@ class SoftScene(NamedTuple):
     """Vertices that are not solved for: they move with their own velocity in `State.v`."""
     params: Params
     """Default parameters."""
+    contact: BodyContact | None = None
+    """Contact between and within the bodies, if any."""
 
     @property
     def free(self) -> Bool[np.ndarray, "n dim"]:
@@ -68,7 +73,13 @@ class State(NamedTuple):
 
 
 def make_scene(
-    mesh: Mesh, terms: Sequence[Term], *, density: float = 1000.0, masses: Any = None, held: Any = ()
+    mesh: Mesh,
+    terms: Sequence[Term],
+    *,
+    density: float = 1000.0,
+    masses: Any = None,
+    held: Any = (),
+    contact: BodyContact | None = None,
 ) -> SoftScene:
     """Builds a scene with its default parameters.
 
@@ -78,13 +89,15 @@ def make_scene(
         density: in kg/m³ (kg/m² in the plane), for the masses of the vertices.
         masses: of the vertices in kg, one for all or [n], instead of a density.
         held: indices of vertices that are not solved for.
+        contact: contact between and within the bodies; without it they pass through each other.
 
     Raises:
-        InputError: two terms of one name, an index or a mass out of range, or no free vertex.
+        InputError: two terms of one name, an index or a mass out of range, no free vertex, or surfaces in contact that
+            cross in the rest shape.
     """
     n = len(mesh.vertices)
     terms = tuple(terms)
-    names = [term.name for term in terms]
+    names = [term.name for term in terms] + ([NAME] if contact is not None else [])
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"two terms are named '{twice[0]}'; give each its own name")
     for term in terms:
@@ -99,8 +112,22 @@ def make_scene(
     masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
     if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
         raise InputError(f"the mass of vertex {bad[0]} is {masses[bad[0]]} kg; expected a positive number")
-    params = Params(jnp.asarray(mesh.vertices), jnp.asarray(masses), {term.name: term.parameters for term in terms})
-    return SoftScene(mesh, terms, held, params)
+    parameters = {term.name: term.parameters for term in terms}
+    if contact is not None:
+        require_apart(mesh, mesh.vertices)
+        parameters[NAME] = contact.parameters
+    params = Params(jnp.asarray(mesh.vertices), jnp.asarray(masses), parameters)
+    return SoftScene(mesh, terms, held, params, contact)
+
+
+def require_apart(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> None:
+    """Refuses positions at which surfaces cross, naming the first pair by its vertices."""
+    if pairs := crossings(mesh, x):
+        (one, other), count = pairs[0], len(pairs)
+        raise InputError(
+            f"{count} pair(s) of the surface cross, the first with the vertices {list(one)} and {list(other)}; "
+            "move the bodies apart, or leave out their contact"
+        )
 
 
 def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
@@ -158,6 +185,23 @@ def prepare(
     return tuple(term.prepare(params.terms[term.name], context) for term in scene.terms)
 
 
+def prepare_contact(
+    scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf
+) -> tuple[Any, ...]:
+    """Returns the data of the contact between bodies for a step of dt in s that starts at x."""
+    if scene.contact is None:
+        return ()
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), None)
+    return scene.contact.prepare(params.terms[NAME], context)
+
+
+def contact_energies(scene: SoftScene) -> tuple[MovingEnergy, ...]:
+    """Returns the contact between bodies in the form of the solver."""
+    return () if scene.contact is None else scene.contact.energies
+
+
 def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Array | None = None) -> Array:
     """V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as from rest at x."""
-    return value(element_energies(scene), x, prepare(scene, params, x, control=control))
+    stored = value(element_energies(scene), x, prepare(scene, params, x, control=control))
+    energies, data = contact_energies(scene), prepare_contact(scene, params, x)
+    return stored + moving_value(energies, x, lists_between(energies, x, jnp.zeros_like(x), data), data)

@@ -23,12 +23,22 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.intersections import count_overlaps
-from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
+from dln_jax.softbody.scene import (
+    Params,
+    Previous,
+    SoftScene,
+    State,
+    contact_energies,
+    element_energies,
+    prepare,
+    prepare_contact,
+)
 from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, energy_balance, least_J, trusted
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.moving import Lists, lists_between, moving_value
 from dln_jax.solvers.elements.selection import by_size, by_stiffness
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
@@ -126,10 +136,13 @@ def make_step(
     """
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
+    if scene.contact is not None and integrator.span != 1.0:
+        raise InputError("this integrator extrapolates, which may push bodies through each other; use backward-euler")
     free = scene.free
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *element_energies(scene))
     at = pattern(energies, free.shape[0], free.shape[1], free)
-    overlaps = count_overlaps(scene.mesh)
+    overlaps = None if scene.contact is not None else count_overlaps(scene.mesh)
+    moving = contact_energies(scene)
     rest, masses = scene.params.rest, scene.params.masses
     known = _known(
         (scene.params, dt),
@@ -137,7 +150,13 @@ def make_step(
     )
     chosen = _linear_solver(linear_solver, energies, at, rest, known)
     solve = partial(
-        minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite
+        minimise,
+        free=free,
+        tolerance=tolerance,
+        iterations=iterations,
+        linear_solver=chosen,
+        definite=definite,
+        moving=moving,
     )
 
     def init(x: Any = None, v: Any = None) -> State:
@@ -157,22 +176,35 @@ def make_step(
         carried = state.x + span * state.v
         # The better of two starts: the present positions, or those of motion without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
-        start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
-        balanced, outcome = solve(energies, start, data, scale=params.masses, at=at)
+        contact = prepare_contact(scene, params, state.x, dt=span)
+        if moving:
+            # Only the present positions are known to be apart; held vertices approach their goals from there.
+            balanced, outcome = solve(
+                energies, stay, data, scale=params.masses, at=at, moving_data=contact, start=state.x
+            )
+        else:
+            start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
+            balanced, outcome = solve(energies, start, data, scale=params.masses, at=at)
         x, v = integrator.finish(state, balanced, dt)
         x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
-        info = judged(params, state, x, v, (balanced, outcome, data[1:]))
+        info = judged(params, state, x, v, (balanced, outcome, data[1:], contact))
         x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
         return State(x, v, before), info
 
-    def judged(params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any]) -> Info:
+    def judged(params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any, Any]) -> Info:
         # The verdict has no derivatives.
-        params, state, x, v, (balanced, outcome, data) = jax.lax.stop_gradient((params, state, x, v, solution))
+        params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
+        balanced, outcome, data, contact = solution
+        lists = lists_between(moving, state.x, x - state.x, contact)
+
+        def contact_value(x: Array) -> Array:
+            return moving_value(moving, x, lists, contact)
+
         growth, at_hand = energy_balance(
-            scene, energies[1:], params.masses, data, (state.x, x), (state.v, v), balanced, outcome
+            scene, energies[1:], params.masses, data, (state.x, x), (state.v, v), balanced, outcome, contact_value
         )
-        info = _of_positions(scene, params, x, outcome, overlaps)
+        info = _of_positions(scene, params, x, outcome, overlaps, contact, lists)
         return info._replace(
             converged=info.converged & (growth <= LARGEST_GROWTH * at_hand),
             energy_growth=growth,
@@ -214,8 +246,12 @@ def static_solve(
     known = _known((params, x, control), lambda: data)
     chosen = _linear_solver(linear_solver, energies, at, x, known)
     solve = partial(minimise, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite)
+    contact = prepare_contact(scene, params, x)
+    solve = partial(solve, moving=contact_energies(scene), moving_data=contact)
     x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
-    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), count_overlaps(scene.mesh))
+    overlaps = None if scene.contact is not None else count_overlaps(scene.mesh)
+    lists = lists_between(contact_energies(scene), x, jnp.zeros_like(x), contact)
+    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), overlaps, contact, lists)
     return trusted(x, info.converged), info
 
 
@@ -241,13 +277,29 @@ def _linear_solver(
 
 
 def _of_positions(
-    scene: SoftScene, params: Params, x: Array, outcome: SolverInfo, overlaps: Callable[[Array], Array] | None
+    scene: SoftScene,
+    params: Params,
+    x: Array,
+    outcome: SolverInfo,
+    overlaps: Callable[[Array], Array] | None,
+    contact: Sequence[Any],
+    lists: Lists,
 ) -> Info:
     """Combines the solver's verdict with that on the positions: no element is inverted."""
     least = least_J(scene, params, x)
     converged = outcome.converged if least is None else outcome.converged & (least > 0)
     pairs = None if overlaps is None else overlaps(x)
-    return Info(outcome.residual, outcome.iterations, converged, outcome.definite, least_J=least, overlaps=pairs)
+    nearest = None if scene.contact is None else scene.contact.least_distance(x, lists[0], contact[0])
+    return Info(
+        outcome.residual,
+        outcome.iterations,
+        converged,
+        outcome.definite,
+        least_J=least,
+        overlaps=pairs,
+        least_distance=nearest,
+        overflow=outcome.overflow,
+    )
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

@@ -10,7 +10,7 @@ of this step) and the work W done by held vertices. The exact motion has growth 
 `LARGEST_GROWTH` of the energy at hand has diverged.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -49,7 +49,12 @@ class Info(NamedTuple):
     """Smallest ratio of an element's volume to its rest volume, over elements that resist deformation, if any."""
     overlaps: Int[Array, ""] | None = None
     """Number of pairs of overlapping mesh components: bodies have no contact with each other and pass through. `None`
-    for a mesh of one component. It does not affect `converged`."""
+    for a mesh of one component and for a scene with contact of its bodies. It does not affect `converged`."""
+    least_distance: Float[Array, ""] | None = None
+    """Smallest distance in m of two surfaces in contact, at most the distance within which contact acts."""
+    overflow: Bool[Array, ""] | None = None
+    """Whether the lists of pairs in contact were too short, which needs a larger `capacity`; such a step has not
+    converged."""
 
 
 def energy_balance(
@@ -61,6 +66,7 @@ def energy_balance(
     v: tuple[Array, Array],
     balanced: Array,
     outcome: SolverInfo,
+    contact: Callable[[Array], Array],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(growth, energy at hand) of a step, in J.
 
@@ -71,12 +77,16 @@ def energy_balance(
         x, v: positions and velocities at the start and the end of the step.
         balanced: the positions at which forces were balanced.
         outcome: of the minimisation.
+        contact: positions -> energy in J of the contact between bodies.
     """
     free = jnp.asarray(scene.free)
     kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * velocity**2, 0)) for velocity in v)
-    stored, stored_after = (value(energies, position, data) for position in x)
+    stored, stored_after = (value(energies, at, data) + contact(at) for at in x)
     moved = x[1] - x[0]
     work = _work(scene.held, energies, data, balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
+    if len(scene.held) and scene.contact is not None:
+        along = jnp.zeros_like(moved).at[scene.held].set(moved[scene.held])
+        work += jax.jvp(contact, (balanced,), (along,))[1]
     # Residual forces do work, and rounding hides some of the energy.
     noise = 0.0 if outcome.energy_noise is None else outcome.energy_noise
     unclear = noise + outcome.residual * jnp.sum(masses[:, None] * jnp.abs(moved))

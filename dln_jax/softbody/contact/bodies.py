@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_energy
-from dln_jax.softbody.contact.candidates import Group, PairList, boxes, group, pairs_near, places
+from dln_jax.softbody.contact.candidates import Group, PairList, boxes, group, meetings, pairs_near, places
 from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
 from dln_jax.softbody.contact.distances import Stencil, edge_edge, point_edge, point_triangle, squared_distance
 from dln_jax.softbody.contact.surface import Surface, areas, surface_of
@@ -55,6 +55,8 @@ class Kind(NamedTuple):
     """[k], which vertices of a pair belong to the first primitive."""
     stencil: Callable[[Array], Stencil]
     """Vertices of a pair -> its closest features."""
+    neighbours: tuple[int, int]
+    """Pairs of clusters, and of primitives, whose boxes meet in the rest shape."""
 
 
 class BodyContact(NamedTuple):
@@ -65,8 +67,8 @@ class BodyContact(NamedTuple):
     """The barrier and, with a coefficient of friction, the friction."""
     prepare: Callable[[ContactParameters, Context], tuple[Any, ...]]
     """(parameters, context) -> data of the energies in a step."""
-    least_distance: Callable[[Float[Array, "n dim"], Any], Float[Array, ""]]
-    """(positions, data of the barrier) -> smallest distance in m of two primitives, at most the distance h."""
+    least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
+    """(positions, elements and data of the barrier) -> smallest distance in m of two primitives, at most the distance h."""
 
 
 def body_contact(
@@ -86,16 +88,16 @@ def body_contact(
         stiffness: kappa in Pa. The gap at which a pressure p is carried depends on p / kappa and h alone: kappa = p
             keeps about half of h. It has no influence on whether bodies cross: they never do.
         friction: Coulomb's coefficient, reached at the threshold speed in m/s.
-        capacity: places in the lists of pairs; by default four for every edge, and at least 256. A step that needs
-            more does not converge, and its `Info.overflow` is true.
+        capacity: places in the lists of near pairs, of every kind; by default two for every vertex of the boundary, and
+            at least 128. A step that needs more does not converge, and its `Info.overflow` is true.
 
     Raises:
         InputError: a number that is not positive.
     """
     require_positive(distance=distance, threshold_speed=threshold_speed, **({"capacity": capacity} if capacity else {}))
     surface = surface_of(mesh)
-    kinds = _kinds(surface, mesh.vertices)
-    capacity = max(256, 4 * len(surface.edges)) if capacity is None else capacity
+    kinds = _kinds(surface, mesh.vertices, distance)
+    capacity = max(128, 2 * len(surface.vertices)) if capacity is None else capacity
     parameters = ContactParameters(
         jnp.asarray(distance, dtype=float),
         material("the stiffness of the contact", stiffness, 1, "contact", POSITIVE),
@@ -120,8 +122,7 @@ def body_contact(
             return (data,)
         return data, _lagged(barrier, parameters, data, context, threshold_speed)
 
-    def least_distance(x: Float[Array, "n dim"], data: Any) -> Float[Array, ""]:
-        elements = barrier.elements(x, jnp.zeros_like(x), data)
+    def least_distance(x: Float[Array, "n dim"], elements: Elements, data: Any) -> Float[Array, ""]:
         pairs = barrier.describe(x, elements, data)
         squares = jax.vmap(squared_distance)(x[elements.indices], pairs.stencil)
         return jnp.sqrt(jnp.min(jnp.where(pairs.strength > 0, squares, pairs.near), initial=data[0].distance ** 2))
@@ -130,14 +131,18 @@ def body_contact(
     return BodyContact(parameters, energies, prepare, least_distance)
 
 
-def _kinds(surface: Surface, rest: np.ndarray) -> tuple[Kind, ...]:
+def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, ...]:
     vertices, edges = group(surface.vertices[:, None], rest), group(surface.edges, rest)
+
+    def kind(one: Group, other: Group, first: list[bool], stencil: Callable[[Array], Stencil]) -> Kind:
+        return Kind(one, other, np.array(first), stencil, meetings(one, other, rest, distance))
+
     if surface.dimension == 2:
-        return (Kind(vertices, edges, np.array([True, False, False]), point_edge),)
+        return (kind(vertices, edges, [True, False, False], point_edge),)
     triangles = group(surface.triangles, rest)
     return (
-        Kind(vertices, triangles, np.array([True, False, False, False]), point_triangle),
-        Kind(edges, edges, np.array([True, True, False, False]), edge_edge),
+        kind(vertices, triangles, [True, False, False, False], point_triangle),
+        kind(edges, edges, [True, True, False, False], edge_edge),
     )
 
 
@@ -150,8 +155,8 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
         of_one = boxes(kind.one, x, x + step, margin)
         of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
         # Boxes of neighbours in one surface always meet, so that these lists are longer than those of near pairs.
-        wide = 16 * capacity
-        listed = pairs_near(kind.one, kind.other, of_one, of_other, (4 * capacity, wide))
+        wide = tuple(2 * count + 2 * capacity for count in kind.neighbours)
+        listed = pairs_near(kind.one, kind.other, of_one, of_other, wide)
         near = listed.used & _within_reach(kind, x, step, listed, parameters.distance)
         chosen, here, too_many = places(near, capacity)
         pairs = listed.pairs[chosen]

@@ -66,6 +66,20 @@ def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margi
     return Boxes(low.min(axis=1) - margin, high.max(axis=1) + margin)
 
 
+def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: float) -> tuple[int, int]:
+    """Returns the numbers of pairs of clusters and of pairs of primitives whose boxes, enlarged by half, meet at x."""
+    counts = []
+    for clusters in (True, False):
+        sides = []
+        for of in (one, other):
+            box = boxes(of, x, x, margin / 2)
+            sides.append([np.asarray(side) for side in (_of_clusters(of, box) if clusters else box)])
+        (low, high), (other_low, other_high) = sides
+        rows = ((row <= other_high).all(axis=1) & (other_low <= top).all(axis=1) for row, top in zip(low, high, strict=True))
+        counts.append(sum(int(row.sum()) for row in rows))
+    return counts[0], counts[1]
+
+
 def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]) -> PairList:
     """Returns the pairs of primitives without a common vertex whose boxes meet.
 

@@ -36,7 +36,8 @@ def longest_step(
     """
     start = distance(jnp.zeros_like(bound))
     target = REMAINING * start
-    moving = bound > 0
+    # Other lanes keep enough of their distance whatever they do.
+    moving = bound > start - target
     rate = jnp.where(moving, bound, 1.0)
 
     def more(state: tuple[Array, Array, Array, Array]) -> Array:

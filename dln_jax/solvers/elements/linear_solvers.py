@@ -117,11 +117,11 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     numbers = np.full(count * size * at.width, at.unknowns)
     numbers[: at.unknowns] = (order[:, None] * at.width + np.arange(at.width)).ravel()
     numbers = numbers.reshape(count, size * at.width)
-    lookup = lookup(at)
-    diagonal = np.stack([lookup(rows[:, None], rows[None, :]) for rows in numbers])
+    place_of = lookup(at)
+    diagonal = np.stack([place_of(rows[:, None], rows[None, :]) for rows in numbers])
     block, row = np.nonzero(numbers == at.unknowns)
     diagonal[block, row, row] = _one(at)
-    below = np.stack([lookup(lower[:, None], upper[None, :]) for upper, lower in itertools.pairwise(numbers)])
+    below = np.stack([place_of(lower[:, None], upper[None, :]) for upper, lower in itertools.pairwise(numbers)])
     back = np.argsort(numbers.ravel()[: at.unknowns], kind="stable")
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> tuple[Array, Array]:

@@ -280,18 +280,18 @@ def _allowed(total: _Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists)
     if not total.moving:
         return lists, direction, jnp.ones((), x.dtype)
 
-    def too_many(state: tuple[Lists, Blocks, Array]) -> Array:
-        return overflow(state[0]) & (state[2] < _SHORTENINGS)
+    def too_many(state: tuple[Lists, Array, Array]) -> Array:
+        lists, _, count = state
+        return (count == 0) | (overflow(lists) & (count < _SHORTENINGS))
 
-    def shorten(state: tuple[Lists, Blocks, Array]) -> tuple[Lists, Blocks, Array]:
-        _, direction, count = state
-        shorter = direction / 8
-        return lists_between(total.moving, x, shorter, data[1]), shorter, count + 1
+    def shorten(state: tuple[Lists, Array, Array]) -> tuple[Lists, Array, Array]:
+        _, _, count = state
+        fraction = (1.0 / 8) ** count.astype(x.dtype)
+        return lists_between(total.moving, x, fraction * direction, data[1]), fraction, count + 1
 
-    begin = lists_between(total.moving, x, direction, data[1]), direction, jnp.asarray(0)
-    lists, shorter, count = jax.lax.while_loop(too_many, shorten, begin)
-    limit = longest_fraction(total.moving, x, shorter, lists, data[1])
-    return lists, direction, limit * (1.0 / 8) ** count
+    begin = lists, jnp.ones((), x.dtype), jnp.asarray(0)
+    lists, fraction, _ = jax.lax.while_loop(too_many, shorten, begin)
+    return lists, direction, fraction * longest_fraction(total.moving, x, fraction * direction, lists, data[1])
 
 
 def _descent_direction(

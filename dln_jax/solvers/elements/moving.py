@@ -120,8 +120,17 @@ def with_moving(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Pat
 
 
 def _projected(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity s s"]:
-    values, vectors = jax.vmap(symmetric_eigen)(jnp.where(jnp.isfinite(hessians), hessians, 0))
-    return (vectors * jnp.maximum(values, 0)[:, None, :]) @ vectors.swapaxes(-1, -2)
+    """Sets negative eigenvalues to zero, one after the other for the elements that act, which are few."""
+    hessians = jnp.where(jnp.isfinite(hessians), hessians, 0)
+    acting = (hessians != 0).any(axis=(1, 2))
+    order = jnp.argsort(~acting)
+
+    def project(number: Array, hessians: Array) -> Array:
+        place = order[number]
+        values, vectors = symmetric_eigen(hessians[place])
+        return hessians.at[place].set((vectors * jnp.maximum(values, 0)) @ vectors.T)
+
+    return jax.lax.fori_loop(0, acting.sum(), project, hessians)
 
 
 def _unknowns(indices: Int[Array, "capacity k"], width: int) -> Int[Array, "capacity s"]:
