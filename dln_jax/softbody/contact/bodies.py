@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_energy
-from dln_jax.softbody.contact.candidates import Group, PairList, boxes, group, meetings, pairs_near, places
+from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_gradient, pair_hessian
+from dln_jax.softbody.contact.candidates import Group, boxes, group, meetings, pairs_near, places
 from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
-from dln_jax.softbody.contact.distances import Stencil, edge_edge, point_edge, point_triangle, squared_distance
+from dln_jax.softbody.contact.distances import EDGE_EDGE, POINT_TRIANGLE, squared_distance, stencil_of
 from dln_jax.softbody.contact.surface import Surface, areas, surface_of
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms.contact import Slip, friction_energy
@@ -51,12 +51,21 @@ class Kind(NamedTuple):
 
     one: Group
     other: Group
-    first: np.ndarray
-    """[k], which vertices of a pair belong to the first primitive."""
-    stencil: Callable[[Array], Stencil]
-    """Vertices of a pair -> its closest features."""
+    number: int
+    """Of the kind, for its closest features."""
     neighbours: tuple[int, int]
     """Pairs of clusters, and of primitives, whose boxes meet in the rest shape."""
+
+
+class Listed(NamedTuple):
+    """Pairs in a list, without derivatives."""
+
+    pairs: Int[Array, "capacity 2"]
+    """Numbers of the primitives."""
+    kind: Int[Array, " capacity"]
+    """Number of the kind."""
+    used: Bool[Array, " capacity"]
+    """False for places that are not used."""
 
 
 class BodyContact(NamedTuple):
@@ -88,8 +97,8 @@ def body_contact(
         stiffness: kappa in Pa. The gap at which a pressure p is carried depends on p / kappa and h alone: kappa = p
             keeps about half of h. It has no influence on whether bodies cross: they never do.
         friction: Coulomb's coefficient, reached at the threshold speed in m/s.
-        capacity: places in the lists of near pairs, of every kind; by default two for every vertex of the boundary, and
-            at least 128. A step that needs more does not converge, and its `Info.overflow` is true.
+        capacity: places in the list of near pairs, for every kind of pairs; by default two for every vertex of the
+            boundary, and at least 128. A step that needs more does not converge, and its `Info.overflow` is true.
 
     Raises:
         InputError: a number that is not positive.
@@ -105,14 +114,16 @@ def body_contact(
     )
     barrier = MovingEnergy(
         elements=partial(_near, kinds, capacity),
-        describe=partial(_described, surface, kinds, capacity),
-        energy=pair_energy,
-        longest=partial(_longest, kinds, capacity),
+        describe=partial(_described, surface),
+        gradient=pair_gradient,
+        hessian=pair_hessian,
+        longest=_longest,
     )
     sliding = MovingEnergy(
         elements=lambda x, step, data: data[0],
         describe=lambda x, elements, data: data[1],
-        energy=_sliding_energy,
+        gradient=jax.value_and_grad(_sliding_energy),
+        hessian=_sliding_hessian,
         longest=lambda x, step, elements, data: jnp.ones((), x.dtype),
     )
 
@@ -123,9 +134,9 @@ def body_contact(
         return data, _lagged(barrier, parameters, data, context, threshold_speed)
 
     def least_distance(x: Float[Array, "n dim"], elements: Elements, data: Any) -> Float[Array, ""]:
-        pairs = barrier.describe(x, elements, data)
-        squares = jax.vmap(squared_distance)(x[elements.indices], pairs.stencil)
-        return jnp.sqrt(jnp.min(jnp.where(pairs.strength > 0, squares, pairs.near), initial=data[0].distance ** 2))
+        squares = jax.vmap(squared_distance)(x[elements.indices], elements.data.kind)
+        farthest = data[0].distance ** 2
+        return jnp.sqrt(jnp.minimum(jnp.min(jnp.where(elements.data.used, squares, farthest)), farthest))
 
     energies = (barrier,) if friction is None else (barrier, sliding)
     return BodyContact(parameters, energies, prepare, least_distance)
@@ -134,39 +145,36 @@ def body_contact(
 def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, ...]:
     vertices, edges = group(surface.vertices[:, None], rest), group(surface.edges, rest)
 
-    def kind(one: Group, other: Group, first: list[bool], stencil: Callable[[Array], Stencil]) -> Kind:
-        return Kind(one, other, np.array(first), stencil, meetings(one, other, rest, distance))
+    def kind(one: Group, other: Group, number: int) -> Kind:
+        return Kind(one, other, number, meetings(one, other, rest, distance))
 
     if surface.dimension == 2:
-        return (kind(vertices, edges, [True, False, False], point_edge),)
+        return (kind(vertices, edges, 0),)
     triangles = group(surface.triangles, rest)
-    return (
-        kind(vertices, triangles, [True, False, False, False], point_triangle),
-        kind(edges, edges, [True, True, False, False], edge_edge),
-    )
+    return kind(vertices, triangles, POINT_TRIANGLE), kind(edges, edges, EDGE_EDGE)
 
 
 def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: Any) -> Elements:
     """Lists the pairs that come within h of each other between x and x + step."""
     parameters, _ = data
-    indices, numbers, used, overflow = [], [], [], jnp.asarray(False)
+    lists = []
     for kind in kinds:
         margin = parameters.distance / 2
         of_one = boxes(kind.one, x, x + step, margin)
         of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
         # Boxes of neighbours in one surface always meet, so that these lists are longer than those of near pairs.
         wide = tuple(2 * count + 2 * capacity for count in kind.neighbours)
-        listed = pairs_near(kind.one, kind.other, of_one, of_other, wide)
-        near = listed.used & _within_reach(kind, x, step, listed, parameters.distance)
-        chosen, here, too_many = places(near, capacity)
-        pairs = listed.pairs[chosen]
-        corners = _corners(kind, pairs)
-        filler = jnp.arange(corners.shape[1])
-        indices.append(jnp.where(here[:, None], corners, filler))
-        numbers.append(pairs)
-        used.append(here)
-        overflow |= too_many | listed.overflow
-    return Elements(jnp.concatenate(indices), (jnp.concatenate(numbers), jnp.concatenate(used)), overflow)
+        lists.append(pairs_near(kind.one, kind.other, of_one, of_other, wide))
+    pairs, used = (jnp.concatenate(parts) for parts in zip(*(listed[:2] for listed in lists), strict=True))
+    number = np.concatenate([np.full(len(of.used), kind.number) for kind, of in zip(kinds, lists, strict=True)])
+    corners = jnp.concatenate([_corners(kind, of.pairs) for kind, of in zip(kinds, lists, strict=True)])
+    squares = jax.vmap(squared_distance)(x[corners], jnp.asarray(number))
+    # Pairs that stay farther apart, by their distance and the bound of their speed, are left out.
+    near = used & (squares < (parameters.distance + jax.vmap(speed_bound)(step[corners], jnp.asarray(number))) ** 2)
+    chosen, here, too_many = places(near, capacity * len(kinds))
+    indices = jnp.where(here[:, None], corners[chosen], jnp.arange(corners.shape[1]))
+    overflow = jnp.stack([too_many, *(listed.overflow for listed in lists)]).any()
+    return Elements(indices, Listed(pairs[chosen], jnp.asarray(number)[chosen], here), overflow)
 
 
 def _corners(kind: Kind, pairs: Int[Array, "m 2"]) -> Int[Array, "m k"]:
@@ -174,57 +182,33 @@ def _corners(kind: Kind, pairs: Int[Array, "m 2"]) -> Int[Array, "m k"]:
     return jnp.concatenate([one[pairs[:, 0]], other[pairs[:, 1]]], axis=1)
 
 
-def _within_reach(kind: Kind, x: Array, step: Array, listed: PairList, distance: Array) -> Array:
-    """Whether pairs can come within h of each other in the step, by their distance and the bound of their speed."""
-    corners = _corners(kind, listed.pairs)
-    at = x[corners]
-    squares = jax.vmap(lambda x: squared_distance(x, kind.stencil(x)))(at)
-    bound = jax.vmap(partial(speed_bound, first=kind.first))(step[corners])
-    return squares < (distance + bound) ** 2
-
-
-def _described(
-    surface: Surface, kinds: tuple[Kind, ...], capacity: int, x: Array, elements: Elements, data: Any
-) -> Pair:
+def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pair:
     """Returns the data of all listed pairs for the barrier at x."""
     parameters, rest = data
+    (one, other), number, used = elements.data.pairs.T, elements.data.kind, elements.data.used
     of_vertices, of_edges = areas(surface, rest)
-    numbers, used = elements.data
-    scale = parameters.stiffness / parameters.distance**3
-    pairs = []
-    for place, kind in enumerate(kinds):
-        here = slice(place * capacity, (place + 1) * capacity)
-        one, other = numbers[here].T
-        corners = elements.indices[here]
-        stencil = jax.vmap(kind.stencil)(jax.lax.stop_gradient(x[corners]))
-        # A pair of faces is counted by vertices and by edges, from both sides (Li et al. 2023, section 4).
-        if kind.one is kind.other:
-            a, b, c, d = (rest[corner] for corner in corners.T)
-            area = (of_edges[one] + of_edges[other]) / 4
-            parallel = MOLLIFIED * jnp.sum((b - a) ** 2, axis=1) * jnp.sum((d - c) ** 2, axis=1)
-        else:
-            area = of_vertices[one] / (2 if surface.dimension == 2 else 4)
-            parallel = jnp.zeros_like(area)
-        strength = jnp.where(used[here], scale * area, 0)
-        near = jnp.broadcast_to(parameters.distance**2, area.shape)
-        pairs.append(Pair(stencil, strength, near, jnp.where(used[here], parallel, 0)))
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *pairs)
+    stencil = jax.vmap(stencil_of)(jax.lax.stop_gradient(x[elements.indices]), number)
+    # A pair of facets is counted from both sides, in space by vertices and by edges (Li et al. 2023, section 4).
+    if surface.dimension == 2:
+        area, parallel = of_vertices[one] / 2, jnp.zeros_like(rest, shape=one.shape)
+    else:
+        a, b, c, d = (rest[corner] for corner in elements.indices.T)
+        edges = used & (number == EDGE_EDGE)
+        area = jnp.where(edges, of_edges[one] + of_edges[other], of_vertices[one]) / 4
+        parallel = jnp.where(edges, MOLLIFIED * jnp.sum((b - a) ** 2, axis=1) * jnp.sum((d - c) ** 2, axis=1), 0)
+    strength = jnp.where(used, parameters.stiffness / parameters.distance**3 * area, 0)
+    return Pair(stencil, strength, jnp.broadcast_to(parameters.distance**2, area.shape), parallel)
 
 
-def _longest(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, elements: Elements, data: Any) -> Array:
+def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
     """Returns the largest fraction of the step in which no listed pair crosses."""
-    fraction = jnp.ones((), x.dtype)
-    for place, kind in enumerate(kinds):
-        here = slice(place * capacity, (place + 1) * capacity)
-        at, moved = x[elements.indices[here]], step[elements.indices[here]]
-        bound = jax.vmap(partial(speed_bound, first=kind.first))(moved)
+    at, moved, number = x[elements.indices], step[elements.indices], elements.data.kind
 
-        def distances(t: Array, at: Array = at, moved: Array = moved, kind: Kind = kind) -> Array:
-            now = at + t[:, None, None] * moved
-            return jnp.sqrt(jax.vmap(lambda x: squared_distance(x, kind.stencil(x)))(now))
+    def distances(t: Array) -> Array:
+        return jnp.sqrt(jax.vmap(squared_distance)(at + t[:, None, None] * moved, number))
 
-        fraction = jnp.minimum(fraction, longest_step(distances, jnp.where(elements.data[1][here], bound, 0)))
-    return fraction
+    bound = jax.vmap(speed_bound)(moved, number)
+    return longest_step(distances, jnp.where(elements.data.used, bound, 0))
 
 
 def _lagged(
@@ -246,3 +230,9 @@ def _lagged(
 def _sliding_energy(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, ""]:
     slip, weights = data
     return friction_energy(weights @ x, slip)
+
+
+def _sliding_hessian(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, "s s"]:
+    slip, weights = data
+    of_point = jax.hessian(lambda point: friction_energy(point, slip))(weights @ x)
+    return jnp.einsum("a,ij,b->aibj", weights, of_point, weights).reshape(x.size, x.size)

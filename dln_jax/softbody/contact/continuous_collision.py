@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
+
+from dln_jax.softbody.contact.distances import EDGE_EDGE
 
 REMAINING = 0.1
 """Fraction of its distance that a pair keeps in one step."""
@@ -19,9 +20,10 @@ _ADVANCE = 0.9
 _ITERATIONS = 200
 
 
-def speed_bound(p: Float[Array, "k dim"], first: np.ndarray) -> Float[Array, ""]:
-    """l in m per unit of time for one pair, whose first primitive has the vertices where `first` is true."""
+def speed_bound(p: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
+    """l in m per unit of time for one pair of a kind of `distances`, whose vertices move by p."""
     speed = jnp.sqrt(jnp.sum((p - p.mean(axis=0)) ** 2, axis=1))
+    first = jnp.arange(len(p)) < jnp.where((kind == EDGE_EDGE) & (len(p) == 4), 2, 1)
     return jnp.max(jnp.where(first, speed, 0)) + jnp.max(jnp.where(first, 0, speed))
 
 

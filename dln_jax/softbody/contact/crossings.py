@@ -6,6 +6,7 @@ Signs of determinants of float64 coordinates are decided in rational arithmetic 
 from fractions import Fraction
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -36,7 +37,8 @@ def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int
 
 
 def _boxes_meet(one: Group, other: Group, x: np.ndarray) -> Int[np.ndarray, "m 2"]:
-    of_one, of_other = (tuple(np.asarray(side) for side in boxes(of, x, x, 0.0)) for of in (one, other))
+    at = jnp.asarray(x)
+    of_one, of_other = (tuple(np.asarray(side) for side in boxes(of, at, at, 0.0)) for of in (one, other))
     pairs = []
     for start in range(0, len(one.primitives), 256):
         here = slice(start, start + 256)

@@ -4,20 +4,23 @@
 
 w joins a point of one primitive to a point of the other, and e_1, e_2 span the closest features: both for the interior
 of a triangle or of two edges, one for a point and an edge, none for two points. A `Stencil` states w and e as
-combinations of the vertices, so that one energy serves all pairs. Which features are closest (`region`) is decided by
-comparisons, without derivatives; D is once continuously differentiable where the region changes (Li et al. 2020,
-section 3.2).
+combinations of the vertices, so that one program serves all pairs. Which features are closest is decided by
+comparisons, without derivatives; D is once continuously differentiable where they change (Li et al. 2020, section 3.2).
+With beta the weights of the vertices in delta and c_i those in e_i, the derivatives are
+
+    dD/dx = 2 beta (x) delta,    d²D/dx² = 2 beta betaᵀ (x) I - 2 A G⁻¹ Aᵀ,    A_i = beta (x) e_i + c_i (x) delta.
 """
 
-import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-# Two edges whose squared sine is below this are parallel, and their closest points are sought at their ends.
+POINT_TRIANGLE, EDGE_EDGE = 0, 1
+"""Kinds of pairs in space: (p, a, b, c), and (a, b, c, d) with edges from a to b and from c to d. In the plane there is
+one kind, a point and an edge: (p, a, b)."""
+# Two directions whose squared sine is below this are parallel, and the closest points are sought on the boundary.
 _PARALLEL = 1e-20
 
 
@@ -32,110 +35,113 @@ class Stencil(NamedTuple):
     """1 for a direction that is not used, else 0."""
 
 
-def squared_distance(x: Float[Array, "k dim"], stencil: Stencil) -> Float[Array, ""]:
-    """D in m² of the closest features of a pair with vertices x."""
-    delta, _ = separation(x, stencil)
-    return delta @ delta
+class Closest(NamedTuple):
+    """Closest points of a pair."""
+
+    delta: Float[Array, "*pairs dim"]
+    """Vector between them in m, from the second primitive to the first."""
+    weights: Float[Array, "*pairs k"]
+    """beta: delta = weights @ x."""
+    directions: Float[Array, "*pairs axes dim"]
+    """e in m."""
+    inverse: Float[Array, "*pairs axes axes"]
+    """G⁻¹ in 1/m²."""
 
 
-def separation(x: Float[Array, "k dim"], stencil: Stencil) -> tuple[Float[Array, " dim"], Float[Array, " k"]]:
-    """Returns delta in m, and the weights of the vertices in it: delta = weights @ x."""
-    w, e = stencil.offset @ x, stencil.directions @ x
-    s = _solved(e @ e.T + jnp.diag(stencil.unused), e @ w)
-    return w - s @ e, stencil.offset - s @ stencil.directions
+def closest(x: Float[Array, "k dim"], stencil: Stencil) -> Closest:
+    """Returns the closest points of the features of a pair with vertices x."""
+    w, e = _combined(stencil.offset, x), _combined(stencil.directions, x)
+    G = jnp.sum(e[:, None, :] * e[None, :, :], axis=-1) + jnp.diag(stencil.unused)
+    inverse = _inverse(G)
+    s = jnp.sum(inverse * jnp.sum(e * w, axis=-1), axis=-1)
+    delta = w - jnp.sum(s[:, None] * e, axis=0)
+    return Closest(delta, stencil.offset - jnp.sum(s[:, None] * stencil.directions, axis=0), e, inverse)
 
 
-def point_edge(x: Float[Array, "3 dim"]) -> Stencil:
-    """Stencil of a point and an edge: x = (p, a, b)."""
-    region, _ = _point_segment(x[0], x[1], x[2])
-    return _stencil(_POINT_EDGE, region, x.dtype)
+def squared_distance(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
+    """D in m² of a pair of a kind."""
+    delta = closest(x, stencil_of(x, kind)).delta
+    return jnp.sum(delta**2)
 
 
-def point_triangle(x: Float[Array, "4 3"]) -> Stencil:
-    """Stencil of a point and a triangle: x = (p, a, b, c)."""
-    p, a, b, c = x
-    inside, _ = _interior(p - a, b - a, c - a)
-    regions, squares = zip(*(_point_segment(p, *ends) for ends in ((a, b), (b, c), (c, a))), strict=True)
-    side = jnp.argmin(jnp.stack(squares))
-    region = jnp.where(inside, 9, 3 * side + jnp.stack(regions)[side])
-    return _stencil(_POINT_TRIANGLE, region, x.dtype)
-
-
-def edge_edge(x: Float[Array, "4 3"]) -> Stencil:
-    """Stencil of two edges: x = (a, b, c, d), from a to b and from c to d."""
-    a, b, c, d = x
-    _, (s, t) = _interior(a - c, d - c, a - b)
-    u, v = b - a, d - c
-    crossed = (u @ u) * (v @ v) - (u @ v) ** 2 > _PARALLEL * (u @ u) * (v @ v)
-    inside = crossed & (s > 0) & (s < 1) & (t > 0) & (t < 1)
-    regions, squares = zip(
-        *(_point_segment(p, *ends) for p, ends in ((a, (c, d)), (b, (c, d)), (c, (a, b)), (d, (a, b)))), strict=True
-    )
-    end = jnp.argmin(jnp.stack(squares))
-    region = jnp.where(inside, 12, 3 * end + jnp.stack(regions)[end])
-    return _stencil(_EDGE_EDGE, region, x.dtype)
-
-
-def _point_segment(p: Array, a: Array, b: Array) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """Returns the region (0 at a, 1 at b, 2 between them) and the squared distance."""
+def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
+    """Returns the closest features of a pair of a kind with vertices x."""
+    tables = _SPACE if x.shape[1] == 3 else _PLANE
+    p, a, b = jnp.moveaxis(_combined(jnp.asarray(tables.segments, x.dtype)[kind], x), 1, 0)
     e, w = b - a, p - a
-    squared = e @ e
-    s = (w @ e) / jnp.where(squared > 0, squared, 1.0)
-    delta = w - jnp.clip(s, 0.0, 1.0) * e
-    return jnp.where(s <= 0, 0, jnp.where(s >= 1, 1, 2)), delta @ delta
+    squared = jnp.sum(e**2, axis=-1)
+    s = jnp.sum(w * e, axis=-1) / jnp.where(squared > 0, squared, 1.0)
+    squares = jnp.sum((w - jnp.clip(s, 0.0, 1.0)[:, None] * e) ** 2, axis=-1)
+    side = jnp.argmin(squares)
+    region = 3 * side + jnp.where(s <= 0, 0, jnp.where(s >= 1, 1, 2))[side]
+    if tables.interior is not None:
+        inside = _inside(*_combined(jnp.asarray(tables.interior, x.dtype)[kind], x), kind)
+        region = jnp.where(inside, len(tables.offset[0]) - 1, region)
+    parts = (jnp.asarray(part, x.dtype)[kind, region] for part in (tables.offset, tables.directions, tables.unused))
+    return Stencil(*parts)
 
 
-def _interior(w: Array, e: Array, f: Array) -> tuple[Array, Float[Array, " 2"]]:
-    """Whether the closest point of the plane w - s e - t f is inside the triangle of e and f, and (s, t)."""
-    ee, ef, ff = e @ e, e @ f, f @ f
+def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
+    """Whether |w - s e - t f| is smallest inside a triangle (s, t >= 0, s + t <= 1) or inside two edges (s, t <= 1)."""
+    ee, ef, ff, ew, fw = (jnp.sum(u * v) for u, v in ((e, e), (e, f), (f, f), (e, w), (f, w)))
     determinant = ee * ff - ef**2
-    good = determinant > _PARALLEL * ee * ff
-    safe = jnp.where(good, determinant, 1.0)
-    s, t = (ff * (e @ w) - ef * (f @ w)) / safe, (ee * (f @ w) - ef * (e @ w)) / safe
-    return good & (s > 0) & (t > 0) & (s + t < 1), jnp.stack([s, t])
+    s, t = ff * ew - ef * fw, ee * fw - ef * ew
+    largest = jnp.where(kind == POINT_TRIANGLE, s + t, jnp.maximum(s, t))
+    return (determinant > _PARALLEL * ee * ff) & (s > 0) & (t > 0) & (largest < determinant)
 
 
-def _solved(G: Float[Array, "axes axes"], r: Float[Array, " axes"]) -> Float[Array, " axes"]:
-    if len(r) == 1:
-        return r / G[0]
-    determinant = G[0, 0] * G[1, 1] - G[0, 1] ** 2
-    return jnp.stack([G[1, 1] * r[0] - G[0, 1] * r[1], G[0, 0] * r[1] - G[0, 1] * r[0]]) / determinant
+def _combined(weights: Float[Array, "*rows k"], x: Float[Array, "k dim"]) -> Float[Array, "*rows dim"]:
+    # A sum and no matrix product, which would round to fewer digits on a GPU.
+    return jnp.sum(weights[..., None] * x, axis=-2)
 
 
-Table = tuple[np.ndarray, np.ndarray, np.ndarray]
+def _inverse(G: Float[Array, "axes axes"]) -> Float[Array, "axes axes"]:
+    if len(G) == 1:
+        return 1 / G
+    adjugate = jnp.stack([jnp.stack([G[1, 1], -G[0, 1]]), jnp.stack([-G[1, 0], G[0, 0]])])
+    return adjugate / (G[0, 0] * G[1, 1] - G[0, 1] ** 2)
 
 
-def _stencil(table: Table, region: Int[Array, ""], dtype: jnp.dtype) -> Stencil:
-    region = jax.lax.stop_gradient(region)
-    return Stencil(*(jnp.asarray(part, dtype)[region] for part in table))
+class _Tables(NamedTuple):
+    """Coefficients of the vertices, by kind: [kinds, ...]."""
+
+    segments: np.ndarray
+    """[s, 3, k]: a point p and the ends a, b of an edge, for the pairs of boundary features."""
+    interior: np.ndarray | None
+    """[3, k]: w, e_1, e_2 of the interior."""
+    offset: np.ndarray
+    """[regions, k] of `Stencil`; three regions for every segment (at a, at b, between), then the interior."""
+    directions: np.ndarray
+    unused: np.ndarray
 
 
-def _rows(entries: list[tuple[str, list[str]]], names: str, axes: int) -> Table:
-    """Returns the table of regions, from w and the directions written as differences: "pa" is p - a."""
+def _tables(kinds: list[tuple[str, list[str], list[str]]], axes: int) -> _Tables:
+    """Builds tables from the names of vertices, segments as "pab", and the interior as differences: "pa" is p - a."""
+    segments, interiors, offsets, directions = [], [], [], []
+    for names, edges, interior in kinds:
+        unit = dict(zip(names, np.eye(len(names)), strict=True))
 
-    def difference(pair: str) -> np.ndarray:
-        row = np.zeros(len(names))
-        row[names.index(pair[0])], row[names.index(pair[1])] = 1.0, -1.0
-        return row
+        def difference(pair: str, unit: dict[str, np.ndarray] = unit) -> np.ndarray:
+            return unit[pair[0]] - unit[pair[1]]
 
-    offset = np.stack([difference(w) for w, _ in entries])
-    directions = np.zeros((len(entries), axes, len(names)))
-    for number, (_, pairs) in enumerate(entries):
-        for axis, pair in enumerate(pairs):
-            directions[number, axis] = difference(pair)
-    return offset, directions, (~directions.any(axis=2)).astype(float)
-
-
-def _ends(p: str, a: str, b: str) -> list[tuple[str, list[str]]]:
-    """Regions of a point p and an edge: at a, at b, between them."""
-    return [(p + a, []), (p + b, []), (p + a, [b + a])]
+        segments.append([[unit[name] for name in edge] for edge in edges])
+        rows = [row for p, a, b in edges for row in ((p + a, []), (p + b, []), (p + a, [b + a]))]
+        if interior:
+            interiors.append([difference(pair) for pair in interior])
+            rows.append((interior[0], interior[1:]))
+        offsets.append([difference(w) for w, _ in rows])
+        none = [np.zeros(len(names))] * axes
+        directions.append([([difference(pair) for pair in pairs] + none)[:axes] for _, pairs in rows])
+    unused = (~np.any(directions, axis=-1)).astype(float)
+    return _Tables(*(np.array(part) if part else None for part in (segments, interiors, offsets, directions)), unused)
 
 
-_POINT_EDGE = _rows(_ends("p", "a", "b"), "pab", 1)
-_POINT_TRIANGLE = _rows(
-    [*_ends("p", "a", "b"), *_ends("p", "b", "c"), *_ends("p", "c", "a"), ("pa", ["ba", "ca"])], "pabc", 2
-)
-_turned = functools.partial(_ends, a="a", b="b")
-_EDGE_EDGE = _rows(
-    [*_ends("a", "c", "d"), *_ends("b", "c", "d"), *_turned("c"), *_turned("d"), ("ac", ["dc", "ab"])], "abcd", 2
+_PLANE = _tables([("pab", ["pab"], [])], 1)
+# A triangle has three edges; the last is repeated to fill the table.
+_SPACE = _tables(
+    [
+        ("pabc", ["pab", "pbc", "pca", "pca"], ["pa", "ba", "ca"]),
+        ("abcd", ["acd", "bcd", "cab", "dab"], ["ac", "dc", "ab"]),
+    ],
+    2,
 )

@@ -48,8 +48,10 @@ class MovingEnergy(NamedTuple):
     """(x, step, data) -> all elements that may act anywhere between x and x + step."""
     describe: Callable[[Blocks, Elements, Any], Any]
     """(x, elements, data) -> the data of the elements for the energy at x."""
-    energy: Callable[[Float[Array, "k b"], Any], Float[Array, ""]]
-    """(unknowns of one element, its data) -> energy."""
+    gradient: Callable[[Float[Array, "k b"], Any], tuple[Float[Array, ""], Float[Array, "k b"]]]
+    """(unknowns of one element, its data) -> energy and its gradient."""
+    hessian: Callable[[Float[Array, "k b"], Any], Float[Array, "s s"]]
+    """(unknowns of one element, its data) -> its Hessian, s = k b."""
     longest: Callable[[Blocks, Blocks, Elements, Any], Float[Array, ""]]
     """(x, step, elements, data) -> largest fraction of the step, at most 1, up to which the energy stays finite."""
 
@@ -78,7 +80,7 @@ def moving_value(moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: 
     """Returns the sum of the energies at x."""
     total = jnp.zeros((), x.dtype)
     for m, at, of in zip(moving, lists, data, strict=True):
-        total += jax.vmap(m.energy)(x[at.indices], m.describe(x, at, of)).sum()
+        total += jax.vmap(m.gradient)(x[at.indices], m.describe(x, at, of))[0].sum()
     return total
 
 
@@ -88,7 +90,7 @@ def moving_gradient(
     """Returns the sum of the energies and its gradient."""
     total, gradient = jnp.zeros((), x.dtype), jnp.zeros_like(x)
     for m, at, of in zip(moving, lists, data, strict=True):
-        values, slopes = jax.vmap(jax.value_and_grad(m.energy))(x[at.indices], m.describe(x, at, of))
+        values, slopes = jax.vmap(m.gradient)(x[at.indices], m.describe(x, at, of))
         total += values.sum()
         gradient = gradient.at[at.indices].add(slopes)
     return total, gradient
@@ -98,12 +100,10 @@ def moving_hessians(
     moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any], *, projected: bool
 ) -> tuple[Float[Array, "capacity s s"], ...]:
     """Returns the Hessians of the elements, projected to positive semi-definite ones for a search direction."""
-    hessians = []
-    for m, at, of in zip(moving, lists, data, strict=True):
-        whole = jax.vmap(jax.hessian(m.energy))(x[at.indices], m.describe(x, at, of))
-        s = at.indices.shape[1] * x.shape[1]
-        hessians.append(whole.reshape(-1, s, s))
-    return tuple(map(_projected, hessians)) if projected else tuple(hessians)
+    hessians = tuple(
+        jax.vmap(m.hessian)(x[at.indices], m.describe(x, at, of)) for m, at, of in zip(moving, lists, data, strict=True)
+    )
+    return tuple(map(_projected, hessians)) if projected else hessians
 
 
 def with_moving(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:

@@ -12,7 +12,7 @@ from dln_jax.softbody.contact.surface import surface_of
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.terms.term import Context
-from dln_jax.solvers.elements.moving import lists_between, moving_gradient, moving_value
+from dln_jax.solvers.elements.moving import lists_between, moving_gradient, moving_hessians
 
 ipctk = pytest.importorskip("ipctk", reason="the reference needs ipctk, of the extra [test]")
 
@@ -35,7 +35,13 @@ def ours(mesh: Mesh, x: np.ndarray):
     lists = lists_between(contact.energies, jnp.asarray(x), jnp.zeros_like(rest), data)
     assert not any(elements.overflow for elements in lists)
     value, gradient = moving_gradient(contact.energies, jnp.asarray(x), lists, data)
-    hessian = jax.hessian(lambda x: moving_value(contact.energies, x, lists, data))(jnp.asarray(x))
+    hessian = jax.jacfwd(lambda x: moving_gradient(contact.energies, x, lists, data)[1])(jnp.asarray(x))
+    (blocks, *_), (elements, *_) = moving_hessians(contact.energies, jnp.asarray(x), lists, data, projected=False), lists
+    d = x.shape[1]
+    unknowns = (np.asarray(elements.indices)[:, :, None] * d + np.arange(d)).reshape(len(blocks), -1)
+    assembled = np.zeros((x.size, x.size))
+    np.add.at(assembled, (unknowns[:, :, None], unknowns[:, None, :]), blocks)
+    np.testing.assert_allclose(assembled, hessian.reshape(x.size, x.size), atol=1e-11 * np.abs(assembled).max())
     return value, gradient.reshape(-1), hessian.reshape(x.size, x.size)
 
 
