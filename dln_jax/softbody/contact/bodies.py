@@ -35,6 +35,10 @@ NAME = "contact"
 """Key of the parameters in `Params.terms`."""
 
 
+_AT_ONCE = 256
+"""Pairs that are measured in one turn of a loop; no list is shorter."""
+
+
 class ContactParameters(NamedTuple):
     """Parameters of the contact between and within bodies."""
 
@@ -106,7 +110,7 @@ def body_contact(
     require_positive(distance=distance, threshold_speed=threshold_speed, **({"capacity": capacity} if capacity else {}))
     surface = surface_of(mesh)
     kinds = _kinds(surface, mesh.vertices, distance)
-    capacity = max(128, 2 * len(surface.vertices)) if capacity is None else capacity
+    capacity = max(_AT_ONCE // 2, 2 * len(surface.vertices) if capacity is None else capacity)
     parameters = ContactParameters(
         jnp.asarray(distance, dtype=float),
         material("the stiffness of the contact", stiffness, 1, "contact", POSITIVE),
@@ -163,18 +167,33 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
         of_one = boxes(kind.one, x, x + step, margin)
         of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
         # Boxes of neighbours in one surface always meet, so that these lists are longer than those of near pairs.
-        wide = tuple(2 * count + 2 * capacity for count in kind.neighbours)
+        wide = tuple(count + count // 2 + 2 * capacity for count in kind.neighbours)
         lists.append(pairs_near(kind.one, kind.other, of_one, of_other, wide))
     pairs, used = (jnp.concatenate(parts) for parts in zip(*(listed[:2] for listed in lists), strict=True))
     number = np.concatenate([np.full(len(of.used), kind.number) for kind, of in zip(kinds, lists, strict=True)])
     corners = jnp.concatenate([_corners(kind, of.pairs) for kind, of in zip(kinds, lists, strict=True)])
-    squares = jax.vmap(squared_distance)(x[corners], jnp.asarray(number))
-    # Pairs that stay farther apart, by their distance and the bound of their speed, are left out.
-    near = used & (squares < (parameters.distance + jax.vmap(speed_bound)(step[corners], jnp.asarray(number))) ** 2)
+    near = used & _within_reach(x, step, corners, number, used, parameters.distance)
     chosen, here, too_many = places(near, capacity * len(kinds))
     indices = jnp.where(here[:, None], corners[chosen], jnp.arange(corners.shape[1]))
     overflow = jnp.stack([too_many, *(listed.overflow for listed in lists)]).any()
     return Elements(indices, Listed(pairs[chosen], jnp.asarray(number)[chosen], here), overflow)
+
+
+def _within_reach(x: Array, step: Array, corners: Array, number: np.ndarray, used: Array, distance: Array) -> Array:
+    """Whether pairs can come within a distance in a step, by their distance and the bound of their speed.
+
+    Only those of the listed pairs that are used are measured, which are a fraction of the list.
+    """
+    order = jnp.argsort(~used)
+    kinds = jnp.asarray(number)
+
+    def measure(turn: Array, near: Array) -> Array:
+        here = jax.lax.dynamic_slice_in_dim(order, jnp.minimum(turn * _AT_ONCE, len(order) - _AT_ONCE), _AT_ONCE)
+        at, kind = corners[here], kinds[here]
+        reach = distance + jax.vmap(speed_bound)(step[at], kind)
+        return near.at[here].set(jax.vmap(squared_distance)(x[at], kind) < reach**2)
+
+    return jax.lax.fori_loop(0, -(-used.sum() // _AT_ONCE), measure, jnp.zeros_like(used))
 
 
 def _corners(kind: Kind, pairs: Int[Array, "m 2"]) -> Int[Array, "m k"]:

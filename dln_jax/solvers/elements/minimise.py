@@ -26,6 +26,7 @@ from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFa
 from dln_jax.solvers.elements.moving import (
     Lists,
     MovingEnergy,
+    add_diagonals,
     lists_between,
     longest_fraction,
     moving_gradient,
@@ -222,11 +223,14 @@ def _newton(
         x, energy, gradient = state.point
         hessians = element_hessians(total.energies, x, data[0])
         values = entries(at, hessians)
-        direction, forced = _direction(total, state, hessians, values, data)
+        # Contact forces on curved distances make Hessians indefinite in most steps, so that these are always projected.
+        of_moving = moving_hessians(moving, x, state.lists, data[1], projected=True)
+        direction, forced = _direction(total, state, hessians, values, of_moving, data)
         lists, direction, limit = _allowed(total, x, direction, data, state.lists)
         slope = jnp.vdot(direction, gradient)
         # Terms that cancel in a row of the gradient are of the size of |H| |x|.
         diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(x.shape)
+        diagonal = add_diagonals(diagonal, state.lists, of_moving)
         extent = jnp.max(jnp.abs(x), initial=0)
         floor = rounding * diagonal * extent
         unclear = rounding * jnp.abs(energy) + floor.sum() * extent
@@ -261,7 +265,12 @@ def _newton(
 
 
 def _direction(
-    total: _Sum, state: _MinimumIterate, hessians: Sequence[Array], values: Array, data: Any
+    total: _Sum,
+    state: _MinimumIterate,
+    hessians: Sequence[Array],
+    values: Array,
+    of_moving: Sequence[Array],
+    data: Any,
 ) -> tuple[Blocks, Array]:
     """Returns Newton's direction, and whether it must be taken although it may raise the energy."""
     x, _, right = state.point
@@ -269,7 +278,7 @@ def _direction(
         # Fixed unknowns move by their gap; the free ones respond as the linearised forces say.
         gradient = functools.partial(_value_and_gradient, total, data=data, lists=state.lists)
         right += jax.jvp(lambda x: gradient(x)[1], (x,), (state.gap,))[1]
-    direction = _descent_direction(total, hessians, values, right, x, data, state.lists)
+    direction = _descent_direction(total, hessians, values, right, of_moving, state.lists)
     if state.gap is None:
         return direction, jnp.asarray(False)
     return direction + state.gap, (state.gap != 0).any()
@@ -295,11 +304,14 @@ def _allowed(total: _Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists)
 
 
 def _descent_direction(
-    total: _Sum, hessians: Sequence[Array], values: Array, gradient: Blocks, x: Blocks, data: Any, lists: Lists
+    total: _Sum,
+    hessians: Sequence[Array],
+    values: Array,
+    gradient: Blocks,
+    of_moving: Sequence[Array],
+    lists: Lists,
 ) -> Blocks:
-    at, solver, moving = total.at, total.solver, total.moving
-    # Contact forces on curved distances make Hessians indefinite in most steps, so that these are always projected.
-    of_moving = moving_hessians(moving, x, lists, data[1], projected=True)
+    _, at, solver, moving = total
 
     def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
         factor = solver.factorise(hessians, (values, lists, of_moving) if moving else values)

@@ -106,6 +106,14 @@ def moving_hessians(
     return tuple(map(_projected, hessians)) if projected else hessians
 
 
+def add_diagonals(diagonal: Blocks, lists: Lists, hessians: Sequence[Array]) -> Blocks:
+    """Adds the sizes of the diagonal entries of moving elements to those of the static ones."""
+    for elements, of_elements in zip(lists, hessians, strict=True):
+        own = jnp.abs(jnp.diagonal(of_elements, axis1=1, axis2=2))
+        diagonal = diagonal.at[elements.indices].add(own.reshape(*elements.indices.shape, -1))
+    return diagonal
+
+
 def with_moving(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Returns the solver of systems with the Hessians of static and of moving elements.
 
