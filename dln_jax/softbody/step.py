@@ -30,8 +30,9 @@ from dln_jax.softbody.scene import (
     State,
     contact_energies,
     element_energies,
+    least_distance,
     prepare,
-    prepare_contact,
+    prepare_contacts,
 )
 from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, energy_balance, least_J, trusted
 from dln_jax.solvers.elements.assembly import Pattern, pattern
@@ -136,12 +137,12 @@ def make_step(
     """
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
-    if scene.contact is not None and integrator.span != 1.0:
+    if scene.contacts and integrator.span != 1.0:
         raise InputError("this integrator extrapolates, which may push bodies through each other; use backward-euler")
     free = scene.free
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *element_energies(scene))
     at = pattern(energies, free.shape[0], free.shape[1], free)
-    overlaps = None if scene.contact is not None else count_overlaps(scene.mesh)
+    overlaps = None if scene.contacts else count_overlaps(scene.mesh)
     moving = contact_energies(scene)
     rest, masses = scene.params.rest, scene.params.masses
     known = _known(
@@ -176,7 +177,7 @@ def make_step(
         carried = state.x + span * state.v
         # The better of two starts: the present positions, or those of motion without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
-        contact = prepare_contact(scene, params, state.x, dt=span)
+        contact = prepare_contacts(scene, params, state.x, dt=span)
         if moving:
             # Only the present positions are known to be apart; held vertices approach their goals from there.
             balanced, outcome = solve(
@@ -246,10 +247,10 @@ def static_solve(
     known = _known((params, x, control), lambda: data)
     chosen = _linear_solver(linear_solver, energies, at, x, known)
     solve = partial(minimise, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite)
-    contact = prepare_contact(scene, params, x)
+    contact = prepare_contacts(scene, params, x)
     solve = partial(solve, moving=contact_energies(scene), moving_data=contact)
     x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
-    overlaps = None if scene.contact is not None else count_overlaps(scene.mesh)
+    overlaps = None if scene.contacts else count_overlaps(scene.mesh)
     lists = lists_between(contact_energies(scene), x, jnp.zeros_like(x), contact)
     info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), overlaps, contact, lists)
     return trusted(x, info.converged), info
@@ -289,7 +290,6 @@ def _of_positions(
     least = least_J(scene, params, x)
     converged = outcome.converged if least is None else outcome.converged & (least > 0)
     pairs = None if overlaps is None else overlaps(x)
-    nearest = None if scene.contact is None else scene.contact.least_distance(x, lists[0], contact[0])
     return Info(
         outcome.residual,
         outcome.iterations,
@@ -297,7 +297,7 @@ def _of_positions(
         outcome.definite,
         least_J=least,
         overlaps=pairs,
-        least_distance=nearest,
+        least_distance=least_distance(scene, x, lists, contact),
         overflow=outcome.overflow,
     )
 

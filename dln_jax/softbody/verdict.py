@@ -84,7 +84,7 @@ def energy_balance(
     stored, stored_after = (value(energies, at, data) + contact(at) for at in x)
     moved = x[1] - x[0]
     work = _work(scene.held, energies, data, balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
-    if len(scene.held) and scene.contact is not None:
+    if len(scene.held) and scene.contacts:
         along = jnp.zeros_like(moved).at[scene.held].set(moved[scene.held])
         work += jax.jvp(contact, (balanced,), (along,))[1]
     # Residual forces do work, and rounding hides some of the energy.

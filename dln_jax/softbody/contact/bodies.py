@@ -11,7 +11,6 @@ Friction is lagged: normal forces and tangent planes are those at the start of t
 with the smooth f of `terms.contact`.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,32 +21,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_gradient, pair_hessian
 from dln_jax.softbody.contact.candidates import Group, boxes, group, meetings, pairs_near, places
+from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact_parameters
 from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
 from dln_jax.softbody.contact.distances import EDGE_EDGE, POINT_TRIANGLE, squared_distance, stencil_of
 from dln_jax.softbody.contact.surface import Surface, areas, surface_of
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms.contact import Slip, friction_energy
-from dln_jax.softbody.terms.term import NOT_NEGATIVE, POSITIVE, Context, Numbers, material
+from dln_jax.softbody.terms.term import Context, Numbers
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
-from dln_jax.types import InputError, require_positive
-
-NAME = "contact"
-"""Key of the parameters in `Params.terms`."""
-
+from dln_jax.types import require_positive
 
 _AT_ONCE = 256
 """Pairs that are measured in one turn of a loop; no list is shorter."""
-
-
-class ContactParameters(NamedTuple):
-    """Parameters of the contact between and within bodies."""
-
-    distance: Float[Array, ""]
-    """h in m, within which surfaces repel each other."""
-    stiffness: Float[Array, ""]
-    """kappa in Pa."""
-    friction: Float[Array, ""] | None
-    """Coulomb's coefficient, or `None`."""
 
 
 class Kind(NamedTuple):
@@ -72,18 +57,6 @@ class Listed(NamedTuple):
     """False for places that are not used."""
 
 
-class BodyContact(NamedTuple):
-    """Contact between and within the bodies of a scene."""
-
-    parameters: ContactParameters
-    energies: tuple[MovingEnergy, ...]
-    """The barrier and, with a coefficient of friction, the friction."""
-    prepare: Callable[[ContactParameters, Context], tuple[Any, ...]]
-    """(parameters, context) -> data of the energies in a step."""
-    least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
-    """(positions, elements and data of the barrier) -> smallest distance in m of two primitives, at most the distance h."""
-
-
 def body_contact(
     mesh: Mesh,
     *,
@@ -92,7 +65,8 @@ def body_contact(
     friction: Numbers | None = None,
     threshold_speed: float = 1e-3,
     capacity: int | None = None,
-) -> BodyContact:
+    name: str = "contact",
+) -> Contact:
     """Contact of all bodies of a mesh with each other and with themselves.
 
     Args:
@@ -103,6 +77,7 @@ def body_contact(
         friction: Coulomb's coefficient, reached at the threshold speed in m/s.
         capacity: places in the list of near pairs, for every kind of pairs; by default two for every vertex of the
             boundary, and at least 128. A step that needs more does not converge, and its `Info.overflow` is true.
+        name: key of its parameters in `Params.terms`.
 
     Raises:
         InputError: a number that is not positive.
@@ -111,11 +86,7 @@ def body_contact(
     surface = surface_of(mesh)
     kinds = _kinds(surface, mesh.vertices, distance)
     capacity = max(_AT_ONCE // 2, 2 * len(surface.vertices) if capacity is None else capacity)
-    parameters = ContactParameters(
-        jnp.asarray(distance, dtype=float),
-        material("the stiffness of the contact", stiffness, 1, "contact", POSITIVE),
-        None if friction is None else material("friction", friction, 1, "contact", NOT_NEGATIVE),
-    )
+    parameters = contact_parameters(distance, stiffness, friction)
     barrier = MovingEnergy(
         elements=partial(_near, kinds, capacity),
         describe=partial(_described, surface),
@@ -135,7 +106,7 @@ def body_contact(
         data = (parameters, context.rest)
         if parameters.friction is None:
             return (data,)
-        return data, _lagged(barrier, parameters, data, context, threshold_speed)
+        return data, _lagged(barrier, parameters.friction, data, context, threshold_speed)
 
     def least_distance(x: Float[Array, "n dim"], elements: Elements, data: Any) -> Float[Array, ""]:
         squares = jax.vmap(squared_distance)(x[elements.indices], elements.data.kind)
@@ -143,7 +114,7 @@ def body_contact(
         return jnp.sqrt(jnp.minimum(jnp.min(jnp.where(elements.data.used, squares, farthest)), farthest))
 
     energies = (barrier,) if friction is None else (barrier, sliding)
-    return BodyContact(parameters, energies, prepare, least_distance)
+    return Contact(name, parameters, energies, prepare, least_distance)
 
 
 def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, ...]:
@@ -167,8 +138,8 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
         of_one = boxes(kind.one, x, x + step, margin)
         of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
         # Boxes of neighbours in one surface always meet, so that these lists are longer than those of near pairs.
-        wide = tuple(count + count // 2 + 2 * capacity for count in kind.neighbours)
-        lists.append(pairs_near(kind.one, kind.other, of_one, of_other, wide))
+        clusters, primitives = (count + count // 2 + 2 * capacity for count in kind.neighbours)
+        lists.append(pairs_near(kind.one, kind.other, of_one, of_other, (clusters, primitives)))
     pairs, used = (jnp.concatenate(parts) for parts in zip(*(listed[:2] for listed in lists), strict=True))
     number = np.concatenate([np.full(len(of.used), kind.number) for kind, of in zip(kinds, lists, strict=True)])
     corners = jnp.concatenate([_corners(kind, of.pairs) for kind, of in zip(kinds, lists, strict=True)])
@@ -231,7 +202,7 @@ def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
 
 
 def _lagged(
-    barrier: MovingEnergy, parameters: ContactParameters, data: Any, context: Context, threshold_speed: float
+    barrier: MovingEnergy, friction: Array, data: Any, context: Context, threshold_speed: float
 ) -> tuple[Elements, tuple[Slip, Array]]:
     """Returns the pairs that rub, with their normal forces at the start of the step."""
     x = context.x
@@ -242,7 +213,7 @@ def _lagged(
     moving = jnp.isfinite(context.dt)
     threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
     start = jnp.einsum("mk,mki->mi", weights, corners)
-    largest = jnp.where(moving, parameters.friction * force, 0.0)
+    largest = jnp.where(moving, friction * force, 0.0)
     return elements, (Slip(start, normal, largest, jnp.broadcast_to(threshold, force.shape)), weights)
 
 

@@ -75,7 +75,9 @@ def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: fl
             box = boxes(of, jnp.asarray(x), jnp.asarray(x), margin / 2)
             sides.append([np.asarray(side) for side in (_of_clusters(of, box) if clusters else box)])
         (low, high), (other_low, other_high) = sides
-        rows = ((row <= other_high).all(axis=1) & (other_low <= top).all(axis=1) for row, top in zip(low, high, strict=True))
+        rows = (
+            (row <= other_high).all(axis=1) & (other_low <= top).all(axis=1) for row, top in zip(low, high, strict=True)
+        )
         counts.append(sum(int(row.sum()) for row in rows))
     return counts[0], counts[1]
 

@@ -43,7 +43,7 @@ def _boxes_meet(one: Group, other: Group, x: np.ndarray) -> Int[np.ndarray, "m 2
     for start in range(0, len(one.primitives), 256):
         here = slice(start, start + 256)
         meet = (of_one[0][here, None] <= of_other[1]).all(axis=2) & (of_other[0] <= of_one[1][here, None]).all(axis=2)
-        pairs.append(np.argwhere(meet) + [start, 0])
+        pairs.append(np.argwhere(meet) + np.array([start, 0]))
     return np.concatenate(pairs)
 
 
@@ -84,7 +84,9 @@ def _side(*points: np.ndarray) -> int:
     size = float(np.prod(np.linalg.norm(rows, axis=1))) + 1e-300
     if abs(value) > 1e-12 * size * (1 + np.abs(np.stack(points)).max() / np.abs(rows).max(initial=1e-300)):
         return 1 if value > 0 else -1
-    exact = [[Fraction(float(u)) - Fraction(float(v)) for u, v in zip(point, points[0], strict=True)] for point in points[1:]]
+    exact = [
+        [Fraction(float(u)) - Fraction(float(v)) for u, v in zip(point, points[0], strict=True)] for point in points[1:]
+    ]
     determinant = _determinant(exact)
     return (determinant > 0) - (determinant < 0)
 

@@ -75,10 +75,13 @@ def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
     side = jnp.argmin(squares)
     region = 3 * side + jnp.where(s <= 0, 0, jnp.where(s >= 1, 1, 2))[side]
     if tables.interior is not None:
-        inside = _inside(*_combined(jnp.asarray(tables.interior, x.dtype)[kind], x), kind)
+        w, e, f = _combined(jnp.asarray(tables.interior, x.dtype)[kind], x)
+        inside = _inside(w, e, f, kind)
         region = jnp.where(inside, len(tables.offset[0]) - 1, region)
-    parts = (jnp.asarray(part, x.dtype)[kind, region] for part in (tables.offset, tables.directions, tables.unused))
-    return Stencil(*parts)
+    offset, directions, unused = (
+        jnp.asarray(part, x.dtype)[kind, region] for part in (tables.offset, tables.directions, tables.unused)
+    )
+    return Stencil(offset, directions, unused)
 
 
 def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
@@ -133,7 +136,8 @@ def _tables(kinds: list[tuple[str, list[str], list[str]]], axes: int) -> _Tables
         none = [np.zeros(len(names))] * axes
         directions.append([([difference(pair) for pair in pairs] + none)[:axes] for _, pairs in rows])
     unused = (~np.any(directions, axis=-1)).astype(float)
-    return _Tables(*(np.array(part) if part else None for part in (segments, interiors, offsets, directions)), unused)
+    interior = np.array(interiors) if interiors else None
+    return _Tables(np.array(segments), interior, np.array(offsets), np.array(directions), unused)
 
 
 _PLANE = _tables([("pab", ["pab"], [])], 1)

@@ -39,7 +39,7 @@ def line_search(
     longest: Float[Array, ""] | float = 1.0,
     any_change: Bool[Array, ""] | bool = False,
 ) -> tuple[Evaluated, Float[Array, ""]]:
-    """Takes the first of the steps `longest` times 1, 1/2, 1/4, ... that lowers the energy, or the gradient if rounding hides that.
+    """Takes the first of the steps l, l/2, l/4, ... that lowers the energy, or the gradient if rounding hides that.
 
     Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
     improving by many digits beyond that. Returns the point, which is the start if no step is accepted, and the length
@@ -52,7 +52,7 @@ def line_search(
         slope: derivative of the energy along the direction, <= 0.
         unclear: changes of the energy that rounding hides.
         scale: unit of the gradient's rows.
-        longest: first length.
+        longest: the first length l.
         any_change: whether any step to a finite energy is accepted.
     """
 

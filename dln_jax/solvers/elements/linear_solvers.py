@@ -190,6 +190,7 @@ def _one(at: Pattern) -> int:
 
 
 def with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"]:
+    """Appends the constants 0 and 1 to the entries, for the indices of `lookup`."""
     return jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
 
 

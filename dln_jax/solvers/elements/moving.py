@@ -65,7 +65,9 @@ def lists_between(moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, data:
     return tuple(m.elements(x, step, of) for m, of in zip(moving, data, strict=True))
 
 
-def longest_fraction(moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, lists: Lists, data: Sequence[Any]) -> Array:
+def longest_fraction(
+    moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, lists: Lists, data: Sequence[Any]
+) -> Array:
     """Returns the largest fraction of the step that all energies allow."""
     fractions = [m.longest(x, step, at, of) for m, at, of in zip(moving, lists, data, strict=True)]
     return jnp.min(jnp.stack([jnp.ones((), x.dtype), *fractions]))
@@ -210,4 +212,3 @@ def _iterative(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Patt
         return run(_SEARCH_RESIDUAL, factor, b)
 
     return LinearSolver(factorise, solve, search)
-
