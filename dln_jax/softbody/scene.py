@@ -203,7 +203,7 @@ def least_distance(
     """Smallest distance in m in a contact; `None` for a scene without."""
     if not scene.contacts:
         return None
-    starts = np.cumsum([0, *(len(contact.energies) for contact in scene.contacts)])
+    starts = np.cumsum([0, *(len(contact.energies) for contact in scene.contacts)]).tolist()
     nearest = [
         contact.least_distance(x, lists[start], data[start])
         for contact, start in zip(scene.contacts, starts, strict=False)

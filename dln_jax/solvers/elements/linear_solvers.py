@@ -47,8 +47,8 @@ _UPPER_PRODUCTS = 10_000
 class LinearSolver(NamedTuple):
     """A method for systems with the Hessian."""
 
-    factorise: Callable[[Sequence[Array], Float[Array, " entries"]], Any]
-    """(element Hessians, entries of their sum) -> the factor for the solves."""
+    factorise: Callable[[Sequence[Array], Any], Any]
+    """(element Hessians, entries of their sum [entries], or what `with_moving` expects) -> factor for the solves."""
     solve: Callable[[Any, Blocks], Blocks]
     """(factor, b) -> p, to the accuracy of rounding; p is zero where the pattern is not free."""
     search: Callable[[Any, Blocks], Blocks]

@@ -149,8 +149,9 @@ def gradients(quick: bool) -> Findings:
     def outcome(values: jax.Array) -> jax.Array:
         elastic = {"youngs_modulus": values[0]}
         params = with_parameters(scene.params, elastic=elastic, contact={"stiffness": values[1]})
-        body = lambda state, _: (step(params, state)[0], None)  # noqa: E731
-        end, _ = jax.lax.scan(body, init(), None, length=20 if quick else 60)
+        end, _ = jax.lax.scan(
+            lambda state, _: (step(params, state, None)[0], None), init(), None, length=20 if quick else 60
+        )
         return jnp.sum(end.x[:, -1] ** 2) + 0.1 * jnp.sum(end.v[:, 0])
 
     at = jnp.array([1e5, 1e5])
