@@ -12,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dln_jax.softbody.contact.contact import Contact
+from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses
 from dln_jax.softbody.terms.term import Context, Term
 from dln_jax.solvers.elements.energies import ElementEnergy, value
+from dln_jax.solvers.elements.moving import Lists, MovingEnergy, lists_between, moving_value
 from dln_jax.types import InputError
 
 
@@ -38,6 +41,8 @@ class SoftScene(NamedTuple):
     """Vertices that are not solved for: they move with their own velocity in `State.v`."""
     params: Params
     """Default parameters."""
+    contacts: tuple[Contact, ...] = ()
+    """Contacts by barriers, between bodies or with obstacles, if any."""
 
     @property
     def free(self) -> Bool[np.ndarray, "n dim"]:
@@ -79,7 +84,13 @@ class State(NamedTuple):
 
 
 def make_scene(
-    mesh: Mesh, terms: Sequence[Term], *, density: float = 1000.0, masses: Any = None, held: Any = ()
+    mesh: Mesh,
+    terms: Sequence[Term],
+    *,
+    density: float = 1000.0,
+    masses: Any = None,
+    held: Any = (),
+    contacts: Sequence[Contact] = (),
 ) -> SoftScene:
     """Builds a scene with its default parameters.
 
@@ -89,13 +100,15 @@ def make_scene(
         density: in kg/m³ (kg/m² in the plane), for the masses of the vertices.
         masses: of the vertices in kg, one for all or [n], instead of a density.
         held: indices of vertices that are not solved for.
+        contacts: contacts by barriers, of bodies (without which they pass through each other) and with obstacles.
 
     Raises:
-        InputError: two terms of one name, an index or a mass out of range, or no free vertex.
+        InputError: two terms of one name, an index or a mass out of range, no free vertex, or surfaces in contact that
+            cross in the rest shape.
     """
     n = len(mesh.vertices)
     terms = tuple(terms)
-    names = [term.name for term in terms]
+    names = [term.name for term in terms] + [contact.name for contact in contacts]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"two terms are named '{twice[0]}'; give each its own name")
     for term in terms:
@@ -110,8 +123,21 @@ def make_scene(
     masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
     if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
         raise InputError(f"the mass of vertex {bad[0]} is {masses[bad[0]]} kg; expected a positive number")
-    params = Params(jnp.asarray(mesh.vertices), jnp.asarray(masses), {term.name: term.parameters for term in terms})
-    return SoftScene(mesh, terms, held, params)
+    if contacts:
+        require_apart(mesh, mesh.vertices)
+    parameters = {part.name: part.parameters for part in (*terms, *contacts)}
+    params = Params(jnp.asarray(mesh.vertices), jnp.asarray(masses), parameters)
+    return SoftScene(mesh, terms, held, params, tuple(contacts))
+
+
+def require_apart(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> None:
+    """Refuses positions at which surfaces cross, naming the first pair by its vertices."""
+    if pairs := crossings(mesh, x):
+        (one, other), count = pairs[0], len(pairs)
+        raise InputError(
+            f"{count} pair(s) of the surface cross, the first with the vertices {list(one)} and {list(other)}; "
+            "move the bodies apart, or leave out their contact"
+        )
 
 
 def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
@@ -169,6 +195,35 @@ def prepare(
     return tuple(term.prepare(params.terms[term.name], context) for term in scene.terms)
 
 
+def prepare_contacts(
+    scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf
+) -> tuple[Any, ...]:
+    """Returns the data of the contacts' energies for a step of dt in s that starts at x."""
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), None)
+    return tuple(data for contact in scene.contacts for data in contact.prepare(params.terms[contact.name], context))
+
+
+def contact_energies(scene: SoftScene) -> tuple[MovingEnergy, ...]:
+    """Returns the contacts in the form of the solver."""
+    return tuple(energy for contact in scene.contacts for energy in contact.energies)
+
+
+def least_distance(
+    scene: SoftScene, x: Float[Array, "n dim"], lists: Lists, data: Sequence[Any]
+) -> Float[Array, ""] | None:
+    """Smallest distance in m in a contact; `None` for a scene without."""
+    if not scene.contacts:
+        return None
+    starts = np.cumsum([0, *(len(contact.energies) for contact in scene.contacts)]).tolist()
+    nearest = [
+        contact.least_distance(x, lists[start], data[start])
+        for contact, start in zip(scene.contacts, starts, strict=False)
+    ]
+    return jnp.min(jnp.stack(nearest))
+
+
 def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Array | None = None) -> Array:
     """V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as from rest at x."""
-    return value(element_energies(scene), x, prepare(scene, params, x, control=control))
+    stored = value(element_energies(scene), x, prepare(scene, params, x, control=control))
+    energies, data = contact_energies(scene), prepare_contacts(scene, params, x)
+    return stored + moving_value(energies, x, lists_between(energies, x, jnp.zeros_like(x), data), data)

@@ -15,13 +15,25 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data
 from dln_jax.softbody.mesh.intersections import count_overlaps
-from dln_jax.softbody.scene import Growth, Params, Previous, SoftScene, State, element_energies, prepare
+from dln_jax.softbody.scene import (
+    Growth,
+    Params,
+    Previous,
+    SoftScene,
+    State,
+    contact_energies,
+    element_energies,
+    least_distance,
+    prepare,
+    prepare_contacts,
+)
 from dln_jax.softbody.substeps import with_shorter_steps
 from dln_jax.softbody.verdict import Info, energy_balance, least_J, trusted, with_energies, work_of_held
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.moving import Lists, lists_between, moving_value
 from dln_jax.solvers.elements.selection import by_size, by_stiffness
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
@@ -79,13 +91,19 @@ def make_step(
             raise InputError("halvings got a method of two steps, which have one length; use another integrator")
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
+    if scene.contacts and (integrator.span != 1.0 or integrator.averaged):
+        raise InputError(
+            "this integrator does not end where forces balance, which may push bodies through each other; "
+            "use BACKWARD_EULER or BDF2"
+        )
     free = scene.free
     terms = stored = element_energies(scene)
     if integrator.averaged:
         terms = tuple(averaged(element, scene.mesh.dimension) for element in stored)
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *terms)
     at = pattern(energies, free.shape[0], free.shape[1], free)
-    overlaps = count_overlaps(scene.mesh)
+    overlaps = None if scene.contacts else count_overlaps(scene.mesh)
+    moving = contact_energies(scene)
     rest, masses = scene.params.rest, scene.params.masses
 
     def along(start: Array, data: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -100,7 +118,13 @@ def make_step(
     )
     chosen = _linear_solver(linear_solver, energies, at, rest, known)
     solve = partial(
-        minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite
+        minimise,
+        free=free,
+        tolerance=tolerance,
+        iterations=iterations,
+        linear_solver=chosen,
+        definite=definite,
+        moving=moving,
     )
 
     def init(x: Any = None, v: Any = None) -> State:
@@ -124,29 +148,48 @@ def make_step(
         at_start = prepare(scene, params, state.x, dt=elapsed, control=control)
         data = ((weights, target), *along(state.x, at_start))
         carried = state.x + span * state.v
-        if x_after is None:
+        contact = prepare_contacts(scene, params, state.x, dt=span)
+        feasible = None
+        if moving:
+            # Only known positions are known to be apart; held vertices approach their goals from there.
+            start = jnp.where(free, state.x, carried)
+            feasible = state.x if x_after is None else x_after
+        elif x_after is None:
             # The better of two starts: the present positions, or those of motion without forces.
             stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
             start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
         else:
             start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
-        balanced, outcome = solve(energies, start, data, scale=params.masses, at=at)
+        balanced, outcome = solve(
+            energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible
+        )
         x, v = integrator.finish(state, balanced, dt)
         x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
-        info, growth = judged(params, state, x, v, (balanced, outcome, at_start, data[1:]))
+        info, growth = judged(params, state, x, v, (balanced, outcome, at_start, data[1:], contact))
         x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
         return State(x, v, before, growth), info
 
     def judged(
-        params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any, Any]
+        params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any, Any, Any]
     ) -> tuple[Info, Growth | None]:
         # The verdict has no derivatives.
         params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
-        balanced, outcome, at_start, data = solution
+        balanced, outcome, at_start, data, contact = solution
+        lists = lists_between(moving, state.x, x - state.x, contact)
+
+        def contact_value(x: Array) -> Array:
+            return moving_value(moving, x, lists, contact)
+
         work = work_of_held(scene.held, terms, data, balanced, x - state.x)
-        balance = energy_balance(scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome)
-        return with_energies(_of_positions(scene, params, x, outcome, overlaps), balance, state.growth)
+        if moving and len(scene.held):
+            along_held = jnp.where(free, 0, x - state.x)
+            work += jax.jvp(contact_value, (balanced,), (along_held,))[1]
+        balance = energy_balance(
+            scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, contact_value
+        )
+        info = _of_positions(scene, params, x, outcome, overlaps, contact, lists)
+        return with_energies(info, balance, state.growth)
 
     if halvings:
         return Stepper(init, with_shorter_steps(advance, dt, halvings))
@@ -185,8 +228,12 @@ def static_solve(
     known = _known((params, x, control), lambda: data)
     chosen = _linear_solver(linear_solver, energies, at, x, known)
     solve = partial(minimise, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite)
+    contact = prepare_contacts(scene, params, x)
+    solve = partial(solve, moving=contact_energies(scene), moving_data=contact)
     x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
-    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), count_overlaps(scene.mesh))
+    overlaps = None if scene.contacts else count_overlaps(scene.mesh)
+    lists = lists_between(contact_energies(scene), x, jnp.zeros_like(x), contact)
+    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), overlaps, contact, lists)
     return trusted(x, info.converged), info
 
 
@@ -212,13 +259,28 @@ def _linear_solver(
 
 
 def _of_positions(
-    scene: SoftScene, params: Params, x: Array, outcome: SolverInfo, overlaps: Callable[[Array], Array] | None
+    scene: SoftScene,
+    params: Params,
+    x: Array,
+    outcome: SolverInfo,
+    overlaps: Callable[[Array], Array] | None,
+    contact: Sequence[Any],
+    lists: Lists,
 ) -> Info:
     """Combines the solver's verdict with that on the positions: no element is inverted."""
     least = least_J(scene, params, x)
     converged = outcome.converged if least is None else outcome.converged & (least > 0)
     pairs = None if overlaps is None else overlaps(x)
-    return Info(outcome.residual, outcome.iterations, converged, outcome.definite, least_J=least, overlaps=pairs)
+    return Info(
+        outcome.residual,
+        outcome.iterations,
+        converged,
+        outcome.definite,
+        least_J=least,
+        overlaps=pairs,
+        least_distance=least_distance(scene, x, lists, contact),
+        overflow=outcome.overflow,
+    )
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

@@ -12,7 +12,7 @@ Therefore the state carries the energy created since the energy was lowest, max(
 exceed the same share of the largest energy at hand so far.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -55,9 +55,14 @@ class Info(NamedTuple):
     their quadrature points."""
     overlaps: Int[Array, ""] | None = None
     """Number of pairs of overlapping mesh components: bodies have no contact with each other and pass through. `None`
-    for a mesh of one component. It does not affect `converged`."""
+    for a mesh of one component and for a scene with contacts. It does not affect `converged`."""
     substeps: Int[Array, ""] | None = None
     """Number of parts that the step was divided into, 1 for a whole step; `None` without `halvings`."""
+    least_distance: Float[Array, ""] | None = None
+    """Smallest distance in m of two surfaces in contact, at most the distance within which contact acts."""
+    overflow: Bool[Array, ""] | None = None
+    """Whether the lists of pairs in contact were too short, which needs a larger `capacity`; such a step has not
+    converged."""
 
 
 class Balance(NamedTuple):
@@ -77,6 +82,7 @@ def energy_balance(
     v: tuple[Array, Array],
     work: Float[Array, ""],
     outcome: SolverInfo,
+    contact: Callable[[Array], Array],
 ) -> Balance:
     """Returns the energies of a step.
 
@@ -87,10 +93,11 @@ def energy_balance(
         x, v: positions and velocities at the start and the end of the step.
         work: of the held vertices, in J.
         outcome: of the minimisation.
+        contact: positions -> energy in J of the contact between bodies.
     """
     free = jnp.asarray(scene.free)
     kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * velocity**2, 0)) for velocity in v)
-    stored, stored_after = (value(element_energies(scene), position, data) for position in x)
+    stored, stored_after = (value(element_energies(scene), at, data) + contact(at) for at in x)
     noise = 0.0 if outcome.energy_noise is None else outcome.energy_noise
     unclear = noise + outcome.residual * jnp.sum(masses[:, None] * jnp.abs(x[1] - x[0]))
     growth = after - kinetic + (stored_after - stored) - work

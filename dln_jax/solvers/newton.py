@@ -37,6 +37,8 @@ class SolverInfo(NamedTuple):
     """Whether the Hessian at a minimum is positive definite (no saddle); `None` unless asked for."""
     energy_noise: Float[Array, ""] | None = None
     """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
+    overflow: Bool[Array, ""] | None = None
+    """Whether a list of moving elements was too short at a minimum; `None` without moving elements."""
 
 
 class _RootIterate(NamedTuple):

@@ -22,6 +22,7 @@ REDUCED = {
     "11_swing_up": {"STARTS": 2, "FRAMES_PER_SECOND": 1.0},
     "12_stiff_plant": {},
     "13_own_mesh": {"STEPS": 6, "TURNS": 2},
+    "14_bodies_that_touch": {"STEPS": 20, "CELLS": 12},
 }
 """Constants of the examples, and what they are here."""
 

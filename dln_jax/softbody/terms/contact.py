@@ -208,12 +208,12 @@ def _contact(
             start, weight = braked
             lost = penalty_integral(depth, width) - penalty_integral(start, width)
             contact += weight * (lost - penalty(depth, width) * (depth - start))
-        return contact if slip is None else contact + _friction_energy(x[0], slip)
+        return contact if slip is None else contact + friction_energy(x[0], slip)
 
     return Term(name, indices, energy, parameters, prepare)
 
 
-def _friction_energy(x: Any, slip: Slip) -> Scalar:
+def friction_energy(x: Any, slip: Slip) -> Scalar:
     """D in J of one vertex."""
     axes = range(len(x))
     moved = [x[i] - slip.start[i] for i in axes]

@@ -35,12 +35,15 @@ def line_search(
     slope: Float[Array, ""],
     unclear: Float[Array, ""],
     scale: Float[Array, "n 1"],
-) -> tuple[Evaluated, Bool[Array, ""]]:
-    """Takes the first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient if rounding hides that.
+    *,
+    longest: Float[Array, ""] | float = 1.0,
+    any_change: Bool[Array, ""] | bool = False,
+) -> tuple[Evaluated, Float[Array, ""]]:
+    """Takes the first of the steps l, l/2, l/4, ... that lowers the energy, or the gradient if rounding hides that.
 
     Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
-    improving by many digits beyond that. Returns the point, which is the start if no step is accepted, and whether a
-    step is accepted.
+    improving by many digits beyond that. Returns the point, which is the start if no step is accepted, and the length
+    of the step, then 0.
 
     Args:
         evaluate: x -> energy and gradient.
@@ -49,6 +52,8 @@ def line_search(
         slope: derivative of the energy along the direction, <= 0.
         unclear: changes of the energy that rounding hides.
         scale: unit of the gradient's rows.
+        longest: the first length l.
+        any_change: whether any step to a finite energy is accepted.
     """
 
     def size(gradient: Blocks) -> Array:
@@ -62,15 +67,15 @@ def line_search(
         change = energy - start.energy
         lower = change <= _DECREASE * trial.length * slope
         flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
-        accepted = (lower | flatter) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
+        accepted = (lower | flatter | any_change) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
         return _LineSearchTrial(Evaluated(x, energy, gradient), trial.length / 2, accepted)
 
-    one = jnp.ones((), start.x.dtype)
-    smallest = 2.0**-_HALVINGS
+    first = jnp.asarray(longest, start.x.dtype)
+    smallest = 2.0**-_HALVINGS * first
     last = jax.lax.while_loop(
         lambda trial: ~trial.accepted & (trial.length > smallest),
         attempt,
-        _LineSearchTrial(start, one, jnp.asarray(False)),
+        _LineSearchTrial(start, first, jnp.asarray(False)),
     )
     kept = [jnp.where(last.accepted, new, old) for new, old in zip(last.point, start, strict=True)]
-    return Evaluated(*kept), last.accepted
+    return Evaluated(*kept), jnp.where(last.accepted, 2 * last.length, 0)

@@ -47,8 +47,8 @@ _UPPER_PRODUCTS = 10_000
 class LinearSolver(NamedTuple):
     """A method for systems with the Hessian."""
 
-    factorise: Callable[[Sequence[Array], Float[Array, " entries"]], Any]
-    """(element Hessians, entries of their sum) -> the factor for the solves."""
+    factorise: Callable[[Sequence[Array], Any], Any]
+    """(element Hessians, entries of their sum [entries], or what `with_moving` expects) -> factor for the solves."""
     solve: Callable[[Any, Blocks], Blocks]
     """(factor, b) -> p, to the accuracy of rounding; p is zero where the pattern is not free."""
     search: Callable[[Any, Blocks], Blocks]
@@ -61,10 +61,10 @@ LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Factorises the whole matrix by Cholesky; under `vmap`, on a CPU, all narrow bands together."""
-    table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
+    table = lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
-        return cholesky(_with_constants(values)[table])
+        return cholesky(with_constants(values)[table])
 
     def substituted(factor: Array, right: Columns) -> Columns:
         return substitute(factor, substitute(factor, right), transposed=True)
@@ -92,10 +92,10 @@ def _one_or_many(
     row, column = places(at.unknowns, band)
     numbers = np.append(order, np.full(max(row.max(), column.max()) + 1 - at.unknowns, at.unknowns))
     beyond = (row == column) & (row >= at.unknowns)
-    table = np.where(beyond, _one(at), _lookup(at)(numbers[row], numbers[column]))
+    table = np.where(beyond, _one(at), lookup(at)(numbers[row], numbers[column]))
 
     def by_bands(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
-        lower = jax.vmap(_with_constants)(values).T[table]
+        lower = jax.vmap(with_constants)(values).T[table]
         x = solve_bands(lower, b.transpose(1, 2, 0)[order])
         return x[np.argsort(order)].transpose(2, 0, 1)
 
@@ -117,15 +117,15 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     numbers = np.full(count * size * at.width, at.unknowns)
     numbers[: at.unknowns] = (order[:, None] * at.width + np.arange(at.width)).ravel()
     numbers = numbers.reshape(count, size * at.width)
-    lookup = _lookup(at)
-    diagonal = np.stack([lookup(rows[:, None], rows[None, :]) for rows in numbers])
+    place_of = lookup(at)
+    diagonal = np.stack([place_of(rows[:, None], rows[None, :]) for rows in numbers])
     block, row = np.nonzero(numbers == at.unknowns)
     diagonal[block, row, row] = _one(at)
-    below = np.stack([lookup(lower[:, None], upper[None, :]) for upper, lower in itertools.pairwise(numbers)])
+    below = np.stack([place_of(lower[:, None], upper[None, :]) for upper, lower in itertools.pairwise(numbers)])
     back = np.argsort(numbers.ravel()[: at.unknowns], kind="stable")
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> tuple[Array, Array]:
-        values = _with_constants(values)
+        values = with_constants(values)
         return factorise_blocks(values[diagonal], values[below])
 
     def solve(factor: tuple[Array, Array], b: Blocks) -> Blocks:
@@ -142,10 +142,10 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """
     n, b = at.blocks, at.width
     numbers = np.arange(n * b).reshape(n, b)
-    of_blocks = _lookup(at)(numbers[:, :, None], numbers[:, None, :])
+    of_blocks = lookup(at)(numbers[:, :, None], numbers[:, None, :])
 
     def factorise(hessians: Sequence[Array], values: Float[Array, " entries"]) -> tuple[tuple[Array, ...], Array]:
-        inverse = jax.vmap(partial(eliminate, b=jnp.eye(b, dtype=values.dtype)))(_with_constants(values)[of_blocks])
+        inverse = jax.vmap(partial(eliminate, b=jnp.eye(b, dtype=values.dtype)))(with_constants(values)[of_blocks])
         return tuple(map(square, hessians)), inverse
 
     def run(tolerance: float, factor: tuple[tuple[Array, ...], Array], right: Blocks) -> Blocks:
@@ -167,7 +167,7 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, SEARCH_RESIDUAL))
 
 
-def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Returns (rows, columns) -> index into the entries followed by the constants 0 and 1; 0 beyond the matrix."""
     size = at.unknowns + 1
     key = at.rows * size + at.columns
@@ -189,7 +189,8 @@ def _one(at: Pattern) -> int:
     return len(at.rows) + 1
 
 
-def _with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"]:
+def with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"]:
+    """Appends the constants 0 and 1 to the entries, for the indices of `lookup`."""
     return jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
 
 

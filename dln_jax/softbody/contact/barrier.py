@@ -1,0 +1,111 @@
+"""The barrier that keeps bodies apart (Li et al. 2020, Incremental Potential Contact, section 4; Li et al. 2023).
+
+    E = kappa A m(c) b(D) / h³,    b(D) = -(D - h²)² ln(D / h²) for 0 < D < h², else 0
+
+with the squared distance D of the pair, the distance h within which it acts, the area A that the pair stands for, and
+the stiffness kappa in Pa. b is twice continuously differentiable at D = h² and grows without bound as D vanishes, so
+that bodies never touch. Nearly parallel edges are mollified, because the closest points of two edges jump there:
+
+    m(c) = (2 - c/epsilon) c/epsilon for c < epsilon, else 1,    c = |u x v|²,    epsilon = 1e-3 |U|² |V|²
+
+for edges u, v, which are U, V in the rest shape. Derivatives are written out: those by automatic differentiation take
+several times as long to compile.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.contact.distances import Stencil, closest
+
+MOLLIFIED = 1e-3
+"""Squared sine of the angle between edges below which their contact is mollified (Li et al. 2020, section 5)."""
+
+
+class Pair(NamedTuple):
+    """Data of the contact of one pair; [pairs, ...] for all."""
+
+    stencil: Stencil
+    strength: Float[Array, "*pairs"]
+    """kappa A / h³ in N/m³; zero for a place in the list that is not used."""
+    near: Float[Array, "*pairs"]
+    """h² in m²."""
+    parallel: Float[Array, "*pairs"]
+    """epsilon in m⁴ of two edges; zero for other pairs, which are not mollified."""
+
+
+def barrier(D: Float[Array, "*pairs"], near: Float[Array, "*pairs"]) -> tuple[Array, Array, Array]:
+    """Returns b in m⁴, db/dD in m² and d²b/dD²; zeros for D >= h², infinite or NaN for D <= 0."""
+    inside = near > D
+    ratio = jnp.where(inside, D / near, 1.0)
+    log, gap = jnp.log(ratio), ratio - 1
+    slope = -near * gap * (2 * log + gap / ratio)
+    return -((near * gap) ** 2) * log, slope, jnp.where(inside, (1 / ratio - 1) * (1 / ratio + 3) - 2 * log, 0)
+
+
+def pair_gradient(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""], Float[Array, "k dim"]]:
+    """Returns E in J and dE/dx in N of one pair."""
+    delta, beta, *_ = closest(x, pair.stencil)
+    value, slope, _ = barrier(jnp.sum(delta**2), pair.near)
+    along = 2 * slope * beta[:, None] * delta
+    if x.shape == (4, 3):
+        m, m_slope, _ = _mollifier(x, pair.parallel)
+        value, along = m * value, m * along + value * m_slope
+    # Places that are not used hold any vertices, even coinciding ones.
+    used = pair.strength > 0
+    return jnp.where(used, pair.strength * value, 0), jnp.where(used, pair.strength * along, 0)
+
+
+def pair_hessian(x: Float[Array, "k dim"], pair: Pair) -> Float[Array, "s s"]:
+    """Returns d²E/dx² in N/m of one pair, s = k dim."""
+    delta, beta, e, inverse = closest(x, pair.stencil)
+    value, slope, curvature = barrier(jnp.sum(delta**2), pair.near)
+    gradient = (2 * beta[:, None] * delta).reshape(-1)
+    A = (beta[:, None] * e[:, None, :] + pair.stencil.directions[:, :, None] * delta).reshape(len(e), -1)
+    of_distance = 2 * jnp.kron(beta[:, None] * beta, jnp.eye(x.shape[1], dtype=x.dtype))
+    of_distance -= 2 * jnp.einsum("ki,kl,lj->ij", A, inverse, A)
+    whole = curvature * gradient[:, None] * gradient + slope * of_distance
+    if x.shape == (4, 3):
+        m, m_slope, m_curvature = _mollifier(x, pair.parallel)
+        mixed = slope * gradient[:, None] * m_slope.reshape(-1)
+        whole = m * whole + mixed + mixed.T + value * m_curvature
+    return jnp.where(pair.strength > 0, pair.strength * whole, 0)
+
+
+def normal_force(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""], Array, Array]:
+    """Returns the force in N that pushes the primitives apart, its unit direction, and the weights of the vertices."""
+    delta, weights, *_ = closest(x, pair.stencil)
+    D = jnp.sum(delta**2)
+    used = (pair.strength > 0) & (pair.near > D)
+    safe = jnp.where(used, D, pair.near)
+    slope = pair.strength * barrier(safe, pair.near)[1]
+    if x.shape == (4, 3):
+        slope *= _mollifier(x, pair.parallel)[0]
+    distance = jnp.sqrt(safe)
+    return -2 * distance * slope, jnp.where(used, delta / distance, 0.0), weights
+
+
+def _mollifier(x: Float[Array, "4 3"], parallel: Float[Array, ""]) -> tuple[Array, Array, Array]:
+    """Returns m, dm/dx [4, 3] and d²m/dx² [12, 12] for the edges of x = (a, b, c, d); m = 1 for other pairs."""
+    u, v = x[1] - x[0], x[3] - x[2]
+    uu, uv, vv = jnp.sum(u * u), jnp.sum(u * v), jnp.sum(v * v)
+    mollified = parallel > 0
+    scale = jnp.where(mollified, parallel, 1.0)
+    ratio = (uu * vv - uv**2) / scale
+    inside = mollified & (ratio < 1)
+    first = jnp.where(inside, (2 - 2 * ratio) / scale, 0)
+    second = jnp.where(inside, -2 / scale**2, 0)
+    c_u, c_v = 2 * (vv * u - uv * v), 2 * (uu * v - uv * u)
+    gradient = jnp.stack([-c_u, c_u, -c_v, c_v])
+    one = jnp.eye(3, dtype=x.dtype)
+    of_u, of_v = 2 * (vv * one - v[:, None] * v), 2 * (uu * one - u[:, None] * u)
+    both = 4 * u[:, None] * v - 2 * uv * one - 2 * v[:, None] * u
+    sign = jnp.array([[1, -1], [-1, 1]], x.dtype)
+    curved = jnp.block([[jnp.kron(sign, of_u), jnp.kron(sign, both)], [jnp.kron(sign, both.T), jnp.kron(sign, of_v)]])
+    flat = gradient.reshape(-1)
+    return (
+        jnp.where(inside, (2 - ratio) * ratio, 1.0),
+        first * gradient,
+        second * flat[:, None] * flat + first * curved,
+    )

@@ -1,0 +1,228 @@
+"""Contact between and within bodies by barriers on the distances of their surfaces (Li et al. 2020).
+
+The energies sum over all pairs of a vertex and an edge in the plane, or of a vertex and a triangle and of two edges in
+space, that share no vertex. Which pairs are near is found anew in every Newton step, in lists of fixed capacity, and
+continuous collision detection bounds the steps, so that no pair ever crosses.
+
+Friction is lagged: normal forces and tangent planes are those at the start of the time step,
+
+    D = mu lambda f(|u|),    u = (1 - n nᵀ) sum_i w_i (x_i - x_i(start)),
+
+with the smooth f of `terms.contact`.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_gradient, pair_hessian
+from dln_jax.softbody.contact.candidates import Group, boxes, group, meetings, pairs_near, places
+from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact_parameters
+from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
+from dln_jax.softbody.contact.distances import EDGE_EDGE, POINT_TRIANGLE, squared_distance, stencil_of
+from dln_jax.softbody.contact.surface import Surface, areas, surface_of
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.terms.contact import Slip, friction_energy
+from dln_jax.softbody.terms.term import Context, Numbers
+from dln_jax.solvers.elements.moving import Elements, MovingEnergy
+from dln_jax.types import require_positive
+
+_AT_ONCE = 256
+"""Pairs that are measured in one turn of a loop; no list is shorter."""
+
+
+class Kind(NamedTuple):
+    """Pairs of two kinds of primitives."""
+
+    one: Group
+    other: Group
+    number: int
+    """Of the kind, for its closest features."""
+    neighbours: tuple[int, int]
+    """Pairs of clusters, and of primitives, whose boxes meet in the rest shape."""
+
+
+class Listed(NamedTuple):
+    """Pairs in a list, without derivatives."""
+
+    pairs: Int[Array, "capacity 2"]
+    """Numbers of the primitives."""
+    kind: Int[Array, " capacity"]
+    """Number of the kind."""
+    used: Bool[Array, " capacity"]
+    """False for places that are not used."""
+
+
+def body_contact(
+    mesh: Mesh,
+    *,
+    distance: float,
+    stiffness: Numbers,
+    friction: Numbers | None = None,
+    threshold_speed: float = 1e-3,
+    capacity: int | None = None,
+    name: str = "contact",
+) -> Contact:
+    """Contact of all bodies of a mesh with each other and with themselves.
+
+    Args:
+        mesh: its boundary is in contact.
+        distance: h in m, within which surfaces repel each other; well below the edges' length.
+        stiffness: kappa in Pa. The gap at which a pressure p is carried depends on p / kappa and h alone: kappa = p
+            keeps about half of h. It has no influence on whether bodies cross: they never do.
+        friction: Coulomb's coefficient, reached at the threshold speed in m/s.
+        capacity: places in the list of near pairs, for every kind of pairs; by default two for every vertex of the
+            boundary, and at least 128. A step that needs more does not converge, and its `Info.overflow` is true.
+        name: key of its parameters in `Params.terms`.
+
+    Raises:
+        InputError: a number that is not positive.
+    """
+    require_positive(distance=distance, threshold_speed=threshold_speed, **({"capacity": capacity} if capacity else {}))
+    surface = surface_of(mesh)
+    kinds = _kinds(surface, mesh.vertices, distance)
+    capacity = max(_AT_ONCE // 2, 2 * len(surface.vertices) if capacity is None else capacity)
+    parameters = contact_parameters(distance, stiffness, friction)
+    barrier = MovingEnergy(
+        elements=partial(_near, kinds, capacity),
+        describe=partial(_described, surface),
+        gradient=pair_gradient,
+        hessian=pair_hessian,
+        longest=_longest,
+    )
+    sliding = MovingEnergy(
+        elements=lambda x, step, data: data[0],
+        describe=lambda x, elements, data: data[1],
+        gradient=jax.value_and_grad(_sliding_energy),
+        hessian=_sliding_hessian,
+        longest=lambda x, step, elements, data: jnp.ones((), x.dtype),
+    )
+
+    def prepare(parameters: ContactParameters, context: Context) -> tuple[Any, ...]:
+        data = (parameters, context.rest)
+        if parameters.friction is None:
+            return (data,)
+        return data, _lagged(barrier, parameters.friction, data, context, threshold_speed)
+
+    def least_distance(x: Float[Array, "n dim"], elements: Elements, data: Any) -> Float[Array, ""]:
+        squares = jax.vmap(squared_distance)(x[elements.indices], elements.data.kind)
+        farthest = data[0].distance ** 2
+        return jnp.sqrt(jnp.minimum(jnp.min(jnp.where(elements.data.used, squares, farthest)), farthest))
+
+    energies = (barrier,) if friction is None else (barrier, sliding)
+    return Contact(name, parameters, energies, prepare, least_distance)
+
+
+def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, ...]:
+    vertices, edges = group(surface.vertices[:, None], rest), group(surface.edges, rest)
+
+    def kind(one: Group, other: Group, number: int) -> Kind:
+        return Kind(one, other, number, meetings(one, other, rest, distance))
+
+    if surface.dimension == 2:
+        return (kind(vertices, edges, 0),)
+    triangles = group(surface.triangles, rest)
+    return kind(vertices, triangles, POINT_TRIANGLE), kind(edges, edges, EDGE_EDGE)
+
+
+def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: Any) -> Elements:
+    """Lists the pairs that come within h of each other between x and x + step."""
+    parameters, _ = data
+    lists = []
+    for kind in kinds:
+        margin = parameters.distance / 2
+        of_one = boxes(kind.one, x, x + step, margin)
+        of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
+        # Boxes of neighbours in one surface always meet, so that these lists are longer than those of near pairs.
+        clusters, primitives = (count + count // 2 + 2 * capacity for count in kind.neighbours)
+        lists.append(pairs_near(kind.one, kind.other, of_one, of_other, (clusters, primitives)))
+    pairs, used = (jnp.concatenate(parts) for parts in zip(*(listed[:2] for listed in lists), strict=True))
+    number = np.concatenate([np.full(len(of.used), kind.number) for kind, of in zip(kinds, lists, strict=True)])
+    corners = jnp.concatenate([_corners(kind, of.pairs) for kind, of in zip(kinds, lists, strict=True)])
+    near = used & _within_reach(x, step, corners, number, used, parameters.distance)
+    chosen, here, too_many = places(near, capacity * len(kinds))
+    indices = jnp.where(here[:, None], corners[chosen], jnp.arange(corners.shape[1]))
+    overflow = jnp.stack([too_many, *(listed.overflow for listed in lists)]).any()
+    return Elements(indices, Listed(pairs[chosen], jnp.asarray(number)[chosen], here), overflow)
+
+
+def _within_reach(x: Array, step: Array, corners: Array, number: np.ndarray, used: Array, distance: Array) -> Array:
+    """Whether pairs can come within a distance in a step, by their distance and the bound of their speed.
+
+    Only those of the listed pairs that are used are measured, which are a fraction of the list.
+    """
+    order = jnp.argsort(~used)
+    kinds = jnp.asarray(number)
+
+    def measure(turn: Array, near: Array) -> Array:
+        here = jax.lax.dynamic_slice_in_dim(order, jnp.minimum(turn * _AT_ONCE, len(order) - _AT_ONCE), _AT_ONCE)
+        at, kind = corners[here], kinds[here]
+        reach = distance + jax.vmap(speed_bound)(step[at], kind)
+        return near.at[here].set(jax.vmap(squared_distance)(x[at], kind) < reach**2)
+
+    return jax.lax.fori_loop(0, -(-used.sum() // _AT_ONCE), measure, jnp.zeros_like(used))
+
+
+def _corners(kind: Kind, pairs: Int[Array, "m 2"]) -> Int[Array, "m k"]:
+    one, other = jnp.asarray(kind.one.primitives), jnp.asarray(kind.other.primitives)
+    return jnp.concatenate([one[pairs[:, 0]], other[pairs[:, 1]]], axis=1)
+
+
+def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pair:
+    """Returns the data of all listed pairs for the barrier at x."""
+    parameters, rest = data
+    (one, other), number, used = elements.data.pairs.T, elements.data.kind, elements.data.used
+    of_vertices, of_edges = areas(surface, rest)
+    stencil = jax.vmap(stencil_of)(jax.lax.stop_gradient(x[elements.indices]), number)
+    # A pair of facets is counted from both sides, in space by vertices and by edges (Li et al. 2023, section 4).
+    if surface.dimension == 2:
+        area, parallel = of_vertices[one] / 2, jnp.zeros_like(rest, shape=one.shape)
+    else:
+        a, b, c, d = (rest[corner] for corner in elements.indices.T)
+        edges = used & (number == EDGE_EDGE)
+        area = jnp.where(edges, of_edges[one] + of_edges[other], of_vertices[one]) / 4
+        parallel = jnp.where(edges, MOLLIFIED * jnp.sum((b - a) ** 2, axis=1) * jnp.sum((d - c) ** 2, axis=1), 0)
+    strength = jnp.where(used, parameters.stiffness / parameters.distance**3 * area, 0)
+    return Pair(stencil, strength, jnp.broadcast_to(parameters.distance**2, area.shape), parallel)
+
+
+def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
+    """Returns the largest fraction of the step in which no listed pair crosses."""
+    at, moved, number = x[elements.indices], step[elements.indices], elements.data.kind
+
+    def distances(t: Array) -> Array:
+        return jnp.sqrt(jax.vmap(squared_distance)(at + t[:, None, None] * moved, number))
+
+    bound = jax.vmap(speed_bound)(moved, number)
+    return longest_step(distances, jnp.where(elements.data.used, bound, 0))
+
+
+def _lagged(
+    barrier: MovingEnergy, friction: Array, data: Any, context: Context, threshold_speed: float
+) -> tuple[Elements, tuple[Slip, Array]]:
+    """Returns the pairs that rub, with their normal forces at the start of the step."""
+    x = context.x
+    elements = jax.lax.stop_gradient(barrier.elements(x, jnp.zeros_like(x), data))
+    corners = x[elements.indices]
+    force, normal, weights = jax.vmap(normal_force)(corners, barrier.describe(x, elements, data))
+    # A static solve (dt infinite) has no velocities, hence no friction.
+    moving = jnp.isfinite(context.dt)
+    threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
+    start = jnp.einsum("mk,mki->mi", weights, corners)
+    largest = jnp.where(moving, friction * force, 0.0)
+    return elements, (Slip(start, normal, largest, jnp.broadcast_to(threshold, force.shape)), weights)
+
+
+def _sliding_energy(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, ""]:
+    slip, weights = data
+    return friction_energy(weights @ x, slip)
+
+
+def _sliding_hessian(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, "s s"]:
+    slip, weights = data
+    of_point = jax.hessian(lambda point: friction_energy(point, slip))(weights @ x)
+    return jnp.einsum("a,ij,b->aibj", weights, of_point, weights).reshape(x.size, x.size)

@@ -1,0 +1,139 @@
+"""Broad phase: lists of primitives that may come near each other, of fixed capacity.
+
+Primitives are grouped once into clusters of neighbours in the rest shape, which stay neighbours while the body deforms.
+Bounding boxes of clusters are compared first, then those of primitives in clusters that meet. Lists that are too short
+are reported, never cut off silently.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+CLUSTER = 8
+"""Primitives that share one bounding box."""
+
+
+class Group(NamedTuple):
+    """Primitives of one kind, in clusters."""
+
+    primitives: Int[np.ndarray, "m k"]
+    """Vertices of the primitives."""
+    clusters: Int[np.ndarray, "c 8"]
+    """Numbers of the primitives in every cluster; -1 for an empty place."""
+
+
+class Boxes(NamedTuple):
+    """Bounding boxes in m."""
+
+    low: Float[Array, "*m dim"]
+    high: Float[Array, "*m dim"]
+
+
+class PairList(NamedTuple):
+    """A list of pairs of primitives."""
+
+    pairs: Int[Array, "capacity 2"]
+    """Numbers of the primitives."""
+    used: Bool[Array, " capacity"]
+    """False for places that are not used."""
+    overflow: Bool[Array, ""]
+    """Whether there are more pairs than places."""
+
+
+def group(primitives: Int[np.ndarray, "m k"], rest: Float[np.ndarray, "n dim"]) -> Group:
+    """Puts primitives into clusters of neighbours, by halving along the longest side."""
+    centres = rest[primitives].mean(axis=1)
+    clusters: list[np.ndarray] = []
+
+    def split(members: np.ndarray) -> None:
+        if len(members) <= CLUSTER:
+            clusters.append(np.pad(members, (0, CLUSTER - len(members)), constant_values=-1))
+            return
+        ordered = members[np.argsort(centres[members, np.argmax(np.ptp(centres[members], axis=0))], kind="stable")]
+        half = CLUSTER * (-(-len(members) // CLUSTER) // 2)
+        split(ordered[:half])
+        split(ordered[half:])
+
+    split(np.arange(len(primitives)))
+    return Group(primitives, np.stack(clusters))
+
+
+def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margin: Array | float) -> Boxes:
+    """Returns the boxes that primitives sweep from x to `end`, enlarged by a margin in m."""
+    low, high = jnp.minimum(x, end)[of.primitives], jnp.maximum(x, end)[of.primitives]
+    return Boxes(low.min(axis=1) - margin, high.max(axis=1) + margin)
+
+
+def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: float) -> tuple[int, int]:
+    """Returns the numbers of pairs of clusters and of pairs of primitives whose boxes, enlarged by half, meet at x."""
+    counts = []
+    for clusters in (True, False):
+        sides = []
+        for of in (one, other):
+            box = boxes(of, jnp.asarray(x), jnp.asarray(x), margin / 2)
+            sides.append([np.asarray(side) for side in (_of_clusters(of, box) if clusters else box)])
+        (low, high), (other_low, other_high) = sides
+        rows = (
+            (row <= other_high).all(axis=1) & (other_low <= top).all(axis=1) for row, top in zip(low, high, strict=True)
+        )
+        counts.append(sum(int(row.sum()) for row in rows))
+    return counts[0], counts[1]
+
+
+def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]) -> PairList:
+    """Returns the pairs of primitives without a common vertex whose boxes meet.
+
+    Args:
+        one, other: the primitives; a pair of one group with itself is listed once.
+        of_one, of_other: their boxes.
+        capacity: places for pairs of clusters and for pairs of primitives.
+    """
+    same = one is other
+    clusters, used, too_many_clusters = places(
+        _meet(_of_clusters(one, of_one), _of_clusters(other, of_other))
+        & (jnp.asarray(np.triu(np.ones((len(one.clusters), len(other.clusters)), bool))) if same else True),
+        capacity[0],
+    )
+    row, column = jnp.divmod(clusters, len(other.clusters))
+    first, second = jnp.asarray(one.clusters)[row], jnp.asarray(other.clusters)[column]
+    present = used[:, None, None] & (first >= 0)[:, :, None] & (second >= 0)[:, None, :]
+    if same:
+        present &= (row != column)[:, None, None] | (first[:, :, None] < second[:, None, :])
+    corners, others = jnp.asarray(one.primitives)[first], jnp.asarray(other.primitives)[second]
+    shared = (corners[:, :, None, :, None] == others[:, None, :, None, :]).any(axis=(3, 4))
+    near = _meet(*(Boxes(*(side[number] for side in box)) for box, number in ((of_one, first), (of_other, second))))
+    place, taken, too_many = places(near & present & ~shared, capacity[1])
+    cluster, i, j = jnp.unravel_index(place, near.shape)
+    return PairList(jnp.stack([first[cluster, i], second[cluster, j]], axis=1), taken, too_many | too_many_clusters)
+
+
+def _of_clusters(of: Group, box: Boxes) -> Boxes:
+    members, empty = jnp.asarray(of.clusters), (of.clusters < 0)[:, :, None]
+    low = jnp.where(empty, jnp.inf, box.low[members]).min(axis=1)
+    return Boxes(low, jnp.where(empty, -jnp.inf, box.high[members]).max(axis=1))
+
+
+def _meet(one: Boxes, other: Boxes) -> Bool[Array, "*batch one other"]:
+    """Whether boxes meet, for all pairs along the last axis of boxes."""
+
+    def axis(i: int) -> Array:
+        return (one.low[..., :, None, i] <= other.high[..., None, :, i]) & (
+            other.low[..., None, :, i] <= one.high[..., :, None, i]
+        )
+
+    meets = axis(0)
+    for i in range(1, one.low.shape[-1]):
+        meets &= axis(i)
+    return meets
+
+
+def places(mask: Bool[Array, "..."], capacity: int) -> tuple[Int[Array, " capacity"], Bool[Array, " capacity"], Array]:
+    """Returns the flat places where the mask is true, which of them are used, and whether some had to be left out."""
+    # A binary search in the running sum is several times faster than `nonzero`, which scatters.
+    running = jnp.cumsum(mask.reshape(-1).astype(jnp.int32))
+    number = jnp.arange(1, capacity + 1)
+    position = jnp.searchsorted(running, number, side="left")
+    used = number <= running[-1]
+    return jnp.where(used, position, 0), used, running[-1] > capacity

@@ -1,0 +1,151 @@
+"""Distances between a point and an edge or a triangle, and between two edges, with one formula for all of them.
+
+    D = |delta|²,  delta = w - s_1 e_1 - s_2 e_2,  s = argmin D = G⁻¹ (e_i·w),  G_ij = e_i·e_j
+
+w joins a point of one primitive to a point of the other, and e_1, e_2 span the closest features: both for the interior
+of a triangle or of two edges, one for a point and an edge, none for two points. A `Stencil` states w and e as
+combinations of the vertices, so that one program serves all pairs. Which features are closest is decided by
+comparisons, without derivatives; D is once continuously differentiable where they change (Li et al. 2020, section 3.2).
+With beta the weights of the vertices in delta and c_i those in e_i, the derivatives are
+
+    dD/dx = 2 beta (x) delta,    d²D/dx² = 2 beta betaᵀ (x) I - 2 A G⁻¹ Aᵀ,    A_i = beta (x) e_i + c_i (x) delta.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+POINT_TRIANGLE, EDGE_EDGE = 0, 1
+"""Kinds of pairs in space: (p, a, b, c), and (a, b, c, d) with edges from a to b and from c to d. In the plane there is
+one kind, a point and an edge: (p, a, b)."""
+# Two directions whose squared sine is below this are parallel, and the closest points are sought on the boundary.
+_PARALLEL = 1e-20
+
+
+class Stencil(NamedTuple):
+    """Coefficients of the vertices in w and in the directions of the closest features."""
+
+    offset: Float[Array, "*pairs k"]
+    """w = offset @ x."""
+    directions: Float[Array, "*pairs axes k"]
+    """e = directions @ x; zero for a direction that is not used."""
+    unused: Float[Array, "*pairs axes"]
+    """1 for a direction that is not used, else 0."""
+
+
+class Closest(NamedTuple):
+    """Closest points of a pair."""
+
+    delta: Float[Array, "*pairs dim"]
+    """Vector between them in m, from the second primitive to the first."""
+    weights: Float[Array, "*pairs k"]
+    """beta: delta = weights @ x."""
+    directions: Float[Array, "*pairs axes dim"]
+    """e in m."""
+    inverse: Float[Array, "*pairs axes axes"]
+    """G⁻¹ in 1/m²."""
+
+
+def closest(x: Float[Array, "k dim"], stencil: Stencil) -> Closest:
+    """Returns the closest points of the features of a pair with vertices x."""
+    w, e = _combined(stencil.offset, x), _combined(stencil.directions, x)
+    G = jnp.sum(e[:, None, :] * e[None, :, :], axis=-1) + jnp.diag(stencil.unused)
+    inverse = _inverse(G)
+    s = jnp.sum(inverse * jnp.sum(e * w, axis=-1), axis=-1)
+    delta = w - jnp.sum(s[:, None] * e, axis=0)
+    return Closest(delta, stencil.offset - jnp.sum(s[:, None] * stencil.directions, axis=0), e, inverse)
+
+
+def squared_distance(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
+    """D in m² of a pair of a kind."""
+    delta = closest(x, stencil_of(x, kind)).delta
+    return jnp.sum(delta**2)
+
+
+def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
+    """Returns the closest features of a pair of a kind with vertices x."""
+    tables = _SPACE if x.shape[1] == 3 else _PLANE
+    p, a, b = jnp.moveaxis(_combined(jnp.asarray(tables.segments, x.dtype)[kind], x), 1, 0)
+    e, w = b - a, p - a
+    squared = jnp.sum(e**2, axis=-1)
+    s = jnp.sum(w * e, axis=-1) / jnp.where(squared > 0, squared, 1.0)
+    squares = jnp.sum((w - jnp.clip(s, 0.0, 1.0)[:, None] * e) ** 2, axis=-1)
+    side = jnp.argmin(squares)
+    region = 3 * side + jnp.where(s <= 0, 0, jnp.where(s >= 1, 1, 2))[side]
+    if tables.interior is not None:
+        w, e, f = _combined(jnp.asarray(tables.interior, x.dtype)[kind], x)
+        inside = _inside(w, e, f, kind)
+        region = jnp.where(inside, len(tables.offset[0]) - 1, region)
+    offset, directions, unused = (
+        jnp.asarray(part, x.dtype)[kind, region] for part in (tables.offset, tables.directions, tables.unused)
+    )
+    return Stencil(offset, directions, unused)
+
+
+def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
+    """Whether |w - s e - t f| is smallest inside a triangle (s, t >= 0, s + t <= 1) or inside two edges (s, t <= 1)."""
+    ee, ef, ff, ew, fw = (jnp.sum(u * v) for u, v in ((e, e), (e, f), (f, f), (e, w), (f, w)))
+    determinant = ee * ff - ef**2
+    s, t = ff * ew - ef * fw, ee * fw - ef * ew
+    largest = jnp.where(kind == POINT_TRIANGLE, s + t, jnp.maximum(s, t))
+    return (determinant > _PARALLEL * ee * ff) & (s > 0) & (t > 0) & (largest < determinant)
+
+
+def _combined(weights: Float[Array, "*rows k"], x: Float[Array, "k dim"]) -> Float[Array, "*rows dim"]:
+    # A sum and no matrix product, which would round to fewer digits on a GPU.
+    return jnp.sum(weights[..., None] * x, axis=-2)
+
+
+def _inverse(G: Float[Array, "axes axes"]) -> Float[Array, "axes axes"]:
+    if len(G) == 1:
+        return 1 / G
+    adjugate = jnp.stack([jnp.stack([G[1, 1], -G[0, 1]]), jnp.stack([-G[1, 0], G[0, 0]])])
+    return adjugate / (G[0, 0] * G[1, 1] - G[0, 1] ** 2)
+
+
+class _Tables(NamedTuple):
+    """Coefficients of the vertices, by kind: [kinds, ...]."""
+
+    segments: np.ndarray
+    """[s, 3, k]: a point p and the ends a, b of an edge, for the pairs of boundary features."""
+    interior: np.ndarray | None
+    """[3, k]: w, e_1, e_2 of the interior."""
+    offset: np.ndarray
+    """[regions, k] of `Stencil`; three regions for every segment (at a, at b, between), then the interior."""
+    directions: np.ndarray
+    unused: np.ndarray
+
+
+def _tables(kinds: list[tuple[str, list[str], list[str]]], axes: int) -> _Tables:
+    """Builds tables from the names of vertices, segments as "pab", and the interior as differences: "pa" is p - a."""
+    segments, interiors, offsets, directions = [], [], [], []
+    for names, edges, interior in kinds:
+        unit = dict(zip(names, np.eye(len(names)), strict=True))
+
+        def difference(pair: str, unit: dict[str, np.ndarray] = unit) -> np.ndarray:
+            return unit[pair[0]] - unit[pair[1]]
+
+        segments.append([[unit[name] for name in edge] for edge in edges])
+        rows = [row for p, a, b in edges for row in ((p + a, []), (p + b, []), (p + a, [b + a]))]
+        if interior:
+            interiors.append([difference(pair) for pair in interior])
+            rows.append((interior[0], interior[1:]))
+        offsets.append([difference(w) for w, _ in rows])
+        none = [np.zeros(len(names))] * axes
+        directions.append([([difference(pair) for pair in pairs] + none)[:axes] for _, pairs in rows])
+    unused = (~np.any(directions, axis=-1)).astype(float)
+    interior = np.array(interiors) if interiors else None
+    return _Tables(np.array(segments), interior, np.array(offsets), np.array(directions), unused)
+
+
+_PLANE = _tables([("pab", ["pab"], [])], 1)
+# A triangle has three edges; the last is repeated to fill the table.
+_SPACE = _tables(
+    [
+        ("pabc", ["pab", "pbc", "pca", "pca"], ["pa", "ba", "ca"]),
+        ("abcd", ["acd", "bcd", "cab", "dab"], ["ac", "dc", "ab"]),
+    ],
+    2,
+)

@@ -1,0 +1,248 @@
+"""Contact of vertices with rigid obstacles, by the barrier on their signed distance.
+
+    E = kappa A b(d²) / h³
+
+with the signed distance d of a vertex to the obstacle, positive outside, and b of `barrier`. The distance bounds the
+steps of a minimisation, so that no vertex gets into an obstacle, however fast it is. Only vertices are in contact: an
+obstacle that is smaller than the triangles of a body can pass between them. Make it a body whose vertices are held, and
+use `body_contact` for that.
+
+A distance function must not overestimate the distance (its slope is at most 1), and must be twice differentiable almost
+everywhere outside the obstacle. An obstacle moves if its parameters do, from step to step, by less than the gap.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.contact.barrier import barrier
+from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact_parameters
+from dln_jax.softbody.contact.continuous_collision import longest_step
+from dln_jax.softbody.contact.surface import areas, surface_of
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.terms.contact import Slip, friction_energy
+from dln_jax.softbody.terms.term import Context, Numbers, vector
+from dln_jax.solvers.elements.moving import Elements, MovingEnergy
+from dln_jax.types import InputError, require_positive
+
+Distance = Callable[[Float[Array, " dim"], Any], Float[Array, ""]]
+"""(position in m, parameters of the shape) -> signed distance in m."""
+
+
+class Obstacle(NamedTuple):
+    """A rigid shape: its distance function and its parameters."""
+
+    distance: Distance
+    shape: Any
+    """Parameters: a NamedTuple of arrays, differentiable."""
+
+
+class ObstacleParameters(NamedTuple):
+    """Parameters of the contact with an obstacle."""
+
+    contact: ContactParameters
+    shape: Any
+
+
+class HalfSpace(NamedTuple):
+    """Points below a plane."""
+
+    normal: Float[Array, " dim"]
+    """Normal out of the ground, of any length."""
+    offset: Float[Array, ""]
+    """Distance of the plane from the origin along the normal, in m."""
+
+
+class Capsule(NamedTuple):
+    """Points within a radius of a segment; a sphere if both ends coincide."""
+
+    start: Float[Array, " dim"]
+    end: Float[Array, " dim"]
+    radius: Float[Array, ""]
+    """In m."""
+
+
+class Box(NamedTuple):
+    """A box with sides along the rows of a rotation."""
+
+    centre: Float[Array, " dim"]
+    half_lengths: Float[Array, " dim"]
+    """In m."""
+    rotation: Float[Array, "dim dim"]
+    """Orthonormal rows: the directions of the sides."""
+
+
+class Heightfield(NamedTuple):
+    """Ground below a smooth surface: the cubic B-spline of heights on a lattice along the horizontal axes."""
+
+    heights: Float[Array, "..."]
+    """Control points in m, [k] in the plane or [k, l] in space; beyond the lattice the ground is level."""
+    origin: Float[Array, " horizontal"]
+    """Position of the first control point, in m."""
+    spacing: Float[Array, ""]
+    """Of the lattice, in m."""
+
+
+def half_space(normal: Numbers, offset: float = 0.0) -> Obstacle:
+    """The half-space n·x < offset, for the unit normal n."""
+
+    def distance(x: Array, shape: HalfSpace) -> Array:
+        return jnp.sum(x * shape.normal) / jnp.linalg.norm(shape.normal) - shape.offset
+
+    normal = vector("the normal of a half-space", normal, zero_allowed=False)
+    return Obstacle(distance, HalfSpace(normal, jnp.asarray(offset, float)))
+
+
+def capsule(start: Numbers, end: Numbers, radius: float) -> Obstacle:
+    """Points within a radius in m of the segment between two points."""
+    require_positive(radius=radius)
+
+    def distance(x: Array, shape: Capsule) -> Array:
+        along, w = shape.end - shape.start, x - shape.start
+        squared = jnp.sum(along**2)
+        s = jnp.clip(jnp.sum(w * along) / jnp.where(squared > 0, squared, 1.0), 0.0, 1.0)
+        return jnp.linalg.norm(w - s * along) - shape.radius
+
+    first, last = vector("the start of a capsule", start), vector("the end of a capsule", end)
+    return Obstacle(distance, Capsule(first, last, jnp.asarray(radius, float)))
+
+
+def sphere(centre: Numbers, radius: float) -> Obstacle:
+    """Points within a radius in m of a centre."""
+    return capsule(centre, centre, radius)
+
+
+def box(centre: Numbers, half_lengths: Numbers, rotation: Any = None) -> Obstacle:
+    """A box of half lengths in m along the rows of a rotation (by default the axes)."""
+    lengths = vector("the half lengths of a box", half_lengths, zero_allowed=False)
+    rows = jnp.eye(len(lengths)) if rotation is None else jnp.asarray(rotation, float)
+
+    def distance(x: Array, shape: Box) -> Array:
+        beyond = jnp.abs(shape.rotation @ (x - shape.centre)) - shape.half_lengths
+        outside = jnp.maximum(beyond, 0.0)
+        squared = jnp.sum(outside**2)
+        away = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+        return jnp.where(squared > 0, away, jnp.max(beyond))
+
+    return Obstacle(distance, Box(vector("the centre of a box", centre), lengths, rows))
+
+
+def heightfield(heights: Any, origin: Numbers, spacing: float) -> Obstacle:
+    """Ground below the cubic B-spline of heights in m, [k] or [k, l]; its slope scales the vertical distance.
+
+    The distance is at most the true one: the height above the ground, divided by sqrt(1 + s²) with the largest slope s
+    of the control points.
+    """
+    require_positive(spacing=spacing)
+    heights = jnp.asarray(heights, float)
+    if heights.ndim not in (1, 2):
+        raise InputError(f"heights has shape {heights.shape}; expected [k] in the plane or [k, l] in space")
+
+    def distance(x: Array, shape: Heightfield) -> Array:
+        at = (x[:-1] - shape.origin) / shape.spacing
+        ground = shape.heights
+        for axis in range(ground.ndim - 1, -1, -1):
+            ground = _spline(ground, at[axis])
+        squared = sum(jnp.max(jnp.diff(shape.heights, axis=i) ** 2) for i in range(shape.heights.ndim))
+        return (x[-1] - ground) / jnp.sqrt(1 + squared / shape.spacing**2)
+
+    shape = Heightfield(heights, jnp.asarray(origin, float).reshape(heights.ndim), jnp.asarray(spacing, float))
+    return Obstacle(distance, shape)
+
+
+def obstacle_contact(
+    mesh: Mesh,
+    obstacle: Obstacle,
+    *,
+    distance: float,
+    stiffness: Numbers,
+    friction: Numbers | None = None,
+    threshold_speed: float = 1e-3,
+    name: str = "obstacle",
+) -> Contact:
+    """Contact of the boundary's vertices with an obstacle; the other arguments as for `body_contact`.
+
+    Raises:
+        InputError: a number that is not positive, or a vertex that is inside the obstacle in the rest shape.
+    """
+    require_positive(distance=distance, threshold_speed=threshold_speed)
+    surface = surface_of(mesh)
+    parameters = ObstacleParameters(contact_parameters(distance, stiffness, friction), obstacle.shape)
+    inside = jax.vmap(obstacle.distance, (0, None))(jnp.asarray(mesh.vertices[surface.vertices]), obstacle.shape) <= 0
+    if inside.any():
+        vertex = surface.vertices[int(jnp.argmax(inside))]
+        raise InputError(
+            f"vertex {vertex} ({int(inside.sum())} in all) is inside the obstacle '{name}' in the rest shape; "
+            "move the body or the obstacle"
+        )
+    indices = jnp.asarray(surface.vertices)[:, None]
+    every = Elements(indices, (), jnp.asarray(False))
+
+    def describe(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> tuple[Any, Array, Array]:
+        parameters, rest = data
+        strength = parameters.contact.stiffness / parameters.contact.distance**3 * areas(surface, rest)[0]
+        count = len(strength)
+        repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), parameters.shape)
+        return repeated, strength, jnp.broadcast_to(parameters.contact.distance**2, (count,))
+
+    def energy(x: Float[Array, "1 dim"], data: tuple[Any, Array, Array]) -> Float[Array, ""]:
+        shape, strength, near = data
+        d = obstacle.distance(x[0], shape)
+        # Inside the obstacle the energy is infinite, which no step accepts.
+        return jnp.where(d > 0, strength * barrier(d**2, near)[0], jnp.inf)
+
+    def distances(x: Array, shape: Any) -> Array:
+        return jax.vmap(obstacle.distance, (0, None))(x[surface.vertices], shape)
+
+    def longest(x: Array, step: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
+        def at(t: Array) -> Array:
+            moved = x[surface.vertices] + t[:, None] * step[surface.vertices]
+            return jax.vmap(obstacle.distance, (0, None))(moved, data[0].shape)
+
+        return longest_step(at, jnp.linalg.norm(step[surface.vertices], axis=1))
+
+    def slide(x: Float[Array, "1 dim"], slip: Slip) -> Float[Array, ""]:
+        return friction_energy(x[0], slip)
+
+    def energies_of(function: Callable[..., Array], describe: Callable[..., Any], longest: Any) -> MovingEnergy:
+        def hessian(x: Array, data: Any) -> Array:
+            return jax.hessian(function)(x, data).reshape(x.size, x.size)
+
+        return MovingEnergy(lambda *_: every, describe, jax.value_and_grad(function), hessian, longest)
+
+    def prepare(parameters: ObstacleParameters, context: Context) -> tuple[Any, ...]:
+        data = (parameters, context.rest)
+        if parameters.contact.friction is None:
+            return (data,)
+        x = context.x[surface.vertices]
+        d, slope = jax.vmap(jax.value_and_grad(obstacle.distance), (0, None))(x, parameters.shape)
+        steep = jnp.linalg.norm(slope, axis=1)
+        _, strength, near = describe(context.x, every, data)
+        force = -2 * d * strength * barrier(d**2, near)[1] * steep
+        moving = jnp.isfinite(context.dt)
+        threshold = jnp.broadcast_to(jnp.where(moving, threshold_speed * context.dt, 1.0), d.shape)
+        largest = jnp.where(moving, parameters.contact.friction * force, 0.0)
+        return data, Slip(x, slope / steep[:, None], largest, threshold)
+
+    energies = [energies_of(energy, describe, longest)]
+    if friction is not None:
+        energies.append(energies_of(slide, lambda x, _, slip: slip, lambda x, *_: jnp.ones((), x.dtype)))
+
+    def least_distance(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
+        return jnp.minimum(jnp.min(distances(x, data[0].shape)), data[0].contact.distance)
+
+    return Contact(name, parameters, tuple(energies), prepare, least_distance)
+
+
+def _spline(values: Float[Array, "*outer k"], at: Float[Array, ""]) -> Float[Array, "*outer"]:
+    """Value of the uniform cubic B-spline along the last axis; constant beyond the ends."""
+    last = values.shape[-1] - 1
+    at = jnp.clip(at, 0.0, last)
+    first = jnp.clip(jnp.floor(at), 0, max(last - 1, 0))
+    t = at - first
+    weights = jnp.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]) / 6
+    number = jnp.clip(first.astype(int) + jnp.arange(-1, 3), 0, last)
+    return jnp.sum(weights * values[..., number], axis=-1)

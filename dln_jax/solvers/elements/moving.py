@@ -1,0 +1,214 @@
+"""Sums of element energies whose elements are not known before tracing, such as pairs of primitives in contact.
+
+An energy of moving elements is a function of a few blocks of unknowns, as in `energies`, but which blocks they are
+depends on the unknowns. It lists all elements that may act between two points, in a list of fixed capacity, and bounds
+how far a step may go. Between two such lists the elements are fixed, and so they are in derivatives.
+
+Systems with their Hessians are solved densely, or by conjugate gradients that are preconditioned with the factor of the
+static elements and the diagonal blocks of the moving ones: the iterations needed are at most about the number of
+elements that act.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.solvers.elements.assembly import Pattern, assemble
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, lookup, with_constants
+from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
+from dln_jax.solvers.lapack import cholesky, substitute, symmetric_eigen
+
+_DENSE_UNKNOWNS = 1000
+"""Largest systems that are solved densely: a factorisation of this size takes about as long as assembling it."""
+_SOLVE_RESIDUAL = 1e-11
+_SEARCH_RESIDUAL = 1e-4
+_UPPER_PRODUCTS = 3000
+
+
+class Elements(NamedTuple):
+    """Elements that may act between two points."""
+
+    indices: Int[Array, "capacity k"]
+    """Blocks of unknowns of every element; all different in an element that is used."""
+    data: Any
+    """What else the energy needs to know of them, without derivatives: a pytree with leading axis `capacity`."""
+    overflow: Bool[Array, ""]
+    """Whether elements had to be left out."""
+
+
+class MovingEnergy(NamedTuple):
+    """A sum of one scalar function over elements that change; `data` is the energy's own, differentiable."""
+
+    elements: Callable[[Blocks, Blocks, Any], Elements]
+    """(x, step, data) -> all elements that may act anywhere between x and x + step."""
+    describe: Callable[[Blocks, Elements, Any], Any]
+    """(x, elements, data) -> the data of the elements for the energy at x."""
+    gradient: Callable[[Float[Array, "k b"], Any], tuple[Float[Array, ""], Float[Array, "k b"]]]
+    """(unknowns of one element, its data) -> energy and its gradient."""
+    hessian: Callable[[Float[Array, "k b"], Any], Float[Array, "s s"]]
+    """(unknowns of one element, its data) -> its Hessian, s = k b."""
+    longest: Callable[[Blocks, Blocks, Elements, Any], Float[Array, ""]]
+    """(x, step, elements, data) -> largest fraction of the step, at most 1, up to which the energy stays finite."""
+
+
+Lists = tuple[Elements, ...]
+
+
+def lists_between(moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, data: Sequence[Any]) -> Lists:
+    """Returns the elements of all energies between x and x + step."""
+    x, step, data = jax.lax.stop_gradient((x, step, tuple(data)))
+    return tuple(m.elements(x, step, of) for m, of in zip(moving, data, strict=True))
+
+
+def longest_fraction(
+    moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, lists: Lists, data: Sequence[Any]
+) -> Array:
+    """Returns the largest fraction of the step that all energies allow."""
+    fractions = [m.longest(x, step, at, of) for m, at, of in zip(moving, lists, data, strict=True)]
+    return jnp.min(jnp.stack([jnp.ones((), x.dtype), *fractions]))
+
+
+def overflow(lists: Lists) -> Bool[Array, ""]:
+    """Whether a list was too short."""
+    return jnp.stack([jnp.asarray(False), *(elements.overflow for elements in lists)]).any()
+
+
+def moving_value(moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any]) -> Float[Array, ""]:
+    """Returns the sum of the energies at x."""
+    total = jnp.zeros((), x.dtype)
+    for m, at, of in zip(moving, lists, data, strict=True):
+        total += jax.vmap(m.gradient)(x[at.indices], m.describe(x, at, of))[0].sum()
+    return total
+
+
+def moving_gradient(
+    moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any]
+) -> tuple[Float[Array, ""], Blocks]:
+    """Returns the sum of the energies and its gradient."""
+    total, gradient = jnp.zeros((), x.dtype), jnp.zeros_like(x)
+    for m, at, of in zip(moving, lists, data, strict=True):
+        values, slopes = jax.vmap(m.gradient)(x[at.indices], m.describe(x, at, of))
+        total += values.sum()
+        gradient = gradient.at[at.indices].add(slopes)
+    return total, gradient
+
+
+def moving_hessians(
+    moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any], *, projected: bool
+) -> tuple[Float[Array, "capacity s s"], ...]:
+    """Returns the Hessians of the elements, projected to positive semi-definite ones for a search direction."""
+    hessians = tuple(
+        jax.vmap(m.hessian)(x[at.indices], m.describe(x, at, of)) for m, at, of in zip(moving, lists, data, strict=True)
+    )
+    return tuple(map(_projected, hessians)) if projected else hessians
+
+
+def add_diagonals(diagonal: Blocks, lists: Lists, hessians: Sequence[Array]) -> Blocks:
+    """Adds the sizes of the diagonal entries of moving elements to those of the static ones."""
+    for elements, of_elements in zip(lists, hessians, strict=True):
+        own = jnp.abs(jnp.diagonal(of_elements, axis1=1, axis2=2))
+        diagonal = diagonal.at[elements.indices].add(own.reshape(*elements.indices.shape, -1))
+    return diagonal
+
+
+def with_moving(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """Returns the solver of systems with the Hessians of static and of moving elements.
+
+    Its `factorise` takes (static element Hessians, (entries of their sum, lists, moving Hessians)).
+
+    Args:
+        solver: of the static elements.
+        energies: the static elements.
+        at: their pattern.
+    """
+    return _dense(at) if at.unknowns <= _DENSE_UNKNOWNS else _iterative(solver, energies, at)
+
+
+def _projected(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity s s"]:
+    """Sets negative eigenvalues to zero, one after the other for the elements that act, which are few."""
+    hessians = jnp.where(jnp.isfinite(hessians), hessians, 0)
+    acting = (hessians != 0).any(axis=(1, 2))
+    order = jnp.argsort(~acting)
+
+    def project(number: Array, hessians: Array) -> Array:
+        place = order[number]
+        values, vectors = symmetric_eigen(hessians[place])
+        return hessians.at[place].set((vectors * jnp.maximum(values, 0)) @ vectors.T)
+
+    return jax.lax.fori_loop(0, acting.sum(), project, hessians)
+
+
+def _unknowns(indices: Int[Array, "capacity k"], width: int) -> Int[Array, "capacity s"]:
+    return (indices[:, :, None] * width + jnp.arange(width)).reshape(len(indices), -1)
+
+
+def _dense(at: Pattern) -> LinearSolver:
+    numbers = np.arange(at.unknowns)
+    table = lookup(at)(numbers[:, None], numbers[None, :])
+
+    def factorise(_: Sequence[Array], parts: tuple[Array, Lists, Sequence[Array]]) -> Array:
+        values, lists, hessians = parts
+        matrix = with_constants(values)[table]
+        for elements, blocks in zip(lists, hessians, strict=True):
+            unknowns = _unknowns(elements.indices, at.width)
+            free = jnp.asarray(at.free.ravel())[unknowns]
+            kept = blocks * free[:, :, None] * free[:, None, :]
+            matrix = matrix.at[unknowns[:, :, None], unknowns[:, None, :]].add(kept)
+        return cholesky(matrix)
+
+    def solve(factor: Array, b: Blocks) -> Blocks:
+        right = jnp.where(at.free, b, 0).reshape(-1, 1)
+        return substitute(factor, substitute(factor, right), transposed=True).reshape(b.shape)
+
+    return LinearSolver(factorise, solve, solve)
+
+
+def _iterative(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    numbers = np.arange(at.unknowns).reshape(at.blocks, at.width)
+    blocks_of = lookup(at)(numbers[:, :, None], numbers[:, None, :])
+    # The diagonal blocks of every vertex are entries of the static pattern.
+    own_entries = (blocks_of < len(at.rows)) & np.tril(np.ones((at.width, at.width), bool))
+
+    def factorise(hessians: Sequence[Array], parts: tuple[Array, Lists, Sequence[Array]]) -> Any:
+        values, lists, moving = parts
+        diagonal = jnp.zeros((at.blocks, at.width, at.width), values.dtype)
+        for elements, blocks in zip(lists, moving, strict=True):
+            k = elements.indices.shape[1]
+            own = blocks.reshape(-1, k, at.width, k, at.width)
+            own = jnp.stack([own[:, i, :, i] for i in range(k)], axis=1)
+            diagonal = diagonal.at[elements.indices].add(own)
+        added = values.at[blocks_of[own_entries]].add(diagonal[own_entries])
+        return tuple(map(square, hessians)), (lists, tuple(moving)), solver.factorise(hessians, added)
+
+    def run(tolerance: float, factor: Any, right: Blocks) -> Blocks:
+        hessians, (lists, moving), static = factor
+
+        def product(x: Blocks) -> Blocks:
+            out = jnp.zeros_like(x)
+            for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
+                at_corners = x[element.indices].reshape(len(element.indices), -1, 1)
+                out += assemble(corners, (of_elements @ at_corners)[..., 0].T)
+            for elements, blocks in zip(lists, moving, strict=True):
+                at_corners = x[elements.indices].reshape(len(blocks), -1, 1)
+                out = out.at[elements.indices].add((blocks @ at_corners).reshape(*elements.indices.shape, -1))
+            return jnp.where(at.free, out, 0)
+
+        right = jnp.where(at.free, right, 0)
+
+        def precondition(r: Blocks) -> Blocks:
+            return solver.solve(static, r)
+
+        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_UPPER_PRODUCTS)
+
+    def solve(factor: Any, b: Blocks) -> Blocks:
+        return run(_SOLVE_RESIDUAL, factor, b)
+
+    def search(factor: Any, b: Blocks) -> Blocks:
+        return run(_SEARCH_RESIDUAL, factor, b)
+
+    return LinearSolver(factorise, solve, search)
