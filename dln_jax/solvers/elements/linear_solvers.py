@@ -19,11 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dln_jax.solvers.elements.assembly import Pattern, assemble
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
+from dln_jax.solvers.elements import multifrontal
+from dln_jax.solvers.elements.dissection import Node, dissect
+from dln_jax.solvers.elements.fronts import Plan, plan
 from dln_jax.solvers.elements.symmetric_systems import (
     conjugate_gradients,
     factorise_blocks,
@@ -38,6 +41,10 @@ from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 # unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
 _LOWER_BANDS = 4
+# Unknowns of a part of the body that is not dissected any further.
+_LEAF_UNKNOWNS = 128
+# Unknowns of a tile.
+_TILE = 64
 # Relative residuals of the conjugate gradients, and the products after which they give up.
 _SOLVE_RESIDUAL = 1e-10
 SEARCH_RESIDUAL = 1e-2
@@ -133,6 +140,37 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
         return solve_blocks(factor, right).reshape(-1)[back].reshape(b.shape)
 
     return LinearSolver(factorise, solve, solve)
+
+
+def sparse(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """Factorises by multifrontal Cholesky, the vertices ordered by nested dissection."""
+    tables = plan(elimination_tree(at), at.rows, at.columns, at.unknowns, _TILE)
+
+    def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> multifrontal.Tiles:
+        return multifrontal.factorise(tables, values)
+
+    def solve(factor: multifrontal.Tiles, b: Blocks) -> Blocks:
+        return multifrontal.solve(tables, factor, b.reshape(-1)).reshape(b.shape)
+
+    return LinearSolver(factorise, solve, solve)
+
+
+def elimination_tree(at: Pattern) -> list[Node]:
+    """Returns the nodes of the free unknowns."""
+    row, column = at.rows // at.width, at.columns // at.width
+    coupled = csr_array(coo_array((np.ones(len(row)), (row, column)), shape=(at.blocks, at.blocks)))
+    graph = csr_array(coupled + coupled.T)
+    graph.setdiag(0)
+    graph.eliminate_zeros()
+    graph.data[:] = 1
+    solved = np.flatnonzero(at.free.any(axis=1))
+    numbers = np.arange(at.unknowns).reshape(at.blocks, at.width)
+
+    def unknowns(vertices: np.ndarray) -> np.ndarray:
+        return numbers[solved[vertices]][at.free[solved[vertices]]]
+
+    nodes = dissect(graph[solved][:, solved], max(1, _LEAF_UNKNOWNS // at.width))
+    return [Node(unknowns(node.own), unknowns(node.boundary), node.children) for node in nodes]
 
 
 def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
