@@ -37,7 +37,10 @@ def factorise(at: Plan, entries: Float[Array, " entries"]) -> Tiles:
             rows, columns = (_rows(at.child_rows, first, at.size) for first in (part.rows, part.columns))
             # Rows and columns have the same order in parent and child: its lower triangle comes from this one's.
             known = (columns.row >= 0) & (rows.row[:, None] >= columns.row)
-            place = jnp.where(known, part.child + rows.as_row[:, None] + columns.as_column, 0)
+            # The barrier keeps the places from being computed once more for every number that is read.
+            place = lax.optimization_barrier(
+                jnp.where(known, part.child + rows.as_row[:, None] + columns.as_column, 0)
+            )
             return sum_ + jnp.where(known, _take(tiles.reshape(-1), place), 0)
 
         def subtract(k: Array, sum_: Array) -> Array:
