@@ -52,22 +52,17 @@ class Targets(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a child adds to a tile."""
+    """What a child adds to a tile: consecutive rows and columns of its U, which lie in two by two tiles at most."""
 
-    child: Numbers
-    """Place of the child's U in the tiles."""
+    upper: Numbers
+    lower: Numbers
+    """First of the two tiles that have the upper rows, and the lower rows."""
+    first_row: Numbers
+    first_column: Numbers
+    """Number of the first row and column of these tiles in U."""
     rows: Numbers
     columns: Numbers
-    """First of the tile's rows and columns in `ChildRows`."""
-
-
-class ChildRows(NamedTuple):
-    """For every row of a parent's front, the row i of the child's U, whose entry j <= i is at as_row + as_column."""
-
-    row: Numbers
-    """i, or -1 for none."""
-    as_row: Numbers
-    as_column: Numbers
+    """First of the target's rows and columns in `child_rows`."""
 
 
 class Plan(NamedTuple):
@@ -80,7 +75,8 @@ class Plan(NamedTuple):
     steps: Steps
     targets: Targets
     parts: Parts
-    child_rows: ChildRows
+    child_rows: Numbers
+    """For every row of a parent's front, the row of the child's U, or -1 for none."""
     below: Numbers
     """Tiles below the diagonal."""
     rows: Int[np.ndarray, "below size"]
@@ -139,7 +135,10 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
         for child in node.children:
             theirs = np.full(m * size, -1)
             theirs[local[nodes[child].boundary]] = np.arange(len(nodes[child].boundary))
-            adding.append((stored[child] * size**2, child_rows + size * tiles, (theirs.reshape(m, -1) >= 0).any(1)))
+            # The tile of U with the first row that is added to each tile, and whether there is one.
+            known = theirs.reshape(m, -1)
+            window = np.where(known < 0, unknowns, known).min(axis=1) // size
+            adding.append((stored[child], beyond[child], window, known.max(axis=1) >= 0, child_rows + size * tiles))
             children.append(theirs)
             child_rows += m * size
         for k in range(s + 1):
@@ -147,7 +146,11 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
             for i in range(k, m):
                 for j in (k,) if eliminated else range(s, i + 1):
                     tile = row[i] + k if eliminated else stored[number] + (i - s) * (i - s + 1) // 2 + j - s
-                    adds = [(at, base[i], base[j]) for at, base, touched in adding if touched[i] and touched[j]]
+                    adds = [
+                        _part(at, end, window[i], window[j], size, base[i], base[j])
+                        for at, end, window, touched, base in adding
+                        if touched[i] and touched[j]
+                    ]
                     targets.append((tile, eliminated, row[i], row[j], k, len(parts), len(parts) + len(adds)))
                     parts += adds
                 if eliminated and i > k:
@@ -156,16 +159,14 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
             diagonal, place = (row[k] + k, start[number] + k * size) if eliminated else (0, 0)
             steps.append((began, len(targets), eliminated, diagonal, began_below, len(below), place))
         local[front] = -1
-    theirs = np.concatenate([*children, np.full(1, -1)])
-    i, j = np.divmod(theirs, size)
-    as_row, as_column = i * (i + 1) // 2 * size**2 + j * size, i * size**2 + j
     return Plan(
         size,
-        end,
+        # Two tiles are read where there may be one.
+        end + 1,
         Steps(*_columns(steps, 7)),
         Targets(*_columns(targets, 7)),
-        Parts(*_columns(parts, 3)),
-        ChildRows(*(table.astype(np.int32) for table in (theirs, as_row, as_column))),
+        Parts(*_columns(parts, 6)),
+        np.concatenate([*children, np.full(size, -1)]).astype(np.int32),
         np.array([*below, 0], np.int32),
         np.array([*rows_below, np.full(size, length)], np.int32),
         entries.astype(np.int32),
@@ -178,6 +179,12 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
 def _columns(rows: list[tuple[int, ...]], count: int) -> Int[np.ndarray, "count number"]:
     # One row at least, because an empty table cannot be indexed.
     return np.array(rows or [(0,) * count], np.int32).T
+
+
+def _part(at: int, tiles: int, i: int, j: int, size: int, rows: int, columns: int) -> tuple[int, ...]:
+    """Returns a row of `Parts` for the tiles i, i + 1 and j, j + 1 of a U that is stored at `at`."""
+    upper, lower = (at + row * (row + 1) // 2 + j for row in (i, min(i + 1, tiles - 1)))
+    return upper, lower, i * size, j * size, rows, columns
 
 
 def _inside(row: Numbers, i: Numbers, j: Numbers, size: int) -> Numbers:

@@ -24,7 +24,7 @@ Tiles = Float[Array, "tiles size size"]
 def factorise(at: Plan, entries: Float[Array, " entries"]) -> Tiles:
     """Returns L; not finite if the matrix is not positive definite."""
     at = _on_device(at)
-    count = at.size**2
+    count, size = at.size**2, jnp.int32(at.size)
     tiles = jnp.zeros(at.tiles * count, entries.dtype)
     tiles = tiles.at[at.entries].set(entries, unique_indices=True, mode="promise_in_bounds")
     tiles = tiles.at[at.units].set(1, unique_indices=True, mode="promise_in_bounds").reshape(-1, at.size, at.size)
@@ -34,14 +34,16 @@ def factorise(at: Plan, entries: Float[Array, " entries"]) -> Tiles:
 
         def add(number: Array, sum_: Array) -> Array:
             part = _row(at.parts, number)
-            rows, columns = (_rows(at.child_rows, first, at.size) for first in (part.rows, part.columns))
+            row, column = (_slice(at.child_rows, first, at.size) for first in (part.rows, part.columns))
             # Rows and columns have the same order in parent and child: its lower triangle comes from this one's.
-            known = (columns.row >= 0) & (rows.row[:, None] >= columns.row)
-            # The barrier keeps the places from being computed once more for every number that is read.
-            place = lax.optimization_barrier(
-                jnp.where(known, part.child + rows.as_row[:, None] + columns.as_column, 0)
-            )
-            return sum_ + jnp.where(known, _take(tiles.reshape(-1), place), 0)
+            known = (column >= 0) & (row[:, None] >= column)
+            i, j = row - part.first_row, column - part.first_column
+            of_row = lax.div(i, size) * (2 * count) + lax.rem(i, size) * size
+            place = jnp.where(known, of_row[:, None] + lax.div(j, size) * count + lax.rem(j, size), -1)
+            # The barrier keeps the places from being computed again, slowly, in the loop that reads the numbers.
+            place = lax.optimization_barrier(place)
+            near = jnp.concatenate([_slice(tiles, first, 2) for first in (part.upper, part.lower)])
+            return sum_ + jnp.where(place >= 0, _take(near.reshape(-1), jnp.maximum(place, 0)), 0)
 
         def subtract(k: Array, sum_: Array) -> Array:
             return sum_ - _tile(tiles, target.left + k) @ _tile(tiles, target.right + k).T
@@ -75,7 +77,7 @@ def solve(at: Plan, factor: Tiles, b: Float[Array, " n"]) -> Float[Array, " n"]:
     x = jnp.zeros(at.length + 1, b.dtype).at[at.places].set(b).at[-1].set(0)
 
     def own(x: Array, place: Array) -> Array:
-        return lax.dynamic_slice(x, (place,), (at.size,))
+        return _slice(x, place, at.size)
 
     def forwards(number: Array, x: Array) -> Array:
         step = _row(at.steps, number)
@@ -116,8 +118,8 @@ def _row(table: Any, number: Array) -> Any:
     return type(table)(*(column[number] for column in table))
 
 
-def _rows(table: Any, first: Array, count: int) -> Any:
-    return type(table)(*(lax.dynamic_slice(column, (first,), (count,)) for column in table))
+def _slice(array: Array, first: Array, count: int) -> Array:
+    return lax.dynamic_slice_in_dim(array, first, count)
 
 
 def _tile(tiles: Tiles, number: Array) -> Float[Array, "size size"]:
