@@ -137,15 +137,17 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
             theirs[local[nodes[child].boundary]] = np.arange(len(nodes[child].boundary))
             # The tile of U with the first row that is added to each tile, and whether there is one.
             known = theirs.reshape(m, -1)
-            window = np.where(known < 0, unknowns, known).min(axis=1) // size
-            adding.append((stored[child], beyond[child], window, known.max(axis=1) >= 0, child_rows + size * tiles))
+            window, touched = np.where(known < 0, unknowns, known).min(axis=1) // size, known.max(axis=1) >= 0
+            tables = (window, touched, child_rows + size * tiles)
+            adding.append((int(stored[child]), int(beyond[child]), *(table.tolist() for table in tables)))
             children.append(theirs)
             child_rows += m * size
+        row, left, begin = row.tolist(), int(stored[number]), int(start[number])
         for k in range(s + 1):
             began, began_below, eliminated = len(targets), len(below), k < s
             for i in range(k, m):
                 for j in (k,) if eliminated else range(s, i + 1):
-                    tile = row[i] + k if eliminated else stored[number] + (i - s) * (i - s + 1) // 2 + j - s
+                    tile = row[i] + k if eliminated else left + (i - s) * (i - s + 1) // 2 + j - s
                     adds = [
                         _part(at, end, window[i], window[j], size, base[i], base[j])
                         for at, end, window, touched, base in adding
@@ -156,7 +158,7 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
                 if eliminated and i > k:
                     below.append(row[i] + k)
                     rows_below.append(places[front[i * size : (i + 1) * size]])
-            diagonal, place = (row[k] + k, start[number] + k * size) if eliminated else (0, 0)
+            diagonal, place = (row[k] + k, begin + k * size) if eliminated else (0, 0)
             steps.append((began, len(targets), eliminated, diagonal, began_below, len(below), place))
         local[front] = -1
     return Plan(
@@ -187,7 +189,7 @@ def _part(at: int, tiles: int, i: int, j: int, size: int, rows: int, columns: in
     return upper, lower, i * size, j * size, rows, columns
 
 
-def _inside(row: Numbers, i: Numbers, j: Numbers, size: int) -> Numbers:
+def _inside(row: Int[np.ndarray, " tiles"], i: Numbers, j: Numbers, size: int) -> Numbers:
     """Returns the places of entries i, j of a front, from the first tiles of its rows."""
     return (row[i // size] + j // size) * size**2 + i % size * size + j % size
 

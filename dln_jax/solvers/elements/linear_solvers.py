@@ -1,9 +1,10 @@
 """Solves symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
 
-There are three methods, between which `selection` chooses:
+There are four methods, between which `selection` chooses:
 
 - dense Cholesky;
-- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks;
+- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for narrow bands;
+- multifrontal Cholesky after nested dissection, for wide bands;
 - matrix-free conjugate gradients with a block-Jacobi preconditioner on the element Hessians.
 
 A matrix that is not positive definite gives a solution that is not finite, without shifts or clamping.
@@ -41,10 +42,10 @@ from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 # unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
 _LOWER_BANDS = 4
-# Unknowns of a part of the body that is not dissected any further.
+# Unknowns of a part of the body that is not dissected any further, and rows of a tile: of 48 to 96 and 96 to 192 the
+# fastest on bodies of 800 to 20,000 unknowns.
 _LEAF_UNKNOWNS = 128
-# Unknowns of a tile.
-_TILE = 64
+TILE = 64
 # Relative residuals of the conjugate gradients, and the products after which they give up.
 _SOLVE_RESIDUAL = 1e-10
 SEARCH_RESIDUAL = 1e-2
@@ -142,9 +143,12 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     return LinearSolver(factorise, solve, solve)
 
 
-def sparse(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Factorises by multifrontal Cholesky, the vertices ordered by nested dissection."""
-    tables = plan(elimination_tree(at), at.rows, at.columns, at.unknowns, _TILE)
+def sparse(_: Sequence[ElementEnergy], at: Pattern, *, tables: Plan | None = None) -> LinearSolver:
+    """Factorises by multifrontal Cholesky, by `tables` if `elimination_plan` is already computed.
+
+    The factor is also a preconditioner of similar matrices: `solve` takes any right-hand side.
+    """
+    tables = elimination_plan(at) if tables is None else tables
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> multifrontal.Tiles:
         return multifrontal.factorise(tables, values)
@@ -155,8 +159,8 @@ def sparse(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     return LinearSolver(factorise, solve, solve)
 
 
-def elimination_tree(at: Pattern) -> list[Node]:
-    """Returns the nodes of the free unknowns."""
+def elimination_plan(at: Pattern) -> Plan:
+    """Returns the tables of a multifrontal factorisation of the free unknowns, ordered by nested dissection."""
     row, column = at.rows // at.width, at.columns // at.width
     coupled = csr_array(coo_array((np.ones(len(row)), (row, column)), shape=(at.blocks, at.blocks)))
     graph = csr_array(coupled + coupled.T)
@@ -170,7 +174,8 @@ def elimination_tree(at: Pattern) -> list[Node]:
         return numbers[solved[vertices]][at.free[solved[vertices]]]
 
     nodes = dissect(graph[solved][:, solved], max(1, _LEAF_UNKNOWNS // at.width))
-    return [Node(unknowns(node.own), unknowns(node.boundary), node.children) for node in nodes]
+    nodes = [Node(unknowns(node.own), unknowns(node.boundary), node.children) for node in nodes]
+    return plan(nodes, at.rows, at.columns, at.unknowns, TILE)
 
 
 def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
