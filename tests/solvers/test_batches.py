@@ -19,7 +19,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.solvers import lapack
 from dln_jax.solvers.elements.energies import ElementEnergy, lower_triangles, project
-from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
+from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free, sparse
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.symmetric_systems import places, solve_bands
 from dln_jax.solvers.elimination import solve, solve_lower, solve_lower_transposed
@@ -204,9 +204,10 @@ CHAINS = (jnp.array([30.0, 50.0, 3.0, 40.0]), jnp.array([0.18, 0.25, 0.2, 0.19])
     [
         (dense, lambda one: jax.jacfwd(jax.value_and_grad(one))),
         pytest.param(block_tridiagonal, lambda one: jax.value_and_grad(one, (0, 1)), marks=pytest.mark.slow),
+        pytest.param(sparse, lambda one: jax.value_and_grad(one, (0, 1)), marks=pytest.mark.slow),
         pytest.param(matrix_free, lambda one: one, marks=pytest.mark.slow),
     ],
-    ids=["dense, second", "blocks, first", "no matrix, none"],
+    ids=["dense, second", "blocks, first", "sparse, first", "no matrix, none"],
 )
 def test_minima_and_their_derivatives_in_batches(way, derived):
     every = derived(lambda stiffness, length: sag(stiffness, length, way))
@@ -243,6 +244,7 @@ PROGRAMS = {
     "a creature's gradient": gradient_of_a_creature,
     "mechanics of 20 coordinates": long_chain,
     "blocks": lambda: (lambda length: sag(50.0, length, block_tridiagonal), np.full((), 0.2)),
+    "sparse": lambda: (lambda length: sag(50.0, length, sparse), np.full((), 0.2)),
     "no matrix": lambda: (lambda length: sag(50.0, length, matrix_free), np.full((), 0.2)),
 }
 # The first result of a call to LAPACK, and whether its factors are a batch.

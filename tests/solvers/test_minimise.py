@@ -17,7 +17,7 @@ from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements import selection
-from dln_jax.solvers.elements.assembly import Pattern, assemble, entries, gradient, pattern
+from dln_jax.solvers.elements.assembly import assemble, entries, gradient, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, project, square, value
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free, sparse
 from dln_jax.solvers.elements.minimise import minimise

@@ -39,7 +39,7 @@ def dissect(graph: csr_array, leaf: int) -> list[Node]:
         leaf: vertices below which a part is not split.
     """
     nodes: list[Node] = []
-    place = np.empty(graph.shape[0], int)
+    place = np.empty(len(graph.indptr) - 1, int)
     count = 0
 
     def eliminate(vertices: np.ndarray, children: tuple[int, ...]) -> int:
@@ -56,7 +56,7 @@ def dissect(graph: csr_array, leaf: int) -> list[Node]:
         children = (*split(left), *split(right))
         return (eliminate(separator, children),) if len(separator) else children
 
-    split(np.arange(graph.shape[0]))
+    split(np.arange(len(graph.indptr) - 1))
     for number, (own, _, children) in enumerate(nodes):
         near = np.concatenate([graph[own].indices, *(nodes[child].boundary for child in children)])
         later = np.unique(near[place[near] > place[own].max()])
@@ -82,7 +82,7 @@ def _work(left: int, right: int, separator: int) -> float:
 
 
 def _separations(graph: csr_array) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    count = graph.shape[0]
+    count = len(graph.indptr) - 1
     low, high = int(_SMALLEST_PART * count), int(np.ceil((1 - _SMALLEST_PART) * count))
     for along in _coordinates(graph).T:
         order = np.argsort(along, kind="stable")
@@ -113,7 +113,7 @@ def _smallest_separator(
 
     A vertex v is an edge of capacity one from node v to node n + v, and is cut if only its first end is reached.
     """
-    count = graph.shape[0]
+    count = len(graph.indptr) - 1
     source, sink, vertices = 2 * count, 2 * count + 1, np.arange(count)
     row, column = graph.nonzero()
     unlimited = count + 1

@@ -23,10 +23,10 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from dln_jax.solvers.elements.assembly import Pattern, assemble
-from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
 from dln_jax.solvers.elements import multifrontal
+from dln_jax.solvers.elements.assembly import Pattern, assemble
 from dln_jax.solvers.elements.dissection import Node, dissect
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
 from dln_jax.solvers.elements.fronts import Plan, plan
 from dln_jax.solvers.elements.symmetric_systems import (
     conjugate_gradients,

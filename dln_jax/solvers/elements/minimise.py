@@ -4,9 +4,9 @@
     dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
 
 Newton's method uses the true Hessian. Only if its factorisation fails are the indefinite element Hessians projected to
-positive semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). The derivative
-belongs to the minimum and not to the iterations: it takes one factorisation and one solve, in forward and reverse mode
-and to any order. At a point that is not a minimum the derivative is NaN, never a plausible number.
+positive semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). The
+derivative belongs to the minimum and not to the iterations: it takes one factorisation and one solve, in forward and
+reverse mode and to any order. At a point that is not a minimum the derivative is NaN, never a plausible number.
 """
 
 import functools
@@ -29,8 +29,8 @@ from dln_jax.types import InputError, require_positive
 
 # Gradients and energies below this many units of rounding are indistinguishable from zero.
 _ROUNDING_UNITS = 16
-# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn: projected
-# elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
+# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn:
+# projected elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
 
 

@@ -118,7 +118,7 @@ def _row(table: Any, number: Array) -> Any:
     return type(table)(*(column[number] for column in table))
 
 
-def _slice(array: Array, first: Array, count: int) -> Array:
+def _slice(array: Any, first: Array, count: int) -> Array:
     return lax.dynamic_slice_in_dim(array, first, count)
 
 
@@ -130,5 +130,5 @@ def _with_tile(tiles: Tiles, number: Array, tile: Float[Array, "size size"]) -> 
     return lax.dynamic_update_index_in_dim(tiles, tile, number, 0)
 
 
-def _take(values: Array, places: Array) -> Array:
+def _take(values: Array, places: Any) -> Array:
     return values.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -55,8 +55,8 @@ _MORE_ITERATIONS = 1.75
 _LOWER_PRODUCTS = 20
 # Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
 _UPPER_ENTRIES = 3e7
-# Operations of the multifrontal factorisation: products of tiles, parts from children, targets, tiles below the diagonal
-# and columns. Measured on the same core (825 to 21,756 unknowns), within a factor of 1.4.
+# Operations of the multifrontal factorisation: products of tiles, parts from children, targets, tiles below the
+# diagonal and columns. Measured in the same way (825 to 21,756 unknowns), within a factor of 1.4.
 _SPARSE_SECONDS = (22e-6, 15e-6, 7e-6, 20e-6, 25e-6)
 # No tree takes less per unknown: a column of tiles, one below it, and their targets and products.
 _LEAST_SPARSE_SECONDS = 1e-4 / TILE
@@ -78,7 +78,7 @@ def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, d
 def least_work(
     energies: Sequence[ElementEnergy], at: Pattern, search_takes_at_most: Callable[[int], bool] | None = None
 ) -> LinearSolverFactory:
-    """Returns `dense`, `block_tridiagonal`, `sparse` or `matrix_free`, by estimates of the work of factorisations and products.
+    """Returns the factory with the least work, by estimates for factorisations and products.
 
     `search_takes_at_most` returns whether a search direction takes at most this many products; it is called only if
     size and structure do not settle the choice. Without it, moderate stiffness and nu = 0.3 are assumed.
