@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from dln_jax.solvers.lapack import cholesky, symmetric_eigen
 
-# Elements that are decomposed at a time.
-_DECOMPOSED = 16
+# Elements that are decomposed at a time, at most.
+_DECOMPOSED = 64
 
 Blocks = Float[Array, "n b"]
 Corners = Sequence[Sequence[Array]] | Float[Array, "k b"]
@@ -110,16 +110,17 @@ def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, 
 
 def _projected(hessians: Float[Array, "m s s"], shift: Float[Array, ""]) -> Float[Array, "m s s"]:
     m, s, _ = hessians.shape
+    count = min(_DECOMPOSED, m)
     unit = jnp.eye(s, dtype=hessians.dtype)
     definite = jnp.isfinite(jax.vmap(cholesky)(hessians + shift / 2 * unit)).all(axis=(1, 2))
     # Places of the others first; places past the end are read as the last element, and not written.
-    order = jnp.append(jnp.argsort(definite), jnp.full(_DECOMPOSED, m))
+    order = jnp.append(jnp.argsort(definite), jnp.full(count, m))
 
     def decompose(number: Array, hessians: Array) -> Array:
-        at = jax.lax.dynamic_slice_in_dim(order, number * _DECOMPOSED, _DECOMPOSED)
+        at = jax.lax.dynamic_slice_in_dim(order, number * count, count)
         values, vectors = jax.vmap(symmetric_eigen)(hessians.at[at].get(mode="clip"))
         semidefinite = (vectors * jnp.maximum(values, 0)[:, None, :]) @ vectors.swapaxes(-1, -2)
         return hessians.at[at].set(semidefinite, mode="drop")
 
-    rounds = -(-jnp.sum(~definite) // _DECOMPOSED)
+    rounds = -(-jnp.sum(~definite) // count)
     return jax.lax.fori_loop(0, rounds, decompose, hessians) + shift * unit

@@ -40,7 +40,7 @@ WAYS = {
 MODULI, RATIOS, TIME_STEPS = (1e5, 1e7, 1e9), (0.3, 0.49), (1e-3, 1 / 60)
 STEPS = 2
 WORSE, RIGHT = 1.5, 0.9
-"""Largest time by the chosen solver relative to the fastest other, and smallest share of bodies with the best choice."""
+"""Largest time by the chosen solver relative to the fastest other; smallest share of bodies with the best choice."""
 
 
 def creature(quick: bool) -> Findings:

@@ -60,9 +60,8 @@ def factorisation(quick: bool) -> Findings:
     for cells in CELLS[: 2 if quick else 3]:
         scene = bar_scene(unordered_bar(cells), 1e6, 0.3)
         energies, at, data = bar_system(scene, DT)
-        values = jax.jit(
-            lambda x, energies=energies, at=at, data=data: entries(at, element_hessians(energies, x, data))
-        )(scene.params.rest)
+        hessians = jax.jit(functools.partial(element_hessians, energies))(scene.params.rest, data)
+        values = jax.jit(functools.partial(entries, at))(hessians)
         b = jnp.where(at.free, 1.0, 0.0)
         solver = linear_solvers.sparse(energies, at)
         solve = jax.jit(lambda values, b, solver=solver: solver.solve(solver.factorise((), values), b))
