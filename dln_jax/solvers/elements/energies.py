@@ -110,6 +110,8 @@ def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, 
 
 def _projected(hessians: Float[Array, "m s s"], shift: Float[Array, ""]) -> Float[Array, "m s s"]:
     m, s, _ = hessians.shape
+    if not m:
+        return hessians
     count = min(_DECOMPOSED, m)
     unit = jnp.eye(s, dtype=hessians.dtype)
     definite = jnp.isfinite(jax.vmap(cholesky)(hessians + shift / 2 * unit)).all(axis=(1, 2))
