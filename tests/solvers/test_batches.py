@@ -19,7 +19,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.solvers import lapack
 from dln_jax.solvers.elements.energies import ElementEnergy, lower_triangles, project
-from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
+from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free, sparse
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.symmetric_systems import places, solve_bands
 from dln_jax.solvers.elimination import solve, solve_lower, solve_lower_transposed
@@ -139,13 +139,13 @@ def test_eigenvalues_in_clusters_and_zeros():
 
 
 def test_projection_of_elements_of_several_sizes():
-    """Against NumPy; the shift is relative to the largest eigenvalue of all, and NaN ends nowhere."""
+    """Against NumPy; the shift is relative to the largest diagonal entry of all, and NaN ends nowhere."""
     random = np.random.default_rng(2)
     wholes = [random.normal(size=(count, size, size)) for count, size in ((3, 2), (5, 6), (2, 12))]
     wholes = [matrices + matrices.swapaxes(1, 2) for matrices in wholes]
     projected = jax.jit(project)(tuple(lower_triangles(jnp.asarray(matrices)) for matrices in wholes), 1e-3)
     spectra = [np.linalg.eigh(matrices) for matrices in wholes]
-    largest = max(values.max() for values, _ in spectra)
+    largest = max(np.diagonal(matrices, axis1=1, axis2=2).max() for matrices in wholes)
     for (values, vectors), lower in zip(spectra, projected, strict=True):
         raised = vectors * (np.maximum(values, 0) + 1e-3 * largest)[:, None] @ vectors.swapaxes(1, 2)
         np.testing.assert_allclose(lower, lower_triangles(jnp.asarray(raised)), atol=1e-12)
@@ -204,9 +204,10 @@ CHAINS = (jnp.array([30.0, 50.0, 3.0, 40.0]), jnp.array([0.18, 0.25, 0.2, 0.19])
     [
         (dense, lambda one: jax.jacfwd(jax.value_and_grad(one))),
         pytest.param(block_tridiagonal, lambda one: jax.value_and_grad(one, (0, 1)), marks=pytest.mark.slow),
+        pytest.param(sparse, lambda one: jax.value_and_grad(one, (0, 1)), marks=pytest.mark.slow),
         pytest.param(matrix_free, lambda one: one, marks=pytest.mark.slow),
     ],
-    ids=["dense, second", "blocks, first", "no matrix, none"],
+    ids=["dense, second", "blocks, first", "sparse, first", "no matrix, none"],
 )
 def test_minima_and_their_derivatives_in_batches(way, derived):
     every = derived(lambda stiffness, length: sag(stiffness, length, way))
@@ -243,6 +244,7 @@ PROGRAMS = {
     "a creature's gradient": gradient_of_a_creature,
     "mechanics of 20 coordinates": long_chain,
     "blocks": lambda: (lambda length: sag(50.0, length, block_tridiagonal), np.full((), 0.2)),
+    "sparse": lambda: (lambda length: sag(50.0, length, sparse), np.full((), 0.2)),
     "no matrix": lambda: (lambda length: sag(50.0, length, matrix_free), np.full((), 0.2)),
 }
 # The first result of a call to LAPACK, and whether its factors are a batch.

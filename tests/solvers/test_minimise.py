@@ -17,15 +17,15 @@ from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements import selection
-from dln_jax.solvers.elements.assembly import Pattern, assemble, entries, gradient, pattern
+from dln_jax.solvers.elements.assembly import assemble, entries, gradient, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, project, square, value
-from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
+from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free, sparse
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.selection import by_size, least_work, search_takes_at_most
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
 from dln_jax.types import InputError
 
-SOLVERS = {"dense": dense, "block-tridiagonal": block_tridiagonal, "matrix-free": matrix_free}
+SOLVERS = {"dense": dense, "block-tridiagonal": block_tridiagonal, "sparse": sparse, "matrix-free": matrix_free}
 CHAIN = 12
 LINKS = np.stack([np.arange(CHAIN - 1), np.arange(1, CHAIN)], axis=1)
 
@@ -75,7 +75,7 @@ CHOICES = {
     "plane": (beam(4.0, 1.0, 80, 20).elements, 2, block_tridiagonal),
     "bar": (box((8.0, 1.0, 1.0), (48, 6, 6)).elements, 3, block_tridiagonal),
     "block": (box((2.0, 1.0, 1.0), (12, 6, 6)).elements, 3, block_tridiagonal),
-    "unordered tetrahedra": (Delaunay(CLOUD).simplices, 3, matrix_free),
+    "unordered tetrahedra": (Delaunay(CLOUD).simplices, 3, sparse),
     "chain": (np.stack([np.arange(4000), np.arange(1, 4001)], axis=1), 1, block_tridiagonal),
 }
 
@@ -84,7 +84,8 @@ CHOICES = {
 def test_the_linear_solver_of_least_work_is_chosen(case):
     indices, dimension, expected = CHOICES[case]
     energies = (ElementEnergy(spring, indices),)
-    assert least_work(energies, pattern(energies, int(indices.max()) + 1, dimension)) is expected
+    chosen = least_work(energies, pattern(energies, int(indices.max()) + 1, dimension))
+    assert getattr(chosen, "func", chosen) is expected
 
 
 def unordered_body(modulus, ratio):
@@ -102,10 +103,10 @@ def chosen(scene, dt):
     seen = []
 
     def observed(way):
-        return lambda *arguments: seen.append(way.__name__) or way(*arguments)
+        return lambda *arguments, **options: seen.append(way.__name__) or way(*arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
-        for way in (dense, block_tridiagonal, matrix_free):
+        for way in (dense, block_tridiagonal, sparse, matrix_free):
             patch.setattr(selection, way.__name__, observed(way))
         make_step(scene, dt)
     return seen[0]
@@ -115,7 +116,7 @@ def chosen(scene, dt):
 def test_the_choice_of_the_solver_follows_the_stiffness():
     soft, stiff = unordered_body(1e4, 0.3), unordered_body(1e9, 0.49)
     assert chosen(soft, 1e-3) == "matrix_free"
-    assert chosen(stiff, 1 / 60) == "block_tridiagonal"
+    assert chosen(stiff, 1 / 60) == "sparse"
     # What is traced is not known: the choice is that of the size alone, and the step is made.
     assert len({chosen_when_traced(scene) for scene in (soft, stiff)}) == 1
 
@@ -140,13 +141,13 @@ def test_products_of_a_search_are_those_that_conjugate_gradients_take():
     assert asked(40) and not asked(2)
 
 
-def test_blocks_that_would_fill_the_memory_are_not_stored():
-    """A star of many springs a spoke: its band is half of it in any order, and products are slow."""
-    n = 8000
-    none = np.zeros(0, int)
-    at = Pattern(n, 1, np.ones((n, 1), bool), np.arange(n), np.zeros(n, int), (), none, ())
-    spokes = ElementEnergy(spring, np.tile(np.stack([np.zeros(n - 1, int), np.arange(1, n)], axis=1), (40, 1)))
-    assert least_work((spokes,), at) is matrix_free
+def test_factors_that_would_fill_the_memory_are_not_stored(monkeypatch):
+    energies = (ElementEnergy(spring, CHOICES["unordered tetrahedra"][0]),)
+    at = pattern(energies, len(CLOUD), 3)
+    monkeypatch.setattr(selection, "_UPPER_ENTRIES", 1e6)
+    assert least_work(energies, at).func is sparse
+    monkeypatch.setattr(selection, "_UPPER_TILE_ENTRIES", 1e6)
+    assert least_work(energies, at) is matrix_free
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -2,7 +2,7 @@
 
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, value
-from dln_jax.solvers.elements.linear_solvers import LinearSolver, block_tridiagonal, dense, matrix_free
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, block_tridiagonal, dense, matrix_free, sparse
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.selection import by_size, by_stiffness
 
@@ -17,5 +17,6 @@ __all__ = [
     "matrix_free",
     "minimise",
     "pattern",
+    "sparse",
     "value",
 ]

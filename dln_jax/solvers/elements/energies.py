@@ -15,7 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dln_jax.solvers.lapack import symmetric_eigen
+from dln_jax.solvers.lapack import cholesky, symmetric_eigen
+
+# Elements that are decomposed at a time, at most.
+_DECOMPOSED = 64
 
 Blocks = Float[Array, "n b"]
 Corners = Sequence[Sequence[Array]] | Float[Array, "k b"]
@@ -97,15 +100,29 @@ def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
 def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, ...]:
     """Sets negative eigenvalues of element Hessians (lower triangles) to zero, and shifts their diagonals.
 
-    `shift` is relative to the largest eigenvalue of all elements.
+    `shift` is relative to the largest diagonal entry of all elements. Elements whose Hessian is positive definite with
+    half of the shift keep it: only the others are decomposed.
     """
-    spectra = []
-    for lower in hessians:
-        whole = square(lower)
-        spectra.append(jax.vmap(symmetric_eigen)(jnp.where(jnp.isfinite(whole), whole, 0)))
-    largest = functools.reduce(jnp.maximum, [jnp.max(values, initial=0) for values, _ in spectra])
-    projected = []
-    for values, vectors in spectra:
-        raised = jnp.maximum(values, 0) + shift * largest
-        projected.append(lower_triangles((vectors * raised[:, None, :]) @ vectors.swapaxes(-1, -2)))
-    return tuple(projected)
+    whole = [jnp.where(jnp.isfinite(h), h, 0) for h in map(square, hessians)]
+    largest = functools.reduce(jnp.maximum, [jnp.max(jnp.diagonal(h, axis1=1, axis2=2), initial=0) for h in whole])
+    return tuple(lower_triangles(_projected(h, shift * largest)) for h in whole)
+
+
+def _projected(hessians: Float[Array, "m s s"], shift: Float[Array, ""]) -> Float[Array, "m s s"]:
+    m, s, _ = hessians.shape
+    if not m:
+        return hessians
+    count = min(_DECOMPOSED, m)
+    unit = jnp.eye(s, dtype=hessians.dtype)
+    definite = jnp.isfinite(jax.vmap(cholesky)(hessians + shift / 2 * unit)).all(axis=(1, 2))
+    # Places of the others first; places past the end are read as the last element, and not written.
+    order = jnp.append(jnp.argsort(definite), jnp.full(count, m))
+
+    def decompose(number: Array, hessians: Array) -> Array:
+        at = jax.lax.dynamic_slice_in_dim(order, number * count, count)
+        values, vectors = jax.vmap(symmetric_eigen)(hessians.at[at].get(mode="clip"))
+        semidefinite = (vectors * jnp.maximum(values, 0)[:, None, :]) @ vectors.swapaxes(-1, -2)
+        return hessians.at[at].set(semidefinite, mode="drop")
+
+    rounds = -(-jnp.sum(~definite) // count)
+    return jax.lax.fori_loop(0, rounds, decompose, hessians) + shift * unit

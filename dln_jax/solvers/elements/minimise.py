@@ -3,10 +3,10 @@
     x* = argmin E(x; theta),    H p = -g,    x <- x + t p                      (Newton with a line search)
     dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
 
-Newton's method uses the true Hessian. Only if its factorisation fails are the element Hessians projected to positive
-semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). The derivative
-belongs to the minimum and not to the iterations: it takes one factorisation and one solve, in forward and reverse mode
-and to any order. At a point that is not a minimum the derivative is NaN, never a plausible number.
+Newton's method uses the true Hessian. Only if its factorisation fails are the indefinite element Hessians projected to
+positive semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). The
+derivative belongs to the minimum and not to the iterations: it takes one factorisation and one solve, in forward and
+reverse mode and to any order. At a point that is not a minimum the derivative is NaN, never a plausible number.
 """
 
 import functools
@@ -40,8 +40,8 @@ from dln_jax.types import InputError, require_positive
 
 # Gradients and energies below this many units of rounding are indistinguishable from zero.
 _ROUNDING_UNITS = 16
-# Shifts of the projected Hessian's diagonal, relative to the largest eigenvalue of an element, tried in turn: projected
-# elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
+# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn:
+# projected elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
 # How often a step whose list of elements overflows is shortened, eightfold.
 _SHORTENINGS = 6
@@ -96,7 +96,8 @@ def minimise(
         scale: positive unit of the gradient's rows, [n] or a number; masses make the residual an acceleration.
         tolerance: largest |dE/dx| / scale that counts as a minimum; a gradient of rounding size always does.
         iterations: Newton steps after which the search gives up, which `SolverInfo.converged` reports.
-        linear_solver: `by_size`, or `dense`, `block_tridiagonal`, `matrix_free` of `solvers.elements.linear_solvers`.
+        linear_solver: `by_size`, or one of `solvers.elements.linear_solvers`: `dense`, `block_tridiagonal`,
+            `sparse`, `matrix_free`. Moving energies have a solver of their own.
         at: the energies' pattern, if already computed.
         definite: also report `SolverInfo.definite`, at the cost of another Hessian, factorisation and accurate solve.
         moving: further energies, whose elements change with x and which bound the steps.
@@ -115,9 +116,9 @@ def minimise(
         data = (jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], data),)
     energies = tuple(energies)
     at = pattern(energies, x0.shape[0], x0.shape[1], free) if at is None else at
-    solver = linear_solver(energies, at)
     moving = tuple(moving)
-    total = _Sum(energies, at, with_moving(solver, energies, at) if moving else solver, moving)
+    solver = with_moving(energies, at) if moving else linear_solver(energies, at)
+    total = _Sum(energies, at, solver, moving)
     scale = jnp.broadcast_to(jnp.asarray(scale, x0.dtype), x0.shape[:1])[:, None]
 
     @jax.custom_jvp
@@ -314,22 +315,28 @@ def _descent_direction(
     lists: Lists,
 ) -> Blocks:
     _, at, solver, moving = total
+    shifts = jnp.asarray(_SHIFTS, gradient.dtype)
 
-    def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
-        factor = solver.factorise(hessians, (values, lists, of_moving) if moving else values)
-        direction = solver.search(factor, -gradient)
-        return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
-
-    # A loop that usually runs zero times: under vmap a branch would always be taken.
     def failing(state: tuple[Blocks, Array, Array]) -> Array:
         _, descends, attempts = state
-        return ~descends & (attempts < len(_SHIFTS))
+        return ~descends & (attempts <= len(_SHIFTS))
 
-    def retry(state: tuple[Blocks, Array, Array]) -> tuple[Blocks, Array, Array]:
-        # The barrier ties the projection to the loop: it would be computed ahead of it, and always, otherwise.
-        here, attempts = jax.lax.optimization_barrier((tuple(hessians), state[2]))
-        projected = project(here, jnp.asarray(_SHIFTS, gradient.dtype)[attempts])
-        return *towards(projected, entries(at, projected)), attempts + 1
+    def attempt(state: tuple[Blocks, Array, Array]) -> tuple[Blocks, Array, Array]:
+        attempts = state[2]
 
-    direction, descends, _ = jax.lax.while_loop(failing, retry, (*towards(hessians, values), jnp.asarray(0)))
+        def project_once(system: tuple[tuple[Array, ...], Array, Array]) -> tuple[tuple[Array, ...], Array, Array]:
+            projected = project(tuple(hessians), shifts[attempts - 1])
+            return projected, entries(at, projected), jnp.asarray(False)
+
+        # Loops in place of branches, because under vmap a branch would always be taken. All attempts share one
+        # factorisation in the program, because compiling it takes time.
+        first = (tuple(hessians), values, attempts > 0)
+        system, assembled, _ = jax.lax.while_loop(lambda system: system[2], project_once, first)
+        factor = solver.factorise(system, (assembled, lists, of_moving) if moving else assembled)
+        direction = solver.search(factor, -gradient)
+        descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+        return direction, descends, attempts + 1
+
+    start = (jnp.zeros_like(gradient), jnp.asarray(False), jnp.asarray(0))
+    direction, descends, _ = jax.lax.while_loop(failing, attempt, start)
     return jnp.where(descends, direction, -gradient)

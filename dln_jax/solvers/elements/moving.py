@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elements.assembly import Pattern, assemble
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
-from dln_jax.solvers.elements.linear_solvers import LinearSolver, lookup, with_constants
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, lookup, sparse, with_constants
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
 from dln_jax.solvers.lapack import cholesky, substitute, symmetric_eigen
 
@@ -116,17 +116,16 @@ def add_diagonals(diagonal: Blocks, lists: Lists, hessians: Sequence[Array]) -> 
     return diagonal
 
 
-def with_moving(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+def with_moving(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Returns the solver of systems with the Hessians of static and of moving elements.
 
     Its `factorise` takes (static element Hessians, (entries of their sum, lists, moving Hessians)).
 
     Args:
-        solver: of the static elements.
         energies: the static elements.
         at: their pattern.
     """
-    return _dense(at) if at.unknowns <= _DENSE_UNKNOWNS else _iterative(solver, energies, at)
+    return _dense(at) if at.unknowns <= _DENSE_UNKNOWNS else _iterative(sparse(energies, at), energies, at)
 
 
 def _projected(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity s s"]:

@@ -1,8 +1,9 @@
 """Chooses a linear solver before tracing, by the estimated work for size, structure and stiffness.
 
 - `dense` for small systems;
-- `block_tridiagonal` for most systems;
-- `matrix_free` for wide bands: bodies in space with more than some thousand unknowns.
+- `block_tridiagonal` for narrow bands: bodies in the plane, and small or long ones in space;
+- `sparse` for other systems, whatever their stiffness;
+- `matrix_free` for soft bodies in small time steps, and for systems whose factor would not fit into memory.
 
 Stiffness, Poisson's ratio, time step and mesh together determine how many products conjugate gradients need for a
 search direction: it grows with the square root of the condition number of the Hessian. It can be measured only for
@@ -24,12 +25,15 @@ from dln_jax.solvers.elements.assembly import Pattern, entries
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, lower_triangles
 from dln_jax.solvers.elements.linear_solvers import (
     SEARCH_RESIDUAL,
+    TILE,
     LinearSolver,
     LinearSolverFactory,
     block_tridiagonal,
     dense,
+    elimination_plan,
     matrix_free,
     narrowest_order,
+    sparse,
     width_of_band,
 )
 
@@ -42,7 +46,7 @@ _DENSE_UNKNOWNS = 160
 # nu = 0.49 or E = 1e8, for N vertices in dimension d; and because it is inexact, a step takes 1.5 to 2 times the Newton
 # iterations. The products below stand for all of that. Whole steps in space by blocks, in units of those without a
 # matrix: 675 unknowns 0.69 (nu = 0.3) and 0.38 (0.49); 1,911: 1.19 and 0.50; 4,131 (6,994 tetrahedra): 1.88 and 0.74.
-_FACTORISATION_SECONDS = 1.3e-10
+_BLOCK_SECONDS = 1.3e-10
 _BLOCK_OVERHEAD = 150
 _PRODUCT_SECONDS = 6e-10
 _PRODUCTS = 15
@@ -51,6 +55,13 @@ _MORE_ITERATIONS = 1.75
 _LOWER_PRODUCTS = 20
 # Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
 _UPPER_ENTRIES = 3e7
+# Operations of the multifrontal factorisation: products of tiles, parts from children, targets, tiles below the
+# diagonal and columns. Measured in the same way (825 to 21,756 unknowns), within a factor of 1.4.
+_SPARSE_SECONDS = (22e-6, 15e-6, 7e-6, 20e-6, 25e-6)
+# No tree takes less per unknown: a column of tiles, one below it, and their targets and products.
+_LEAST_SPARSE_SECONDS = 1e-4 / TILE
+# Entries of the tiles, 8 bytes each; their places are 32-bit numbers.
+_UPPER_TILE_ENTRIES = 5e8
 
 
 def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
@@ -67,30 +78,43 @@ def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, d
 def least_work(
     energies: Sequence[ElementEnergy], at: Pattern, search_takes_at_most: Callable[[int], bool] | None = None
 ) -> LinearSolverFactory:
-    """Returns `dense`, `block_tridiagonal` or `matrix_free`, by estimates of the work of factorisations and products.
+    """Returns the factory with the least work, by estimates for factorisations and products.
 
     `search_takes_at_most` returns whether a search direction takes at most this many products; it is called only if
-    size and structure do not settle the choice. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer
-    or nearly incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
-    `matrix_free`.
+    size and structure do not settle the choice. Without it, moderate stiffness and nu = 0.3 are assumed.
     """
     if at.unknowns <= _DENSE_UNKNOWNS:
         return dense
-    size = width_of_band(at, narrowest_order(at)) * at.width
-    stored = at.unknowns * size
-    if stored > _UPPER_ENTRIES:
+    direct, factorisation = _direct(at)
+    if direct is None:
         return matrix_free
-    factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
     product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
     if search_takes_at_most is None:
         # Vertices along an edge of the body; a product carries information across one of them.
         across = at.blocks ** (1 / min(at.width, 3))
-        return block_tridiagonal if factorisation <= _PRODUCTS * across * product else matrix_free
+        return direct if factorisation <= _PRODUCTS * across * product else matrix_free
     affordable = int(factorisation / (_MORE_ITERATIONS * product))
     # So few products gain little, and the measurement costs a compilation.
     if affordable < _LOWER_PRODUCTS or not search_takes_at_most(affordable):
-        return block_tridiagonal
+        return direct
     return matrix_free
+
+
+def _direct(at: Pattern) -> tuple[LinearSolverFactory | None, float]:
+    """Returns the direct solver with the least work that fits into memory, if one does, and its estimated seconds."""
+    size = width_of_band(at, narrowest_order(at)) * at.width
+    stored = at.unknowns * size
+    seconds = _BLOCK_SECONDS * stored * (size + _BLOCK_OVERHEAD) if stored <= _UPPER_ENTRIES else np.inf
+    if seconds <= _LEAST_SPARSE_SECONDS * at.unknowns:
+        return block_tridiagonal, seconds
+    tables = elimination_plan(at)
+    counts = (tables.targets.products.sum(), *map(len, (tables.parts.upper, tables.targets.tile, tables.below)))
+    sparse_seconds = float(np.dot(_SPARSE_SECONDS, (*counts, tables.steps.columns.sum())))
+    if seconds <= sparse_seconds:
+        return block_tridiagonal, seconds
+    if tables.tiles * tables.size**2 > _UPPER_TILE_ENTRIES:
+        return None, sparse_seconds
+    return partial(sparse, tables=tables), sparse_seconds
 
 
 def search_takes_at_most(

@@ -12,7 +12,7 @@ from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, in_subjects, report_cases
-from scripts.reports.soft_bodies import contact, elements, gradients, motions, robustness, speed, statics
+from scripts.reports.soft_bodies import contact, elements, gradients, motions, robustness, speed, statics, stiffness
 
 MEASURES = {
     "references": (
@@ -28,7 +28,10 @@ MEASURES = {
         *(contact.stack, contact.folding_beam, contact.impact, contact.sliding, contact.ring),
         *(contact.twisted_bar, contact.gripper, contact.gradients),
     ),
-    "speed": (speed.creature, speed.beams, speed.backward, speed.solver_choice),
+    "speed": (
+        *(speed.creature, speed.beams, speed.backward, speed.solver_choice),
+        *(stiffness.steps, stiffness.factorisation),
+    ),
 }
 """Functions quick -> findings, by subject."""
 FIGURES = {elements.locking: elements.locking_figure}
