@@ -3,68 +3,34 @@
     x* = argmin E(x; theta),    H p = -g,    x <- x + t p                      (Newton with a line search)
     dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
 
-Newton's method uses the true Hessian. Only if its factorisation fails are the indefinite element Hessians projected to
-positive semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). The
-derivative belongs to the minimum and not to the iterations: it takes one factorisation and one solve, in forward and
-reverse mode and to any order. At a point that is not a minimum the derivative is NaN, never a plausible number.
+The iterations are in `descent`. The derivative belongs to the minimum and not to the iterations: it takes one
+factorisation and one solve, in forward and reverse mode and to any order. At a point that is not a minimum the
+derivative is NaN, never a plausible number.
 """
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from dln_jax.solvers.elements.assembly import Pattern, entries, pattern, value_and_gradient
-from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians, project
-from dln_jax.solvers.elements.line_search import Evaluated, line_search
-from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFactory
+from dln_jax.solvers.elements.assembly import Pattern, entries, pattern
+from dln_jax.solvers.elements.descent import Sum, descend, lists_at, sum_and_gradient
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.moving import (
     Lists,
     MovingEnergy,
-    add_diagonals,
-    lists_between,
-    longest_fraction,
-    moving_gradient,
     moving_hessians,
-    overflow,
     with_moving,
 )
 from dln_jax.solvers.elements.selection import by_size
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
-
-# Gradients and energies below this many units of rounding are indistinguishable from zero.
-_ROUNDING_UNITS = 16
-# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn:
-# projected elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
-_SHIFTS = (1e-6, 1e-3, 1.0)
-# How often a step whose list of elements overflows is shortened, eightfold.
-_SHORTENINGS = 6
-
-
-class _Sum(NamedTuple):
-    """The sum that is minimised, and the solver of its linear systems."""
-
-    energies: tuple[ElementEnergy, ...]
-    at: Pattern
-    solver: LinearSolver
-    moving: tuple[MovingEnergy, ...] = ()
-
-
-class _MinimumIterate(NamedTuple):
-    point: Evaluated
-    lists: Lists
-    floor: Blocks
-    unclear: Float[Array, ""]
-    iterations: Int[Array, ""]
-    stuck: Bool[Array, ""]
-    gap: Blocks | None
-    """What fixed unknowns are away from their values, where they approach them; `None` without moving elements."""
 
 
 def minimise(
@@ -118,16 +84,16 @@ def minimise(
     at = pattern(energies, x0.shape[0], x0.shape[1], free) if at is None else at
     moving = tuple(moving)
     solver = with_moving(energies, at) if moving else linear_solver(energies, at)
-    total = _Sum(energies, at, solver, moving)
+    total = Sum(energies, at, solver, moving)
     scale = jnp.broadcast_to(jnp.asarray(scale, x0.dtype), x0.shape[:1])[:, None]
 
     @jax.custom_jvp
     def minimum(x0: Blocks, data: Any, scale: Array, start: Blocks) -> tuple[Blocks, SolverInfo]:
-        x, info = _newton(total, x0, data, scale, tolerance, iterations, start)
+        x, info = descend(total, x0, data, scale, tolerance, iterations, start)
         if not definite:
             return x, info
         # For a matrix that is not positive definite, the factor and its solutions are not finite.
-        solved = total.solver.solve(_factor(total, x, data, _lists(total, x, data)), jnp.ones_like(x))
+        solved = total.solver.solve(_factor(total, x, data, lists_at(total, x, data)), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
 
     def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
@@ -151,8 +117,8 @@ def no_tangent(leaf: Array) -> Any:
     return jnp.zeros_like(leaf) if floating else np.zeros(leaf.shape, jax.dtypes.float0)
 
 
-def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_dot: Any) -> Blocks:
-    at, solver, lists = total.at, total.solver, _lists(total, x, data)
+def _implicit_derivative(total: Sum, x: Blocks, data: Any, x0_dot: Any, data_dot: Any) -> Blocks:
+    at, solver, lists = total.at, total.solver, lists_at(total, x, data)
     # Constant data are left out: their derivatives would only be multiplied by zero.
     leaves, structure = jax.tree.flatten(data)
     dots = jax.tree.leaves(data_dot, is_leaf=is_constant)
@@ -167,11 +133,11 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
         def gradient_of(x: Blocks, variables: list[Array]) -> Blocks:
             replaced = dict(zip(varying, variables, strict=True))
             all_leaves = [replaced.get(i, leaf) for i, leaf in enumerate(leaves)]
-            return _value_and_gradient(total, x, structure.unflatten(all_leaves), lists)[1]
+            return sum_and_gradient(total, x, structure.unflatten(all_leaves), lists)[1]
 
         def product(v: Blocks) -> Blocks:
             masked = jnp.where(at.free, v, 0)
-            curved = jax.jvp(lambda x: _value_and_gradient(total, x, data, lists)[1], (x,), (masked,))[1]
+            curved = jax.jvp(lambda x: sum_and_gradient(total, x, data, lists)[1], (x,), (masked,))[1]
             return jnp.where(at.free, curved, v)
 
         varied = [leaves[i] for i in varying]
@@ -188,155 +154,10 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
     return solution if fixed_dot is None else solution + fixed_dot
 
 
-def _lists(total: _Sum, x: Blocks, data: Any) -> Lists:
-    return lists_between(total.moving, x, jnp.zeros_like(x), data[1])
-
-
-def _value_and_gradient(total: _Sum, x: Blocks, data: Any, lists: Lists) -> tuple[Array, Blocks]:
-    energy, slope = value_and_gradient(total.energies, total.at, x, data[0])
-    if not total.moving:
-        return energy, slope
-    more, moving_slope = moving_gradient(total.moving, x, lists, data[1])
-    return energy + more, slope + jnp.where(total.at.free, moving_slope, 0)
-
-
-def _factor(total: _Sum, x: Blocks, data: Any, lists: Lists) -> Any:
+def _factor(total: Sum, x: Blocks, data: Any, lists: Lists) -> Any:
     hessians = element_hessians(total.energies, x, data[0])
     values = entries(total.at, hessians)
     if not total.moving:
         return total.solver.factorise(hessians, values)
     moving = moving_hessians(total.moving, x, lists, data[1], projected=False)
     return total.solver.factorise(hessians, (values, lists, moving))
-
-
-def _newton(
-    total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, iterations: int, start: Blocks
-) -> tuple[Blocks, SolverInfo]:
-    at, moving = total.at, total.moving
-    rounding = _ROUNDING_UNITS * jnp.finfo(x0.dtype).eps
-
-    def within(state: _MinimumIterate) -> Array:
-        small = (jnp.abs(state.point.gradient) <= jnp.maximum(tolerance * scale, state.floor)).all()
-        return small if state.gap is None else small & (state.gap == 0).all()
-
-    def running(state: _MinimumIterate) -> Array:
-        return ~within(state) & ~state.stuck & (state.iterations < iterations)
-
-    def iterate(state: _MinimumIterate) -> _MinimumIterate:
-        x, energy, gradient = state.point
-        hessians = element_hessians(total.energies, x, data[0])
-        values = entries(at, hessians)
-        # Contact forces on curved distances make Hessians indefinite in most steps, so that these are always projected.
-        of_moving = moving_hessians(moving, x, state.lists, data[1], projected=True)
-        direction, forced = _direction(total, state, hessians, values, of_moving, data)
-        lists, direction, limit = _allowed(total, x, direction, data, state.lists)
-        slope = jnp.vdot(direction, gradient)
-        # Terms that cancel in a row of the gradient are of the size of |H| |x|.
-        diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(x.shape)
-        diagonal = add_diagonals(diagonal, state.lists, of_moving)
-        extent = jnp.max(jnp.abs(x), initial=0)
-        floor = rounding * diagonal * extent
-        unclear = rounding * jnp.abs(energy) + floor.sum() * extent
-
-        def evaluate(x: Blocks) -> tuple[Array, Blocks]:
-            return _value_and_gradient(total, x, data, lists)
-
-        point, length = line_search(
-            evaluate, state.point, direction, slope, unclear, scale, longest=limit, any_change=forced
-        )
-        gap = None if state.gap is None else (1 - length) * state.gap
-        stuck = (length == 0) | overflow(lists)
-        return _MinimumIterate(point, lists, floor, unclear, state.iterations + 1, stuck, gap)
-
-    lists = _lists(total, start, data)
-    first = Evaluated(start, *_value_and_gradient(total, start, data, lists))
-    begin = _MinimumIterate(
-        first,
-        lists,
-        jnp.zeros_like(x0),
-        rounding * jnp.abs(first.energy),
-        jnp.asarray(0),
-        overflow(lists),
-        None if not moving or at.free.all() else jnp.where(at.free, 0, x0 - start),
-    )
-    last = jax.lax.while_loop(running, iterate, begin)
-    x, energy, slope = last.point
-    residual = jnp.max(jnp.abs(slope) / scale, initial=0)
-    converged = within(last) & jnp.isfinite(energy) & ~overflow(last.lists)
-    too_many = overflow(last.lists) if moving else None
-    return x, SolverInfo(residual, last.iterations, converged, None, last.unclear, too_many)
-
-
-def _direction(
-    total: _Sum,
-    state: _MinimumIterate,
-    hessians: Sequence[Array],
-    values: Array,
-    of_moving: Sequence[Array],
-    data: Any,
-) -> tuple[Blocks, Array]:
-    """Returns Newton's direction, and whether it must be taken although it may raise the energy."""
-    x, _, right = state.point
-    if state.gap is not None:
-        # Fixed unknowns move by their gap; the free ones respond as the linearised forces say.
-        gradient = functools.partial(_value_and_gradient, total, data=data, lists=state.lists)
-        right += jax.jvp(lambda x: gradient(x)[1], (x,), (state.gap,))[1]
-    direction = _descent_direction(total, hessians, values, right, of_moving, state.lists)
-    if state.gap is None:
-        return direction, jnp.asarray(False)
-    return direction + state.gap, (state.gap != 0).any()
-
-
-def _allowed(total: _Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) -> tuple[Lists, Blocks, Array]:
-    """Returns the elements along the direction, the direction, shortened if they are too many, and its limit."""
-    if not total.moving:
-        return lists, direction, jnp.ones((), x.dtype)
-
-    def too_many(state: tuple[Lists, Array, Array]) -> Array:
-        lists, _, count = state
-        return (count == 0) | (overflow(lists) & (count < _SHORTENINGS))
-
-    def shorten(state: tuple[Lists, Array, Array]) -> tuple[Lists, Array, Array]:
-        _, _, count = state
-        fraction = (1.0 / 8) ** count.astype(x.dtype)
-        return lists_between(total.moving, x, fraction * direction, data[1]), fraction, count + 1
-
-    begin = lists, jnp.ones((), x.dtype), jnp.asarray(0)
-    lists, fraction, _ = jax.lax.while_loop(too_many, shorten, begin)
-    return lists, direction, fraction * longest_fraction(total.moving, x, fraction * direction, lists, data[1])
-
-
-def _descent_direction(
-    total: _Sum,
-    hessians: Sequence[Array],
-    values: Array,
-    gradient: Blocks,
-    of_moving: Sequence[Array],
-    lists: Lists,
-) -> Blocks:
-    _, at, solver, moving = total
-    shifts = jnp.asarray(_SHIFTS, gradient.dtype)
-
-    def failing(state: tuple[Blocks, Array, Array]) -> Array:
-        _, descends, attempts = state
-        return ~descends & (attempts <= len(_SHIFTS))
-
-    def attempt(state: tuple[Blocks, Array, Array]) -> tuple[Blocks, Array, Array]:
-        attempts = state[2]
-
-        def project_once(system: tuple[tuple[Array, ...], Array, Array]) -> tuple[tuple[Array, ...], Array, Array]:
-            projected = project(tuple(hessians), shifts[attempts - 1])
-            return projected, entries(at, projected), jnp.asarray(False)
-
-        # Loops in place of branches, because under vmap a branch would always be taken. All attempts share one
-        # factorisation in the program, because compiling it takes time.
-        first = (tuple(hessians), values, attempts > 0)
-        system, assembled, _ = jax.lax.while_loop(lambda system: system[2], project_once, first)
-        factor = solver.factorise(system, (assembled, lists, of_moving) if moving else assembled)
-        direction = solver.search(factor, -gradient)
-        descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
-        return direction, descends, attempts + 1
-
-    start = (jnp.zeros_like(gradient), jnp.asarray(False), jnp.asarray(0))
-    direction, descends, _ = jax.lax.while_loop(failing, attempt, start)
-    return jnp.where(descends, direction, -gradient)
