@@ -178,28 +178,24 @@ def _descent_direction(
     _, at, solver, moving = total
     shifts = jnp.asarray(_SHIFTS, gradient.dtype)
 
-    def failing(state: tuple[Blocks, Array, Array]) -> Array:
-        _, descends, attempts = state
-        return ~descends & (attempts <= len(_SHIFTS))
-
-    def attempt(state: tuple[Blocks, Array, Array]) -> tuple[Blocks, Array, Array]:
-        attempts = state[2]
-
-        def project_once(system: tuple[tuple[Array, ...], Array, Array]) -> tuple[tuple[Array, ...], Array, Array]:
-            projected = project(tuple(hessians), shifts[attempts - 1])
-            return projected, entries(at, projected), jnp.asarray(False)
-
-        # Loops in place of branches, because under vmap a branch would always be taken. All attempts share one
-        # factorisation in the program, because compiling it takes time.
-        first = (tuple(hessians), values, attempts > 0)
-        system, assembled, _ = jax.lax.while_loop(lambda system: system[2], project_once, first)
-        factor = solver.factorise(system, (assembled, lists, of_moving) if moving else assembled)
+    def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
+        factor = solver.factorise(hessians, (values, lists, of_moving) if moving else values)
         direction = solver.search(factor, -gradient)
-        descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
-        return direction, descends, attempts + 1
+        return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
 
-    start = (jnp.zeros_like(gradient), jnp.asarray(False), jnp.asarray(0))
-    direction, descends, _ = jax.lax.while_loop(failing, attempt, start)
+    # A loop that usually runs zero times: under vmap a branch would always be taken.
+    def failing(state: tuple[Blocks, Array, Array, tuple[Array, ...]]) -> Array:
+        _, descends, attempts, _ = state
+        return ~descends & (attempts < len(_SHIFTS))
+
+    def retry(state: tuple[Blocks, Array, Array, tuple[Array, ...]]) -> tuple[Blocks, Array, Array, tuple[Array, ...]]:
+        # The Hessians belong to the loop's state: the projection would be computed ahead of it, and always, otherwise.
+        _, _, attempts, hessians = state
+        projected = project(hessians, shifts[attempts])
+        return *towards(projected, entries(at, projected)), attempts + 1, hessians
+
+    start = (*towards(hessians, values), jnp.asarray(0), tuple(hessians))
+    direction, descends, _, _ = jax.lax.while_loop(failing, retry, start)
     return jnp.where(descends, direction, -gradient)
 
 
