@@ -11,8 +11,7 @@ from scripts.reports.case import named
 from scripts.reports.commands import softbody_report
 from scripts.reports.commands.softbody_report import cases
 
-# Cases that take minutes, and two that miss a bound, as the page of soft bodies says: the twisted bar snaps in a step that
-# reports that it has not converged, and the stack creeps by its smooth friction.
+# Cases that take minutes. In one of them, the twisted bar snaps in a step that reports that it has not converged.
 ELSEWHERE = ("folding-beam", "ring", "twisted-bar", "gradients", "stack")
 CASES = [
     case.name for case in cases() if not case.name.startswith(("speed/", *(f"contact/{name}" for name in ELSEWHERE)))
