@@ -164,7 +164,9 @@ def make_step(
             energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible
         )
         x, v = integrator.finish(state, balanced, dt)
-        x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
+        # Where a contact holds vertices back from their goals, going there would push them through it.
+        x = jnp.where(free, x, balanced if moving else state.x + dt * state.v)
+        v = jnp.where(free, v, state.v)
         info, growth = judged(params, state, x, v, (balanced, outcome, at_start, data[1:], contact))
         x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None

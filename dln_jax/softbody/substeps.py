@@ -207,6 +207,8 @@ def _together(first: Info, second: Info) -> Info:
         energy_growth=merged(jnp.add, "energy_growth"),
         energy_at_hand=merged(jnp.maximum, "energy_at_hand"),
         least_J=merged(jnp.minimum, "least_J"),
+        least_distance=merged(jnp.minimum, "least_distance"),
+        overflow=merged(jnp.logical_or, "overflow"),
     )
 
 

@@ -96,13 +96,15 @@ def solve_on_grid(
     def policy(x: Array, slope: Array) -> Array:
         return optimal_control(problem, x, slope)[0]
 
-    solution = start
-    for count in points:
+    def on_grid(count: int, coarse: GridValue | None) -> GridValue:
         shape = tuple(count - closed for closed in circle)
         grid = Grid(tuple(low.tolist()), tuple(((high - low) / (count - 1)).tolist()), shape, circle)
-        V = jnp.zeros(shape) if solution is None else interpolated(solution.grid, solution.V, grid.nodes)
-        solution = GridValue(grid, *_iterate(step, policy, grid, discount, V, limit, tolerance, improvements))
-    assert solution is not None  # there are points
+        V = jnp.zeros(shape) if coarse is None else interpolated(coarse.grid, coarse.V, grid.nodes)
+        return GridValue(grid, *_iterate(step, policy, grid, discount, V, limit, tolerance, improvements))
+
+    solution = on_grid(points[0], start)
+    for count in points[1:]:
+        solution = on_grid(count, solution)
     return solution
 
 

@@ -90,12 +90,11 @@ def _bodies(program: Program, node: Node) -> list[Loop]:
 
 def is_direct(node: Node) -> bool:
     """Returns whether the positions of a gather are linear in the indices of a loop."""
-    return len(node.args) == 1 and strides(node.value) is not None
+    return len(node.args) == 1 and node.value is not None and strides(node.value) is not None
 
 
-def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
+def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
     """Returns (first, steps) with positions = first + sum_a steps_a i_a, or None if there are none."""
-    assert positions is not None
     if positions.size == 0:
         return 0, (0,) * positions.ndim
     first = int(positions.flat[0])

@@ -32,7 +32,7 @@ from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import require_positive
 
 _AT_ONCE = 256
-"""Pairs that are measured in one turn of a loop; no list is shorter."""
+"""Pairs whose distance is measured in one turn of a loop; no list is shorter."""
 
 
 class Kind(NamedTuple):

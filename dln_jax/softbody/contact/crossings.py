@@ -3,16 +3,20 @@
 Signs of determinants of float64 coordinates are decided in rational arithmetic wherever rounding could change them.
 """
 
+import itertools
 from fractions import Fraction
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dln_jax.softbody.contact.candidates import Group, boxes, group
 from dln_jax.softbody.contact.surface import surface_of
 from dln_jax.softbody.mesh.mesh import Mesh
+
+_ROUNDING = 1e-14
+"""Rounding error of a determinant, relative to the sum of the absolute values of its products; 20 units of rounding."""
 
 
 def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
@@ -24,16 +28,15 @@ def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int
     surface = surface_of(mesh)
     x = np.asarray(x, float)
     others = surface.edges if mesh.dimension == 2 else surface.triangles
-    meet = _segments_meet if mesh.dimension == 2 else _segment_meets_triangle
-    pairs = _boxes_meet(group(surface.edges, x), group(others, x), x)
+    one, other = _boxes_meet(group(surface.edges, x), group(others, x), x).T
     if mesh.dimension == 2:
-        pairs = pairs[pairs[:, 0] < pairs[:, 1]]
-    result = []
-    for one, other in pairs:
-        edge, facet = surface.edges[one], others[other]
-        if not set(edge) & set(facet) and meet(x[edge], x[facet]):
-            result.append((tuple(edge.tolist()), tuple(facet.tolist())))
-    return result
+        one, other = one[one < other], other[one < other]
+    edges, facets = surface.edges[one], others[other]
+    apart = ~(edges[:, :, None] == facets[:, None, :]).any(axis=(1, 2))
+    edges, facets = edges[apart], facets[apart]
+    meet = _segments_meet if mesh.dimension == 2 else _segments_meet_triangles
+    hit = meet(x[edges], x[facets])
+    return [(tuple(edge), tuple(facet)) for edge, facet in zip(edges[hit].tolist(), facets[hit].tolist(), strict=True)]
 
 
 def _boxes_meet(one: Group, other: Group, x: np.ndarray) -> Int[np.ndarray, "m 2"]:
@@ -47,52 +50,63 @@ def _boxes_meet(one: Group, other: Group, x: np.ndarray) -> Int[np.ndarray, "m 2
     return np.concatenate(pairs)
 
 
-def _segments_meet(one: np.ndarray, other: np.ndarray) -> bool:
-    (a, b), (c, d) = one, other
-    sides = [_side(a, b, c), _side(a, b, d), _side(c, d, a), _side(c, d, b)]
-    if not any(sides):
-        return True  # in one line, and the boxes meet
-    return sides[0] * sides[1] <= 0 and sides[2] * sides[3] <= 0
+def _segments_meet(one: Float[np.ndarray, "m 2 2"], other: Float[np.ndarray, "m 2 2"]) -> Bool[np.ndarray, " m"]:
+    """Whether segments of the plane have a common point."""
+    (a, b), (c, d) = one.swapaxes(0, 1), other.swapaxes(0, 1)
+    of_other, of_one = _sides(a, b, c) * _sides(a, b, d), _sides(c, d, a) * _sides(c, d, b)
+    # The boxes of segments in one line meet if they do; those of others do, if they have a common point.
+    boxes_meet = (one.min(axis=1) <= other.max(axis=1)) & (other.min(axis=1) <= one.max(axis=1))
+    return (of_other <= 0) & (of_one <= 0) & boxes_meet.all(axis=1)
 
 
-def _segment_meets_triangle(edge: np.ndarray, triangle: np.ndarray) -> bool:
-    (p, q), (a, b, c) = edge, triangle
-    start, end = _side(a, b, c, p), _side(a, b, c, q)
-    if start * end > 0:
-        return False
-    if start == 0 and end == 0:
-        return _meet_in_plane(edge, triangle)
-    around = [_side(p, q, a, b), _side(p, q, b, c), _side(p, q, c, a)]
-    return min(around) >= 0 or max(around) <= 0
+def _segments_meet_triangles(
+    edges: Float[np.ndarray, "m 2 3"], triangles: Float[np.ndarray, "m 3 3"]
+) -> Bool[np.ndarray, " m"]:
+    """Whether segments of space have a common point with triangles."""
+    (p, q), (a, b, c) = edges.swapaxes(0, 1), triangles.swapaxes(0, 1)
+    start, end = _sides(a, b, c, p), _sides(a, b, c, q)
+    flat = (start == 0) & (end == 0)
+    result = (start * end <= 0) & ~flat
+    p, q, a, b, c = (points[result] for points in (p, q, a, b, c))
+    around = np.stack([_sides(p, q, a, b), _sides(p, q, b, c), _sides(p, q, c, a)])
+    result[result] = (around.min(axis=0) >= 0) | (around.max(axis=0) <= 0)
+    result[flat] = _meet_in_plane(edges[flat], triangles[flat])
+    return result
 
 
-def _meet_in_plane(edge: np.ndarray, triangle: np.ndarray) -> bool:
-    """Whether an edge in the plane of a triangle meets it, in the projection along the longest axis of its normal."""
-    a, b, c = triangle
-    axis = int(np.argmax(np.abs(np.cross(b - a, c - a))))
-    edge, triangle = np.delete(edge, axis, axis=1), np.delete(triangle, axis, axis=1)
-    if any(_segments_meet(edge, triangle[[i, (i + 1) % 3]]) for i in range(3)):
-        return True
-    sides = [_side(triangle[i], triangle[(i + 1) % 3], edge[0]) for i in range(3)]
-    return min(sides) >= 0 or max(sides) <= 0
+def _meet_in_plane(edges: np.ndarray, triangles: np.ndarray) -> Bool[np.ndarray, " m"]:
+    """Whether segments in the planes of triangles meet them, in the projections along the longest axes of normals."""
+    a, b, c = triangles.swapaxes(0, 1)
+    axis = np.argmax(np.abs(np.cross(b - a, c - a)), axis=1)
+    kept = np.array([[1, 2], [0, 2], [0, 1]])[axis][:, None, :]
+    edges, triangles = (np.take_along_axis(points, kept, axis=2) for points in (edges, triangles))
+    sides = np.stack([_sides(triangles[:, i], triangles[:, (i + 1) % 3], edges[:, 0]) for i in range(3)])
+    result = (sides.min(axis=0) >= 0) | (sides.max(axis=0) <= 0)
+    for i in range(3):
+        result |= _segments_meet(edges, triangles[:, [i, (i + 1) % 3]])
+    return result
 
 
-def _side(*points: np.ndarray) -> int:
-    """Sign of the orientation of dim + 1 points."""
-    rows = np.stack([point - points[0] for point in points[1:]])
-    value = float(np.linalg.det(rows))
-    size = float(np.prod(np.linalg.norm(rows, axis=1))) + 1e-300
-    if abs(value) > 1e-12 * size * (1 + np.abs(np.stack(points)).max() / np.abs(rows).max(initial=1e-300)):
-        return 1 if value > 0 else -1
-    exact = [
-        [Fraction(float(u)) - Fraction(float(v)) for u, v in zip(point, points[0], strict=True)] for point in points[1:]
-    ]
-    determinant = _determinant(exact)
-    return (determinant > 0) - (determinant < 0)
+def _sides(*points: Float[np.ndarray, "m dim"]) -> Int[np.ndarray, " m"]:
+    """Signs of the orientations of dim + 1 points."""
+    rows = np.stack([point - points[0] for point in points[1:]], axis=1)
+    value, size = _determinants(rows)
+    signs = np.sign(value).astype(int)
+    # Differences of equal coordinates are exactly zero, and so is a determinant all of whose products are.
+    for number in np.flatnonzero((np.abs(value) <= _ROUNDING * size) & (size > 0)):
+        first, *others = ([Fraction(float(u)) for u in point[number]] for point in points)
+        exact, _ = _determinants(np.array([[np.subtract(other, first) for other in others]], dtype=object))
+        signs[number] = (exact[0] > 0) - (exact[0] < 0)
+    return signs
 
 
-def _determinant(rows: list[list[Any]]) -> Any:
-    if len(rows) == 2:
-        return rows[0][0] * rows[1][1] - rows[0][1] * rows[1][0]
-    minors = (_determinant([[row[j] for j in range(3) if j != i] for row in rows[1:]]) for i in range(3))
-    return sum((-1) ** i * rows[0][i] * minor for i, minor in enumerate(minors))
+def _determinants(rows: np.ndarray) -> tuple[Any, Any]:
+    """Returns determinants [m] of rows [m, dim, dim], and the sums of the absolute values of their products."""
+    value, size = 0, 0
+    for order in itertools.permutations(range(rows.shape[1])):
+        product = rows[:, 0, order[0]]
+        for row, column in enumerate(order[1:], start=1):
+            product = product * rows[:, row, column]
+        swaps = sum(i > j for i, j in itertools.combinations(order, 2))
+        value, size = value + (-1) ** swaps * product, size + abs(product)
+    return value, size

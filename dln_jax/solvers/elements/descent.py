@@ -164,7 +164,9 @@ def _allowed(total: Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) 
 
     begin = lists, jnp.ones((), x.dtype), jnp.asarray(0)
     lists, fraction, _ = jax.lax.while_loop(too_many, shorten, begin)
-    return lists, direction, fraction * longest_fraction(total.moving, x, fraction * direction, lists, data[1])
+    limit = fraction * longest_fraction(total.moving, x, fraction * direction, lists, data[1])
+    # With elements left out, no step is known to be allowed.
+    return lists, direction, jnp.where(overflow(lists), 0.0, limit)
 
 
 def _descent_direction(

@@ -195,11 +195,7 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
         hessians, inverse = factor
 
         def product(x: Blocks) -> Blocks:
-            out = jnp.zeros_like(x)
-            for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
-                at_corners = x[element.indices].reshape(len(element.indices), -1, 1)
-                out += assemble(corners, (of_elements @ at_corners)[..., 0].T)
-            return jnp.where(at.free, out, 0)
+            return jnp.where(at.free, summed_products(energies, at, hessians, x), 0)
 
         def precondition(x: Blocks) -> Blocks:
             return (inverse @ x[..., None])[..., 0]
@@ -208,6 +204,17 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
         return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_UPPER_PRODUCTS)
 
     return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, SEARCH_RESIDUAL))
+
+
+def summed_products(
+    energies: Sequence[ElementEnergy], at: Pattern, hessians: Sequence[Float[Array, "m s s"]], x: Blocks
+) -> Blocks:
+    """Returns the product of the sum of whole element Hessians with x."""
+    out = jnp.zeros_like(x)
+    for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
+        at_corners = x[element.indices].reshape(len(element.indices), -1, 1)
+        out += assemble(corners, (of_elements @ at_corners)[..., 0].T)
+    return out
 
 
 def lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

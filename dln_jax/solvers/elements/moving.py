@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.solvers.elements.assembly import Pattern, assemble
+from dln_jax.solvers.elements.assembly import Pattern
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
-from dln_jax.solvers.elements.linear_solvers import LinearSolver, lookup, sparse, with_constants
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, lookup, sparse, summed_products, with_constants
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
 from dln_jax.solvers.lapack import cholesky, substitute, symmetric_eigen
 
@@ -188,10 +188,7 @@ def _iterative(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Patt
         hessians, (lists, moving), static = factor
 
         def product(x: Blocks) -> Blocks:
-            out = jnp.zeros_like(x)
-            for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
-                at_corners = x[element.indices].reshape(len(element.indices), -1, 1)
-                out += assemble(corners, (of_elements @ at_corners)[..., 0].T)
+            out = summed_products(energies, at, hessians, x)
             for elements, blocks in zip(lists, moving, strict=True):
                 at_corners = x[elements.indices].reshape(len(blocks), -1, 1)
                 out = out.at[elements.indices].add((blocks @ at_corners).reshape(*elements.indices.shape, -1))

@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from dln_jax.softbody import MIDPOINT, make_scene, make_step, with_parameters
 from dln_jax.softbody.contact import body_contact, crossings
+from dln_jax.softbody.contact.crossings import _segments_meet_triangles
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh, vertices_where
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.terms.elasticity import elastic
@@ -150,3 +152,43 @@ def test_two_boxes_in_space_come_to_rest_on_each_other():
         assert info.converged
         assert not crossings(mesh, np.asarray(state.x))
     assert jnp.abs(state.v).max() < 1e-2
+
+
+def test_crossings_agree_with_linear_programming_in_degenerate_positions():
+    # On a coarse lattice most pairs touch, are in one plane or in one line.
+    random = np.random.default_rng(0)
+    edges, triangles = (random.integers(0, 4, (300, count, 3)).astype(float) for count in (2, 3))
+    proper = (edges[:, 0] != edges[:, 1]).any(axis=1)
+    proper &= np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]).any(axis=1)
+    met = 0
+    for (p, q), (a, b, c) in zip(edges[proper], triangles[proper], strict=True):
+        # p + t (q - p) = a + u (b - a) + v (c - a) with 0 <= t <= 1, u, v >= 0, u + v <= 1.
+        columns = np.stack([q - p, a - b, a - c], axis=1)
+        program = linprog(np.zeros(3), [[0, 1, 1]], [1], columns, a - p, bounds=[(0, 1), (0, None), (0, None)])
+        result = _segments_meet_triangles(np.stack([p, q])[None], np.stack([a, b, c])[None])
+        assert bool(result[0]) == (program.status == 0)
+        met += program.status == 0
+    assert 30 < met < proper.sum() - 30
+
+
+def test_a_step_beyond_its_list_moves_nothing():
+    """With pairs left out, no motion is known to be free: the body stays where it is, and the step says so."""
+    mesh = joined(beam(4.0, 0.2, 80, 1), shifted(beam(4.0, 0.2, 80, 1), 0.01, 0.215))
+    scene = scene_of(mesh, weight=False, capacity=1)
+    init, step = make_step(scene, 0.01)
+    above = mesh.vertices[:, 1] > 0.21
+    state, info = jax.jit(step)(scene.params, init(v=np.where(above[:, None], [0.0, -50.0], 0.0)))
+    assert info.overflow and not info.converged
+    assert not crossings(mesh, np.asarray(state.x))
+
+
+@pytest.mark.slow
+def test_held_vertices_that_cannot_reach_their_goal_stop_before_the_obstacle():
+    mesh = joined(beam(0.4, 0.2, 2, 1), shifted(beam(0.4, 0.2, 2, 1), 0.45, 0.0))
+    scene = scene_of(mesh, held=vertices_where(mesh, lambda x: abs(x[:, 0] - 0.425) > 0.2), weight=False)
+    init, step = make_step(scene, 0.01)
+    # The held ends of both bodies would have to pass through each other.
+    v = np.where(mesh.vertices[:, :1] < 0.425, [100.0, 0.0], 0.0)
+    state, info = jax.jit(step)(scene.params, init(v=v))
+    assert not info.converged
+    assert not crossings(mesh, np.asarray(state.x))
