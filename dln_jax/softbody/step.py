@@ -55,6 +55,32 @@ class Stepper(NamedTuple):
     """step(params, state, control=None) -> (state after dt, Info): differentiable in all of its arguments."""
 
 
+class Balanced(NamedTuple):
+    """Minimum of a step's potential."""
+
+    x: Float[Array, "n dim"]
+    """In m."""
+    outcome: SolverInfo
+    at_start: tuple[Any, ...]
+    """Data of the scene's terms."""
+    data: tuple[Any, ...]
+    """Data of the step's energies: inertia, and the terms, averaged if the integrator is."""
+    contact: tuple[Any, ...]
+    """Data of the contacts."""
+
+
+class StepParts(NamedTuple):
+    """A time step in two parts, for steps around it that also decide where held vertices go."""
+
+    init: Callable[..., State]
+    balance: Callable[..., Balanced]
+    """balance(params, state, control, dt, x_after=None): x_after starts the search."""
+    forces: Callable[[State, Balanced], Float[Array, "n dim"]]
+    """Forces of the energies and of inertia on all vertices, in N: zero on free ones."""
+    conclude: Callable[..., tuple[State, Info]]
+    """conclude(params, state, balanced, dt): the state after the step, and the verdict."""
+
+
 def make_step(
     scene: SoftScene,
     dt: Any,
@@ -89,6 +115,31 @@ def make_step(
         require_positive(halvings=halvings)
         if integrator.two_steps:
             raise InputError("halvings got a method of two steps, which have one length; use another integrator")
+    init, balance, _, conclude = step_parts(
+        scene, dt, integrator, tolerance, iterations, linear_solver=linear_solver, definite=definite
+    )
+
+    def advance(
+        params: Params, state: State, control: Any = None, dt: Any = dt, x_after: Array | None = None
+    ) -> tuple[State, Info]:
+        return conclude(params, state, balance(params, state, control, dt, x_after), dt)
+
+    if halvings:
+        return Stepper(init, with_shorter_steps(advance, dt, halvings))
+    return Stepper(init, lambda params, state, control=None: advance(params, state, control))
+
+
+def step_parts(
+    scene: SoftScene,
+    dt: Any,
+    integrator: Integrator = BACKWARD_EULER,
+    tolerance: float = TOLERANCE,
+    iterations: int = 100,
+    *,
+    linear_solver: LinearSolverFactory | None = None,
+    definite: bool = False,
+) -> StepParts:
+    """Returns the parts of the step that `make_step` returns, which explains the arguments."""
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
     if scene.contacts and (integrator.span != 1.0 or integrator.averaged):
@@ -137,9 +188,7 @@ def make_step(
         previous = Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None
         return State(x, v, previous, Growth(jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)))
 
-    def advance(
-        params: Params, state: State, control: Any = None, dt: Any = dt, x_after: Array | None = None
-    ) -> tuple[State, Info]:
+    def balance(params: Params, state: State, control: Any, dt: Any, x_after: Array | None = None) -> Balanced:
         h, target = integrator.target(state, dt)
         span = jnp.asarray(integrator.span * dt, state.x.dtype)
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
@@ -163,21 +212,27 @@ def make_step(
         balanced, outcome = solve(
             energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible
         )
-        x, v = integrator.finish(state, balanced, dt)
+        return Balanced(balanced, outcome, at_start, data, contact)
+
+    def forces(state: State, balanced: Balanced) -> Float[Array, "n dim"]:
+        x, _, _, data, contact = balanced
+        lists = lists_between(moving, state.x, x - state.x, contact)
+        return -jax.grad(lambda x: value(energies, x, data) + moving_value(moving, x, lists, contact))(x)
+
+    def conclude(params: Params, state: State, balanced: Balanced, dt: Any) -> tuple[State, Info]:
+        x, v = integrator.finish(state, balanced.x, dt)
         # Where a contact holds vertices back from their goals, going there would push them through it.
-        x = jnp.where(free, x, balanced if moving else state.x + dt * state.v)
+        x = jnp.where(free, x, balanced.x if moving else state.x + dt * state.v)
         v = jnp.where(free, v, state.v)
-        info, growth = judged(params, state, x, v, (balanced, outcome, at_start, data[1:], contact))
+        info, growth = judged(params, state, x, v, balanced)
         x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
         return State(x, v, before, growth), info
 
-    def judged(
-        params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any, Any, Any]
-    ) -> tuple[Info, Growth | None]:
+    def judged(params: Params, state: State, x: Array, v: Array, solution: Balanced) -> tuple[Info, Growth | None]:
         # The verdict has no derivatives.
         params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
-        balanced, outcome, at_start, data, contact = solution
+        balanced, outcome, at_start, (_, *data), contact = solution
         lists = lists_between(moving, state.x, x - state.x, contact)
 
         def contact_value(x: Array) -> Array:
@@ -187,15 +242,13 @@ def make_step(
         if moving and len(scene.held):
             along_held = jnp.where(free, 0, x - state.x)
             work += jax.jvp(contact_value, (balanced,), (along_held,))[1]
-        balance = energy_balance(
+        energies_of_step = energy_balance(
             scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, contact_value
         )
         info = _of_positions(scene, params, x, outcome, overlaps, contact, lists)
-        return with_energies(info, balance, state.growth)
+        return with_energies(info, energies_of_step, state.growth)
 
-    if halvings:
-        return Stepper(init, with_shorter_steps(advance, dt, halvings))
-    return Stepper(init, lambda params, state, control=None: advance(params, state, control))
+    return StepParts(init, balance, forces, conclude)
 
 
 def positions_and_convergence(state: State, info: Info) -> tuple[Array, Array]:
