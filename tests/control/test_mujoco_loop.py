@@ -15,7 +15,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system
 from dln_jax.types import InputError
 
-mujoco = pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
 B = np.array([[1.0], [0.0]])
 START = np.array([0.1, 0.5, 0.0, -0.3])
 FREE = np.full((2, 2), [-np.inf, np.inf])

@@ -6,7 +6,7 @@ import pytest
 from dln_jax.data.robots import read_robot
 from dln_jax.types import InputError
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 URDF = """<robot name="arm"><link name="base"/><link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="elbow" type="{}"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/><limit {}/></joint></robot>"""

@@ -10,7 +10,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system
 from dln_jax.types import InputError
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 
 

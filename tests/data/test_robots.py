@@ -11,7 +11,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
 from dln_jax.types import InputError
 
-mujoco = pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco", reason="MuJoCo is the reference; it is in the extra [robot]")
 LINK = """
 <link name="{name}">
   <inertial>
@@ -96,7 +96,7 @@ def test_forces_are_those_of_mujoco(name, tmp_path):
 
 
 def test_forces_are_those_of_pinocchio(tmp_path):
-    pinocchio = pytest.importorskip("pinocchio")
+    pinocchio = pytest.importorskip("pinocchio", reason="the reference is Pinocchio, of the extra [reference]")
     path = written(tmp_path, "arm.urdf", ARM.replace("continuous", "revolute"))
     robot, model = read_robot(path), pinocchio.buildModelFromUrdf(str(path))
     order = [model.joints[model.getJointId(name)].idx_q for name in robot.tree.names]

@@ -207,9 +207,9 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 
 
 def summed_products(
-    energies: Sequence[ElementEnergy], at: Pattern, hessians: Sequence[Float[Array, "m s s"]], x: Blocks
+    energies: Sequence[ElementEnergy], at: Pattern, hessians: Sequence[Float[Array, "_ _ _"]], x: Blocks
 ) -> Blocks:
-    """Returns the product of the sum of whole element Hessians with x."""
+    """Returns the product of the sum of whole element Hessians, one array [m, s, s] for each energy, with x."""
     out = jnp.zeros_like(x)
     for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
         at_corners = x[element.indices].reshape(len(element.indices), -1, 1)

@@ -15,6 +15,7 @@ from dln_jax.data.splits import hold_out
 from dln_jax.learning import accelerations
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import loss_of
 from dln_jax.learning.model_selection import grow, segments
 from dln_jax.learning.rates import match_linear
 from dln_jax.training.hamiltonian.measurements import MEASURED, forces_of
@@ -221,12 +222,11 @@ def validation_errors(
         return match_linear(build(description), parts[0], validation=parts[1])[1]
     task = first_problem(problem, description, parts, 0)
     training = fit(task, GaussNewton(steps=TRIAL_STEPS), must_start=False)
-    residual = task.residual
-    assert residual is not None
+    loss = loss_of(task)
     keys = accelerations.KEYS if in_velocities(problem, description) else ("q", "p", "qd", "pd")
-    arrays = tuple(column(parts[1], key) for key in keys)
-    left = jax.jit(jax.vmap(lambda *sample: residual(training.parameters, *sample)))(*arrays)
-    errors = np.sum(np.asarray(left) ** 2, axis=1)
+    # The loss of a batch of one sample is the squared error of that sample.
+    batches = [column(parts[1], key)[:, None] for key in keys]
+    errors = np.asarray(jax.jit(jax.vmap(lambda *batch: loss(training.parameters, batch)))(*batches))
     if not in_velocities(problem, description):
         return errors
     numbers = segments(parts[1])

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.figures.phase_space import Field, motion_figure
 from dln_jax.figures.style import TRUTH
+from dln_jax.learning.measured_motions import MeasuredWindows
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
@@ -39,7 +40,7 @@ def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float],
         rates = partial(velocity_field, model, parameters)
     numbers = motion_errors(predicted, problem.truth, problem.energy, published_energy=problem.published_energy)
     if problem.tests is not None:
-        numbers |= predicted_times(problem, trained)
+        numbers |= predicted_times(problem, problem.tests, trained)
     if problem.train is not None and problem.test is not None:
         fitted, tested = (field_errors(model, parameters, part) for part in (problem.train, problem.test))
         numbers["train_loss"], numbers["test_loss"] = fitted["loss"], tested["loss"]
@@ -74,14 +75,13 @@ def first_samples(motions: Motions, count: int) -> Motions:
     return Motions(motions.t[:count], motions.q[:, :count], motions.p[:, :count])
 
 
-def predicted_times(problem: Problem, trained: Trained) -> dict[str, float]:
+def predicted_times(problem: Problem, tests: MeasuredWindows, trained: Trained) -> dict[str, float]:
     """Valid prediction times on measured motions, with starts fitted to one window."""
-    assert problem.tests is not None
     model, fitted = build(trained.description), WINDOW[MEASURED]
     known = {"fitted": fitted, "substeps": SUBSTEPS, "momenta": not in_velocities(problem, trained.description)}
-    predicted = predict_measured(model, trained.result.parameters, problem.tests, **known)
+    predicted = predict_measured(model, trained.result.parameters, tests, **known)
     variance = problem.fitted.q.var(axis=0)
-    return prediction_metrics(problem.tests, predicted, fitted=fitted, variance=np.where(variance > 0, variance, 1.0))
+    return prediction_metrics(tests, predicted, fitted=fitted, variance=np.where(variance > 0, variance, 1.0))
 
 
 def velocity_field(

@@ -89,7 +89,7 @@ def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, tmp_path,
 
 
 def test_joints_of_a_gripper_are_held(log, tmp_path, capsys):
-    pytest.importorskip("mujoco")
+    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     links = "".join(
         f'<link name="{name}"><inertial><origin xyz="0 0 -0.3"/><mass value="1"/>'
         '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>'

@@ -14,7 +14,7 @@ from dln_jax.data.robots import read_robot
 from dln_jax.identification.excitation.limits import limits_of_robot
 from dln_jax.types import InputError
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 LINK = """<link name="{name}"><inertial><origin xyz="0.2 0.02 0.05"/><mass value="1.5"/>
 <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0.004" ixz="-0.002" iyz="0.001"/></inertial></link>"""
 JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>

@@ -17,7 +17,7 @@ from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.zoo.run import load
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 LINK = """<link name="{name}"><inertial><origin xyz="0.1 0.05 0.2"/><mass value="{mass}"/>
 <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 JOINT = """<joint name="{name}" type="continuous"><parent link="{parent}"/><child link="{child}"/>

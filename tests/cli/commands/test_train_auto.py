@@ -76,7 +76,7 @@ def workplace(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
-    pytest.importorskip("mujoco")
+    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     options = {"data": Path("rigid.npz"), "robot": Path("arm.xml"), "velocity_scale": 0.01}
     typed = arguments_of(train_delan.Arguments, model="auto", **options)
     task, training = selection.fit(prepare(typed), typed, workplace, None)
@@ -175,7 +175,7 @@ def test_a_mistake_is_one_line(workplace, capsys, mistake):
     arguments, message = MISTAKES[mistake]
     (workplace / "wrong.json").write_text('{"colour": "red"}')
     if "arm.xml" in arguments or "none.urdf" in arguments:
-        pytest.importorskip("mujoco")
+        pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     assert message in refused(capsys, train_delan, *arguments, "--out", workplace / "refused")
     assert not (workplace / "refused").exists()
 

@@ -320,7 +320,7 @@ def kill_as_it_begins(job):
 @pytest.mark.parametrize(("where", "package"), [("here", "dln_jax"), ("ray", "ray")])
 def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
     """One is done, one fails, and one is killed by a signal."""
-    pytest.importorskip(package)
+    pytest.importorskip(package, reason="jobs by ray need the extra [ray]")
     recorded = generators.uniform(scene_named("pendulum"), samples=50)
     for name in ("good", "killed"):
         schema.save(tmp_path / f"{name}.npz", recorded)

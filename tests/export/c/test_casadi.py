@@ -16,7 +16,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes import pendulum, two_link_arm
 from dln_jax.types import InputError
 
-casadi = pytest.importorskip("casadi")
+casadi = pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
 )

@@ -9,7 +9,7 @@ from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system
 from scripts.reports.robots.arm import EVERY, D, Motion, arm, exact_torque, follow, measured, motion, trajectories
 
-pytest.importorskip("mujoco")
+pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 
 
 @pytest.fixture(scope="module")

@@ -209,7 +209,7 @@ def test_without_pinocchio_its_rows_are_left_out_with_a_line(monkeypatch, capsys
 
 
 def test_the_rival_undoes_its_own_inverse_dynamics():
-    pytest.importorskip("pinocchio")
+    pytest.importorskip("pinocchio", reason="the reference is Pinocchio, of the extra [reference]")
     functions = pinocchio.pinocchio_functions(pinocchio.rival_arm(7))
     q, qd, qdd = np.random.default_rng(0).normal(size=(3, 7))
     tau = functions["rnea"].function(q, qd, qdd).copy()

@@ -108,8 +108,13 @@ def fit(task: Task, options: NetworkOptions, folder: Path, mesh: Mesh | None) ->
 
 
 def solver_of(task: Task) -> Solver:
-    """The solver that `plan` has made."""
-    assert task.solver is not None
+    """The solver that `plan` has made.
+
+    Raises:
+        InputError: another `plan` made the task, and it has no solver.
+    """
+    if task.solver is None:
+        raise InputError(f"{task.kind} was planned without an optimiser; plan it with the method of networks")
     return task.solver
 
 
