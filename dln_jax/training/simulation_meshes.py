@@ -97,8 +97,8 @@ def _loads(mesh: Mesh, pressures: dict[str, list[float]], forces: dict[str, list
         try:
             facets = facets_in(mesh, name)
         except InputError:
-            each = np.array(force) / len(vertices)
-            terms.append(point_force(mesh, vertices, each, name=f"load-{name}"))
+            share = np.array(force) / len(vertices)
+            terms.append(point_force(mesh, vertices, share, name=f"load-{name}"))
             continue
         _, normals = facet_points(mesh.vertices[facets])
         area = np.linalg.norm(normals, axis=2).sum()
