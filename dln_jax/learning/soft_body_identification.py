@@ -32,8 +32,9 @@ class ObservedMotions(NamedTuple):
     """Positions at the start, in m."""
     v0: Float[Array, "K n dim"]
     """Velocities at the start, in m/s."""
-    controls: Float[Array, "K T controls"]
-    """Actuation of the steps; [K, T, 0] for a body without."""
+    controls: Any
+    """Actuation of the steps: an array [K, T, controls], [K, T, 0] for a body without, or a dict of arrays [K, T, ...]
+    by the names of the actuated terms."""
     x: Float[Array, "K T n dim"]
     """Positions after every step, in m; not finite for vertices that were not seen."""
 
@@ -76,8 +77,9 @@ def identify(
     require_positive(noise=noise, iterations=iterations)
     init, step = stepper
 
-    def residual(theta: Any, x0: Array, v0: Array, controls: Array, observed: Array) -> Array:
-        advance, inputs = functools.partial(step, params_of(theta)), controls if controls.shape[1] else None
+    def residual(theta: Any, x0: Array, v0: Array, controls: Any, observed: Array) -> Array:
+        driven = any(leaf.size for leaf in jax.tree.leaves(controls))
+        advance, inputs = functools.partial(step, params_of(theta)), controls if driven else None
         _, x = rollout(advance, init(x0, v0), inputs, steps=observed.shape[0], observe=lambda state, info: state.x)
         return _seen_difference(x, observed) / noise
 

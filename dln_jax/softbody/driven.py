@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,8 +31,8 @@ class Example(NamedTuple):
     """Initial velocities in m/s, [n, dim] or one for all; initial positions are the rest shape's."""
     ground: float | None = None
     """Slope of the ground, rise over run; it passes through the origin. `None` without ground."""
-    control: Callable[[np.ndarray], np.ndarray] | None = None
-    """Times [T] in s -> actuation [T, k]."""
+    control: Callable[[np.ndarray], Any] | None = None
+    """Times [T] in s -> actuation [T, k], or a dict of such arrays by actuator."""
     held_path: Callable[[np.ndarray], np.ndarray] | None = None
     """Times [T] in s -> positions of the held vertices [T, k, dim]; by default they stay."""
     muscles: np.ndarray | None = None
@@ -45,8 +46,8 @@ class Drive(NamedTuple):
 
     t: Float[Array, "*steps"]
     """Time at the end of the step, in s."""
-    control: Float[Array, "*steps k"] | None
-    """Actuation at the end of the step."""
+    control: Any
+    """Actuation [k] at the end of the step, or a dict of such arrays; `None` without actuators."""
     held_velocity: Float[Array, "*steps k dim"] | None
     """Velocities of the held vertices, in m/s."""
 
@@ -59,7 +60,9 @@ def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
     """
     t = dt * np.arange(first, first + steps + 1)
     dtype = example.scene.params.rest.dtype
-    control = None if example.control is None else jnp.asarray(example.control(t[1:]), dtype)
+    control = (
+        None if example.control is None else jax.tree.map(lambda of: jnp.asarray(of, dtype), example.control(t[1:]))
+    )
     velocity = None if example.held_path is None else jnp.asarray(np.diff(example.held_path(t), axis=0) / dt, dtype)
     return Drive(jnp.asarray(t[1:], dtype), control, velocity)
 

@@ -14,7 +14,7 @@ creature is the published preset of `terms.creature`.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,10 +55,19 @@ SHORTEST, LONGEST = 0.3, 1.0
 """Range of the actuation of the creature's muscles."""
 
 
+Loads = Callable[[Mesh], Sequence[Term]]
+
+
+def no_loads(_: Mesh) -> Sequence[Term]:
+    """No further terms."""
+    return ()
+
+
 def beam(
     *,
     mesh: Mesh | None = None,
     held: ArrayLike | None = None,
+    loads: Loads = no_loads,
     dimension: int = 2,
     cells: int = 4,
     youngs_modulus: Numbers = 2e6,
@@ -69,7 +78,7 @@ def beam(
 ) -> Example:
     """A beam of 4 m x 1 m (x 1 m) with `cells` cells across, or a custom mesh, held on the left.
 
-    Without `held`, the vertices of smallest x are held.
+    Without `held`, the vertices of smallest x are held. `loads` returns further terms for the mesh.
     """
     if mesh is None:
         _require_dimension(dimension)
@@ -81,7 +90,9 @@ def beam(
     if held is None:
         left, extent = mesh.vertices[:, 0].min(), np.ptp(mesh.vertices[:, 0])
         held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
-    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), held=held)
+    scene = _solid(
+        mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), *loads(mesh), held=held
+    )
     return Example(scene, dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
 
 
@@ -137,6 +148,7 @@ def slope(
 def drop(
     *,
     mesh: Mesh | None = None,
+    loads: Loads = no_loads,
     dimension: int = 2,
     cells: int = 5,
     friction: float = 0.5,
@@ -150,7 +162,7 @@ def drop(
     """A body that falls from its own height with 2 m/s to the right and a random rate of rotation (±1 rad/s).
 
     The body is a disc of radius 0.5 m with `cells` rings, a box of 1 m in space with a random tilt, or a custom mesh,
-    lifted or lowered to that height. The seed decides rate and tilt.
+    lifted or lowered to that height. The seed decides rate and tilt. `loads` returns further terms for the mesh.
     """
     random = np.random.default_rng(seed)
     if mesh is None:
@@ -162,7 +174,7 @@ def drop(
     lift[-1] = height - mesh.vertices[:, -1].min()
     mesh = mesh._replace(vertices=mesh.vertices + lift)
     ground = _ground(mesh, friction, height=height, normal=np.eye(mesh.dimension)[-1])
-    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), ground)
+    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), ground, *loads(mesh))
     arms = mesh.vertices - np.average(mesh.vertices, axis=0, weights=np.asarray(scene.params.masses))
     v = np.zeros_like(arms)
     v[:, 0], v[:, -1] = arms[:, -1], -arms[:, 0]

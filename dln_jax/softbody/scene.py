@@ -4,7 +4,7 @@ Terms that a scene does not list are never traced. Everything in `Params` is dif
 """
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -188,18 +188,37 @@ def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
 
 
 def prepare(
-    scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf, control: Array | None = None
+    scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf, control: Any = None
 ) -> tuple[Any, ...]:
     """Returns the data of all terms' elements for a step of dt in s that starts at x; by default for bodies at rest."""
-    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), control)
-    return tuple(term.prepare(params.terms[term.name], context) for term in scene.terms)
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype))
+    controls = _by_term(scene, control)
+    return tuple(
+        term.prepare(params.terms[term.name], context._replace(control=controls(term.name))) for term in scene.terms
+    )
+
+
+def _by_term(scene: SoftScene, control: Any) -> Callable[[str], Any]:
+    """Returns the function from a term's name to its control: one array for the only actuator, or a dict by names."""
+    driven = [term.name for term in scene.terms if term.control is not None]
+    if not isinstance(control, Mapping):
+        if control is not None and len(driven) > 1:
+            raise InputError(
+                f"the control is one array, but the scene has the actuators {', '.join(driven)}; "
+                "pass a dict of arrays by these names"
+            )
+        return lambda name: control
+    if unknown := [name for name in control if name not in driven]:
+        known = f"expected {', '.join(driven)}" if driven else "it has none: give a term no value, so that it reads one"
+        raise InputError(f"the control names '{unknown[0]}', which is no actuator of the scene; {known}")
+    return control.get
 
 
 def prepare_contacts(
     scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf
 ) -> tuple[Any, ...]:
     """Returns the data of the contacts' energies for a step of dt in s that starts at x."""
-    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), None)
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype))
     return tuple(data for contact in scene.contacts for data in contact.prepare(params.terms[contact.name], context))
 
 
@@ -222,7 +241,7 @@ def least_distance(
     return jnp.min(jnp.stack(nearest))
 
 
-def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Array | None = None) -> Array:
+def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Any = None) -> Array:
     """V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as from rest at x."""
     stored = value(element_energies(scene), x, prepare(scene, params, x, control=control))
     energies, data = contact_energies(scene), prepare_contacts(scene, params, x)

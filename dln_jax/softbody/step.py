@@ -52,7 +52,8 @@ class Stepper(NamedTuple):
     """init(x=None, v=None): the rest shape at rest, or positions in m and velocities in m/s, [n, dim] or one [dim]
     for all vertices. `InputError` for a known value that is not finite."""
     step: Step
-    """step(params, state, control=None) -> (state after dt, Info): differentiable in all of its arguments."""
+    """step(params, state, control=None) -> (state after dt, Info): differentiable in all of its arguments. The control
+    is an array for the scene's only actuator, or a dict of arrays by the names of the actuated terms."""
 
 
 class Balanced(NamedTuple):

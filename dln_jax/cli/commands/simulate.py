@@ -60,6 +60,12 @@ class Arguments(Folder, Drawn):
     """beam with --mesh: named sets that are held, separated by commas."""
     youngs_modulus_of: Unstated[str] = None
     """--mesh: E in Pa of named sets of elements, as tip=1e6,core=5e6."""
+    pressure: Unstated[str] = None
+    """--mesh: gauge pressure in Pa in chambers, as inner=2e4 for all closed cavities or wall=2e4,bag=1e3 for chambers
+    whose facets are in named sets; flat caps close their openings."""
+    load: Unstated[str] = None
+    """--mesh: total force in N on named sets, as tip=0,-5 or tip=0,-5;side=2,0: two components in the plane, three in
+    space, spread over the area of the set, or over its vertices if it covers no part of the surface."""
     vtu: bool = False
     """Also write motion.pvd and its .vtu files, for ParaView (extra [mesh])."""
     precision: Literal["f32", "f64"] = "f64"

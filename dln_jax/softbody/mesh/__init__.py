@@ -27,6 +27,14 @@ from dln_jax.softbody.mesh.shapes import (
     quadruped,
 )
 from dln_jax.softbody.mesh.simplices import simplex_volumes
+from dln_jax.softbody.mesh.surfaces import (
+    closed_surface,
+    enclosed_volume,
+    facets_in,
+    inner_surface,
+    outer_surface,
+    surface_parts,
+)
 
 __all__ = [
     "Creature",
@@ -39,17 +47,23 @@ __all__ = [
     "boundary",
     "boundary_vertices",
     "box",
+    "closed_surface",
     "crawler",
     "disc",
     "edges",
+    "enclosed_volume",
+    "facets_in",
+    "inner_surface",
     "lattice",
     "lumped_masses",
     "make_mesh",
+    "outer_surface",
     "overlaps",
     "quadratic",
     "quadruped",
     "read_mesh",
     "simplex_volumes",
+    "surface_parts",
     "values_by_set",
     "vertices_in",
     "vertices_where",

@@ -61,6 +61,32 @@ def reference_gradients(dimension: int) -> Float[np.ndarray, "points nodes dim"]
     return np.concatenate([corners, 4 * (points[:, i, None] * slopes[j] + points[:, j, None] * slopes[i])], axis=1)
 
 
+def facet_rule(
+    dimension: int, quadratic: bool
+) -> tuple[Float[np.ndarray, "points nodes"], Float[np.ndarray, "points nodes d"], Float[np.ndarray, " points"]]:
+    """Shape functions of a facet at its quadrature points, their derivatives by its coordinates, and the weights.
+
+    Nodes are the corners, then the mid-side nodes in the order of `SIDES`. The rules (centroid; Gauss with 2 points;
+    Strang and Fix 1973 with 6 points) integrate the volume that facets enclose exactly.
+    """
+    slopes = np.concatenate([-np.ones((1, dimension - 1)), np.eye(dimension - 1)])
+    if not quadratic:
+        return np.full((1, dimension), 1 / dimension), slopes[None], np.array([1.0 / math.factorial(dimension - 1)])
+    if dimension == 2:
+        first, weights, sides = (1 + np.array([-1.0, 1.0]) / math.sqrt(3)) / 2, np.full(2, 0.5), [(0, 1)]
+        points = np.stack([first, 1 - first], axis=1)
+    else:
+        root, sides = math.sqrt(10), SIDES[2]
+        spread, share = math.sqrt(38 - 44 * math.sqrt(2 / 5)), math.sqrt(213125 - 53320 * root)
+        fractions = np.repeat([(8 - root + spread) / 18, (8 - root - spread) / 18], 3)
+        weights = np.repeat([(620 + share) / 7440, (620 - share) / 7440], 3)
+        points = np.where(np.tile(np.eye(3, dtype=bool), (2, 1)), 1 - 2 * fractions[:, None], fractions[:, None])
+    i, j = np.array(sides).T
+    values = np.concatenate([points * (2 * points - 1), 4 * points[:, i] * points[:, j]], axis=1)
+    between = 4 * (points[:, i, None] * slopes[j] + points[:, j, None] * slopes[i])
+    return values, np.concatenate([(4 * points - 1)[:, :, None] * slopes, between], axis=1), weights
+
+
 def determinant(F: Any) -> Any:
     """Determinant of a 2 x 2 or 3 x 3 matrix from its rows; entries are scalars, or arrays over several matrices."""
     if len(F) == 2:

@@ -6,8 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Indices, Numbers, Term, material, vertex_pairs
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.softbody.terms.term import (
+    NOT_NEGATIVE,
+    Context,
+    Corners,
+    Indices,
+    Numbers,
+    Term,
+    control_of,
+    material,
+    vertex_pairs,
+)
+from dln_jax.types import Scalar, require_positive
 
 
 class Springs(NamedTuple):
@@ -67,14 +77,11 @@ def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name
     parameters = Muscles(material("stiffness", stiffness, count, "muscle"))
 
     def prepare(parameters: Muscles, context: Context) -> tuple[Array, Array]:
-        actuation = context.control
-        if actuation is None or actuation.shape != (count,):
-            got = "no control" if actuation is None else f"a control of shape {actuation.shape}"
-            raise InputError(f"{name} got {got}; expected shape ({count},): the actuation a > 0 of each muscle")
+        actuation = control_of(name, context, (count,), "the actuation a > 0 of each muscle")
         length = actuation * _rest_lengths(context, indices, 0.0)
         return parameters.stiffness / length**2, length
 
-    return Term(name, indices, _energy(softening), parameters, prepare)
+    return Term(name, indices, _energy(softening), parameters, prepare, control=(count,))
 
 
 def _energy(softening: float):
@@ -84,7 +91,7 @@ def _energy(softening: float):
     def energy(x: Corners, spring: tuple[Array, Array]) -> Scalar:
         stiffness, rest_length = spring
         squared = jnp.asarray(sum((end - start) ** 2 for start, end in zip(*x, strict=True)))
-        deviation = (_length(squared, softening) - rest_length) ** 2
+        deviation = (length_of(squared, softening) - rest_length) ** 2
         if softening == 0.0:
             deviation = jnp.where(squared > 0, deviation, squared + rest_length**2)
         return 0.5 * stiffness * deviation
@@ -92,7 +99,7 @@ def _energy(softening: float):
     return energy
 
 
-def _length(squared_distance: Float[Array, "*m"], softening: float) -> Float[Array, "*m"]:
+def length_of(squared_distance: Float[Array, "*m"], softening: float) -> Float[Array, "*m"]:
     """sqrt(d² + softening²); without softening its derivative at zero is zero."""
     if softening > 0.0:
         return jnp.sqrt(squared_distance + softening**2)
@@ -102,4 +109,4 @@ def _length(squared_distance: Float[Array, "*m"], softening: float) -> Float[Arr
 
 def _rest_lengths(context: Context, indices: np.ndarray, softening: float) -> Float[Array, " m"]:
     squared = jnp.sum((context.rest[indices[:, 1]] - context.rest[indices[:, 0]]) ** 2, axis=1)
-    return _length(squared, softening)
+    return length_of(squared, softening)

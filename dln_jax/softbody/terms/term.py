@@ -10,6 +10,7 @@ Values that users pass to the factories of terms are checked when the scene is b
 built under `jit` or `grad`) they are traced and pass unchecked, like those that later replace the defaults.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -38,8 +39,8 @@ class Context(NamedTuple):
     """Positions at the start of the step, in m."""
     dt: Float[Array, ""]
     """Length of the step in s; infinite for a static solve."""
-    control: Float[Array, " controls"] | None
-    """Actuation, for scenes that have one."""
+    control: Any = None
+    """Control of the step for this term, if there is one: an array, in the scene's only actuator the whole control."""
 
 
 class Term(NamedTuple):
@@ -58,6 +59,8 @@ class Term(NamedTuple):
     """(parameters, context) -> data of the elements: a pytree of arrays with leading axis m."""
     unrolled: bool = True
     """False if the energy takes an array [k, dim] instead of scalars: compiles faster beyond a dozen unknowns."""
+    control: tuple[int, ...] | None = None
+    """Shape of the control that the preparation reads from its context; `None` for a term without."""
 
 
 class Bound(NamedTuple):
@@ -85,6 +88,18 @@ def material(
         where = f" of {element} {wrong[0]}" if result.shape else ""
         raise InputError(f"{name}{where} is {float(known[wrong[0]])}; expected {bound.expected}")
     return result
+
+
+def control_of(name: str, context: Context, shape: tuple[int, ...], meaning: str) -> Float[Array, "..."]:
+    """Returns the control of a driven term in its shape; `InputError` says what it means if it is missing.
+
+    A single number may have the shape [] or [1].
+    """
+    control = context.control
+    if control is None or (jnp.shape(control) != shape and not jnp.size(control) == math.prod(shape) == 1):
+        got = "no control" if control is None else f"a control of shape {jnp.shape(control)}"
+        raise InputError(f"{name} got {got}; expected shape {shape}: {meaning}")
+    return jnp.asarray(control, context.x.dtype).reshape(shape)
 
 
 def vector(name: str, value: Numbers, *, zero_allowed: bool = True) -> Float[Array, " dim"]:

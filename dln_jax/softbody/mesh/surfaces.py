@@ -1,0 +1,245 @@
+"""Facets of bodies: parts of the surface, facets by named sets, closed surfaces of chambers, and what they enclose.
+
+Facets are edges of the plane or triangles of space, [f, dim] corners. A chamber is bounded by a closed surface of
+facets between any vertices: the wall of a cavity, and caps over its openings. Its facets are oriented out of the
+chamber, into the material, so that the enclosed volume
+
+    plane:  sum over edges of ½ (a x b)        space:  sum over triangles of 1/6 a·(b x c)
+
+is positive. It does not depend on the origin.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from dln_jax.softbody.mesh.mesh import Mesh, boundary
+from dln_jax.softbody.mesh.sets import vertices_in
+from dln_jax.softbody.mesh.simplices import SIDES, AnyArray, determinant, facet_rule
+from dln_jax.types import InputError
+
+RIDGES = {2: "vertex", 3: "edge"}
+
+
+def surface_parts(mesh: Mesh) -> list[Int[np.ndarray, "f dim"]]:
+    """Connected parts of the boundary, oriented out of the body: outer surfaces first, then the walls of its cavities.
+
+    Parts are in the order of the signed volume that they enclose, which is negative for a cavity.
+    """
+    outside = boundary(mesh)
+    ridges, _ = _ridges(outside)
+    _, number = np.unique(ridges.reshape(-1, mesh.dimension - 1), axis=0, return_inverse=True)
+    number = number.reshape(len(outside), -1)
+    count = len(outside) + number.max() + 1
+    pairs = np.repeat(np.arange(len(outside)), number.shape[1]), len(outside) + number.ravel()
+    _, label = connected_components(coo_array((np.ones(number.size), pairs), shape=(count, count)))
+    parts = [outside[label[: len(outside)] == part] for part in np.unique(label[: len(outside)])]
+    return sorted(parts, key=lambda part: -float(enclosed_volume(mesh.vertices, part)))
+
+
+def inner_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
+    """Walls of all closed cavities of a body, for `pressure`.
+
+    Raises:
+        InputError: the body has no closed cavity.
+    """
+    walls = [part for part in surface_parts(mesh) if enclosed_volume(mesh.vertices, part) < 0]
+    if not walls:
+        raise InputError("the body has no closed cavity; name the facets of the chamber, and cap its openings")
+    return np.concatenate(walls)
+
+
+def outer_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
+    """Outer surface of all bodies of a mesh, without the walls of cavities."""
+    return np.concatenate([part for part in surface_parts(mesh) if enclosed_volume(mesh.vertices, part) > 0])
+
+
+def facets_in(mesh: Mesh, name: str) -> Int[np.ndarray, "f dim"]:
+    """Facets of the boundary whose corners are all in a named set.
+
+    Raises:
+        InputError: a set that does not exist, or that contains no facet of the boundary.
+    """
+    outside = boundary(mesh)
+    chosen = outside[np.isin(outside, vertices_in(mesh, [name])).all(axis=1)]
+    if not len(chosen):
+        what = {2: "edge", 3: "triangle"}[mesh.dimension]
+        raise InputError(f"the set '{name}' contains no {what} of the surface; expected a set that covers part of it")
+    return chosen
+
+
+def closed_surface(mesh: Mesh, facets: ArrayLike, *, cap: bool = False) -> Int[np.ndarray, "f dim"]:
+    """Facets of a chamber, oriented out of it.
+
+    Facets of the body's boundary are turned into its material. Others, such as caps, are turned like their neighbours;
+    a part without any facet of the boundary is turned so that it encloses a positive volume.
+
+    Args:
+        mesh: the body.
+        facets: [f, dim] vertices, in any orientation and order.
+        cap: close openings by flat facets between the vertices of their rims. In the plane there may be one opening.
+
+    Raises:
+        InputError: facets that are repeated or do not fit the mesh, or a surface that is open; the message names where.
+    """
+    chosen = _oriented(mesh, checked_facets(mesh, facets))
+    if cap:
+        chosen = np.concatenate([chosen, _caps(chosen)])
+    if len(gaps := _open_ridges(chosen)):
+        place, kind = gaps[0].tolist(), RIDGES[mesh.dimension]
+        at = np.round(mesh.vertices[gaps[0]].mean(axis=0), 6).tolist()
+        name = place[0] if mesh.dimension == 2 else place
+        raise InputError(
+            f"the surface is open at {len(gaps)} {'vertices' if mesh.dimension == 2 else 'edges'}, the first is {kind} "
+            f"{name} near {at} m; add the facets that close it, or pass cap=True"
+        )
+    return chosen
+
+
+def checked_facets(mesh: Mesh, facets: ArrayLike) -> Int[np.ndarray, "f dim"]:
+    """Facets as integers [f, dim]; refuses ones that are repeated or do not fit the mesh."""
+    chosen = np.asarray(facets)
+    if chosen.ndim != 2 or chosen.shape[1] != mesh.dimension or not len(chosen) or chosen.dtype.kind not in "iu":
+        raise InputError(
+            f"facets are {chosen.dtype} of shape {list(chosen.shape)}; expected integers [f, {mesh.dimension}], f >= 1"
+        )
+    chosen, n = chosen.astype(np.int64), len(mesh.vertices)
+    ordered = np.sort(chosen, axis=1)
+    wrong = (chosen < 0).any(axis=1) | (chosen >= n).any(axis=1) | (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+    if wrong.any():
+        bad = int(np.argmax(wrong))
+        raise InputError(
+            f"facet {bad} is {chosen[bad].tolist()}; expected {mesh.dimension} different ones of 0..{n - 1}"
+        )
+    _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
+    if (count > 1).any():
+        raise InputError(f"facet {chosen[first[np.argmax(count > 1)]].tolist()} is repeated; name it once")
+    return chosen
+
+
+def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "f nodes"]:
+    """Corners of facets, followed by their mid-side nodes in a quadratic mesh, in the order of `facet_rule`.
+
+    Raises:
+        InputError: a facet of a quadratic mesh with an edge that has no mid-side node, such as a cap.
+    """
+    if mesh.midsides is None:
+        return facets
+    sides = np.array([[0, 1]] if mesh.dimension == 2 else SIDES[2])
+    size = np.array([len(mesh.vertices), 1])
+    keys = np.sort(mesh.elements[:, np.array(SIDES[mesh.dimension])].reshape(-1, 2), axis=1) @ size
+    order = np.argsort(keys)
+    wanted = np.sort(facets[:, sides], axis=2) @ size
+    place = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
+    if len(missing := np.argwhere(keys[place] != wanted)):
+        edge = facets[missing[0][0], sides[missing[0][1]]].tolist()
+        raise InputError(f"edge {edge} of a facet is no edge of the quadratic mesh; only linear meshes can have caps")
+    return np.concatenate([facets, mesh.midsides.reshape(-1)[place]], axis=1)
+
+
+def enclosed_volume(x: Float[AnyArray, "n dim"], nodes: Int[np.ndarray, "f nodes"]) -> Any:
+    """Volume in m³ (area in m²) enclosed by facets with these nodes at positions x in m; takes NumPy and JAX arrays."""
+    dimension = x.shape[1]
+    if nodes.shape[1] == dimension:
+        return determinant(x[nodes].transpose(1, 2, 0)).sum() / math.factorial(dimension)
+    points, normals = facet_points(x[nodes])
+    return (points * normals).sum() / dimension
+
+
+def facet_points(
+    nodes: Float[AnyArray, "f nodes dim"],
+) -> tuple[Float[AnyArray, "f points dim"], Float[AnyArray, "f points dim"]]:
+    """Quadrature points of facets in m, and their normals, as long as the points' shares of the area in m²."""
+    values, slopes, weights = facet_rule(nodes.shape[2], nodes.shape[1] > nodes.shape[2])
+    points = (nodes.swapaxes(1, 2)[:, None] @ values[:, :, None])[..., 0]
+    tangents = nodes.swapaxes(1, 2)[:, None] @ slopes
+    if nodes.shape[2] == 2:
+        return points, (tangents[..., 0] @ np.array([[0.0, -1.0], [1.0, 0.0]])) * weights[:, None]
+    one, other = tangents[..., 0], tangents[..., 1]
+    ahead, behind = [1, 2, 0], [2, 0, 1]
+    normals = one[..., ahead] * other[..., behind] - one[..., behind] * other[..., ahead]
+    return points, normals * weights[:, None]
+
+
+def _ridges(facets: Int[np.ndarray, "f dim"]) -> tuple[Int[np.ndarray, "f dim d"], Int[np.ndarray, "f dim"]]:
+    """Ends of edges, or edges of triangles, with sorted vertices, and the direction in which the facet passes them."""
+    if facets.shape[1] == 2:
+        return facets[:, :, None], np.broadcast_to([-1, 1], facets.shape)
+    ends = facets[:, np.array(SIDES[2])]
+    return np.sort(ends, axis=2), np.where(ends[:, :, 0] < ends[:, :, 1], 1, -1)
+
+
+def _open_ridges(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "g d"]:
+    """Ridges that the facets do not pass equally often in both directions, in the direction of the surplus."""
+    ridges, signs = _ridges(facets)
+    distinct, number = np.unique(ridges.reshape(-1, ridges.shape[2]), axis=0, return_inverse=True)
+    net = np.bincount(number.reshape(-1), weights=signs.ravel()).astype(int)
+    gaps = distinct[net != 0]
+    if gaps.shape[1] == 2:
+        return np.where(net[net != 0, None] < 0, gaps[:, ::-1], gaps)
+    # Starts come first.
+    return gaps[np.argsort(net[net != 0], kind="stable")]
+
+
+def _oriented(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "f dim"]:
+    """Turns facets of the boundary into the body, and others like their neighbours."""
+    outside = {frozenset(facet): facet for facet in boundary(mesh).tolist()}
+    ridges, _ = _ridges(facets)
+    owners: dict[tuple, list[int]] = {}
+    for facet, of_facet in enumerate(ridges.tolist()):
+        for ridge in of_facet:
+            owners.setdefault(tuple(ridge), []).append(facet)
+    turned: dict[int, list[int]] = {}
+    for number, facet in enumerate(facets.tolist()):
+        if (known := outside.get(frozenset(facet))) is not None:
+            turned[number] = known[::-1]
+    _spread(turned, list(turned), facets, owners)
+    for number in range(len(facets)):
+        if number not in turned:
+            turned[number] = facets[number].tolist()
+            part = _spread(turned, [number], facets, owners)
+            if enclosed_volume(mesh.vertices, np.array([turned[i] for i in part])) < 0:
+                for i in part:
+                    turned[i] = turned[i][::-1]
+    return np.array([turned[number] for number in range(len(facets))])
+
+
+def _spread(turned: dict[int, list[int]], front: list[int], facets: np.ndarray, owners: dict) -> list[int]:
+    """Turns the neighbours of facets like these, and theirs; returns the facets and all that were turned."""
+    reached = list(front)
+    while front:
+        facet = front.pop()
+        for ridge, sign in zip(*(part[0].tolist() for part in _ridges(np.array([turned[facet]]))), strict=True):
+            both = owners[tuple(ridge)]
+            for other in both if len(both) == 2 else ():
+                if other not in turned:
+                    candidate = facets[other].tolist()
+                    passed, signs = (part[0].tolist() for part in _ridges(np.array([candidate])))
+                    turned[other] = candidate if signs[passed.index(ridge)] == -sign else candidate[::-1]
+                    front.append(other)
+                    reached.append(other)
+    return reached
+
+
+def _caps(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "c dim"]:
+    """Facets that close all openings: an edge of the plane, or fans of triangles over the rims in space."""
+    gaps = _open_ridges(facets)
+    if facets.shape[1] == 2:
+        if len(gaps) > 2:
+            raise InputError(f"the surface has {len(gaps)} open ends; expected 2: add the edges that join them")
+        return gaps[::-1].reshape(-1, 2)
+    following = dict(gaps[:, ::-1].tolist())
+    if len(following) < len(gaps):
+        raise InputError("the rims of two openings meet in a vertex; add the triangles that close them")
+    fans = []
+    while following:
+        start, at = following.popitem()
+        while (after := following.pop(at)) != start:
+            fans.append([start, at, after])
+            at = after
+    return np.array(fans, dtype=np.int64).reshape(-1, 3)

@@ -1,0 +1,125 @@
+"""Contractile fibres in the material, with a direction in every element.
+
+    W = a s |F d| + ½ k (|F d| - 1)²
+
+per volume, with the unit direction d, the stretch |F d| along it, the strength s in Pa (force per area of the rest
+shape at full activation), the activation a, and the passive stiffness k in Pa of the fibres, if they have one.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.terms.elasticity import deformation_gradient, quadratic_geometry, rest_geometry
+from dln_jax.softbody.terms.springs import length_of
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Numbers, Term, control_of, material
+from dln_jax.types import InputError, Scalar
+
+
+class Fibres(NamedTuple):
+    """Parameters of fibres, for all elements [] or per element [m]."""
+
+    direction: Float[Array, "*m dim"]
+    """Of any length, in the rest shape; one or per element."""
+    strength: Float[Array, "..."]
+    """s in Pa."""
+    activation: Float[Array, " groups"] | None
+    """a of every group, from 0 to 1, or `None` if it is the control."""
+    stiffness: Float[Array, "..."] | None
+    """k in Pa, or `None`."""
+
+
+def fibres(
+    mesh: Mesh,
+    direction: Numbers,
+    *,
+    strength: Numbers,
+    activation: Numbers | None = None,
+    stiffness: Numbers | None = None,
+    elements: ArrayLike | None = None,
+    groups: ArrayLike | None = None,
+    name: str = "fibres",
+) -> Term:
+    """Fibres that contract with the activation of their group; parameters are `Fibres`.
+
+    Args:
+        mesh: linear or quadratic.
+        direction: one [dim], or one per element [m, dim], of any length but zero.
+        strength: s in Pa, one or per element.
+        activation: a, one or one per group; without it, a is the control of the step, one number per group.
+        stiffness: k in Pa, one or per element; without it the fibres have no passive stiffness.
+        elements: those with fibres, such as `mesh.sets["muscle"].elements`; by default all. There are m of them.
+        groups: number of every element's group [m], from 0 on; by default all are in group 0.
+        name: of the term.
+
+    Raises:
+        InputError: a number out of range, or shapes that do not fit.
+    """
+    chosen = np.arange(len(mesh.elements)) if elements is None else np.asarray(elements, dtype=int).reshape(-1)
+    wrong = (chosen < 0) | (chosen >= len(mesh.elements))
+    if not len(chosen) or wrong.any():
+        what = f"element {chosen[np.argmax(wrong)]}" if len(chosen) else "no element"
+        raise InputError(f"the fibres are in {what}; expected elements 0..{len(mesh.elements) - 1}")
+    count = len(chosen)
+    group = np.zeros(count, dtype=int) if groups is None else np.asarray(groups)
+    if group.shape != (count,) or group.dtype.kind not in "iu" or group.min() < 0:
+        raise InputError(
+            f"groups are {group.dtype} of shape {list(group.shape)}; expected [{count}] integers from 0 on"
+        )
+    number = int(group.max()) + 1
+    parameters = Fibres(
+        _directions(direction, count, mesh.dimension),
+        material("strength", strength, count, "element", NOT_NEGATIVE),
+        None if activation is None else material("activation", activation, number, "group", NOT_NEGATIVE),
+        None if stiffness is None else material("stiffness", stiffness, count, "element"),
+    )
+    nodes = mesh.nodes[chosen]
+
+    def prepare(parameters: Fibres, context: Context) -> tuple[Any, ...]:
+        activation = parameters.activation
+        if activation is None:
+            activation = control_of(name, context, (number,), "the activation of every group of fibres, from 0 to 1")
+        geometry = jax.vmap(rest_geometry if mesh.midsides is None else quadratic_geometry)(context.rest[nodes])
+        direction = jnp.broadcast_to(parameters.direction, (count, mesh.dimension))
+        unit = direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
+        stress = jnp.broadcast_to(activation, number)[group] * parameters.strength
+        passive = parameters.stiffness
+        return *geometry, unit, stress, None if passive is None else jnp.broadcast_to(passive, count)
+
+    def density(x: Corners, gradients: Array, element: tuple[Any, ...]) -> Scalar:
+        unit, stress, passive = element
+        F = deformation_gradient(x, gradients)
+        along = [sum(entry * unit[j] for j, entry in enumerate(row)) for row in F]
+        stretch = length_of(jnp.asarray(sum(part**2 for part in along)), 0.0)
+        return stress * stretch if passive is None else stress * stretch + 0.5 * passive * (stretch - 1) ** 2
+
+    def energy(x: Corners, element: tuple[Any, ...]) -> Scalar:
+        gradients, volume, *rest = element
+        return volume * density(x, gradients, tuple(rest))
+
+    def quadratic_energy(x: Corners, element: tuple[Any, ...]) -> Scalar:
+        gradients, weights, *rest = element
+        at_points = jax.vmap(lambda slopes: density(jnp.asarray(x), slopes, tuple(rest)))(gradients)
+        return jnp.sum(weights * at_points)
+
+    linear, control = mesh.midsides is None, (number,) if activation is None else None
+    return Term(name, nodes, energy if linear else quadratic_energy, parameters, prepare, linear, control)
+
+
+def _directions(direction: Numbers, count: int, dimension: int) -> Float[Array, "*m dim"]:
+    result = jnp.asarray(direction, dtype=float)
+    if result.shape not in ((dimension,), (count, dimension)):
+        raise InputError(
+            f"direction has shape {list(result.shape)}; expected [{dimension}], or [{count}, {dimension}]: per element"
+        )
+    if not isinstance(result, Tracer):
+        lengths = np.atleast_1d(np.linalg.norm(np.asarray(result), axis=-1))
+        if (wrong := ~(np.isfinite(lengths) & (lengths > 0))).any():
+            raise InputError(f"the direction of fibres {np.argmax(wrong)} has no length; expected a unit vector")
+    return result

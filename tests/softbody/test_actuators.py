@@ -1,0 +1,338 @@
+"""Pressure, gas, tendons, fibres and loads against closed forms, laws of mechanics and finite differences."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+
+from dln_jax.softbody.mesh import (
+    beam,
+    boundary,
+    box,
+    closed_surface,
+    enclosed_volume,
+    facets_in,
+    inner_surface,
+    lattice,
+    make_mesh,
+    outer_surface,
+    quadratic,
+    surface_parts,
+    vertices_where,
+    volumes,
+)
+from dln_jax.softbody.mesh.mesh import NamedSet
+from dln_jax.softbody.scene import make_scene, potential, with_parameters
+from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.terms import (
+    body_force,
+    elastic,
+    fibres,
+    gas,
+    gravity,
+    muscles,
+    path_length,
+    point_force,
+    pressure,
+    stable_neo_hookean,
+    tendon_of_length,
+    tendon_of_tension,
+    traction,
+)
+from dln_jax.types import InputError
+
+E, NU = 1e5, 0.3
+
+
+def ring(inner, outer, around, across):
+    """A ring in the plane."""
+    angles = 2 * np.pi * np.arange(around) / around
+    radii = np.linspace(inner, outer, across + 1)
+    vertices = np.concatenate([r * np.stack([np.cos(angles), np.sin(angles)], axis=1) for r in radii])
+    i, k = np.meshgrid(np.arange(around), np.arange(across))
+    a, b = (k * around + i).ravel(), (k * around + (i + 1) % around).ravel()
+    return make_mesh(
+        vertices, np.concatenate([np.stack([a, a + around, b], 1), np.stack([b, a + around, b + around], 1)])
+    )
+
+
+def hollow_box(size=4):
+    """A cube of 1 m with a cubic cavity of 0.5 m."""
+    cells = [c for c in np.ndindex(size, size, size) if not all(size // 4 <= i < size - size // 4 for i in c)]
+    positions, elements = lattice(cells)
+    return make_mesh(positions / size, elements)
+
+
+def open_box():
+    """A cube with a cavity that is open at the bottom, z = 0."""
+    positions, elements = lattice([c for c in np.ndindex(3, 3, 3) if not (c[0] == 1 == c[1] and c[2] < 2)])
+    return make_mesh(positions / 3, elements)
+
+
+def forces(term, mesh, x, control=None):
+    scene = make_scene(mesh, [term])
+    return -np.asarray(jax.grad(lambda x: potential(scene, x, scene.params, control))(jnp.asarray(x)))
+
+
+def shaken(mesh, amount=0.03):
+    return mesh.vertices + amount * np.random.default_rng(0).normal(size=mesh.vertices.shape)
+
+
+@pytest.mark.parametrize("mesh", [ring(0.5, 1.0, 12, 2), hollow_box()], ids=["plane", "space"])
+def test_surfaces_enclose_the_volume_of_the_body_and_of_its_cavity(mesh):
+    outer, wall = surface_parts(mesh)
+    cavity = enclosed_volume(mesh.vertices, closed_surface(mesh, inner_surface(mesh)))
+    assert cavity == pytest.approx(0.125 if mesh.dimension == 3 else 6 * 0.25 * np.sin(np.pi / 6), rel=1e-12)
+    assert enclosed_volume(mesh.vertices, outer_surface(mesh)) - cavity == pytest.approx(volumes(mesh).sum(), rel=1e-12)
+    assert enclosed_volume(mesh.vertices, wall) == pytest.approx(-cavity)
+    shuffled = np.random.default_rng(1).permuted(wall, axis=1)
+    assert enclosed_volume(mesh.vertices + 7.0, closed_surface(mesh, shuffled)) == pytest.approx(cavity)
+    assert len(outer) + len(wall) == len(boundary(mesh))
+
+
+@pytest.mark.parametrize("make", [lambda mesh: mesh, quadratic], ids=["linear", "quadratic"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_pressure_on_a_closed_surface_has_no_resultant_force_or_moment(dimension, make):
+    mesh = make(ring(0.5, 1.0, 12, 1) if dimension == 2 else hollow_box())
+    x = shaken(mesh)
+    f = forces(pressure(mesh, inner_surface(mesh), pressure=3e3), mesh, x)
+    size = np.abs(f).sum()
+    assert size > 1e2
+    np.testing.assert_allclose(f.sum(axis=0), 0, atol=1e-12 * size)
+    np.testing.assert_allclose(np.einsum("ni,nj->ij", x, f) - np.einsum("ni,nj->ji", x, f), 0, atol=1e-12 * size)
+
+
+def test_pressure_under_a_cap_lifts_with_its_area_and_pulls_at_the_rim_of_the_opening():
+    mesh = open_box()
+    open_cavity = boundary(mesh)
+    middle = mesh.vertices[open_cavity].mean(axis=1)
+    inside = (np.abs(middle[:, :2] - 0.5) < 0.17).all(axis=1) & (middle[:, 2] < 0.67) & (middle[:, 2] > 1e-9)
+    with pytest.raises(InputError, match=r"open at 4 edges.*cap=True"):
+        closed_surface(mesh, open_cavity[inside])
+    chamber = closed_surface(mesh, open_cavity[inside], cap=True)
+    assert enclosed_volume(mesh.vertices, chamber) == pytest.approx(2 / 27)
+    f = forces(pressure(mesh, open_cavity[inside], pressure=900.0, cap=True), mesh, mesh.vertices)
+    up = mesh.vertices[:, 2] > 0.5
+    assert f[up, 2].sum() == pytest.approx(100.0)
+    assert f[mesh.vertices[:, 2] < 1e-9, 2].sum() == pytest.approx(-100.0)
+
+
+def test_work_of_pressure_is_the_change_of_the_volume():
+    mesh = ring(0.5, 1.0, 12, 1)
+    scene = make_scene(mesh, [pressure(mesh, inner_surface(mesh), pressure=40.0)])
+    surface = closed_surface(mesh, inner_surface(mesh))
+    x = shaken(mesh)
+    work = potential(scene, jnp.asarray(mesh.vertices), scene.params) - potential(scene, jnp.asarray(x), scene.params)
+    change = enclosed_volume(x, surface) - enclosed_volume(mesh.vertices, surface)
+    assert work == pytest.approx(40.0 * change, rel=1e-9)
+
+
+def lame(a, b, p, r):
+    """Radial displacement of a thick-walled cylinder in plane strain."""
+    return p * a**2 / (b**2 - a**2) * (1 + NU) / E * ((1 - 2 * NU) * r + b**2 / r)
+
+
+def displacement(term_of, around, across):
+    mesh = quadratic(ring(0.5, 1.0, around, across))
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    # Mid-side nodes of circles are on them.
+    ends = np.round(radius / 0.5 * across) * 0.5 / across
+    curved = np.where((np.abs(ends - radius) < 0.01)[:, None], mesh.vertices * (ends / radius)[:, None], mesh.vertices)
+    mesh = mesh._replace(vertices=np.where(np.isin(np.round(ends, 9), [0.5, 1.0])[:, None], curved, mesh.vertices))
+    terms = [elastic(mesh, stable_neo_hookean, youngs_modulus=E, poisson_ratio=NU), term_of(mesh)]
+    # A weak spring keeps rigid motions fixed.
+    scene = make_scene(mesh, terms, masses=1e-3, held=[int(np.argmax(mesh.vertices[:, 0]))])
+    x, info = static_solve(scene, scene.params, tolerance=1e-5)
+    assert info.converged
+    return mesh, np.asarray(x)
+
+
+@pytest.mark.slow
+def test_a_thick_walled_cylinder_widens_as_lame_says():
+    p = 1e-4 * E
+    mesh, x = displacement(lambda mesh: pressure(mesh, inner_surface(mesh), pressure=p), 24, 2)
+    x = x - x.mean(axis=0) + mesh.vertices.mean(axis=0)
+    for r in (0.5, 1.0):
+        at = np.abs(np.linalg.norm(mesh.vertices, axis=1) - r) < 1e-6
+        moved = np.linalg.norm(x[at], axis=1).mean() - r
+        assert moved == pytest.approx(lame(0.5, 1.0, p, r), rel=3e-3)
+
+
+def test_a_sealed_gas_keeps_pressure_times_volume_and_resists_a_load():
+    mesh = ring(0.5, 1.0, 12, 1)
+    term = gas(mesh, inner_surface(mesh), pressure=2e3, ambient=1e4)
+    surface = closed_surface(mesh, inner_surface(mesh))
+    x = 1.1 * mesh.vertices
+    volume = enclosed_volume(x, surface)
+    absolute = 1.2e4 * enclosed_volume(mesh.vertices, surface) / volume
+    of_gauge = forces(pressure(mesh, inner_surface(mesh), pressure=absolute - 1e4), mesh, x)
+    np.testing.assert_allclose(forces(term, mesh, x), of_gauge, atol=1e-9)
+    pumped = gas(mesh, inner_surface(mesh), pressure=None, ambient=1e4)
+    np.testing.assert_allclose(forces(pumped, mesh, x, jnp.asarray(absolute * volume)), of_gauge, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_eccentric_tendon_bends_a_beam_with_its_end_moment():
+    length, height, tension = 1.0, 0.05, 0.05
+    mesh = quadratic(beam(length, height, 20, 2))
+    held = vertices_where(mesh, lambda x: x[:, 0] < 1e-9)
+    path = np.stack([np.linspace(0, length, 21), np.full(21, 0.8 * height)], axis=1)
+    terms = [
+        elastic(mesh, stable_neo_hookean, youngs_modulus=E, poisson_ratio=NU),
+        tendon_of_tension(mesh, path, tension=tension),
+    ]
+    scene = make_scene(mesh, terms, held=held, masses=1e-3)
+    x, info = static_solve(scene, scene.params)
+    assert info.converged
+    tip = np.asarray(x)[np.abs(mesh.vertices[:, 0] - length) < 1e-9, 1].mean() - height / 2
+    stiffness = E / (1 - NU**2) * height**3 / 12
+    assert tip == pytest.approx(tension * 0.3 * height * length**2 / (2 * stiffness), rel=0.02)
+
+
+def test_a_tendon_pulls_with_one_tension_and_never_pushes():
+    mesh = box((1.0, 0.2, 0.2), (3, 1, 1))
+    path = np.array([[0.05, 0.1, 0.03], [0.5, 0.12, 0.1], [0.95, 0.1, 0.17]])
+    rest = float(path_length(mesh, path))
+    assert rest == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    tense = tendon_of_length(mesh, path, stiffness=200.0, length=0.9 * rest)
+    slack = tendon_of_length(mesh, path, stiffness=200.0, length=1.1 * rest)
+    assert not forces(slack, mesh, mesh.vertices).any()
+    pulled = forces(tendon_of_tension(mesh, path, tension=20.0 * rest), mesh, mesh.vertices)
+    np.testing.assert_allclose(forces(tense, mesh, mesh.vertices), pulled, atol=1e-12)
+    np.testing.assert_allclose(pulled.sum(axis=0), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [lambda mesh: mesh, quadratic], ids=["linear", "quadratic"])
+def test_fibres_shorten_a_bar_to_where_their_stress_balances_that_of_the_material(make):
+    mu, strength, passive, activation = E / 2, 2e4, 5e4, 0.5
+
+    def stresses(stretches):
+        """First Piola stresses of the stable neo-Hookean bar with nu = 0 and fibres along the first axis."""
+        one, other = stretches
+        J = one * other
+        along = mu * (one - other) + mu * (J - 1) * other + activation * strength + passive * (one - 1)
+        return along, mu * (other - one) + mu * (J - 1) * one
+
+    one, other = fsolve(stresses, [0.95, 1.0], xtol=1e-14)
+    assert one < 0.95
+    mesh = make(beam(1.0, 0.5, 2, 1))
+    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=E, poisson_ratio=0.0)
+    muscle = fibres(mesh, (3.0, 0.0), strength=strength, stiffness=passive)
+    shortened = mesh.vertices * np.array([one, other])
+    contracting = forces(muscle, mesh, shortened, jnp.asarray([activation]))
+    assert np.abs(contracting).max() > 100
+    np.testing.assert_allclose(contracting, -forces(solid, mesh, shortened), atol=1e-8)
+
+
+def test_loads_add_up_to_force_times_area_or_volume():
+    for mesh in (quadratic(box((0.3, 0.4, 0.5), (2, 2, 2))), beam(0.3, 0.5, 3, 2)):
+        top = boundary(mesh)[(mesh.vertices[boundary(mesh)][..., -1] == 0.5).all(axis=1)]
+        t = np.arange(1.0, mesh.dimension + 1)
+        area = 0.12 if mesh.dimension == 3 else 0.3
+        np.testing.assert_allclose(forces(traction(mesh, top, t), mesh, mesh.vertices).sum(axis=0), t * area)
+        f = forces(body_force(mesh, t), mesh, mesh.vertices)
+        np.testing.assert_allclose(f.sum(axis=0), t * volumes(mesh).sum())
+        one = forces(point_force(mesh, [2], t), mesh, mesh.vertices)
+        np.testing.assert_allclose(one[2], t)
+        assert not np.delete(one, 2, axis=0).any()
+
+
+@functools.cache
+def actuated():
+    """A ring with a chamber, a tendon and fibres, all of them driven, and a driven muscle and load."""
+    mesh = ring(0.5, 1.0, 8, 1)
+    terms = [
+        elastic(mesh, stable_neo_hookean, youngs_modulus=E, poisson_ratio=NU),
+        pressure(mesh, inner_surface(mesh), name="air"),
+        tendon_of_length(mesh, [8, 10, 12], stiffness=3e4),
+        fibres(mesh, (1.0, 0.5), strength=2e4, groups=np.arange(16) % 2),
+        muscles([[8, 12], [9, 13]], stiffness=900.0),
+        traction(mesh, outer_surface(mesh), name="wind"),
+        gravity(mesh),
+    ]
+    return mesh, make_scene(mesh, terms, held=[8, 9])
+
+
+CONTROL = {
+    "air": jnp.asarray(3e3),
+    "tendon": jnp.asarray([2.1]),
+    "fibres": jnp.asarray([0.3, 0.8]),
+    "muscles": jnp.asarray([0.8, 0.9]),
+    "wind": jnp.asarray([40.0, -30.0]),
+}
+
+
+@pytest.mark.slow
+def test_derivatives_by_all_controls_and_parameters_are_those_of_finite_differences():
+    _, scene = actuated()
+    init, step = make_step(scene, 0.02, tolerance=1e-10)
+    weights = np.random.default_rng(2).normal(size=scene.mesh.vertices.shape)
+
+    @jax.jit
+    def outcome(control, strength, stiffness):
+        params = with_parameters(scene.params, fibres={"strength": strength}, tendon={"stiffness": stiffness})
+        state = init()
+        for _ in range(2):
+            state, info = step(params, state, control)
+        return jnp.sum(weights * state.x), info.converged
+
+    at = (CONTROL, 2e4, 3e4)
+    slopes, converged = jax.jit(jax.grad(outcome, argnums=(0, 1, 2), has_aux=True))(*at)
+    assert converged
+    leaves, structure = jax.tree.flatten(at)
+    for number, (leaf, slope) in enumerate(zip(leaves, jax.tree.leaves(slopes), strict=True)):
+        for place in np.ndindex(np.shape(leaf)):
+            value = float(np.asarray(leaf)[place])
+
+            def moved(to, number=number, leaf=leaf, place=place):
+                changed = np.array(leaf, float)
+                changed[place] = to
+                return float(
+                    outcome(*structure.unflatten([*leaves[:number], jnp.asarray(changed), *leaves[number + 1 :]]))[0]
+                )
+
+            h = 1e-3 * abs(value)
+            difference = (8 * (moved(value + h) - moved(value - h)) - moved(value + 2 * h) + moved(value - 2 * h)) / (
+                12 * h
+            )
+            assert float(np.asarray(slope)[place]) == pytest.approx(difference, rel=1e-6), (number, place)
+
+
+def test_controls_are_shared_by_name():
+    mesh, scene = actuated()
+    step = make_step(scene, 0.02).step
+    state = make_step(scene, 0.02).init()
+    with pytest.raises(InputError, match="one array, but the scene has the actuators air, tendon"):
+        step(scene.params, state, jnp.ones(2))
+    with pytest.raises(InputError, match=r"names 'water', which is no actuator.*air"):
+        step(scene.params, state, CONTROL | {"water": jnp.ones(1)})
+    with pytest.raises(InputError, match=r"air got no control; expected shape .*: the gauge pressure in Pa"):
+        step(scene.params, state, {name: of for name, of in CONTROL.items() if name != "air"})
+    alone = make_scene(mesh, [elastic(mesh, stable_neo_hookean), pressure(mesh, inner_surface(mesh))])
+    x, info = make_step(alone, 0.02).step(alone.params, make_step(alone, 0.02).init(), jnp.asarray([100.0]))
+    assert info.converged and np.linalg.norm(x.x[:8], axis=1).mean() > 0.5
+
+
+def test_mistakes_of_actuators_say_what_is_wrong():
+    mesh, cube = ring(0.5, 1.0, 8, 1), box((1.0, 1.0, 1.0), (1, 1, 1))
+    named = mesh._replace(sets={"few": NamedSet(np.array([0, 12]), np.zeros(0, int))})
+    for mistake, message in (
+        (lambda: pressure(mesh, inner_surface(mesh)[1:]), "open at 2 vertices, the first is vertex 1"),
+        (lambda: pressure(mesh, [[0, 99]]), "facet 0 is .0, 99.; expected 2 different ones of 0..15"),
+        (lambda: pressure(mesh, [[0, 1], [1, 0]]), "is repeated"),
+        (lambda: inner_surface(cube), "no closed cavity"),
+        (lambda: facets_in(named, "few"), "'few' contains no edge of the surface"),
+        (lambda: facets_in(named, "many"), "no set 'many'; the sets are few"),
+        (lambda: tendon_of_tension(mesh, [[0.7, 0.0], [3.0, 0.0]], tension=1.0), "point 1 at .3.0, 0.0. m is outside"),
+        (lambda: tendon_of_tension(mesh, [0, 0], tension=1.0), "points 0 and 1 of the path coincide"),
+        (lambda: tendon_of_tension(mesh, [0], tension=1.0), "the path has 1 points"),
+        (lambda: fibres(mesh, (0.0, 0.0), strength=1.0), "direction of fibres 0 has no length"),
+        (lambda: fibres(mesh, (0.0, 1.0), strength=1.0, elements=[99]), "in element 99; expected elements 0..15"),
+        (lambda: traction(mesh, outer_surface(mesh), [1.0, 2.0, 3.0]), "has shape .3.; expected .2."),
+        (lambda: gas(mesh, inner_surface(mesh), pressure=-2e5), "absolute pressure"),
+    ):
+        with pytest.raises(InputError, match=message):
+            mistake()
