@@ -11,7 +11,8 @@ from scripts.reports.case import named
 from scripts.reports.commands import softbody_report
 from scripts.reports.commands.softbody_report import cases
 
-# Speed and rivals depend on the machine. Cases that take minutes. In one of them, the twisted bar snaps in a step that reports that it has not converged.
+# Speed and rivals depend on the machine.
+# Cases that take minutes. In one of them, the twisted bar snaps in a step that reports that it has not converged.
 ELSEWHERE = ("folding-beam", "ring", "twisted-bar", "gradients", "stack")
 CASES = [
     case.name

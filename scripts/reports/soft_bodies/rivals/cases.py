@@ -2,8 +2,8 @@
 
 A cantilever of 540 linear tetrahedra swings under its weight for 0.5 s, and a block of 320 falls on a rigid floor
 without friction and rebounds. All have the same mesh, lumped masses, load and material. Errors are those of the
-displacement against `reference_motion`, which shares the mesh: what remains are time steps, solvers and contact. Processor time
-leaves compilation out. Set OPENBLAS_NUM_THREADS=1: waiting threads would count.
+displacement against `reference_motion`, which shares the mesh: what remains are time steps, solvers and
+contact. Processor time leaves compilation out. Set OPENBLAS_NUM_THREADS=1: waiting threads would count.
 """
 
 import importlib

@@ -18,7 +18,7 @@ VERSION = newton.__version__
 def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Run:
     """A motion with steps of dt in s; the stiffness of contact in N/m is Newton's default."""
     mu, lam = body.lame
-    builder = newton.ModelBuilder(gravity=-GRAVITY)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
     builder.default_shape_cfg.ke, builder.default_shape_cfg.kd, builder.default_shape_cfg.mu = stiffness, 0.0, 0.0
     builder.add_soft_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
