@@ -74,20 +74,22 @@ assert converged.all()
 assert not any(crossings(mesh, at) for at in x[::10])
 
 # %%
-# Five moments of the fall, the earliest palest, with the shadow on each stair.
+# Four moments of the fall, the earliest palest, with the shadows on the stairs.
 
 figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
 for left, right, top in zip(lefts, rights, tops, strict=True):
     axes.add_patch(plt.Rectangle((left, -0.1), right - left, top + 0.1, color="0.82", linewidth=0))
 every = np.concatenate([mesh.vertices[None], x])
-for k in np.linspace(0, STEPS, 5).astype(int):
+for k in np.linspace(0, STEPS, 4).astype(int):
     alpha = 0.25 + 0.75 * k / STEPS
     corners = every[k]
-    under = tops[int(np.searchsorted(rights, corners[:, 0].mean()))]
-    axes.plot([corners[:, 0].min(), corners[:, 0].max()], [under, under], color="0.55", linewidth=3, alpha=alpha)
+    shadow = corners[:, 0].min(), corners[:, 0].max()
+    for left, right, top in zip(lefts, rights, tops, strict=True):
+        if (ends := np.clip(shadow, left, right))[0] < ends[1]:
+            axes.plot(ends, [top, top], color="0.55", linewidth=3, alpha=alpha, solid_capstyle="butt")
     axes.add_collection(
         PolyCollection(corners[mesh.elements], facecolor=style.BLUE, edgecolor="white", linewidth=0.3, alpha=alpha)
     )
     axes.text(corners[:, 0].mean(), corners[:, 1].max() + 0.02, f"{DT * k:.2f} s", ha="center", fontsize=8)
-axes.set(xlim=(lefts[0] + 0.1, rights[-1] - 0.3), ylim=(-0.1, 1.1), aspect="equal")
+axes.set(xlim=(lefts[0] + 0.1, rights[-1] - 0.9), ylim=(-0.1, 1.1), aspect="equal")
 axes.set_axis_off()
