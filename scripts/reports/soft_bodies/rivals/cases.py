@@ -36,13 +36,13 @@ LABELS = {
 
 def rivals() -> tuple[dict[str, ModuleType], str]:
     """The rivals that can be imported, and a sentence about those that cannot."""
-    found, missing = {}, []
+    simulators, missing = {}, []
     for name, package in NEEDED.items():
         try:
-            found[name] = importlib.import_module(f"scripts.reports.soft_bodies.rivals.{name}")
+            simulators[name] = importlib.import_module(f"scripts.reports.soft_bodies.rivals.{name}")
         except ImportError:
             missing.append(package)
-    return found, f"not installed: {', '.join(missing)} (pip install 'dln-jax[rivals]')" if missing else ""
+    return simulators, f"not installed: {', '.join(missing)} (pip install 'dln-jax[rivals]')" if missing else ""
 
 
 def swing(quick: bool) -> Findings:
@@ -50,11 +50,11 @@ def swing(quick: bool) -> Findings:
     mesh = box((1.0, 0.25, 0.25), (12, 3, 3))
     held = vertices_where(mesh, lambda x: x[:, 0] == 0)
     body = Body(mesh, held, 1e6, 0.3, 0.1 * np.arange(1, 3 if quick else 6))
-    reference, (found, missing) = reference_motion(body, 2e-4), rivals()
+    reference, (simulators, missing) = reference_motion(body, 2e-4), rivals()
     runs = {f"{rule}/{dt}": own.motion(body, rule, dt) for rule in ("backward-euler", "midpoint") for dt in STEPS}
-    if flex := found.get("mujoco_flex"):
+    if flex := simulators.get("mujoco_flex"):
         runs |= {f"mujoco-discrete/{dt}": flex.motion(body, "discrete", dt) for dt in (0.01, 0.005, 0.002, 0.001, 1e-4)}
-    if vbd := found.get("newton_vbd"):
+    if vbd := simulators.get("newton_vbd"):
         runs |= {f"newton-{n}/{dt}": vbd.motion(body, dt, n) for n in (10, 50) for dt in (0.01, 0.002, 0.0005)}
     findings = _findings("swing", body, runs, reference, missing)
     if flex:
@@ -73,13 +73,13 @@ def drop(quick: bool) -> Findings:
     mesh = box((0.5, 0.5, 0.5), (4, 4, 4))
     mesh = mesh._replace(vertices=mesh.vertices + np.array([0.0, 0.0, 0.1]))
     body = Body(mesh, np.zeros(0, int), 1e5, 0.3, 0.1 * np.arange(1, 3 if quick else 6), floor=True)
-    reference, (found, missing) = reference_motion(body, 1e-4, 1e6), rivals()
+    reference, (simulators, missing) = reference_motion(body, 1e-4, 1e6), rivals()
     runs = {f"{rule}/{dt}": own.motion(body, rule, dt) for rule in ("backward-euler", "midpoint") for dt in STEPS}
-    if flex := found.get("mujoco_flex"):
+    if flex := simulators.get("mujoco_flex"):
         runs |= {f"mujoco-discrete/{dt}": flex.motion(body, "discrete", dt) for dt in (0.01, 0.002, 5e-4)}
         stiff = {dt: flex.motion(body, "discrete", dt, (max(2 * dt, 2e-3), 1.0)) for dt in (0.002, 5e-4)}
         runs |= {f"mujoco-stiff-contact/{dt}": run for dt, run in stiff.items()}
-    if vbd := found.get("newton_vbd"):
+    if vbd := simulators.get("newton_vbd"):
         runs |= {f"newton-10/{dt}": vbd.motion(body, dt, 10) for dt in (0.002, 5e-4)}
         runs |= {f"newton-50-stiff-contact/{dt}": vbd.motion(body, dt, 50, 1e6) for dt in (0.002, 5e-4)}
     return _findings("drop", body, runs, reference, missing)
@@ -90,13 +90,13 @@ def hanging(quick: bool) -> Findings:
     del quick
     mesh = box((1.0, 0.25, 0.25), (12, 3, 3))
     body = Body(mesh, vertices_where(mesh, lambda x: x[:, 0] == 0), 3e6, 0.3, np.ones(1))
-    (found, missing), ours = rivals(), own.static(body)
+    (simulators, missing), ours = rivals(), own.static(body)
     slope, value = own.static_gradient(body)
     rows = [
         _seconds("hanging/dln_jax", "solve", ours, missing),
         _seconds("hanging/dln_jax", "gradient", slope, f"{value:.6e} m/Pa"),
     ]
-    if fem := found.get("torch_fem"):
+    if fem := simulators.get("torch_fem"):
         theirs, (their_slope, their_value) = fem.static(body), fem.static_gradient(body)
         difference = relative_error(body, theirs.x, ours.x)
         rows += [

@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 """MuJoCo's flexes: a body with three slide joints for every vertex, and linear tetrahedra between them.
 
 The stable neo-Hookean law needs the integrator `discrete` (one linearised implicit step, no iteration of it); the

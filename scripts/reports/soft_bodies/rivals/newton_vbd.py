@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 """Newton's vertex block descent (Chen et al. 2024) on a processor, in single precision, as Newton has it.
 
 A step is backward Euler, by a fixed number of sweeps over the vertices. `SolverVBD` has no gradients.

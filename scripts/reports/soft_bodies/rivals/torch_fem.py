@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 """torch-fem: quasi-static finite elements in PyTorch with implicit derivatives of the solution. It has no motions."""
 
 from importlib.metadata import version
