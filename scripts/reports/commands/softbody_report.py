@@ -1,7 +1,8 @@
 """Measure soft bodies: closed forms, hard cases, gradients and speed, each number beside what one may expect.
 
 Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), and writes report.json. All of it
-is float64. Only `speed` depends on the machine.
+is float64. Only `speed` and `rivals` depend on the machine. `rivals` measures the
+other simulators that are installed (extra `[rivals]`), in minutes.
 """
 
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from dln_jax.cli.options import Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, in_subjects, report_cases
 from scripts.reports.soft_bodies import contact, elements, gradients, motions, robustness, speed, statics, stiffness
+from scripts.reports.soft_bodies.rivals import cases as rivals
 
 MEASURES = {
     "references": (
@@ -32,17 +34,18 @@ MEASURES = {
         *(speed.creature, speed.beams, speed.backward, speed.solver_choice),
         *(stiffness.steps, stiffness.factorisation),
     ),
+    "rivals": (rivals.swing, rivals.drop, rivals.hanging),
 }
 """Functions quick -> findings, by subject."""
-FIGURES = {elements.locking: elements.locking_figure}
+FIGURES = {elements.locking: elements.locking_figure, rivals.swing: rivals.figure}
 
 
 @dataclass(frozen=True)
 class Arguments(Folder):
     """What to measure."""
 
-    only: Annotated[str, choice(MEASURES, several=True)] = ",".join(MEASURES)
-    """Subjects (default: all)."""
+    only: Annotated[str, choice(MEASURES, several=True)] = ",".join(name for name in MEASURES if name != "rivals")
+    """Subjects (default: all but rivals)."""
     quick: bool = False
     """Smaller meshes, fewer and shorter motions: 90 s instead of minutes."""
 

@@ -1,0 +1,62 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+"""MuJoCo's flexes: a body with three slide joints for every vertex, and linear tetrahedra between them.
+
+The stable neo-Hookean law needs the integrator `discrete` (one linearised implicit step, no iteration of it); the
+default St. Venant-Kirchhoff law also runs with the others. A flex has no derivatives but finite differences.
+"""
+
+import warnings
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dln_jax.softbody.mesh.mesh import lumped_masses
+from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, KIRCHHOFF, Body, Run, measured
+
+VERSION = mujoco.__version__
+RADIUS = 1e-4
+"""Of the vertices, in m: the floor is lowered by it."""
+
+
+def model_of(body: Body, integrator: str, dt: float, solref: tuple[float, float] = (0.02, 1.0)) -> Any:
+    """The compiled model; `solref` of the contact with the floor is MuJoCo's default."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = dt, [0.0, 0.0, -GRAVITY]
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    masses, held = lumped_masses(body.mesh, DENSITY), set(body.held.tolist())
+    for i, (place, mass) in enumerate(zip(body.mesh.vertices, masses, strict=True)):
+        part = spec.worldbody.add_body(name=f"v{i}", pos=place, mass=mass, inertia=[mass * 1e-6] * 3)
+        part.explicitinertial = True
+        for axis in np.eye(3) if i not in held else ():
+            part.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    flex = spec.add_flex(name="body", dim=3, radius=RADIUS, young=body.modulus, poisson=body.ratio, condim=1)
+    flex.elastic3d = int(body.law != KIRCHHOFF)
+    flex.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+    flex.vertbody = [f"v{i}" for i in range(len(masses))]
+    flex.elem = body.mesh.elements.ravel().tolist()
+    flex.solref = solref
+    if body.floor:
+        floor = {"pos": [0.0, 0.0, -RADIUS], "size": [5.0, 5.0, 0.1], "condim": 1, "solref": solref}
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, **floor)
+    with warnings.catch_warnings():  # MuJoCo 4.0 warns that a stable neo-Hookean flex has no passive forces; it has
+        warnings.simplefilter("ignore")
+        return spec.compile()
+
+
+def motion(body: Body, integrator: str, dt: float, solref: tuple[float, float] = (0.02, 1.0)) -> Run:
+    """A motion with steps of dt in s."""
+    model = model_of(body, integrator, dt, solref)
+    free = np.setdiff1d(np.arange(len(body.mesh.vertices)), body.held)
+    ends = np.round(body.times / dt).astype(int)
+
+    def run() -> np.ndarray:
+        data, out = mujoco.MjData(model), []
+        for count in np.diff(ends, prepend=0):
+            mujoco.mj_step(model, data, int(count))
+            x = body.mesh.vertices.copy()
+            x[free] += data.qpos.reshape(-1, 3)
+            out.append(x)
+        return np.array(out)
+
+    return measured(body, run)

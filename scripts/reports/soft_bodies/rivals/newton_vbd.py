@@ -1,0 +1,62 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+"""Newton's vertex block descent (Chen et al. 2024) on a processor, in single precision, as Newton has it.
+
+A step is backward Euler, by a fixed number of sweeps over the vertices. `SolverVBD` has no gradients.
+"""
+
+import numpy as np
+import warp as wp
+
+wp.config.quiet = True
+
+import newton  # noqa: E402
+
+from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, Body, Run, measured  # noqa: E402
+
+VERSION = newton.__version__
+
+
+def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Run:
+    """A motion with steps of dt in s; the stiffness of contact in N/m is Newton's default."""
+    mu, lam = body.lame
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
+    builder.default_shape_cfg.ke, builder.default_shape_cfg.kd, builder.default_shape_cfg.mu = stiffness, 0.0, 0.0
+    builder.add_soft_mesh(
+        pos=wp.vec3(0.0, 0.0, 0.0),
+        rot=wp.quat_identity(),
+        scale=1.0,
+        vel=wp.vec3(0.0, 0.0, 0.0),
+        vertices=[wp.vec3(*place) for place in body.mesh.vertices],
+        indices=body.mesh.elements.ravel().tolist(),
+        density=DENSITY,
+        k_mu=mu,
+        k_lambda=lam,
+        k_damp=0.0,
+        particle_radius=0.0,
+        add_surface_mesh_edges=False,
+    )
+    for vertex in body.held:
+        builder.particle_mass[vertex] = 0.0
+    if body.floor:
+        builder.add_ground_plane()
+    builder.color()
+    model = builder.finalize(device="cpu")
+    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = stiffness, 0.0, 0.0
+    solver = newton.solvers.SolverVBD(model, iterations=iterations, particle_enable_tile_solve=False)
+    pipeline = newton.CollisionPipeline(model)
+    contacts, control = pipeline.contacts(), model.control()
+    ends = np.round(body.times / dt).astype(int)
+
+    def run() -> np.ndarray:
+        now, after, out = model.state(), model.state(), []
+        for count in np.diff(ends, prepend=0):
+            for _ in range(count):
+                now.clear_forces()
+                if body.floor:
+                    pipeline.collide(now, contacts)
+                solver.step(now, after, control, contacts, dt)
+                now, after = after, now
+            out.append(now.particle_q.numpy().astype(float))
+        return np.array(out)
+
+    return measured(body, run)

@@ -1,0 +1,94 @@
+"""This library's side: time steps, a static solve and their gradients."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.rollout import rollout
+from dln_jax.softbody.integrators import INTEGRATORS
+from dln_jax.softbody.scene import Params, SoftScene, make_scene, with_parameters
+from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.terms.contact import plane_contact
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import st_venant_kirchhoff, stable_neo_hookean
+from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, KIRCHHOFF, Body, Run, measured
+
+FLOOR = 1e6
+"""Stiffness of the floor, N/m for each vertex."""
+
+
+def scene_of(body: Body) -> SoftScene:
+    """The body's scene."""
+    law = st_venant_kirchhoff if body.law == KIRCHHOFF else stable_neo_hookean
+    terms = [
+        elastic(body.mesh, law, youngs_modulus=body.modulus, poisson_ratio=body.ratio),
+        gravity(body.mesh, (0.0, 0.0, -GRAVITY)),
+    ]
+    if body.floor:
+        vertices = range(len(body.mesh.vertices))
+        terms.append(plane_contact(vertices, normal=(0, 0, 1), stiffness=FLOOR, width=0.0))
+    return make_scene(body.mesh, terms, density=DENSITY, held=body.held)
+
+
+def motion(body: Body, integrator: str, dt: float) -> Run:
+    """A motion by one integrator with steps of dt in s."""
+    program = _program(body, integrator, dt)
+    params = scene_of(body).params
+    run = measured(body, lambda: program(params)[0])
+    if not program(params)[1]:
+        run = run._replace(x=np.full_like(run.x, np.nan))
+    return run
+
+
+def motion_gradient(body: Body, integrator: str, dt: float) -> tuple[Run, float]:
+    """Derivative of the mean height at the end by Young's modulus, in m/Pa, by reverse mode: time and value."""
+    program, params = _program(body, integrator, dt), scene_of(body).params
+
+    @jax.jit
+    def slope(modulus: Any) -> Any:
+        height = lambda E: program(with_parameters(params, elastic={"youngs_modulus": E}))[0][-1, :, 2].mean()  # noqa: E731
+        return jax.grad(height)(modulus)
+
+    at = jnp.asarray(body.modulus)
+    return measured(body, lambda: jax.block_until_ready(slope(at))), float(slope(at))
+
+
+def static(body: Body) -> Run:
+    """Equilibrium under the weight; its time is that of one solve (`body.times` is one second)."""
+    scene = scene_of(body)
+    solve = jax.jit(lambda params: static_solve(scene, params)[0])
+    return measured(body, lambda: jax.block_until_ready(solve(scene.params))[None])
+
+
+def static_gradient(body: Body) -> tuple[Run, float]:
+    """Derivative of the mean height at equilibrium by Young's modulus, in m/Pa."""
+    scene = scene_of(body)
+
+    @jax.jit
+    def slope(modulus: Any) -> Any:
+        def height(E: Any) -> Any:
+            return static_solve(scene, with_parameters(scene.params, elastic={"youngs_modulus": E}))[0][:, 2].mean()
+
+        return jax.grad(height)(modulus)
+
+    at = jnp.asarray(body.modulus)
+    return measured(body, lambda: jax.block_until_ready(slope(at))), float(slope(at))
+
+
+def _program(body: Body, integrator: str, dt: float) -> Any:
+    """params -> (positions at the body's times, whether all steps converged), compiled."""
+    scene = scene_of(body)
+    init, step = make_step(scene, dt, INTEGRATORS[integrator])
+    ends = np.round(body.times / dt).astype(int)
+    observe = lambda state, info: (state.x, info.converged)  # noqa: E731
+
+    @jax.jit
+    def run(params: Params) -> Any:
+        x, converged = rollout(partial(step, params), init(), steps=int(ends[-1]), observe=observe)[1]
+        return x[ends - 1], converged.all()
+
+    return run

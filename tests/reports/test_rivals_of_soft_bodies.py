@@ -1,0 +1,34 @@
+"""The reference that all simulators of soft bodies are compared with, and the part of the report that always runs."""
+
+import numpy as np
+import pytest
+
+from dln_jax.precision import in_float64
+from dln_jax.softbody.mesh.mesh import vertices_where
+from dln_jax.softbody.mesh.shapes import box
+from scripts.reports.soft_bodies.rivals import own
+from scripts.reports.soft_bodies.rivals.body import KIRCHHOFF, NEO_HOOKEAN, Body, reference_motion, relative_error
+
+MESH = box((0.4, 0.2, 0.2), (2, 1, 1))
+
+
+@pytest.mark.parametrize("law", [NEO_HOOKEAN, KIRCHHOFF])
+def test_explicit_reference_agrees_with_implicit_midpoint_steps(law):
+    body = Body(MESH, vertices_where(MESH, lambda x: x[:, 0] == 0), 1e5, 0.3, np.array([0.1, 0.2]), law=law)
+    reference = reference_motion(body, 4e-4)
+    coarse, fine = (
+        relative_error(body, in_float64(lambda dt=dt: own.motion(body, "midpoint", dt))().x, reference)
+        for dt in (0.01, 0.005)
+    )
+    assert fine < 5e-3
+    assert coarse / fine == pytest.approx(4, rel=0.3)
+
+
+def test_reference_of_a_fall_is_free_until_it_meets_the_floor():
+    mesh = MESH._replace(vertices=MESH.vertices + np.array([0.0, 0.0, 0.1]))
+    body = Body(mesh, np.zeros(0, int), 1e5, 0.3, np.array([0.1, 0.2]), floor=True)
+    x = reference_motion(body, 2e-4, 1e6)
+    np.testing.assert_allclose(
+        x[0] - mesh.vertices, np.tile([0.0, 0.0, -0.5 * 9.81 * 0.1**2], (len(mesh.vertices), 1)), atol=1e-9
+    )
+    assert x[1][:, 2].min() > -1e-3
