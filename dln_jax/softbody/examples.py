@@ -21,8 +21,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from dln_jax.softbody.contact.bodies import body_contact
+from dln_jax.softbody.contact.contact import Contact
 from dln_jax.softbody.driven import Example
-from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses, vertices_where
+from dln_jax.softbody.mesh.mesh import Mesh, boundary, lumped_masses, vertices_where
 from dln_jax.softbody.mesh.quadratic import quadratic, with_midsides
 from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
@@ -41,6 +43,8 @@ DENSITY = 1000.0
 """In kg/m³."""
 SLOPE = 0.5
 """Rise of the slope over its run."""
+CONTACT_FRICTION = 0.3
+"""Coulomb's coefficient between bodies."""
 DROP_SPEED = 2.0
 """Initial velocity of the falling body to the right, in m/s."""
 TURNING = 4.0
@@ -75,6 +79,7 @@ def beam(
     strain_energy: StrainEnergy = stable_neo_hookean,
     order: int = 1,
     mixed: bool = False,
+    contact: bool = False,
 ) -> Example:
     """A beam of 4 m x 1 m (x 1 m) with `cells` cells across, or a custom mesh, held on the left.
 
@@ -91,7 +96,7 @@ def beam(
         left, extent = mesh.vertices[:, 0].min(), np.ptp(mesh.vertices[:, 0])
         held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
     scene = _solid(
-        mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), *loads(mesh), held=held
+        mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed, contact), gravity(mesh), *loads(mesh), held=held
     )
     return Example(scene, dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
 
@@ -105,15 +110,16 @@ def twist(
     strain_energy: StrainEnergy = stable_neo_hookean,
     order: int = 1,
     mixed: bool = False,
+    contact: bool = False,
 ) -> Example:
     """A bar of 1 m x 8 m x 1 m whose ends are turned against each other about its axis, half of the turns each.
 
-    The turns take 4 s, then the ends are held for 1 s. There is no gravity, and no contact of the
-    bar with itself: beyond two turns it buckles, and can pass through itself.
+    The turns take 4 s, then the ends are held for 1 s. There is no gravity. Beyond two turns the bar buckles, and
+    without `contact` it can pass through itself.
     """
     mesh = _of_order(box((1.0, 8.0, 1.0), (cells, 8 * cells, cells)), order)
     held = vertices_where(mesh, lambda x: (x[:, 1] == 0.0) | (x[:, 1] == 8.0))
-    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), held=held)
+    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed, contact), held=held)
     x, y, z = (mesh.vertices[held] - [0.5, 0.0, 0.5]).T
 
     def path(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T k dim"]:
@@ -157,6 +163,7 @@ def drop(
     strain_energy: StrainEnergy = stable_neo_hookean,
     order: int = 1,
     mixed: bool = False,
+    contact: bool = False,
     seed: int = 0,
 ) -> Example:
     """A body that falls from its own height with 2 m/s to the right and a random rate of rotation (±1 rad/s).
@@ -174,7 +181,8 @@ def drop(
     lift[-1] = height - mesh.vertices[:, -1].min()
     mesh = mesh._replace(vertices=mesh.vertices + lift)
     ground = _ground(mesh, friction, height=height, normal=np.eye(mesh.dimension)[-1])
-    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), ground, *loads(mesh))
+    law = _Law(strain_energy, youngs_modulus, poisson_ratio, mixed, contact)
+    scene = _solid(mesh, law, gravity(mesh), ground, *loads(mesh))
     arms = mesh.vertices - np.average(mesh.vertices, axis=0, weights=np.asarray(scene.params.masses))
     v = np.zeros_like(arms)
     v[:, 0], v[:, -1] = arms[:, -1], -arms[:, 0]
@@ -214,13 +222,23 @@ class _Law(NamedTuple):
     youngs_modulus: Numbers
     poisson_ratio: float
     mixed: bool
+    contact: bool = False
+    """Between and within the bodies of the mesh."""
 
 
 def _solid(mesh: Mesh, law: _Law, *others: Term, held: ArrayLike = ()) -> SoftScene:
     """Returns the scene of an elastic body from its material and its other terms."""
-    density, modulus, ratio, mixed = law
+    density, modulus, ratio, mixed, touching = law
     material = elastic(mesh, density, youngs_modulus=modulus, poisson_ratio=ratio, mixed=mixed)
-    return make_scene(mesh, [material, *others], density=DENSITY, held=held)
+    contacts = [_contact(mesh, float(np.min(modulus)))] if touching else []
+    return make_scene(mesh, [material, *others], density=DENSITY, held=held, contacts=contacts)
+
+
+def _contact(mesh: Mesh, youngs_modulus: float) -> Contact:
+    """Contact of all surfaces, within a tenth of the boundary's shortest edge."""
+    corners = mesh.vertices[boundary(mesh)]
+    shortest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min()
+    return body_contact(mesh, distance=0.1 * float(shortest), stiffness=0.1 * youngs_modulus, friction=CONTACT_FRICTION)
 
 
 def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:

@@ -116,10 +116,10 @@ def simulate(prepared: PreparedScene, folder: Path) -> Moments:
         print(statement)
     if mesh.sets:
         print(f"named sets: {listed(mesh)}")
-    if pieces > 1:
+    if pieces > 1 and not options.contact:
         loose = "no two elements share a vertex" if pieces == len(mesh.elements) else f"{pieces} parts share no vertex"
         print(
-            f"warning: {loose}: they move apart, or through one another, for there is no contact between them; if the "
+            f"warning: {loose}: they move apart, or through one another; add --contact to keep them apart, or, if the "
             "body is one, merge vertices at the same position before you save the mesh"
         )
     if size.max() > LARGEST_SIZE:
@@ -159,6 +159,7 @@ def example_of(options: Any) -> tuple[Example, tuple[str, ...]]:
     choices: dict[str, Any] = {name: getattr(options, name) for name in names}
     choices["strain_energy"] = None if options.material is None else MATERIALS[options.material]
     choices["mixed"] = options.mixed or None
+    choices["contact"] = options.contact or None
     if options.mixed and options.order != 2:
         raise InputError("--mixed needs --order 2: mixed elements are quadratic")
     choices = {name: value for name, value in choices.items() if value is not None}

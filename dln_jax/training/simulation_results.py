@@ -59,6 +59,8 @@ def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
         numbers += (("steps_shortened", float((info.substeps > 1).sum()), "1", None),)
     if info.overlaps is not None:
         numbers += (("overlapping_components_max", float(info.overlaps.max()), "1", None),)
+    if info.least_distance is not None:
+        numbers += (("least_distance_of_surfaces", float(info.least_distance.min()), "m", None),)
     return [Row(scene, name, value, unit, bound=bound) for name, value, unit, bound in numbers]
 
 
