@@ -1,10 +1,10 @@
 """A policy, and the loop that trains it: update, evaluate, record, until a distance or a number of environment steps.
 
-    h = tanh(W_b body + W_c clock + b),    actuation = 0.25 + 0.75 sigmoid(W_a h + b_a + 1)
+    change of the actuation = 0.3 tanh(W3 tanh(W1 body + W2 clock + b1) + b3)
 
-Layers start with variances 0.3, 1 and 1 over their fan-in: initially the clock has more influence than the body. An
-environment step is one step of the simulator for one creature. A policy is evaluated by one episode from rest after
-every call of `improve`; the steps of evaluations are counted separately.
+Layers start with variances 0.3, 1 and 0.3 over their fan-in: at first the clock moves the muscles. An environment step
+is one step of the simulator for one creature. A policy is evaluated by one episode from rest after every call of
+`improve`; the steps of evaluations are counted separately.
 """
 
 import math
@@ -23,7 +23,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
 from dln_jax.interrupts import held_back
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
-from dln_jax.locomotion.task import SHORTEST, LocomotionTask, beginning, observe, run_episode
+from dln_jax.locomotion.task import LARGEST_CHANGE, LocomotionTask, beginning, observe, run_episode
 from dln_jax.scale.mesh import local, program, spread
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError
@@ -31,8 +31,6 @@ from dln_jax.zoo import parameter_files as checkpoints
 
 WIDTH = 32
 """Hidden units of the policy."""
-CLOCK = 2
-"""Numbers at the end of an observation that show the clock."""
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
 LANES = "creatures side by side"
@@ -47,7 +45,7 @@ class Policy(NamedTuple):
     init: Callable[[Array], Parameters]
     """Random key -> parameters."""
     apply: Callable[[Parameters, Float[Array, " o"]], Float[Array, " k"]]
-    """Observation -> actuation."""
+    """Observation -> change of the actuation."""
 
 
 class Record(NamedTuple):
@@ -119,12 +117,12 @@ def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
     require_network(width=width, depth=1)
 
     def network(observation: Float[Array, " o"]) -> Float[Array, " k"]:
-        body, clock = observation[:-CLOCK], observation[-CLOCK:]
-        scaled = hk.initializers.VarianceScaling
-        from_body = hk.Linear(width, w_init=scaled(0.3), name="body")(body)
-        from_clock = hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(clock)
-        muscles = hk.Linear(task.muscle_count, w_init=scaled(1.0), name="muscles")
-        return SHORTEST + (1.0 - SHORTEST) * jax.nn.sigmoid(muscles(jnp.tanh(from_body + from_clock)) + 1.0)
+        scaled, split = hk.initializers.VarianceScaling, len(observation) - task.clock_size
+        hidden = hk.Linear(width, w_init=scaled(0.3), name="body")(observation[:split])
+        if task.clock_size:
+            hidden += hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(observation[split:])
+        muscles = hk.Linear(task.muscle_count, w_init=scaled(0.3), name="muscles")
+        return LARGEST_CHANGE * jnp.tanh(muscles(jnp.tanh(hidden)))
 
     transformed = hk.without_apply_rng(hk.transform(network))
     return Policy(lambda key: transformed.init(key, observe(task, beginning(task))), transformed.apply)

@@ -3,7 +3,7 @@ A gait in a minute
 ==================
 
 A soft creature with 24 muscles learns to crawl. Gradients go back through the simulator, including friction and
-contact. Two thousand environment steps are enough for a body length, and most of the time is compilation.
+contact.
 """
 
 import jax

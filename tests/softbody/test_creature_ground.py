@@ -1,4 +1,4 @@
-"""The ground of creatures: bumps, friction along both horizontal axes in space, and flat ground that computes no bumps."""
+"""The ground of creatures: bumps, friction along both horizontal axes, and flat ground that computes no bumps."""
 
 import jax
 import jax.numpy as jnp

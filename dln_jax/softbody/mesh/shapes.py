@@ -111,7 +111,7 @@ def quadruped() -> Creature:
 
 
 def box_quadruped() -> Creature:
-    """A body in space on four legs, of cubes of 0.4 m: 56 vertices, 48 muscles along its legs, its back and its belly."""
+    """A body in space on four legs, of cubes of 0.4 m: 56 vertices, 48 muscles along legs, back and belly."""
     body = itertools.product(range(4), range(3), (1,))
     legs = itertools.product((0, 3), (0, 2), (0,))
     positions, elements = lattice([*body, *legs])

@@ -1,6 +1,6 @@
-"""Train one soft creature by gradients, by evolution and by PPO, and print what each needs for one body length.
+"""Train one soft creature by gradients, by evolution and by PPO, and print what each needs for five body lengths.
 
-Several seeds each, until 1.2 body lengths or --steps. Writes report.json, a figure of the distance against environment
+Several seeds each, until 6 body lengths or --steps. Writes report.json, a figure of the distance against environment
 steps and against wall time, and the model and gait of each method's best seed. Evolution needs the extra [rivals], PPO
 the extra [rl].
 """
@@ -41,11 +41,13 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     seeds: int = 3
     """Of each method, one after the other."""
     steps: Unstated[int] = None
-    """Environment steps of each seed (default: 40000 by gradients, 500000 by evolution, 300000 by ppo)."""
-    until: Unstated[float] = 1.2
-    """Body lengths at which a seed ends (default: 1.2)."""
+    """Environment steps of each seed (default: 400000 by gradients, 500000 by evolution, 300000 by ppo)."""
+    until: Unstated[float] = 6.0
+    """Body lengths at which a seed ends (default: 6)."""
+    start: float = 0.0
+    """Standard deviation of the vertices' initial positions, m; rivals start at rest."""
     lanes: Unstated[int] = None
-    """Creatures side by side, which devices share (default: 2 by gradients, 32 by evolution, 16 by ppo)."""
+    """Creatures side by side, which devices share (default: 8 by gradients, 32 by evolution, 16 by ppo)."""
 
 
 def main(options: Arguments) -> None:
@@ -55,7 +57,7 @@ def main(options: Arguments) -> None:
     rivals = {"ppo": (ppo, ppo.train_by_ppo), "evolution": (evolution, evolution.train_by_evolution)}
     for rival, _ in rivals.values():
         rival.check(lanes, mesh)
-    settings: dict[str, Any] = {"gradient": settings_of(task, options.window, lanes)}
+    settings: dict[str, Any] = {"gradient": settings_of(options.window, lanes)}
     settings |= {method: rival.settings_of(lanes) for method, (rival, _) in rivals.items()}
     ways = {"gradient": partial(trained, task, options, mesh)}
     for method, (rival, run) in rivals.items():

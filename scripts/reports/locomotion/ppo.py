@@ -1,6 +1,6 @@
 """Proximal policy optimisation (Schulman et al. 2017) by stable-baselines3, whose actor becomes a policy of dln_jax.
 
-The actor is a network of two tanh layers; its mean in [-1, 1] is an actuation in [0.25, 1].
+The actor is a network of two tanh layers; its mean in [-1, 1] is a change of the actuation by at most 0.3.
 """
 
 import importlib.util
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.locomotion.gradient import Report, TrainedPolicies, learn_seeds
 from dln_jax.locomotion.learning import LANES, CompiledLearner, Goal, Learner, Parameters, Policy, compile_evaluation
-from dln_jax.locomotion.task import LocomotionTask, actuation_of
+from dln_jax.locomotion.task import LARGEST_CHANGE, LocomotionTask
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError
@@ -79,7 +79,7 @@ def make_actor(task: LocomotionTask) -> Policy:
         h, (*hidden, last) = observation.astype(parameters[0]["w"].dtype), parameters
         for layer in hidden:
             h = jnp.tanh(layer["w"] @ h + layer["b"])
-        return actuation_of(last["w"] @ h + last["b"]).astype(observation.dtype)
+        return LARGEST_CHANGE * jnp.clip(last["w"] @ h + last["b"], -1.0, 1.0).astype(observation.dtype)
 
     def init(key: Array) -> Parameters:
         sizes = task.observation_size, task.muscle_count
