@@ -9,11 +9,11 @@ from pathlib import Path
 
 from dln_jax.cli.options import Folder
 from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.data.arrays import read_arrays
+from dln_jax.data.arrays import load_file
 from dln_jax.locomotion.gradient import shown_walk
 from dln_jax.locomotion.perturbed import STEPS, numbers_of, perturbed_trials
 from dln_jax.locomotion.worlds import Variation
-from scripts.reports.locomotion.published import DISTANCE, published_biped
+from scripts.reports.locomotion.published import DISTANCE, KEYS, published_biped
 from scripts.reports.rows import Row, conditions, print_report, write_report
 
 
@@ -27,7 +27,7 @@ class Arguments(Folder):
 
 def main(options: Arguments) -> None:
     """Measures and writes the report."""
-    data = read_arrays(options.data)
+    data = load_file(options.data, lambda arrays: arrays, KEYS)
     task, policy, parameters = published_biped(data)
     with command_folder(options, "published_biped") as folder:
         walked = float(shown_walk(task, policy, parameters, STEPS).travelled.sum())

@@ -21,6 +21,10 @@ from dln_jax.types import InputError
 
 DISTANCE = 41.37
 """Body lengths in 2,000 steps from rest in its author's program."""
+LAYERS = (f"policy_fc{i}_{part}" for i in (1, 2) for part in ("weight", "bias"))
+NAMES = ("vertices", "triangles", "muscles", *LAYERS, "policy_center_vertex_id", "policy_forward_vertex_id")
+KEYS = tuple(f"biped_{name}" for name in NAMES)
+"""Arrays of the file."""
 
 
 def published_biped(
@@ -31,11 +35,9 @@ def published_biped(
     Raises:
         InputError: an array is missing.
     """
-    layers = [f"policy_fc{i}_{part}" for i in (1, 2) for part in ("weight", "bias")]
-    names = ["vertices", "triangles", "muscles", *layers, "policy_center_vertex_id", "policy_forward_vertex_id"]
-    if missing := [f"biped_{name}" for name in names if f"biped_{name}" not in data]:
-        raise InputError(f"the file lacks {missing[0]}; expected the published biped with its policy")
-    vertices, triangles, muscles, *weights, centre, forward = (data[f"biped_{name}"] for name in names)
+    if missing := [key for key in KEYS if key not in data]:
+        raise InputError(f"{missing[0]} is missing; expected the published biped with its policy")
+    vertices, triangles, muscles, *weights, centre, forward = (data[key] for key in KEYS)
     mesh = make_mesh(vertices, triangles)
     frame = vertex_frame(len(vertices), [int(centre), int(forward)])
     task = make_task(Creature("published-biped", mesh, muscles), frame=frame, variation=variation, clock_period=0.0)
