@@ -206,8 +206,7 @@ def make_gradient_learner(
         parameters, value = policy.init(jax.random.key(seed)), value_init(jax.random.fold_in(jax.random.key(seed), 1))
         places = jax.vmap(lambda key: beginning(task, key))(jax.random.split(jax.random.key(seed), lanes))
         moments, zero = (optimiser.init(parameters), value_optimiser.init(value)), jnp.asarray(0)
-        seed = jnp.asarray(seed)  # pyright: ignore[reportAssignmentType]
-        return GradientState(parameters, moments[0], value, moments[1], value, places, seed, zero, zero)
+        return GradientState(parameters, moments[0], value, moments[1], value, places, jnp.asarray(seed), zero, zero)
 
     def loss(parameters: Parameters, value: Parameters, key: Array, place: EpisodeState) -> tuple[Array, Any]:
         noise = settings.deviation * jax.random.normal(key, (window, task.muscle_count))

@@ -2,7 +2,7 @@
 
     change of the actuation = 0.3 tanh(W3 tanh(W1 body + W2 clock + b1) + b3)
 
-Layers start with variances 0.3, 1 and 0.3 over their fan-in: at first the clock moves the muscles. An environment step
+Layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. An environment step
 is one step of the simulator for one creature. A policy is evaluated by one episode from rest after every call of
 `improve`; the steps of evaluations are counted separately.
 """
@@ -29,7 +29,7 @@ from dln_jax.sizes import require_network
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
-WIDTH = 32
+WIDTH = 64
 """Hidden units of the policy."""
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
@@ -121,7 +121,7 @@ def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
         hidden = hk.Linear(width, w_init=scaled(0.3), name="body")(observation[:split])
         if task.clock_size:
             hidden += hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(observation[split:])
-        muscles = hk.Linear(task.muscle_count, w_init=scaled(0.3), name="muscles")
+        muscles = hk.Linear(task.muscle_count, w_init=scaled(0.1), name="muscles")
         return LARGEST_CHANGE * jnp.tanh(muscles(jnp.tanh(hidden)))
 
     transformed = hk.without_apply_rng(hk.transform(network))

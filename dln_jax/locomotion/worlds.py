@@ -85,7 +85,7 @@ def drawn_world(variation: Variation, key: Array, level: World, length: float, *
         shortest, longest = WAVE_LENGTHS
         lengths = length * shortest * (longest / shortest) ** jax.random.uniform(for_length, (WAVES, 1))
         direction = _direction(for_wave, (WAVES,), bumps.wave_vector.shape[1])
-        phase = 2 * jnp.pi * jax.random.uniform(for_phase, WAVES)
+        phase = 2 * jnp.pi * jax.random.uniform(for_phase, (WAVES,))
         bumps = Bumps(jnp.full(WAVES, variation.rough / WAVES), 2 * jnp.pi / lengths * direction, phase)
     if level.seed is None:
         return World(gravity, bumps, None, None)

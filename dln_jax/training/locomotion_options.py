@@ -22,7 +22,7 @@ class LocomotionOptions:
     """Body lengths at which a seed ends (default: no limit)."""
     upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
-    clock_period: float = 16.0
+    clock_period: float = 0.0
     """Steps of 0.033 s of one turn of the policy's clock; 0 for no clock."""
     episode: int = 400
     """Steps of 0.033 s."""
@@ -36,7 +36,7 @@ class LocomotionOptions:
     """Change of velocity by the pushes, m/s."""
     window: Unstated[int] = None
     """Steps that gradients go back (default: 32)."""
-    width: int = 32
+    width: int = 64
     """Hidden units of the policy."""
     lanes: Unstated[int] = None
     """Creatures side by side, which devices share (default: 8)."""
