@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.locomotion.task import FALLEN, LARGEST_CHANGE, LocomotionTask, advance, beginning, observe
+from dln_jax.locomotion.task import FALLEN, LocomotionTask, advance, beginning, change_of, observe
 
 
 def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -17,7 +17,8 @@ def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces
 
 
 class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Environment of one creature, with the task's rewards; actions in [-1, 1] are changes of the actuation by 0.3.
+    """Environment of one creature, with the task's rewards; actions in [-1, 1] are commands: the
+    actuation approaches theirs by at most 0.3 a step.
 
     An episode is truncated after the task's number of steps. It is terminated by a fall, or by a step of the simulator
     that does not converge; `info["converged"]` distinguishes the two.
@@ -28,7 +29,7 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = spaces(task)
         self._place = beginning(task)
         self._begin = jax.jit(lambda key: beginning(task, key))
-        self._advance = jax.jit(lambda place, action: advance(task, place, LARGEST_CHANGE * action))
+        self._advance = jax.jit(lambda place, action: advance(task, place, change_of(place.actuation, action)))
         self._observe = jax.jit(lambda place: observe(task, place))
 
     def reset(

@@ -1,11 +1,12 @@
 """Learns to move by short-horizon gradients through the simulator, with a learned value at the end of the horizon.
 
-    J(theta) = E[ sum over t < H of gamma^t r_t  +  gamma^H V(o_H) ],    change_t = policy(o_t) + s eps_t
+    J(theta) = E[ sum over t < H of gamma^t r_t  +  gamma^H V(o_H) ]  under theta + s eps,    eps ~ N(0, I)
 
-Every lane walks H steps from the end of its last window, for episodes of any length. Gradients go back to the beginning
-of the window and no further, so that they neither explode nor vanish over an episode; V stands for all later rewards
-(Xu et al. 2022, "Accelerated policy learning with parallel differentiable simulation"). After a fall, rewards and value
-of a window are zero, and the lane begins a new episode with a start of its own.
+Lanes come in pairs, +eps and -eps. Every lane walks H steps from the end of its last window, for episodes of any
+length. Gradients go back to the beginning of the window and no further, so that they neither explode nor vanish over an
+episode; V stands for all later rewards (Xu et al. 2022, "Accelerated policy learning with parallel differentiable
+simulation"). After a fall, rewards and value of a window are zero, and the lane begins a new episode with a start of
+its own.
 V is fitted to TD(lambda) targets, made by a slowly following copy of itself:
 
     G_t = r_t + gamma ((1 - lambda) V'(o_t+1) + lambda G_t+1),    G_H = V'(o_H)
@@ -43,7 +44,7 @@ from dln_jax.locomotion.learning import (
 )
 from dln_jax.locomotion.task import EpisodeState, LocomotionTask, Walk, advance, beginning, chosen, observe, walk
 from dln_jax.scale.mesh import shares, spread
-from dln_jax.types import require_positive
+from dln_jax.types import InputError, require_positive
 
 Report = Callable[[int, Record], None]
 VALUE_WIDTH = 64
@@ -55,11 +56,11 @@ class GradientSettings(NamedTuple):
 
     window: int = 32
     """H, steps that gradients go back."""
-    lanes: int = 8
+    lanes: int = 4
     """Creatures side by side."""
-    deviation: float = 0.05
-    """s, of the changes of the actuation."""
-    learning_rate: float = 0.005
+    deviation: float = 0.01
+    """s, of the parameters."""
+    learning_rate: float = 0.01
     """Of Adam, for the policy."""
     value_learning_rate: float = 0.002
     """Of Adam, for the value."""
@@ -139,7 +140,7 @@ def train(
         goal: conditions that end the learning of a seed.
         width: of the hidden layer of the policy.
         window: steps that gradients go back (default: 32).
-        lanes: creatures side by side (default: 8).
+        lanes: creatures side by side (default: 4).
         directory: where states are stored.
         resume: continue the runs stored there.
         mesh: devices that share the creatures simulated side by side.
@@ -196,6 +197,10 @@ def make_gradient_learner(
     """Returns the learner; raises `InputError` for settings out of range, or a mesh that does not divide the lanes."""
     require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
     shares(mesh, settings.lanes, LANES)
+    if settings.lanes % 2:
+        raise InputError(
+            f"{settings.lanes} creatures are no pairs, in which the gradient takes them; give an even number"
+        )
     lanes, window, discount = settings.lanes, settings.window, settings.discount
     clipped = optax.clip_by_global_norm(1.0)
     optimiser = optax.adam(settings.learning_rate, b1=0.7, b2=0.95)
@@ -208,17 +213,17 @@ def make_gradient_learner(
         moments, zero = (optimiser.init(parameters), value_optimiser.init(value)), jnp.asarray(0)
         return GradientState(parameters, moments[0], value, moments[1], value, places, jnp.asarray(seed), zero, zero)
 
-    def loss(parameters: Parameters, value: Parameters, key: Array, place: EpisodeState) -> tuple[Array, Any]:
-        noise = settings.deviation * jax.random.normal(key, (window, task.muscle_count))
+    def loss(parameters: Parameters, value: Parameters, noise: Parameters, place: EpisodeState) -> tuple[Array, Any]:
+        own = jax.tree.map(lambda p, eps: p + settings.deviation * eps, parameters, noise)
 
-        def one(carry: tuple[EpisodeState, Array], noise: Array) -> tuple[Any, Any]:
+        def one(carry: tuple[EpisodeState, Array], _: None) -> tuple[Any, Any]:
             place, alive = carry
             seen = observe(task, place)
-            place, at = advance(task, place, policy.apply(parameters, seen) + noise)
+            place, at = advance(task, place, policy.apply(own, seen))
             standing = alive * jnp.where(at.lost, 0.0, 1.0)
             return (place, standing), (seen, at.reward, alive, at.converged)
 
-        (end, alive), (seen, rewards, lived, converged) = jax.lax.scan(one, (place, jnp.ones(())), noise)
+        (end, alive), (seen, rewards, lived, converged) = jax.lax.scan(one, (place, jnp.ones(())), length=window)
         last = observe(task, end)
         weights = discount ** jnp.arange(window)
         later = jnp.where(alive > 0, discount**window * value_of(value, last), 0.0)
@@ -226,7 +231,7 @@ def make_gradient_learner(
         records = Window(jnp.concatenate([seen, last[None]]), rewards, jnp.append(lived, alive))
         return -total, (end, records, converged.all())
 
-    def descent(shared: tuple[Parameters, Parameters], own: tuple[Array, EpisodeState]) -> tuple[Any, Any]:
+    def descent(shared: tuple[Parameters, Parameters], own: tuple[Parameters, EpisodeState]) -> tuple[Any, Any]:
         gradient, (end, records, converged) = jax.grad(loss, has_aux=True)(*shared, *own)
         finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all() & converged
         gradient, _ = clipped.update(
@@ -241,7 +246,9 @@ def make_gradient_learner(
         key = jax.random.fold_in(jax.random.key(state.seed), state.updates)
         for_noise, for_starts = jax.random.split(key)
         shared = state.parameters, state.followed
-        (gradients, finite), (ends, records) = descents(shared, (jax.random.split(for_noise, lanes), state.lanes))
+        (gradients, finite), (ends, records) = descents(
+            shared, (_opposite_pairs(for_noise, state.parameters, lanes), state.lanes)
+        )
         gradient = jax.tree.map(lambda of_lanes: of_lanes.sum(axis=0) / jnp.maximum(finite.sum(), 1), gradients)
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
@@ -279,6 +286,14 @@ def make_gradient_learner(
         parameters=lambda state: state.parameters,
         steps=settings.updates * lanes * window,
     )
+
+
+def _opposite_pairs(key: Array, parameters: Parameters, lanes: int) -> Parameters:
+    """Normal noise of the shape of the parameters for every lane; each lane's is the negative of its neighbour's."""
+    leaves, structure = jax.tree.flatten(parameters)
+    keys = jax.random.split(key, len(leaves))
+    halves = [jax.random.normal(k, (lanes // 2, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
+    return structure.unflatten([jnp.concatenate([half, -half]) for half in halves])
 
 
 def shown_walk(

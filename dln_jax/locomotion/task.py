@@ -58,8 +58,8 @@ CROUCHED = 0.8
 """Mean height, relative to that at rest, below which crouching is penalised."""
 FALLEN = 1.0
 """Tilt of a fall, in rad."""
-CLOCK_PERIOD = 0.0
-"""P in steps; without a clock."""
+CLOCK_PERIOD = 16.0
+"""P in steps; 0 leaves the clock out."""
 FALL = 1.0
 """Reward that a fall costs, in body lengths."""
 
@@ -209,6 +209,21 @@ def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"
     reward = travelled - task.upright * (1.0 - cosine + lowered**2) - FALL * (tilt > FALLEN)
     after = EpisodeState(state, actuation, place.steps + 1, place.world)
     return after, Walk(state.x, actuation, info.converged, travelled, reward, tilt)
+
+
+def change_of(actuation: Float[Array, " k"], command: Float[Array, " k"]) -> Float[Array, " k"]:
+    """Returns the change towards the actuation of a command in [-1, 1], 0.3 tanh((target - actuation) / 0.3).
+
+    Learners choose a target instead of the change: its limits bound the actuation without a flat gradient.
+    """
+    target = SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + command)
+    return LARGEST_CHANGE * jnp.tanh((target - actuation) / LARGEST_CHANGE)
+
+
+def actuation_seen(task: LocomotionTask, observation: Float[Array, " o"]) -> Float[Array, " k"]:
+    """Returns the actuation within an observation."""
+    end = task.observation_size - task.clock_size
+    return observation[end - task.muscle_count : end]
 
 
 def params_of(task: LocomotionTask, world: World) -> Params:

@@ -5,8 +5,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from dln_jax.cli.arguments import require_positive_if_given
@@ -17,11 +19,11 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.gradient import Report, TrainedPolicies, settings_of, shown_walk, train
 from dln_jax.locomotion.learning import LANES, Goal, Record
 from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
-from dln_jax.locomotion.task import LocomotionTask, Walk, creature_named, make_task
+from dln_jax.locomotion.task import LocomotionTask, Walk, beginning, creature_named, make_task
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
-from dln_jax.softbody.terms.creature import TIME_STEP
+from dln_jax.softbody.terms.creature import TIME_STEP, ground_height
 from dln_jax.training.locomotion_options import LocomotionOptions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.parameter_files import save_tree
@@ -31,6 +33,8 @@ GOAL = 5.0
 """Distance in body lengths at which the effort of learning is measured."""
 STEPS = 400_000
 """Default number of environment steps."""
+SHOWN = 3_000_000
+"""Seed of the rough ground that is shown."""
 
 
 def prepare(options: LocomotionOptions, mesh: Mesh | None) -> LocomotionTask:
@@ -113,7 +117,8 @@ def write_run(
     facts = {"name": f"locomotion-{method}", "creature": creature, "precision": "f64"}
     facts |= {"clock_period": task.clock_period, "variation": task.variation._asdict(), "settings": settings}
     save_tree(folder, MODEL, best.parameters, {"model": facts})
-    seen = shown_walk(task, policies.policy, best.parameters, task.episode)
+    start = SHOWN if task.variation.rough else None
+    seen = shown_walk(task, policies.policy, best.parameters, task.episode, start)
     numbers = metrics_of(task, policies, seen)
     if any(task.variation):
         numbers |= numbers_of(perturbed_trials(task, policies.policy, best.parameters))
@@ -128,11 +133,22 @@ def write_run(
             x,
             TIME_STEP * np.arange(len(x)),
             muscles=task.creature.muscles,
+            ground=ground_line(task, x),
             actuation=np.concatenate([seen.actuation[:1], seen.actuation]),
             title=f"{creature}, {method}: {best.distance:.2f} body lengths",
             frames_per_second=0.5 / TIME_STEP,
         )
     return numbers
+
+
+def ground_line(task: LocomotionTask, x: Float[np.ndarray, "T n dim"]) -> float | Float[np.ndarray, "g 2"]:
+    """Ground of the walk that is shown, for figures: its line in the plane, or 0 where it is flat."""
+    bumps = beginning(task, jax.random.key(SHOWN)).world.bumps
+    if bumps is None or x.shape[2] != 2:
+        return 0.0
+    margin = 0.2 * task.length
+    along = np.linspace(x[..., 0].min() - margin, x[..., 0].max() + margin, 500)
+    return np.stack([along, jax.vmap(lambda at: ground_height(bumps, (at,)))(along)], axis=1)
 
 
 def metrics_of(task: LocomotionTask, policies: TrainedPolicies, seen: Walk) -> dict[str, float]:

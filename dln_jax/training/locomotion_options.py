@@ -22,7 +22,7 @@ class LocomotionOptions:
     """Body lengths at which a seed ends (default: no limit)."""
     upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
-    clock_period: float = 0.0
+    clock_period: float = 16.0
     """Steps of 0.033 s of one turn of the policy's clock; 0 for no clock."""
     episode: int = 400
     """Steps of 0.033 s."""
@@ -39,4 +39,4 @@ class LocomotionOptions:
     width: int = 64
     """Hidden units of the policy."""
     lanes: Unstated[int] = None
-    """Creatures side by side, which devices share (default: 8)."""
+    """Creatures side by side, which devices share (default: 4)."""

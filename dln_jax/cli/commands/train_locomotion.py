@@ -2,10 +2,10 @@
 
 The creature starts on the ground and has an episode of 400 steps of 0.033 s. A policy is judged by how many body
 lengths the mean x of the vertices travels before the creature falls, if it does. The policy observes the body in its
-own frame, and changes the actuation of the muscles, 0.25 to 1 of their rest length, by at most 0.3 a step.
-Episodes may start perturbed, on slopes or rough ground, and be disturbed by pushes; then the policy is also judged by
-100 episodes of 2,000 steps. A run folder gets config.json, metrics.json, the model of the best seed, a figure of the
-learning, and a GIF of the gait.
+own frame and a clock, and changes the actuation of the muscles, 0.25 to 1 of their rest length, by at most 0.3 a step.
+Episodes may start perturbed, on slopes or rough ground, and be disturbed by pushes. Then the policy is selected by
+several such episodes, and judged by 100 others of 2,000 steps. A run folder gets config.json, metrics.json, the model
+of the best seed, a figure of the learning, and a GIF of the gait.
 """
 
 from dataclasses import dataclass

@@ -17,7 +17,7 @@ from scripts.reports.rows import Row
 
 Curves = Mapping[str, Sequence[Sequence[Record]]]
 """Records of the seeds, by the name of the method."""
-COLOURS = {"gradient": style.BLUE, "evolution": style.GREEN, "ppo": style.ORANGE}
+COLOURS = {"gradient": style.BLUE, "evolution": style.GREEN, "ppo": style.ORANGE, "sac": style.PURPLE}
 BELOW_LEGEND = 0.62
 """Share of a panel's height for the curves, below the legend."""
 
