@@ -127,7 +127,7 @@ class Walk(NamedTuple):
     """In rad."""
 
     @property
-    def lost(self) -> Bool[Array, " T"]:
+    def lost(self) -> Bool[Array, "*T"]:
         """Whether the creature has fallen, or the step did not converge."""
         return (self.tilt > FALLEN) | ~self.converged
 
