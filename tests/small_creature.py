@@ -15,4 +15,4 @@ def block_task():
     mesh = make_mesh(0.4 * np.asarray(positions, float), triangles)
     number = {tuple(place): index for index, place in enumerate(np.asarray(positions).tolist())}
     muscles = np.array([[number[0, 0], number[0, 1]], [number[0, 1], number[1, 1]]])
-    return make_task(Creature("block", mesh, muscles), episode=EPISODE, clock_period=6.0, upright=0.5)
+    return make_task(Creature("block", mesh, muscles), episode=EPISODE, clock_period=6.0, upright=0.04)

@@ -144,7 +144,8 @@ def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
         along = np.linspace(low[0], high[0], 100)
         ground = np.stack([along, panel.ground * along], axis=-1)
         for level in levels:
-            draw_ground(axis, (low[0], high[0]), level, panel.ground, depth=0.02 * (high[0] - low[0]))
+            line = straight_ground((low[0], high[0]), level, panel.ground)
+            draw_ground(axis, line, depth=0.02 * (high[0] - low[0]))
     elif panel.ground == 0.0:
         axis.fill(*floor(np.asarray(panel.positions), 0.0).T, color=GROUND, zorder=0)
     for number, x in enumerate(np.asarray(panel.positions)):
@@ -206,11 +207,16 @@ def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> C
     return show
 
 
-def draw_ground(axis: Axes, ends: tuple[float, float], level: float, slope: float, *, depth: float) -> None:
-    """Draws the ground in the plane, y = level + slope x, as a strip of this depth."""
-    line = level + slope * np.array(ends)
-    axis.fill_between(ends, line, line - depth, color=GROUND, zorder=0, linewidth=0)
-    axis.plot(ends, line, color=GROUND_LINE, linewidth=1.2, zorder=1)
+def straight_ground(ends: tuple[float, float], level: float, slope: float) -> Float[np.ndarray, "2 2"]:
+    """The line y = level + slope x between two x."""
+    return np.stack([np.array(ends), level + slope * np.array(ends)], axis=1)
+
+
+def draw_ground(axis: Axes, line: Float[np.ndarray, "g 2"], *, depth: float) -> None:
+    """Draws the ground in the plane below a line as a strip of this depth."""
+    x, y = line.T
+    axis.fill_between(x, y, y - depth, color=GROUND, zorder=0, linewidth=0)
+    axis.plot(x, y, color=GROUND_LINE, linewidth=1.2, zorder=1)
 
 
 def floor(positions: Float[np.ndarray, "*k 3"], height: float) -> Float[np.ndarray, "4 2"]:

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from dln_jax.figures import style
 from dln_jax.figures.animations import DPI, write_gif
-from dln_jax.figures.soft_bodies import GROUND, add_body, draw_ground, flattened, floor
+from dln_jax.figures.soft_bodies import GROUND, add_body, draw_ground, flattened, floor, straight_ground
 from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.types import InputError, require_positive
 
@@ -30,7 +30,7 @@ def write_soft_body_gif(
     *,
     muscles: Any = None,
     actuation: Float[np.ndarray, "times k"] | None = None,
-    ground: float | None = 0.0,
+    ground: float | np.ndarray | None = 0.0,
     slope: float = 0.0,
     title: str = "",
     stride: int = 1,
@@ -45,7 +45,7 @@ def write_soft_body_gif(
         t: time of every frame, s.
         muscles: pairs of vertices [k, 2], drawn as lines (in the plane).
         actuation: length of the muscles in every frame relative to their rest length; red is short.
-        ground: height of the ground at x = 0, m; `None` draws none.
+        ground: height of the ground at x = 0, m, or in the plane the points [g, 2] of its line; `None` draws none.
         slope: slope of the ground (in the plane).
         title: title above the drawing.
         stride: frames of the motion per frame of the GIF.
@@ -68,7 +68,7 @@ def soft_body_frame(
     *,
     muscles: Any = None,
     actuation: Float[np.ndarray, " k"] | None = None,
-    ground: float | None = 0.0,
+    ground: float | np.ndarray | None = 0.0,
     slope: float = 0.0,
 ) -> Figure:
     """One frame of `write_soft_body_gif` as a figure."""
@@ -79,7 +79,7 @@ def soft_body_frame(
 
 
 def _prepared(
-    mesh: Mesh, positions: np.ndarray, muscles: Any, actuation: Any, ground: float | None, slope: float
+    mesh: Mesh, positions: np.ndarray, muscles: Any, actuation: Any, ground: Any, slope: float
 ) -> tuple[Figure, Callable[[int], None]]:
     """The figure with the ground and axes of equal scale that hold all frames, and the function that draws a frame."""
     shape = mesh.vertices.shape
@@ -92,10 +92,14 @@ def _prepared(
     below = floor(positions, ground) if ground is not None and not plane else np.zeros((0, 2))
     every = np.concatenate([points.reshape(-1, 2), below])
     low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
-    if plane and ground is not None:
-        low[1] = min(low[1], ground + slope * (low[0] if slope > 0 else high[0]))
     margin = 0.06 * max(high - low)
-    low, high = low - margin, high + margin
+    low[0], high[0] = low[0] - margin, high[0] + margin
+    line = np.zeros((0, 2))
+    if plane and ground is not None:
+        flat = not isinstance(ground, np.ndarray)
+        line = straight_ground((low[0], high[0]), ground, slope) if flat else ground
+        low[1] = min(low[1], line[:, 1].min())
+    low[1], high[1] = low[1] - margin, high[1] + margin
     height = float(np.clip(style.WIDTH * (high[1] - low[1]) / (high[0] - low[0]), 0.9, 5.4))
     figure, [[axis]] = style.figure(height=height + 1.2, dpi=DPI)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
@@ -104,7 +108,7 @@ def _prepared(
     axis.yaxis.set_major_locator(MaxNLocator(4))
     if plane:
         if ground is not None:
-            draw_ground(axis, (low[0], high[0]), ground, slope, depth=float(np.ptp([low, high], axis=0).sum()))
+            draw_ground(axis, line, depth=float(np.ptp([low, high], axis=0).sum()))
         axis.add_collection(LineCollection(list(points[0][boundary(mesh)]), colors="0.8", linewidths=1.0, zorder=1))
     elif ground is not None:
         axis.fill(*below.T, color=GROUND, zorder=0)

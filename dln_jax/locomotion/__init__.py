@@ -3,6 +3,7 @@
 from dln_jax.locomotion.gradient import TrainedPolicies, shown_walk, train
 from dln_jax.locomotion.learning import Goal, Learned, Record
 from dln_jax.locomotion.task import LocomotionTask, creature_named, make_task
+from dln_jax.locomotion.worlds import Variation
 
 __all__ = [
     "Goal",
@@ -10,6 +11,7 @@ __all__ = [
     "LocomotionTask",
     "Record",
     "TrainedPolicies",
+    "Variation",
     "creature_named",
     "make_task",
     "shown_walk",

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.locomotion.task import FALLEN, LocomotionTask, actuation_of, advance, beginning, observe
+from dln_jax.locomotion.task import FALLEN, LocomotionTask, advance, beginning, change_of, observe
 
 
 def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -17,7 +17,8 @@ def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces
 
 
 class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Environment of one creature, with the task's rewards; actions in [-1, 1] are actuations in [0.25, 1].
+    """Environment of one creature, with the task's rewards; actions in [-1, 1] are commands: the
+    actuation approaches theirs by at most 0.3 a step.
 
     An episode is truncated after the task's number of steps. It is terminated by a fall, or by a step of the simulator
     that does not converge; `info["converged"]` distinguishes the two.
@@ -26,25 +27,26 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(self, task: LocomotionTask):
         self.task = task
         self.observation_space, self.action_space = spaces(task)
-        self._place = self._start = beginning(task)
-        self._advance = jax.jit(lambda place, action: advance(task, place, actuation_of(action)))
+        self._place = beginning(task)
+        self._begin = jax.jit(lambda key: beginning(task, key))
+        self._advance = jax.jit(lambda place, action: advance(task, place, change_of(place.actuation, action)))
         self._observe = jax.jit(lambda place: observe(task, place))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
-        """Returns the observation of the rest shape at rest; nothing is random."""
+        """Returns the observation of a start that the task's variation perturbs: without one, at rest."""
         super().reset(seed=seed, options=options)
-        self._place = self._start
+        self._place = self._begin(jax.random.key(int(self.np_random.integers(2**31))))
         return self._observation(), {}
 
     def step(
         self, action: Float[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, " o"], float, bool, bool, dict[str, Any]]:
-        """Returns observation, reward, terminated, truncated, and `info` with "x" [n, 2] in m and "converged"."""
+        """Returns observation, reward, terminated, truncated, and `info` with "x" [n, dim] in m and "converged"."""
         self._place, seen = self._advance(self._place, np.asarray(action, self._place.state.x.dtype))
         converged = bool(seen.converged)
-        terminated = not converged or abs(float(seen.tilt)) > FALLEN
+        terminated = not converged or float(seen.tilt) > FALLEN
         truncated = int(self._place.steps) >= self.task.episode
         info = {"x": np.asarray(seen.x), "converged": converged}
         return self._observation(), float(seen.reward), terminated, truncated, info

@@ -1,12 +1,18 @@
-"""Learns to move by short-horizon gradients through the simulator, of a smoothed objective.
+"""Learns to move by short-horizon gradients through the simulator, with a learned value at the end of the horizon.
 
-    J(theta) = E[ reward of a window of H steps under theta + sigma eps ],    eps ~ N(0, I)
+    J(theta) = E[ sum over t < H of gamma^t r_t  +  gamma^H V(o_H) ]  under theta + s eps,    eps ~ N(0, I)
 
-Every lane walks H steps from the end of its last window, with its own parameters. Gradients go back to the beginning of
-the window and no further, so that they neither explode nor vanish over the length of an episode (Xu et al. 2022,
-"Accelerated policy learning with parallel differentiable simulation"). Windows are longer than the clock's period: they
-include the effect of a step on the next stride, and no value function is needed. Lanes come in pairs, +eps and -eps.
-The gradient is the mean over lanes in their order, so that it does not depend on their assignment to devices.
+Lanes come in pairs, +eps and -eps. Every lane walks H steps from the end of its last window, for episodes of any
+length. Gradients go back to the beginning of the window and no further, so that they neither explode nor vanish over an
+episode; V stands for all later rewards (Xu et al. 2022, "Accelerated policy learning with parallel differentiable
+simulation"). After a fall, rewards and value of a window are zero, and the lane begins a new episode with a start of
+its own.
+V is fitted to TD(lambda) targets, made by a slowly following copy of itself:
+
+    G_t = r_t + gamma ((1 - lambda) V'(o_t+1) + lambda G_t+1),    G_H = V'(o_H)
+
+A lane's gradient is clipped, and left out if it is not finite. The gradient is the mean over lanes in their order, so
+that it does not depend on their assignment to devices.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,12 +20,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from dln_jax.locomotion.learning import (
     LANES,
@@ -35,34 +42,38 @@ from dln_jax.locomotion.learning import (
     learn,
     make_policy,
 )
-from dln_jax.locomotion.task import FALLEN, EpisodeState, LocomotionTask, Walk, beginning, chosen, walk
+from dln_jax.locomotion.task import EpisodeState, LocomotionTask, Walk, advance, beginning, chosen, observe, walk
 from dln_jax.scale.mesh import shares, spread
 from dln_jax.types import InputError, require_positive
 
-BALANCING = {"biped": 80}
-"""Windows of creatures that need one longer than the default: balance on two legs needs the whole episode."""
-
 Report = Callable[[int, Record], None]
+VALUE_WIDTH = 64
+"""Units of the two hidden layers of the value."""
 
 
 class GradientSettings(NamedTuple):
-    """Settings of the gradients and of their descent."""
+    """Settings of the gradients and of their descent, the same for all creatures."""
 
-    window: int = 40
-    """Steps that gradients go back; divides the episode."""
-    pairs: int = 1
-    """Half of the number of lanes."""
+    window: int = 32
+    """H, steps that gradients go back."""
+    lanes: int = 4
+    """Creatures side by side."""
     deviation: float = 0.01
-    """sigma; 0 takes the plain objective."""
-    learning_rate: float = 0.02
-    """Of Adam, after clipping the gradient's norm at 1 body length per episode."""
+    """s, of the parameters."""
+    learning_rate: float = 0.01
+    """Of Adam, for the policy."""
+    value_learning_rate: float = 0.002
+    """Of Adam, for the value."""
+    value_fits: int = 16
+    """Steps of Adam for the value in an update, of all lanes' windows."""
+    discount: float = 0.99
+    """gamma."""
+    trace: float = 0.95
+    """lambda."""
+    following: float = 0.2
+    """Share of the value that its copy takes over in an update."""
     updates: int = 5
     """Between two evaluations."""
-
-    @property
-    def lanes(self) -> int:
-        """Number of creatures simulated side by side."""
-        return 2 * self.pairs
 
 
 class GradientState(NamedTuple):
@@ -70,11 +81,24 @@ class GradientState(NamedTuple):
 
     parameters: Parameters
     optimiser: Any
+    value: Parameters
+    value_optimiser: Any
+    followed: Parameters
+    """Copy of the value that makes targets."""
     lanes: EpisodeState
     """States of the lanes."""
     seed: Int[Array, ""]
     updates: Int[Array, ""]
     skipped: Int[Array, ""]
+
+
+class Window(NamedTuple):
+    """Records of one lane, for the value."""
+
+    seen: Float[Array, "H_plus_1 o"]
+    reward: Float[Array, " H"]
+    alive: Float[Array, " H_plus_1"]
+    """1 before a fall, 0 after."""
 
 
 class TrainedPolicies(NamedTuple):
@@ -89,20 +113,10 @@ class TrainedPolicies(NamedTuple):
         return max(self.learned, key=lambda seed: seed.distance if np.isfinite(seed.distance) else -np.inf)
 
 
-def settings_of(task: LocomotionTask, window: int | None = None, lanes: int | None = None) -> GradientSettings:
-    """Returns the settings for a creature; only the window depends on it.
-
-    Raises:
-        InputError: a window that does not divide the episode, or an odd number of lanes.
-    """
-    settings = GradientSettings()
-    window = window or BALANCING.get(task.creature.name, settings.window)
-    lanes = settings.lanes if lanes is None else lanes
-    if lanes % 2:
-        raise InputError(f"{lanes} creatures are no pairs, in which the gradient takes them; give an even number")
-    if task.episode % window:
-        raise InputError(f"a window has {window} steps; expected a divisor of the episode's {task.episode}")
-    return settings._replace(window=window, pairs=lanes // 2)
+def settings_of(window: int | None = None, lanes: int | None = None) -> GradientSettings:
+    """Returns the settings, with another window or another number of lanes if they are stated."""
+    stated = {name: value for name, value in (("window", window), ("lanes", lanes)) if value is not None}
+    return GradientSettings()._replace(**stated)
 
 
 def train(
@@ -118,15 +132,15 @@ def train(
     mesh: Mesh | None = None,
     report: Report = lambda seed, record: None,
 ) -> TrainedPolicies:
-    """Learns with several seeds; settings are the same for all seeds and, except the window, for all creatures.
+    """Learns with several seeds; settings are the same for all seeds and creatures.
 
     Args:
         task: to learn.
         seeds: trained one after the other; programs are compiled once.
         goal: conditions that end the learning of a seed.
         width: of the hidden layer of the policy.
-        window: steps that gradients go back, a divisor of the episode (default: 40, for the biped 80).
-        lanes: creatures side by side, an even number (default: 2).
+        window: steps that gradients go back (default: 32).
+        lanes: creatures side by side (default: 4).
         directory: where states are stored.
         resume: continue the runs stored there.
         mesh: devices that share the creatures simulated side by side.
@@ -135,10 +149,10 @@ def train(
     Raises:
         InputError: settings out of range, a stored run with others, or a mesh that does not divide the creatures.
     """
-    settings = settings_of(task, window, lanes)
+    settings = settings_of(window, lanes)
     learner = make_gradient_learner(task, make_policy(task, width=width), settings, mesh=mesh)
-    facts = {"creature": task.creature.name, "width": width, "episode": task.episode}
-    facts |= {"clock_period": task.clock_period, "upright": task.upright, **settings._asdict()}
+    facts = {"creature": task.creature.name, "width": width, "episode": task.episode, "upright": task.upright}
+    facts |= {**task.variation._asdict(), **settings._asdict()}
     compiled = compile_learner(task, learner, mesh)
     return learn_seeds(compiled, seeds, goal, report, directory=directory, settings=facts, resume=resume)
 
@@ -151,6 +165,28 @@ def learn_seeds(
     return TrainedPolicies(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
 
+def make_value(size: int) -> tuple[Callable[[Array], Parameters], Callable[[Parameters, Array], Array]]:
+    """Returns (init, apply) of the value of observations of this size."""
+
+    def network(seen: Float[Array, " o"]) -> Float[Array, ""]:
+        return hk.nets.MLP([VALUE_WIDTH, VALUE_WIDTH, 1], activation=jnp.tanh, name="value")(seen)[0]
+
+    transformed = hk.without_apply_rng(hk.transform(network))
+    return lambda key: transformed.init(key, jnp.zeros(size)), transformed.apply
+
+
+def targets(window: Window, values: Float[Array, " H_plus_1"], discount: float, trace: float) -> Float[Array, " H"]:
+    """TD(lambda) targets G_t of a window; `values` are V' of its observations, which count before a fall only."""
+    values = window.alive * values
+
+    def back(later: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
+        reward, value = at
+        target = reward + discount * ((1 - trace) * value + trace * later)
+        return target, target
+
+    return jax.lax.scan(back, values[-1], (window.alive[:-1] * window.reward, values[1:]), reverse=True)[1]
+
+
 def make_gradient_learner(
     task: LocomotionTask,
     policy: Policy,
@@ -161,41 +197,87 @@ def make_gradient_learner(
     """Returns the learner; raises `InputError` for settings out of range, or a mesh that does not divide the lanes."""
     require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
     shares(mesh, settings.lanes, LANES)
-    lanes, window = settings.lanes, settings.window
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(settings.learning_rate, b2=0.95))
+    if settings.lanes % 2:
+        raise InputError(
+            f"{settings.lanes} creatures are no pairs, in which the gradient takes them; give an even number"
+        )
+    lanes, window, discount = settings.lanes, settings.window, settings.discount
+    clipped = optax.clip_by_global_norm(1.0)
+    optimiser = optax.adam(settings.learning_rate, b1=0.7, b2=0.95)
+    value_init, value_of = make_value(task.observation_size)
+    value_optimiser = optax.adam(settings.value_learning_rate)
 
     def start(seed: int) -> GradientState:
-        parameters = policy.init(jax.random.key(seed))
-        # Lanes start in different parts of the episode, so that every update sees several.
-        counts = jnp.arange(lanes) * window % task.episode
-        places = jax.vmap(lambda steps: beginning(task)._replace(steps=steps))(counts)
-        zero = jnp.asarray(0)
-        return GradientState(parameters, optimiser.init(parameters), places, jnp.asarray(seed), zero, zero)
+        parameters, value = policy.init(jax.random.key(seed)), value_init(jax.random.fold_in(jax.random.key(seed), 1))
+        places = jax.vmap(lambda key: beginning(task, key))(jax.random.split(jax.random.key(seed), lanes))
+        moments, zero = (optimiser.init(parameters), value_optimiser.init(value)), jnp.asarray(0)
+        return GradientState(parameters, moments[0], value, moments[1], value, places, jnp.asarray(seed), zero, zero)
 
-    def loss(parameters: Parameters, sign: Array, noise: Parameters, place: EpisodeState) -> tuple[Array, Any]:
-        own = jax.tree.map(lambda p, eps: p + sign * settings.deviation * eps, parameters, noise)
-        end, seen = walk(task, lambda observation: policy.apply(own, observation), place, window)
-        usable = seen.converged.all() & (jnp.abs(seen.tilt[-1]) < FALLEN)
-        return -seen.reward.sum() * task.episode / window, (end, usable)
+    def loss(parameters: Parameters, value: Parameters, noise: Parameters, place: EpisodeState) -> tuple[Array, Any]:
+        own = jax.tree.map(lambda p, eps: p + settings.deviation * eps, parameters, noise)
 
-    of_lanes = jax.vmap(jax.grad(loss, has_aux=True), (None, 0, 0, 0))
-    descents = spread(lambda parameters, lanes: of_lanes(parameters, *lanes), mesh)
-    signs = jnp.tile(jnp.asarray([1.0, -1.0]), settings.pairs)
+        def one(carry: tuple[EpisodeState, Array], _: None) -> tuple[Any, Any]:
+            place, alive = carry
+            seen = observe(task, place)
+            place, at = advance(task, place, policy.apply(own, seen))
+            standing = alive * jnp.where(at.lost, 0.0, 1.0)
+            return (place, standing), (seen, at.reward, alive, at.converged)
+
+        (end, alive), (seen, rewards, lived, converged) = jax.lax.scan(one, (place, jnp.ones(())), length=window)
+        last = observe(task, end)
+        weights = discount ** jnp.arange(window)
+        later = jnp.where(alive > 0, discount**window * value_of(value, last), 0.0)
+        total = jnp.sum(weights * jnp.where(lived > 0, rewards, 0.0)) + later
+        records = Window(jnp.concatenate([seen, last[None]]), rewards, jnp.append(lived, alive))
+        return -total, (end, records, converged.all())
+
+    def descent(shared: tuple[Parameters, Parameters], own: tuple[Parameters, EpisodeState]) -> tuple[Any, Any]:
+        gradient, (end, records, converged) = jax.grad(loss, has_aux=True)(*shared, *own)
+        finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all() & converged
+        gradient, _ = clipped.update(
+            jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient), optax.EmptyState()
+        )
+        records = records._replace(alive=jnp.where(finite, records.alive, 0.0))
+        return (gradient, finite), (end, jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), records))
+
+    descents = spread(lambda shared, own: jax.vmap(partial(descent, shared))(own), mesh)
 
     def update(state: GradientState, _: None) -> tuple[GradientState, None]:
         key = jax.random.fold_in(jax.random.key(state.seed), state.updates)
-        noise = _pairs_of_noise(key, state.parameters, settings.pairs)
-        gradients, (ends, usable_ends) = descents(state.parameters, (signs, noise, state.lanes))
-        gradient = jax.tree.map(lambda of_lanes: of_lanes.mean(axis=0), gradients)
-        # A step that does not converge has NaN as its gradient.
-        usable = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all()
+        for_noise, for_starts = jax.random.split(key)
+        shared = state.parameters, state.followed
+        (gradients, finite), (ends, records) = descents(
+            shared, (_opposite_pairs(for_noise, state.parameters, lanes), state.lanes)
+        )
+        gradient = jax.tree.map(lambda of_lanes: of_lanes.sum(axis=0) / jnp.maximum(finite.sum(), 1), gradients)
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
-        parameters, moments = chosen(usable, (moved, moments), (state.parameters, state.optimiser))
-        over = (ends.steps >= task.episode) | ~usable_ends
-        lanes = jax.vmap(lambda over, end: chosen(over, beginning(task), end))(over, ends)
-        skipped = state.skipped + (~usable).astype(state.skipped.dtype)
-        return GradientState(parameters, moments, lanes, state.seed, state.updates + 1, skipped), None
+        parameters, moments = chosen(finite.any(), (moved, moments), (state.parameters, state.optimiser))
+
+        values = jax.vmap(jax.vmap(partial(value_of, state.followed)))(records.seen)
+        aims = jax.vmap(partial(targets, discount=discount, trace=settings.trace))(records, values)
+        counted = records.alive[:, :-1]
+
+        def misfit(value: Parameters) -> Array:
+            off = jax.vmap(jax.vmap(partial(value_of, value)))(records.seen[:, :-1]) - aims
+            return jnp.sum(counted * off**2) / jnp.maximum(counted.sum(), 1.0)
+
+        def fit(fitted: tuple[Parameters, Any], _: None) -> tuple[tuple[Parameters, Any], None]:
+            value, moments = fitted
+            change, moments = value_optimiser.update(jax.grad(misfit)(value), moments, value)
+            return (optax.apply_updates(value, change), moments), None
+
+        fitted = (state.value, state.value_optimiser)
+        (value, value_moments), _ = jax.lax.scan(fit, fitted, length=settings.value_fits)
+        followed = optax.incremental_update(value, state.followed, settings.following)
+        over = (ends.steps >= task.episode) | (records.alive[:, -1] == 0)
+        starts = jax.vmap(lambda key: beginning(task, key))(jax.random.split(for_starts, lanes))
+        places = jax.vmap(chosen)(over, starts, ends)
+        skipped = state.skipped + (~finite.all()).astype(state.skipped.dtype)
+        after = GradientState(
+            parameters, moments, value, value_moments, followed, places, state.seed, state.updates + 1, skipped
+        )
+        return after, None
 
     return Learner(
         policy=policy,
@@ -206,15 +288,18 @@ def make_gradient_learner(
     )
 
 
-def _pairs_of_noise(key: Array, like: Parameters, pairs: int) -> Parameters:
-    """Normal numbers that are the same for the two lanes of a pair."""
-    leaves, structure = jax.tree.flatten(like)
+def _opposite_pairs(key: Array, parameters: Parameters, lanes: int) -> Parameters:
+    """Normal noise of the shape of the parameters for every lane; each lane's is the negative of its neighbour's."""
+    leaves, structure = jax.tree.flatten(parameters)
     keys = jax.random.split(key, len(leaves))
-    drawn = [jax.random.normal(k, (pairs, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
-    return structure.unflatten([jnp.repeat(noise, 2, axis=0) for noise in drawn])
+    halves = [jax.random.normal(k, (lanes // 2, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
+    return structure.unflatten([jnp.concatenate([half, -half]) for half in halves])
 
 
-def shown_walk(task: LocomotionTask, policy: Policy, parameters: Parameters, steps: int) -> Walk:
-    """Runs a policy from rest and returns its steps as NumPy arrays."""
-    program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), beginning(task), steps)[1])
+def shown_walk(
+    task: LocomotionTask, policy: Policy, parameters: Parameters, steps: int, seed: int | None = None
+) -> Walk:
+    """Runs a policy from rest, or from a start drawn by a seed, and returns its steps as NumPy arrays."""
+    start = beginning(task, None if seed is None else jax.random.key(seed))
+    program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), start, steps)[1])
     return jax.tree.map(np.asarray, program(parameters))

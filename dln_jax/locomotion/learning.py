@@ -1,10 +1,11 @@
 """A policy, and the loop that trains it: update, evaluate, record, until a distance or a number of environment steps.
 
-    h = tanh(W_b body + W_c clock + b),    actuation = 0.25 + 0.75 sigmoid(W_a h + b_a + 1)
+    command = tanh(W3 tanh(W1 body + W2 clock + b1) + b3)
+    change of the actuation = 0.3 tanh((0.625 + 0.375 command - actuation) / 0.3)
 
-Layers start with variances 0.3, 1 and 1 over their fan-in: initially the clock has more influence than the body. An
-environment step is one step of the simulator for one creature. A policy is evaluated by one episode from rest after
-every call of `improve`; the steps of evaluations are counted separately.
+Layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. An environment step
+is one step of the simulator for one creature. A policy is evaluated after every call of `improve`, by one
+episode from rest or, if the task varies, by several starts; the steps of evaluations are counted separately.
 """
 
 import math
@@ -23,16 +24,25 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
 from dln_jax.interrupts import held_back
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
-from dln_jax.locomotion.task import SHORTEST, LocomotionTask, beginning, observe, run_episode
+from dln_jax.locomotion.task import (
+    EpisodeState,
+    LocomotionTask,
+    actuation_seen,
+    beginning,
+    change_of,
+    observe,
+    run_episode,
+)
 from dln_jax.scale.mesh import local, program, spread
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
-WIDTH = 32
+WIDTH = 64
 """Hidden units of the policy."""
-CLOCK = 2
-"""Numbers at the end of an observation that show the clock."""
+VALIDATION = 2_000_000
+"""Seed of the starts by which a policy is selected; neither learning nor `perturbed` draws them."""
+VALIDATION_STARTS = 8
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
 LANES = "creatures side by side"
@@ -47,7 +57,7 @@ class Policy(NamedTuple):
     init: Callable[[Array], Parameters]
     """Random key -> parameters."""
     apply: Callable[[Parameters, Float[Array, " o"]], Float[Array, " k"]]
-    """Observation -> actuation."""
+    """Observation -> change of the actuation."""
 
 
 class Record(NamedTuple):
@@ -119,12 +129,12 @@ def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
     require_network(width=width, depth=1)
 
     def network(observation: Float[Array, " o"]) -> Float[Array, " k"]:
-        body, clock = observation[:-CLOCK], observation[-CLOCK:]
-        scaled = hk.initializers.VarianceScaling
-        from_body = hk.Linear(width, w_init=scaled(0.3), name="body")(body)
-        from_clock = hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(clock)
-        muscles = hk.Linear(task.muscle_count, w_init=scaled(1.0), name="muscles")
-        return SHORTEST + (1.0 - SHORTEST) * jax.nn.sigmoid(muscles(jnp.tanh(from_body + from_clock)) + 1.0)
+        scaled, split = hk.initializers.VarianceScaling, len(observation) - task.clock_size
+        hidden = hk.Linear(width, w_init=scaled(0.3), name="body")(observation[:split])
+        if task.clock_size:
+            hidden += hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(observation[split:])
+        muscles = hk.Linear(task.muscle_count, w_init=scaled(0.1), name="muscles")
+        return change_of(actuation_seen(task, observation), jnp.tanh(muscles(jnp.tanh(hidden))))
 
     transformed = hk.without_apply_rng(hk.transform(network))
     return Policy(lambda key: transformed.init(key, observe(task, beginning(task))), transformed.apply)
@@ -142,10 +152,20 @@ def compile_learner(task: LocomotionTask, learner: Learner, mesh: Mesh | None = 
 def compile_evaluation(
     task: LocomotionTask, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
 ) -> Callable[[Parameters], Any]:
-    """Parameters -> body lengths in one episode from rest; every device walks, and the first device's result counts."""
+    """Parameters -> body lengths in one episode from rest, or the mean of several starts of the task's variation.
+
+    A start with a step that does not converge counts 0. Every device walks, and the first device's result counts.
+    """
 
     def distance(parameters: Parameters, ones: Array) -> Array:
-        return ones * run_episode(task, lambda observation: policy.apply(parameters, observation)).distance
+        def walked(start: EpisodeState | None) -> Array:
+            return run_episode(task, lambda observation: policy.apply(parameters, observation), start).distance
+
+        if not any(task.variation):
+            return ones * walked(None)
+        keys = jax.random.split(jax.random.key(VALIDATION), VALIDATION_STARTS)
+        distances = jax.vmap(lambda key: walked(beginning(task, key)))(keys)
+        return ones * jnp.mean(jnp.nan_to_num(distances))
 
     # Devices of different models may round differently, and must come to the same decisions.
     evaluate = program(lambda parameters: spread(distance, mesh)(parameters, jnp.ones(1))[0], mesh)

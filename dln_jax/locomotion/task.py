@@ -1,14 +1,16 @@
-"""The task: a creature at rest on the ground goes as far along x as it can within an episode, and does not fall.
+"""The task: a creature goes as far along x as it can, and does not fall.
 
-    observation = [(x - x_rest) / (0.1 L) relative to the mean x, v / (L / 1 s), sin 2 pi t / P, cos 2 pi t / P]
-    reward of a step = change of mean x / L - w posture / T
-    posture = 1 - cos tilt + (max(0, 0.8 - h / h_rest) / 0.2)²
+    observation = [((x - o) Rᵀ - rest) / (0.1 L), v Rᵀ / (L / 1 s), R u, R h (in space), actuation, c]
+    actuation of a step = clip(actuation + clip(change, -0.3, 0.3), 0.25, 1)
+    reward of a step = change of mean x / L - w posture - (1 if fallen)
+    posture = 1 - cos tilt + (max(0, 0.8 - y / y_rest) / 0.2)²
 
-L is the creature's body length, t the time since the episode of T steps began, and P the period of the clock. Heights
-are relative to the ground; along the ground only positions relative to the mean x are observed, so that all places are
-equivalent. h is the mean height, and the tilt is that of the rotation which takes the rest shape nearest to the body
-(Procrustes). A body that has tilted by more than 1 rad has fallen, and distance after a fall does not count: tall
-bodies would go far by rolling.
+A policy maps the observation to the change of the muscles' actuation, which begins at 1. It sees the body in its own
+frame, of origin o and axes R (`frames`), so that all places along the ground are equivalent. L is the body length, u
+points against gravity, and h is the horizontal direction nearest to x. c is a clock, sin and cos of 2 pi t / P at step
+t, and a period P of 0 leaves it out. The tilt is the angle between the body's up and the ground's normal, and y the
+mean height. A body that has tilted by more than 1 rad has fallen, which ends the episode, and distance after it does
+not count: tall bodies would go far by rolling.
 """
 
 from collections.abc import Callable
@@ -16,55 +18,83 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dln_jax.locomotion.frames import Frame, axes_of, fitted_frame
+from dln_jax.locomotion.worlds import (
+    FLAT,
+    Variation,
+    World,
+    drawn_world,
+    level_world,
+    lifted,
+    pushed,
+    require_variation,
+)
 from dln_jax.softbody.examples import creature_scene
-from dln_jax.softbody.mesh.shapes import Creature, biped, body_length, crawler, quadruped
-from dln_jax.softbody.scene import SoftScene, State
+from dln_jax.softbody.mesh.shapes import Creature, biped, body_length, box_quadruped, crawler, quadruped
+from dln_jax.softbody.scene import Params, SoftScene, State
 from dln_jax.softbody.step import Stepper, make_step
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError, require_positive
 
-CREATURES: dict[str, Callable[[], Creature]] = {"crawler": crawler, "biped": biped, "quadruped": quadruped}
-EPISODE = 80
+CREATURES: dict[str, Callable[[], Creature]] = {
+    "crawler": crawler,
+    "biped": biped,
+    "quadruped": quadruped,
+    "box-quadruped": box_quadruped,
+}
+EPISODE = 400
 """Steps of an episode."""
-CLOCK_PERIOD = 16.0
-"""Period of the clock in steps."""
 SHORTEST = 0.25
 """Smallest actuation: length of a muscle relative to its rest length; the largest is 1."""
+LARGEST_CHANGE = 0.3
+"""Of an actuation in one step, as published."""
 POSITION_UNIT = 0.1
 """Unit of observed positions, in body lengths."""
-UPRIGHT = 4.0
-"""w, in body lengths per episode."""
+UPRIGHT = 0.05
+"""w, in body lengths per step."""
 CROUCHED = 0.8
 """Mean height, relative to that at rest, below which crouching is penalised."""
 FALLEN = 1.0
 """Tilt of a fall, in rad."""
+CLOCK_PERIOD = 16.0
+"""P in steps; 0 leaves the clock out."""
+FALL = 1.0
+"""Reward that a fall costs, in body lengths."""
 
 Act = Callable[[Float[Array, " o"]], Float[Array, " k"]]
-"""Observation -> actuation."""
+"""Observation -> change of the actuation."""
 
 
 class LocomotionTask(NamedTuple):
-    """A creature with its scene and time step."""
+    """A creature with its scene, time step and variation."""
 
     creature: Creature
     scene: SoftScene
     stepper: Stepper
+    frame: Frame
     length: float
     """Body length in m."""
     episode: int
     """Steps."""
-    clock_period: float
-    """Steps."""
     upright: float
-    """w of the reward, in body lengths per episode."""
+    """w of the reward, in body lengths per step."""
+    variation: Variation
+    """How episodes differ."""
+    clock_period: float
+    """P in steps; 0 for no clock."""
 
     @property
     def observation_size(self) -> int:
         """Length of an observation."""
-        return 2 * self.creature.mesh.vertices.size + 2
+        count, dimension = self.creature.mesh.vertices.shape
+        return 2 * count * dimension + dimension * (dimension - 1) + self.muscle_count + self.clock_size
+
+    @property
+    def clock_size(self) -> int:
+        """Numbers at the end of an observation that show the clock."""
+        return 2 if self.clock_period else 0
 
     @property
     def muscle_count(self) -> int:
@@ -76,31 +106,54 @@ class EpisodeState(NamedTuple):
     """State of an episode."""
 
     state: State
+    actuation: Float[Array, " k"]
     steps: Int[Array, ""]
     """Steps since its beginning."""
+    world: World
 
 
 class Walk(NamedTuple):
     """Records of T steps."""
 
-    x: Float[Array, "T n 2"]
+    x: Float[Array, "T n dim"]
     """Positions after the steps, in m."""
     actuation: Float[Array, "T k"]
     converged: Bool[Array, " T"]
+    travelled: Float[Array, " T"]
+    """Change of mean x, in body lengths."""
     reward: Float[Array, " T"]
     """In body lengths."""
     tilt: Float[Array, " T"]
     """In rad."""
 
+    @property
+    def lost(self) -> Bool[Array, "*T"]:
+        """Whether the creature has fallen, or the step did not converge."""
+        return (self.tilt > FALLEN) | ~self.converged
+
 
 def make_task(
-    creature: Creature, *, episode: int = EPISODE, clock_period: float = CLOCK_PERIOD, upright: float = UPRIGHT
+    creature: Creature,
+    *,
+    episode: int = EPISODE,
+    upright: float = UPRIGHT,
+    variation: Variation = FLAT,
+    frame: Frame | None = None,
+    clock_period: float = CLOCK_PERIOD,
 ) -> LocomotionTask:
-    """Returns the task of a creature of the "creature" preset, with its published time step."""
-    require_positive(episode=episode, clock_period=clock_period)
-    scene = creature_scene(creature)
-    stepper, length = make_step(scene, TIME_STEP), body_length(creature)
-    return LocomotionTask(creature, scene, stepper, length, episode, clock_period, upright)
+    """Returns the task of a creature of the "creature" preset, with its published time step.
+
+    Raises:
+        InputError: an episode that is not positive, or a variation out of range.
+    """
+    require_positive(episode=episode, clock_period=clock_period or 1.0)
+    require_variation(variation)
+    length, vertices = body_length(creature), creature.mesh.vertices
+    bumps = level_world(variation, vertices.shape[1]).bumps
+    scene = creature_scene(creature, bumps)
+    frame = fitted_frame(vertices) if frame is None else frame
+    stepper = make_step(scene, TIME_STEP)
+    return LocomotionTask(creature, scene, stepper, frame, length, episode, upright, variation, clock_period)
 
 
 def creature_named(name: str) -> Creature:
@@ -110,28 +163,77 @@ def creature_named(name: str) -> Creature:
     return CREATURES[name]()
 
 
-def beginning(task: LocomotionTask) -> EpisodeState:
-    """Returns the creature's rest shape at rest."""
-    return EpisodeState(task.stepper.init(), jnp.asarray(0))
+def beginning(task: LocomotionTask, key: Array | None = None, *, steepest: bool = False) -> EpisodeState:
+    """Returns the rest shape at rest on level ground, or by a key a start that is perturbed by the task's variation.
+
+    With `steepest`, slopes are the largest ones, up or down, instead of uniform between them.
+    """
+    state, world = task.stepper.init(), level_world(task.variation, task.creature.mesh.dimension)
+    if key is not None:
+        for_world, for_x, for_v = jax.random.split(key, 3)
+        world = drawn_world(task.variation, for_world, world, task.length, steepest=steepest)
+        x, v = (jax.random.normal(k, state.x.shape, state.x.dtype) for k in (for_x, for_v))
+        start = task.variation.start
+        state = state._replace(x=lifted(world, state.x + start * x), v=state.v + 10.0 * start * v)
+    return EpisodeState(state, jnp.ones(task.muscle_count, state.x.dtype), jnp.asarray(0), world)
 
 
 def observe(task: LocomotionTask, place: EpisodeState) -> Float[Array, " o"]:
     """Returns the observation defined at the top of the module."""
-    rest = jnp.asarray(task.creature.mesh.vertices, place.state.x.dtype)
-    moved = place.state.x - rest
-    moved = moved.at[:, 0].add(-moved[:, 0].mean()) / (POSITION_UNIT * task.length)
-    angle = 2.0 * jnp.pi / task.clock_period * place.steps.astype(moved.dtype)
-    clock = jnp.stack([jnp.sin(angle), jnp.cos(angle)])
-    return jnp.concatenate([moved.ravel(), place.state.v.ravel() / task.length, clock])
+    rest, x = jnp.asarray(task.creature.mesh.vertices, place.state.x.dtype), place.state.x
+    R, rest_R = axes_of(task.frame, x), axes_of(task.frame, rest)
+    moved = (x - task.frame.origin @ x) @ R.T - (rest - task.frame.origin @ rest) @ rest_R.T
+    up = _up(task, place)
+    directions = [R @ up]
+    if len(up) == 3:
+        ahead = jnp.eye(3, dtype=x.dtype)[0] - up[0] * up
+        directions.append(R @ (ahead / jnp.linalg.norm(ahead)))
+    parts = [moved.ravel() / (POSITION_UNIT * task.length), (place.state.v @ R.T).ravel() / task.length]
+    if task.clock_period:
+        angle = 2.0 * jnp.pi / task.clock_period * place.steps.astype(x.dtype)
+        directions += [place.actuation, jnp.stack([jnp.sin(angle), jnp.cos(angle)])]
+    else:
+        directions.append(place.actuation)
+    return jnp.concatenate([*parts, *directions])
 
 
-def advance(task: LocomotionTask, place: EpisodeState, actuation: Float[Array, " k"]) -> tuple[EpisodeState, Walk]:
+def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"]) -> tuple[EpisodeState, Walk]:
     """Returns the place after one step, and the record of the step."""
-    state, info = task.stepper.step(task.scene.params, place.state, actuation)
-    cost, angle = _posture(task, state.x)
-    travelled = (state.x[:, 0].mean() - place.state.x[:, 0].mean()) / task.length
-    reward = travelled - task.upright * cost / task.episode
-    return EpisodeState(state, place.steps + 1), Walk(state.x, actuation, info.converged, reward, angle)
+    change = jnp.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
+    actuation = jnp.clip(place.actuation + change, SHORTEST, 1.0)
+    start = pushed(place.world, place.state, place.steps)
+    state, info = task.stepper.step(params_of(task, place.world), start, actuation)
+    travelled = (state.x[:, 0].mean() - start.x[:, 0].mean()) / task.length
+    cosine, lowered = _posture(task, state.x)
+    tilt = jnp.arccos(jnp.clip(jax.lax.stop_gradient(cosine), -1.0, 1.0))
+    reward = travelled - task.upright * (1.0 - cosine + lowered**2) - FALL * (tilt > FALLEN)
+    after = EpisodeState(state, actuation, place.steps + 1, place.world)
+    return after, Walk(state.x, actuation, info.converged, travelled, reward, tilt)
+
+
+def change_of(actuation: Float[Array, " k"], command: Float[Array, " k"]) -> Float[Array, " k"]:
+    """Returns the change towards the actuation of a command in [-1, 1], 0.3 tanh((target - actuation) / 0.3).
+
+    Learners choose a target instead of the change: its limits bound the actuation without a flat gradient.
+    """
+    target = SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + command)
+    return LARGEST_CHANGE * jnp.tanh((target - actuation) / LARGEST_CHANGE)
+
+
+def actuation_seen(task: LocomotionTask, observation: Float[Array, " o"]) -> Float[Array, " k"]:
+    """Returns the actuation within an observation."""
+    end = task.observation_size - task.clock_size
+    return observation[end - task.muscle_count : end]
+
+
+def params_of(task: LocomotionTask, world: World) -> Params:
+    """Returns the parameters of the scene in a world."""
+    terms = dict(task.scene.params.terms)
+    if world.gravity is not None:
+        terms["gravity"] = terms["gravity"]._replace(acceleration=world.gravity)
+    if world.bumps is not None:
+        terms["ground"] = terms["ground"]._replace(bumps=world.bumps)
+    return task.scene.params._replace(terms=terms)
 
 
 def walk(task: LocomotionTask, act: Act, start: EpisodeState, steps: int) -> tuple[EpisodeState, Walk]:
@@ -144,26 +246,24 @@ def walk(task: LocomotionTask, act: Act, start: EpisodeState, steps: int) -> tup
 
 
 class Episode(NamedTuple):
-    """Results of an episode from rest; NaN if a step did not converge."""
+    """Results of an episode; NaN if a step before a fall did not converge."""
 
     distance: Float[Array, ""]
     """Body lengths before a fall, if any; the criterion for policies."""
-    total_reward: Float[Array, ""]
-    """Reward before a fall."""
+    steps: Int[Array, ""]
+    """Steps before a fall."""
 
 
-def run_episode(task: LocomotionTask, act: Act) -> Episode:
-    """Runs one episode from rest."""
-    return judged(task, walk(task, act, beginning(task), task.episode)[1])
+def run_episode(task: LocomotionTask, act: Act, start: EpisodeState | None = None) -> Episode:
+    """Runs one episode, from rest unless a start is given."""
+    return judged(walk(task, act, beginning(task) if start is None else start, task.episode)[1])
 
 
-def judged(task: LocomotionTask, seen: Walk) -> Episode:
-    """Evaluates the steps of an episode from rest."""
-    before_fall = jnp.cumsum(jnp.abs(seen.tilt) > FALLEN) == 0
-    means = jnp.concatenate([beginning(task).state.x[None, :, 0], seen.x[:, :, 0]]).mean(axis=1)
-    distance = (before_fall * jnp.diff(means)).sum() / task.length
-    usable = jnp.where(seen.converged.all(), 1.0, jnp.nan)
-    return Episode(usable * distance, usable * (before_fall * seen.reward).sum())
+def judged(seen: Walk) -> Episode:
+    """Evaluates the steps of an episode."""
+    standing = jnp.cumsum(seen.tilt > FALLEN) == 0
+    usable = jnp.where((seen.converged | ~standing).all(), 1.0, jnp.nan)
+    return Episode(usable * jnp.sum(jnp.where(standing, seen.travelled, 0.0)), standing.sum())
 
 
 def chosen(condition: Any, new: Any, old: Any) -> Any:
@@ -171,17 +271,17 @@ def chosen(condition: Any, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
 
 
-def actuation_of(command: Float[Array, "*k"] | Float[np.ndarray, "*k"]) -> Float[Array, "*k"]:
-    """Actuation in [0.25, 1] of commands, which are clipped to [-1, 1]."""
-    return SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + jnp.clip(command, -1.0, 1.0))
+def _up(task: LocomotionTask, place: EpisodeState) -> Float[Array, " dim"]:
+    gravity = place.world.gravity
+    if gravity is None:
+        gravity = task.scene.params.terms["gravity"].acceleration
+    return -gravity / jnp.linalg.norm(gravity)
 
 
-def _posture(task: LocomotionTask, x: Float[Array, "n 2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Posture of the reward, and tilt in rad, positive to the left."""
+def _posture(task: LocomotionTask, x: Float[Array, "n dim"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Cosine of the tilt, and how far the body has crouched, 0 to 5."""
     rest = jnp.asarray(task.creature.mesh.vertices, x.dtype)
-    lowered = jnp.maximum(0.0, CROUCHED - x[:, 1].mean() / rest[:, 1].mean()) / (1.0 - CROUCHED)
-    rest, x = rest - rest.mean(axis=0), x - x.mean(axis=0)
-    along, across = jnp.sum(rest * x), jnp.sum(rest[:, 0] * x[:, 1] - rest[:, 1] * x[:, 0])
-    # The norm is zero only for a body that has shrunk to a point.
-    cosine = along / jnp.sqrt(along**2 + across**2)
-    return 1.0 - cosine + lowered**2, jnp.arctan2(across, along)
+    lowered = jnp.maximum(0.0, CROUCHED - x[:, -1].mean() / rest[:, -1].mean()) / (1.0 - CROUCHED)
+    # The direction of the body's frame that points up at rest.
+    cosine = axes_of(task.frame, rest)[:, -1] @ axes_of(task.frame, x)[:, -1]
+    return cosine, lowered

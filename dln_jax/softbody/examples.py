@@ -30,7 +30,7 @@ from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, di
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import SoftScene, make_scene
 from dln_jax.softbody.terms.contact import plane_contact
-from dln_jax.softbody.terms.creature import MASS, TIME_STEP, creature_terms
+from dln_jax.softbody.terms.creature import MASS, TIME_STEP, Bumps, creature_terms
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import StrainEnergy, stable_neo_hookean
@@ -191,9 +191,9 @@ def drop(
     return Example(scene, dt=1 / 200, seconds=2.5, v=v, ground=0.0, moments=(0.0, 0.3, 0.52, 0.9, 1.25))
 
 
-def creature_scene(creature: Creature) -> SoftScene:
-    """Returns the scene of a creature of the preset above its ground."""
-    return make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles), masses=MASS)
+def creature_scene(creature: Creature, bumps: Bumps | None = None) -> SoftScene:
+    """Returns the scene of a creature of the preset above its ground, which is rough with `bumps`."""
+    return make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles, bumps=bumps), masses=MASS)
 
 
 def creature() -> Example:

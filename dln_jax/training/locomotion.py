@@ -5,8 +5,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from dln_jax.cli.arguments import require_positive_if_given
@@ -16,33 +18,38 @@ from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.gradient import Report, TrainedPolicies, settings_of, shown_walk, train
 from dln_jax.locomotion.learning import LANES, Goal, Record
-from dln_jax.locomotion.task import LocomotionTask, Walk, creature_named, make_task
+from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
+from dln_jax.locomotion.task import LocomotionTask, Walk, beginning, creature_named, make_task
+from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
-from dln_jax.softbody.terms.creature import TIME_STEP
+from dln_jax.softbody.terms.creature import TIME_STEP, ground_height
 from dln_jax.training.locomotion_options import LocomotionOptions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.parameter_files import save_tree
 from dln_jax.zoo.run import MODEL
 
-GOAL = 1.0
+GOAL = 5.0
 """Distance in body lengths at which the effort of learning is measured."""
-STEPS = 40_000
+STEPS = 400_000
 """Default number of environment steps."""
+SHOWN = 3_000_000
+"""Seed of the rough ground that is shown."""
 
 
 def prepare(options: LocomotionOptions, mesh: Mesh | None) -> LocomotionTask:
     """Makes the task, and refuses settings that cannot be trained on these devices, before anything is written."""
-    require_positive(
-        seeds=options.seeds, width=options.width, episode=options.episode, clock_period=options.clock_period
-    )
+    require_positive(seeds=options.seeds, width=options.width, episode=options.episode)
+    if not (math.isfinite(options.clock_period) and options.clock_period >= 0):
+        raise InputError(f"--clock-period is {options.clock_period}; expected a positive number, or 0 for no clock")
     require_positive_if_given(options, ["steps", "until", "window", "lanes"])
     require_seed(options.seed, options.seeds)
     if not (math.isfinite(options.upright) and options.upright >= 0):
         raise InputError(f"--upright is {options.upright}; expected 0 or a positive number")
-    creature, clock, upright = creature_named(options.creature), options.clock_period, options.upright
-    task = make_task(creature, episode=options.episode, clock_period=clock, upright=upright)
-    shares(mesh, settings_of(task, options.window, options.lanes).lanes, f"{LANES} (--lanes)")
+    variation = Variation(options.start, options.slope, options.rough, options.push)
+    sizes = {"episode": options.episode, "clock_period": options.clock_period, "upright": options.upright}
+    task = make_task(creature_named(options.creature), variation=variation, **sizes)
+    shares(mesh, settings_of(options.window, options.lanes).lanes, f"{LANES} (--lanes)")
     return task
 
 
@@ -108,10 +115,13 @@ def write_run(
     if not math.isfinite(best.distance):
         raise InputError(f"no evaluation converged; {folder} holds no model: lower the number of steps or the width")
     facts = {"name": f"locomotion-{method}", "creature": creature, "precision": "f64"}
-    facts |= {"clock_period": task.clock_period, "settings": settings}
+    facts |= {"clock_period": task.clock_period, "variation": task.variation._asdict(), "settings": settings}
     save_tree(folder, MODEL, best.parameters, {"model": facts})
-    seen = shown_walk(task, policies.policy, best.parameters, task.episode)
+    start = SHOWN if task.variation.rough else None
+    seen = shown_walk(task, policies.policy, best.parameters, task.episode, start)
     numbers = metrics_of(task, policies, seen)
+    if any(task.variation):
+        numbers |= numbers_of(perturbed_trials(task, policies.policy, best.parameters))
     write_json(folder / "metrics.json", numbers)
     if figures:
         records = [seed.records for seed in policies.learned]
@@ -123,6 +133,7 @@ def write_run(
             x,
             TIME_STEP * np.arange(len(x)),
             muscles=task.creature.muscles,
+            ground=ground_line(task, x),
             actuation=np.concatenate([seen.actuation[:1], seen.actuation]),
             title=f"{creature}, {method}: {best.distance:.2f} body lengths",
             frames_per_second=0.5 / TIME_STEP,
@@ -130,17 +141,27 @@ def write_run(
     return numbers
 
 
+def ground_line(task: LocomotionTask, x: Float[np.ndarray, "T n dim"]) -> float | Float[np.ndarray, "g 2"]:
+    """Ground of the walk that is shown, for figures: its line in the plane, or 0 where it is flat."""
+    bumps = beginning(task, jax.random.key(SHOWN)).world.bumps
+    if bumps is None or x.shape[2] != 2:
+        return 0.0
+    margin = 0.2 * task.length
+    along = np.linspace(x[..., 0].min() - margin, x[..., 0].max() + margin, 500)
+    return np.stack([along, jax.vmap(lambda at: ground_height(bumps, (at,)))(along)], axis=1)
+
+
 def metrics_of(task: LocomotionTask, policies: TrainedPolicies, seen: Walk) -> dict[str, float]:
     """Finite metrics of the best seed, whose episode is `seen`, and medians over all seeds."""
     best, records = policies.best, [seed.records for seed in policies.learned]
-    heights = seen.x[:, :, 1].mean(axis=1) / task.creature.mesh.vertices[:, 1].mean()
+    heights = seen.x[:, :, -1].mean(axis=1) / task.creature.mesh.vertices[:, -1].mean()
     numbers = {
         "distance_body_lengths": best.distance,
         "distance_body_lengths_median": np.median([float(seed.distance) for seed in policies.learned]),
         "environment_steps": best.records[-1].steps,
         "evaluation_steps": len(best.records) * task.episode,
-        "environment_steps_to_one_body_length": median_to_reach(records, GOAL, "steps"),
-        "seconds_to_one_body_length": median_to_reach(records, GOAL, "seconds"),
+        "environment_steps_to_five_body_lengths": median_to_reach(records, GOAL, "steps"),
+        "seconds_to_five_body_lengths": median_to_reach(records, GOAL, "seconds"),
         "compile_seconds": best.compile_seconds,
         "train_seconds": best.records[-1].seconds - best.compile_seconds,
         "skipped_updates": best.records[-1].skipped,
@@ -167,7 +188,7 @@ def learning_figure(seeds: Sequence[Sequence[Record]], *, method: str) -> Figure
     for records in seeds:
         steps, distances = [record.steps for record in records], [record.distance for record in records]
         axis.plot(steps, distances, color=style.BLUE, linewidth=1.2, alpha=0.8)
-    axis.axhline(1.0, color="0.6", linewidth=0.8, linestyle="--")
+    axis.axhline(GOAL, color="0.6", linewidth=0.8, linestyle="--")
     axis.set(xlabel="environment steps", ylabel="distance in one episode, body lengths")
     style.title(axis, f"{method}, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}")
     return figure

@@ -3,7 +3,7 @@ A gait in a minute
 ==================
 
 A soft creature with 24 muscles learns to crawl. Gradients go back through the simulator, including friction and
-contact. Two thousand environment steps are enough for a body length, and most of the time is compilation.
+contact.
 """
 
 import jax
@@ -16,13 +16,13 @@ from dln_jax.locomotion import Goal, creature_named, make_task, shown_walk, trai
 
 jax.config.update("jax_enable_x64", True)
 
-GOAL = 1.0  # body lengths in an episode
-STEPS = 6_000  # environment steps, at most
+GOAL = 5.0  # body lengths in an episode
+STEPS = 60_000  # environment steps, at most
 
 # %%
 # The task
 # --------
-# Go as far along x as you can within 80 steps, and do not fall.
+# Go as far along x as you can within 400 steps, and do not fall.
 
 task = make_task(creature_named("crawler"))
 print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, body length {task.length:.2f} m")
@@ -30,7 +30,8 @@ print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles
 # %%
 # Learning
 # --------
-# The policy is a network with one hidden layer, from observations of the body to the actuation of the muscles.
+# The policy is a network with one hidden layer, from observations of the body and a clock to the
+# actuation of the muscles, which follows by at most 0.3 a step.
 
 records = []
 trained = train(
@@ -41,7 +42,7 @@ trained = train(
 )
 for record in records[:: max(1, len(records) // 5)]:
     print(f"{record.steps:6d} environment steps, {record.seconds:4.0f} s: {record.distance:5.2f} body lengths")
-assert trained.best.distance > min(GOAL, 0.2)
+assert trained.best.distance > 1.0
 
 # %%
 # The gait

@@ -35,7 +35,7 @@ FEW = Iteration(iterations=2, starts=6, seconds=0.1, dt=0.025, steps=3, batch=8,
 def block():
     """Two triangles on the ground, and a muscle along one side."""
     mesh = make_mesh([[0.0, 0.0], [0.4, 0.0], [0.0, 0.4], [0.4, 0.4]], [[0, 1, 2], [1, 3, 2]])
-    return make_task(Creature("block", mesh, np.array([[0, 2]])), episode=3, clock_period=4.0, upright=0.5)
+    return make_task(Creature("block", mesh, np.array([[0, 2]])), episode=3, clock_period=4.0, upright=0.1)
 
 
 def walked(folder, name, compiled):
@@ -85,7 +85,7 @@ def main(folder, name, *, whole):
     mesh = batch_mesh()
     found = {"stiffness": stiffness(mesh), "value": value(mesh)}
     if whole:
-        task, settings = block(), GradientSettings(window=3, pairs=2, updates=1)
+        task, settings = block(), GradientSettings(window=3, lanes=4, updates=1)
         gradient = make_gradient_learner(task, make_policy(task, width=2), settings, mesh=mesh)
         found |= {"gradient": walked(folder, "gradient", compile_learner(task, gradient, mesh))}
         found |= {"equation": equation(mesh)}

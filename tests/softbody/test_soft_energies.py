@@ -547,7 +547,12 @@ def with_control(control):
         (lambda: plane_contact([0], normal=(0, 0), stiffness=1.0, width=0.1), "normal of a plane is zero"),
         (lambda: plane_contact([0], normal=(0, 1), stiffness=1.0, width=-0.1), "width is -0.1"),
         (lambda: plane_contact([0], normal=(0, 1), stiffness=1.0, width=0.1, friction=-1.0), "friction is -1.0"),
-        (lambda: creature.creature_terms(MESHES[3], PAIRS), "dimension 3"),
+        (
+            lambda: creature.creature_terms(
+                MESHES[3], PAIRS, bumps=creature.Bumps(np.ones(1), np.ones((1, 1)), np.ones(1))
+            ),
+            "have 1 components; expected 2",
+        ),
     ],
 )
 def test_mistakes_are_named(mistake, message):

@@ -228,7 +228,7 @@ def test_batches_of_batches_of_minima():
 
 def gradient_of_a_creature():
     task = make_task(creature_named("crawler"), episode=1)
-    one = lambda actuation: run_episode(task, lambda _: actuation).total_reward  # noqa: E731
+    one = lambda actuation: run_episode(task, lambda _: actuation).distance  # noqa: E731
     return jax.grad(one), np.full(task.muscle_count, 0.9)
 
 
@@ -284,7 +284,7 @@ def one(a):
     factor = lapack.cholesky(matrix)
     values, _ = lapack.symmetric_eigen(matrix[:6, :6])
     x = lapack.solve(matrix, lapack.substitute(factor, jnp.ones((40, 1)))[:, 0])
-    return run_episode(task, lambda _: a).total_reward, x.sum() + values.sum()
+    return run_episode(task, lambda _: a).distance, x.sum() + values.sum()
 
 lanes = 0.6 + 0.02 * np.arange(8)[:, None] * np.ones(task.muscle_count)
 mesh = batch_mesh()

@@ -1,9 +1,11 @@
 """Train a policy that moves a soft creature, by gradients through the simulator.
 
-The creature starts at rest on the ground and has an episode of 80 steps of 0.033 s. A policy is judged by how many body
-lengths the mean x of the vertices travels before the creature falls, if it does. The policy observes the body and a
-clock, and sets the actuation of the muscles, 0.25 to 1 of their rest length. A run folder gets config.json,
-metrics.json, the model of the best seed, a figure of the learning, and a GIF of the gait.
+The creature starts on the ground and has an episode of 400 steps of 0.033 s. A policy is judged by how many body
+lengths the mean x of the vertices travels before the creature falls, if it does. The policy observes the body in its
+own frame and a clock, and changes the actuation of the muscles, 0.25 to 1 of their rest length, by at most 0.3 a step.
+Episodes may start perturbed, on slopes or rough ground, and be disturbed by pushes. Then the policy is selected by
+several such episodes, and judged by 100 others of 2,000 steps. A run folder gets config.json, metrics.json, the model
+of the best seed, a figure of the learning, and a GIF of the gait.
 """
 
 from dataclasses import dataclass
@@ -30,7 +32,7 @@ def main(options: Arguments) -> None:
     with command_folder(options, "train_locomotion") as folder:
         announce(task)
         policies = trained(task, options, mesh, directory=folder, resume=options.resume)
-        settings = {"width": options.width, **settings_of(task, options.window, options.lanes)._asdict()}
+        settings = {"width": options.width, **settings_of(options.window, options.lanes)._asdict()}
         numbers = write_run(folder, task, policies, settings, figures=options.figures)
         rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()]
         print_numbers(rows, title=f"{options.creature}, gradient", columns=("quantity", "value"))

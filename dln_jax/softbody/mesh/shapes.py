@@ -110,6 +110,19 @@ def quadruped() -> Creature:
     return _drawn("quadruped", 0.4, "########", "########", "#.#..#.#", "#.#..#.#")
 
 
+def box_quadruped() -> Creature:
+    """A body in space on four legs, of cubes of 0.4 m: 56 vertices, 48 muscles along legs, back and belly."""
+    body = itertools.product(range(4), range(3), (1,))
+    legs = itertools.product((0, 3), (0, 2), (0,))
+    positions, elements = lattice([*body, *legs])
+    mesh = make_mesh(0.4 * positions.astype(np.float64), elements)
+    number = {tuple(position): index for index, position in enumerate(positions.tolist())}
+    along = [(p, (p[0] + 1, p[1], p[2])) for p in number if p[2] > 0]
+    upright = [(p, (p[0], p[1], 1)) for p in number if p[2] == 0]
+    pairs = [(number[start], number[end]) for start, end in along + upright if end in number]
+    return Creature("box-quadruped", mesh, np.array(pairs))
+
+
 def body_length(creature: Creature) -> float:
     """Extent of the rest shape along x, in m."""
     return float(np.ptp(creature.mesh.vertices[:, 0]))

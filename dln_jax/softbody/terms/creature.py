@@ -1,19 +1,23 @@
-"""Terms of the published soft creatures: a preset for comparison with their simulator (2-D; J. Rojas, algovivo).
+"""Terms of the published soft creatures: a preset for comparison with their simulator (J. Rojas, algovivo).
 
 There a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here the same divided by h², so that V is unscaled:
 
-    triangle   ½ mu (I1 - 2) - mu s(J) + ½ lambda s(J)²,   s(J) = -1.5 + 2 J - 0.5 J²
+    element    ½ mu (I1 - dim) - mu s(J) + ½ lambda s(J)²,   s(J) = -1.5 + 2 J - 0.5 J²
     muscle     ½ k_m ((l - a l0)/(a l0))²,   l = sqrt(d² + 1e-6)
     gravity    m g y
     ground     k y² for y < 0, plus friction k_f ((x - x_n)/h)² (0.01 - y_n) for y_n < 0.01
 
-s is the second-order expansion of ln J, and the weight of a triangle is 1 for any area, so mu and lambda are in J.
+s is the second-order expansion of ln J, and the weight of an element is 1 for any size, so mu and lambda are in J.
 The friction is viscous and lagged. k_f is in kg/m, because its part of V is an energy although it is friction: with
 vx = (x - x_n)/h the force is -2 k_f (0.01 - y_n) vx / h, which depends on the time step, and h² V does not contain h.
 A static solve (h infinite) has no friction.
+
+The published creatures are plane and their ground is flat. In space y is the last coordinate, x stands for the others,
+and elements are tetrahedra. Above rough ground, y is the height over sum_i A_i sin(k_i·x + phi_i).
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +50,17 @@ class CreatureMaterial(NamedTuple):
     """In J."""
 
 
+class Bumps(NamedTuple):
+    """Waves of the ground, whose height at x is the sum of `amplitude` sin(`wave_vector`·x + `phase`)."""
+
+    amplitude: Float[Array, " w"]
+    """In m."""
+    wave_vector: Float[Array, "w horizontal"]
+    """In rad/m, along the horizontal axes."""
+    phase: Float[Array, " w"]
+    """In rad."""
+
+
 class CreatureGround(NamedTuple):
     """Parameters of the ground, for all vertices [] or per vertex [n]."""
 
@@ -53,6 +68,14 @@ class CreatureGround(NamedTuple):
     """k in J/m²: half of the stiffness in N/m."""
     friction: Float[Array, "..."]
     """k_f in kg/m."""
+    bumps: Bumps | None = None
+    """Shape of rough ground; `None` for flat ground, which computes none."""
+
+
+def ground_height(bumps: Bumps, horizontal: Sequence[Array] | Array) -> Array:
+    """Height of rough ground in m at a point with these horizontal coordinates."""
+    phase = bumps.phase + sum(bumps.wave_vector[:, i] * coordinate for i, coordinate in enumerate(horizontal))
+    return jnp.sum(bumps.amplitude * jnp.sin(phase))
 
 
 def creature_terms(
@@ -65,22 +88,25 @@ def creature_terms(
     ground_stiffness: Numbers = 14000.0,
     ground_friction: Numbers = 300.0,
     gravity: float = 9.8,
+    bumps: Bumps | None = None,
 ) -> tuple[Term, ...]:
     """Terms "elastic", "muscles", "gravity" and "ground" of a creature above y = 0; muscles are pairs [k, 2].
 
-    The control of a step is the actuation of the muscles, 0.25 to 1 in the published creatures.
+    The control of a step is the actuation of the muscles, 0.25 to 1 in the published creatures. With `bumps` the ground
+    is rough.
     """
-    if mesh.dimension != 2:
-        raise InputError(f"creature_terms got a mesh of dimension {mesh.dimension}; the preset exists in 2-D only")
+    if bumps is not None and np.shape(bumps.wave_vector)[-1] != mesh.dimension - 1:
+        got, expected = np.shape(bumps.wave_vector)[-1], mesh.dimension - 1
+        raise InputError(f"the bumps' wave vectors have {got} components; expected {expected}, the horizontal ones")
     return (
-        _triangles(mesh, mu, lam),
+        _elements(mesh, mu, lam),
         driven_springs(muscles, stiffness=muscle_stiffness, softening=1e-3),
-        weight(mesh, (0.0, -gravity)),
-        _ground(len(mesh.vertices), ground_stiffness, ground_friction),
+        weight(mesh, (*(0.0,) * (mesh.dimension - 1), -gravity)),
+        _ground(len(mesh.vertices), ground_stiffness, ground_friction, bumps),
     )
 
 
-def _triangles(mesh: Mesh, mu: Numbers, lam: Numbers) -> Term:
+def _elements(mesh: Mesh, mu: Numbers, lam: Numbers) -> Term:
     count = len(mesh.elements)
     parameters = CreatureMaterial(
         material("mu", mu, count, "element"), material("lam", lam, count, "element", NOT_NEGATIVE)
@@ -90,29 +116,35 @@ def _triangles(mesh: Mesh, mu: Numbers, lam: Numbers) -> Term:
         gradients, _ = jax.vmap(rest_geometry)(context.rest[mesh.elements])
         return gradients, *(jnp.broadcast_to(value, count) for value in parameters)
 
-    def energy(x: Corners, triangle: tuple[Array, ...]) -> Scalar:
-        """½ mu (I1 - 2) - mu s(J) + ½ lambda s(J)², in J."""
-        gradients, mu, lam = triangle
+    def energy(x: Corners, element: tuple[Array, ...]) -> Scalar:
+        """½ mu (I1 - dim) - mu s(J) + ½ lambda s(J)², in J."""
+        gradients, mu, lam = element
         F = deformation_gradient(x, gradients)
         change = determinant(F) - 1.0
         strain = change - 0.5 * change**2
-        return 0.5 * mu * (squared_norm(F) - 2.0) - mu * strain + 0.5 * lam * strain**2
+        return 0.5 * mu * (squared_norm(F) - len(F)) - mu * strain + 0.5 * lam * strain**2
 
     return Term("elastic", mesh.elements, energy, parameters, prepare)
 
 
-def _ground(count: int, stiffness: Numbers, friction: Numbers) -> Term:
+def _ground(count: int, stiffness: Numbers, friction: Numbers, bumps: Bumps | None) -> Term:
     rough = material("ground_friction", friction, count, "vertex", NOT_NEGATIVE)
-    parameters = CreatureGround(material("ground_stiffness", stiffness, count, "vertex"), rough)
+    parameters = CreatureGround(material("ground_stiffness", stiffness, count, "vertex"), rough, bumps)
 
-    def prepare(parameters: CreatureGround, context: Context) -> tuple[Array, ...]:
-        x, y = context.x.T
-        drag = parameters.friction * jnp.maximum(FRICTION_HEIGHT - y, 0.0) / context.dt**2
-        return jnp.broadcast_to(parameters.stiffness, count), drag, x
+    def height(x: Sequence[Array] | Array, bumps: Bumps | None) -> Array:
+        return x[-1] if bumps is None else x[-1] - ground_height(bumps, x[:-1])
 
-    def energy(x: Corners, vertex: tuple[Array, ...]) -> Scalar:
-        stiffness, drag, start = vertex
-        along, height = x[0][0] - start, x[0][1]
-        return stiffness * jnp.where(height < 0, height**2, 0.0) + drag * along**2
+    def prepare(parameters: CreatureGround, context: Context) -> tuple[Any, ...]:
+        bumps = parameters.bumps
+        above = jax.vmap(lambda x: height(x, bumps))(context.x)
+        drag = parameters.friction * jnp.maximum(FRICTION_HEIGHT - above, 0.0) / context.dt**2
+        everywhere = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), bumps)
+        return jnp.broadcast_to(parameters.stiffness, count), drag, context.x[:, :-1], everywhere
+
+    def energy(x: Corners, vertex: tuple[Any, ...]) -> Scalar:
+        stiffness, drag, start, bumps = vertex
+        above = height(x[0], bumps)
+        along = sum((coordinate - start[i]) ** 2 for i, coordinate in enumerate(x[0][:-1]))
+        return stiffness * jnp.where(above < 0, above**2, 0.0) + drag * along
 
     return Term("ground", np.arange(count)[:, None], energy, parameters, prepare)

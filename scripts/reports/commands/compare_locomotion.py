@@ -1,8 +1,8 @@
-"""Train one soft creature by gradients, by evolution and by PPO, and print what each needs for one body length.
+"""Train one soft creature by gradients, PPO, SAC and evolution, and print what each needs for five body lengths.
 
-Several seeds each, until 1.2 body lengths or --steps. Writes report.json, a figure of the distance against environment
+Several seeds each, until 6 body lengths or --steps. Writes report.json, a figure of the distance against environment
 steps and against wall time, and the model and gait of each method's best seed. Evolution needs the extra [rivals], PPO
-the extra [rl].
+and SAC the extra [rl].
 """
 
 import math
@@ -27,7 +27,7 @@ from dln_jax.training.locomotion import (
     trained,
     write_run,
 )
-from scripts.reports.locomotion import comparison, evolution, ppo
+from scripts.reports.locomotion import comparison, evolution, ppo, sac
 from scripts.reports.locomotion.comparison import comparison_rows
 from scripts.reports.rows import conditions, print_report, write_report
 
@@ -41,21 +41,28 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     seeds: int = 3
     """Of each method, one after the other."""
     steps: Unstated[int] = None
-    """Environment steps of each seed (default: 40000 by gradients, 500000 by evolution, 300000 by ppo)."""
-    until: Unstated[float] = 1.2
-    """Body lengths at which a seed ends (default: 1.2)."""
+    """Environment steps of each seed (default: 400000 by gradients, 500000 by evolution, 300000 by
+    ppo, 60000 by sac)."""
+    until: Unstated[float] = 6.0
+    """Body lengths at which a seed ends (default: 6)."""
+    start: float = 0.0
+    """Standard deviation of the vertices' initial positions, m; rivals start at rest."""
     lanes: Unstated[int] = None
-    """Creatures side by side, which devices share (default: 2 by gradients, 32 by evolution, 16 by ppo)."""
+    """Creatures side by side, which devices share (default: 4 by gradients, 32 by evolution, 16 by ppo and sac)."""
 
 
 def main(options: Arguments) -> None:
     """Trains by all methods, prints the comparison and writes it."""
     mesh, lanes = mesh_of(options), options.lanes
     task = prepare(options, mesh)
-    rivals = {"ppo": (ppo, ppo.train_by_ppo), "evolution": (evolution, evolution.train_by_evolution)}
+    rivals = {
+        "ppo": (ppo, ppo.train_by_ppo),
+        "sac": (sac, sac.train_by_sac),
+        "evolution": (evolution, evolution.train_by_evolution),
+    }
     for rival, _ in rivals.values():
         rival.check(lanes, mesh)
-    settings: dict[str, Any] = {"gradient": settings_of(task, options.window, lanes)}
+    settings: dict[str, Any] = {"gradient": settings_of(options.window, lanes)}
     settings |= {method: rival.settings_of(lanes) for method, (rival, _) in rivals.items()}
     ways = {"gradient": partial(trained, task, options, mesh)}
     for method, (rival, run) in rivals.items():
@@ -73,7 +80,7 @@ def main(options: Arguments) -> None:
             curves[method] = [seed.records for seed in policies.learned]
         rows = comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
         facts = conditions(
-            dtype="float64; ppo's networks float32",
+            dtype="float64; the networks of ppo and sac float32",
             seeds=list(range(options.seed, options.seed + options.seeds)),
             settings={method: values._asdict() for method, values in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",

@@ -1,1 +1,1 @@
-"""Ways of learning to move compared: what each needs until a creature travels one body length."""
+"""Ways of learning to move compared: what each needs until a creature travels five body lengths."""

@@ -1,4 +1,4 @@
-"""Methods of learning to move, compared by their cost until a creature travels one body length: rows and a figure."""
+"""Methods of learning to move, compared by their cost until a creature travels five body lengths: rows and a figure."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from scripts.reports.rows import Row
 
 Curves = Mapping[str, Sequence[Sequence[Record]]]
 """Records of the seeds, by the name of the method."""
-COLOURS = {"gradient": style.BLUE, "evolution": style.GREEN, "ppo": style.ORANGE}
+COLOURS = {"gradient": style.BLUE, "evolution": style.GREEN, "ppo": style.ORANGE, "sac": style.PURPLE}
 BELOW_LEGEND = 0.62
 """Share of a panel's height for the curves, below the legend."""
 
@@ -50,7 +50,7 @@ def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goa
 
     `curves` holds, by method, the records of successive seeds starting at `seed`; `goal` is in body lengths.
     """
-    rows, needed, crawls, steps = [], {}, creature == "crawler", "environment_steps_to_one_body_length"
+    rows, needed, crawls, steps = [], {}, creature == "crawler", "environment_steps_to_five_body_lengths"
     for method, seeds in curves.items():
         case = f"{creature}/{method}"
         for number, records in enumerate(seeds, start=seed):
@@ -59,7 +59,7 @@ def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goa
         median, seconds = (median_to_reach(seeds, goal, field) for field in ("steps", "seconds"))
         needed[method] = float(max(r[-1].steps for r in seeds)) if math.isinf(median) else median
         bound = 60.0 if method == "gradient" and crawls else None
-        rows += [Row(case, steps, median), Row(case, "seconds_to_one_body_length", seconds, "s", bound=bound)]
+        rows += [Row(case, steps, median), Row(case, "seconds_to_five_body_lengths", seconds, "s", bound=bound)]
     name, bound = "environment_steps_ratio_to_gradient", 3.0 if crawls else None
     ratios = {method: needed[method] / needed["gradient"] for method in curves if method != "gradient"}
     rows += [Row(f"{creature}/{method}", name, ratio, bound=bound, at_least=True) for method, ratio in ratios.items()]

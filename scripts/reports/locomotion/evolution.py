@@ -77,7 +77,7 @@ def make_evolution_learner(
         return EvolutionState(search, jnp.asarray(seed), jnp.asarray(0))
 
     def cost(parameters: Any) -> Float[Array, ""]:
-        return -run_episode(task, lambda observation: policy.apply(parameters, observation)).total_reward
+        return -run_episode(task, lambda observation: policy.apply(parameters, observation)).distance
 
     costs_of = spread(lambda _, population: jax.vmap(cost)(population), mesh)
 

@@ -1,6 +1,6 @@
 """Proximal policy optimisation (Schulman et al. 2017) by stable-baselines3, whose actor becomes a policy of dln_jax.
 
-The actor is a network of two tanh layers; its mean in [-1, 1] is an actuation in [0.25, 1].
+The actor is a network of two tanh layers; its mean in [-1, 1] is the command of the muscles.
 """
 
 import importlib.util
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.locomotion.gradient import Report, TrainedPolicies, learn_seeds
 from dln_jax.locomotion.learning import LANES, CompiledLearner, Goal, Learner, Parameters, Policy, compile_evaluation
-from dln_jax.locomotion.task import LocomotionTask, actuation_of
+from dln_jax.locomotion.task import LocomotionTask, actuation_seen, change_of
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError
@@ -66,10 +66,10 @@ def train_by_ppo(
     return learn_seeds(compile_ppo(task, settings_of(lanes), mesh=mesh), seeds, goal, report)
 
 
-def require_stable_baselines3() -> None:
+def require_stable_baselines3(method: str = "ppo") -> None:
     """Raises `InputError` if stable-baselines3 is not installed."""
     if importlib.util.find_spec("stable_baselines3") is None:
-        raise InputError("ppo needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
+        raise InputError(f"{method} needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
 
 
 def make_actor(task: LocomotionTask) -> Policy:
@@ -79,7 +79,8 @@ def make_actor(task: LocomotionTask) -> Policy:
         h, (*hidden, last) = observation.astype(parameters[0]["w"].dtype), parameters
         for layer in hidden:
             h = jnp.tanh(layer["w"] @ h + layer["b"])
-        return actuation_of(last["w"] @ h + last["b"]).astype(observation.dtype)
+        command = jnp.clip(last["w"] @ h + last["b"], -1.0, 1.0).astype(observation.dtype)
+        return change_of(actuation_seen(task, observation), command)
 
     def init(key: Array) -> Parameters:
         sizes = task.observation_size, task.muscle_count
@@ -90,10 +91,15 @@ def make_actor(task: LocomotionTask) -> Policy:
 
 def actor_parameters(model: Any) -> Parameters:
     """Returns the parameters of `make_actor` from a stable-baselines3 model."""
-    stored = model.policy.state_dict()
+    return layers_of(model.policy, _ACTOR)
+
+
+def layers_of(network: Any, names: Sequence[str]) -> Parameters:
+    """Returns the linear layers of these names in a network of torch."""
+    stored = network.state_dict()
     return tuple(
         {"w": jnp.asarray(stored[f"{name}.weight"].numpy()), "b": jnp.asarray(stored[f"{name}.bias"].numpy())}
-        for name in _ACTOR
+        for name in names
     )
 
 

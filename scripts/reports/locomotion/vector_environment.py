@@ -12,12 +12,11 @@ from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMis
 from dln_jax.locomotion.environment import spaces
 from dln_jax.locomotion.learning import LANES
 from dln_jax.locomotion.task import (
-    FALLEN,
     EpisodeState,
     LocomotionTask,
-    actuation_of,
     advance,
     beginning,
+    change_of,
     chosen,
     observe,
 )
@@ -39,8 +38,8 @@ class VectorEnvironment(VecEnv):
         self._places, self._actions = self._start, np.zeros((lanes, task.muscle_count), np.float32)
 
         def one(place: EpisodeState, action: Any) -> tuple[EpisodeState, Any]:
-            after, seen = advance(task, place, actuation_of(action))
-            terminated = (jnp.abs(seen.tilt) > FALLEN) | ~seen.converged
+            after, seen = advance(task, place, change_of(place.actuation, action))
+            terminated = seen.lost
             truncated = (after.steps >= task.episode) & ~terminated
             kept = chosen(terminated | truncated, beginning(task), after)
             last, first = observe(task, after).astype(jnp.float32), observe(task, kept).astype(jnp.float32)
