@@ -135,8 +135,8 @@ assert UP < lifted < UP + 5e-3
 assert abs(carried / weight - 1) < 0.03
 
 # %%
-# The gripper at five moments. Darker parts of the fingers are stretched more, and the orange of the chambers deepens with
-# their pressure.
+# The gripper at five moments. Darker parts of the fingers are stretched more, and the orange of the chambers deepens
+# with their pressure.
 
 
 def largest_stretch(corners, rest):
