@@ -91,7 +91,10 @@ def _loads(mesh: Mesh, pressures: dict[str, list[float]], forces: dict[str, list
     terms = []
     for name, (value,) in pressures.items():
         facets = inner_surface(mesh) if name == INNER and name not in mesh.sets else facets_in(mesh, name)
-        terms.append(pressure(mesh, facets, pressure=value, cap=mesh.midsides is None, name=f"pressure-{name}"))
+        try:
+            terms.append(pressure(mesh, facets, pressure=value, cap=mesh.midsides is None, name=f"pressure-{name}"))
+        except InputError as error:
+            raise InputError(f"pressure on '{name}': {error}") from None
     for name, force in forces.items():
         vertices = vertices_in(mesh, [name])
         try:

@@ -23,6 +23,7 @@ REDUCED = {
     "12_stiff_plant": {},
     "13_own_mesh": {"STEPS": 6, "TURNS": 2},
     "14_bodies_that_touch": {"STEPS": 20, "CELLS": 12},
+    "15_pressure_gripper": {"STEPS": 32, "RINGS": 2},
 }
 """Constants of the examples, and what they are here."""
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
+from dln_jax.softbody.integrators import BDF2
 from dln_jax.softbody.mesh import (
     beam,
     boundary,
@@ -128,6 +129,22 @@ def test_work_of_pressure_is_the_change_of_the_volume():
     work = potential(scene, jnp.asarray(mesh.vertices), scene.params) - potential(scene, jnp.asarray(x), scene.params)
     change = enclosed_volume(x, surface) - enclosed_volume(mesh.vertices, surface)
     assert work == pytest.approx(40.0 * change, rel=1e-9)
+
+
+@pytest.mark.parametrize("options", [{"integrator": BDF2}, {"halvings": 2}], ids=["bdf2", "halvings"])
+def test_long_steps_under_a_driven_pressure_end_in_the_static_shape(options):
+    mesh = ring(0.5, 1.0, 8, 1)
+    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=E, poisson_ratio=NU)
+    scene = make_scene(mesh, [solid, pressure(mesh, inner_surface(mesh))], held=[8, 9])
+    p = jnp.asarray(0.05 * E)
+    shape, solved = static_solve(scene, scene.params, p)
+    init, step = make_step(scene, 1e3, **options)
+    state, step = init(), jax.jit(step)
+    for _ in range(3):
+        state, info = step(scene.params, state, p)
+        assert info.converged
+    assert solved.converged and np.abs(shape - mesh.vertices).max() > 0.01
+    np.testing.assert_allclose(state.x, shape, atol=1e-6)
 
 
 def lame(a, b, p, r):
@@ -321,6 +338,7 @@ def test_mistakes_of_actuators_say_what_is_wrong():
     named = mesh._replace(sets={"few": NamedSet(np.array([0, 12]), np.zeros(0, int))})
     for mistake, message in (
         (lambda: pressure(mesh, inner_surface(mesh)[1:]), "open at 2 vertices, the first is vertex 1"),
+        (lambda: pressure(quadratic(mesh), inner_surface(mesh)[1:]), r"or use linear elements \(order 1\)"),
         (lambda: pressure(mesh, [[0, 99]]), "facet 0 is .0, 99.; expected 2 different ones of 0..15"),
         (lambda: pressure(mesh, [[0, 1], [1, 0]]), "is repeated"),
         (lambda: inner_surface(cube), "no closed cavity"),

@@ -94,9 +94,10 @@ def closed_surface(mesh: Mesh, facets: ArrayLike, *, cap: bool = False) -> Int[n
         place, kind = gaps[0].tolist(), RIDGES[mesh.dimension]
         at = np.round(mesh.vertices[gaps[0]].mean(axis=0), 6).tolist()
         name = place[0] if mesh.dimension == 2 else place
+        capped = "pass cap=True" if mesh.midsides is None else "use linear elements (order 1), whose openings have caps"
         raise InputError(
             f"the surface is open at {len(gaps)} {'vertices' if mesh.dimension == 2 else 'edges'}, the first is {kind} "
-            f"{name} near {at} m; add the facets that close it, or pass cap=True"
+            f"{name} near {at} m; add the facets that close it, or {capped}"
         )
     return chosen
 
