@@ -3,7 +3,8 @@ A gripper closed by pressure
 ============================
 
 Two soft fingers have chambers on their outer sides. Pressure stretches these sides, so that the fingers bend inwards.
-They close around a ball on the ground, and friction holds it while the palm lifts the fingers.
+They close around a ball on the ground and grip it below its middle, and friction holds it while the palm lifts the
+fingers.
 """
 
 import jax
