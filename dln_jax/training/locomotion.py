@@ -33,6 +33,8 @@ GOAL = 5.0
 """Distance in body lengths at which the effort of learning is measured."""
 STEPS = 400_000
 """Default number of environment steps."""
+FILMED = 160
+"""Steps of the film."""
 SHOWN = 3_000_000
 """Seed of the rough ground that is shown."""
 
@@ -98,7 +100,7 @@ def write_run(
     method: str = "gradient",
     figures: bool,
 ) -> dict[str, float]:
-    """Writes model, metrics, figure and GIF (at half speed) of the best seed; returns the metrics.
+    """Writes model, metrics, figure and GIF (of the first steps) of the best seed; returns the metrics.
 
     Args:
         folder: where files are written.
@@ -126,7 +128,7 @@ def write_run(
     if figures:
         records = [seed.records for seed in policies.learned]
         write_figure(folder / "learning.png", learning_figure(records, method=method))
-        x = np.concatenate([task.creature.mesh.vertices[None], seen.x])
+        x = np.concatenate([task.creature.mesh.vertices[None], seen.x])[: FILMED + 1]
         write_soft_body_gif(
             folder / "gait.gif",
             task.creature.mesh,
@@ -134,8 +136,9 @@ def write_run(
             TIME_STEP * np.arange(len(x)),
             muscles=task.creature.muscles,
             ground=ground_line(task, x),
-            actuation=np.concatenate([seen.actuation[:1], seen.actuation]),
+            actuation=np.concatenate([seen.actuation[:1], seen.actuation])[: FILMED + 1],
             title=f"{creature}, {method}: {best.distance:.2f} body lengths",
+            stride=2,
             frames_per_second=0.5 / TIME_STEP,
         )
     return numbers

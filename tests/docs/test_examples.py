@@ -15,7 +15,7 @@ REDUCED = {
     "04_two_bodies": {"TRAJECTORIES": 20, "SECONDS": 5},
     "05_differential_network": {"SAMPLES": 500},
     "06_soft_body": {"STEPS": 30, "RINGS": 2},
-    "07_gait": {"GOAL": 0.3},
+    "07_gait": {"GOAL": 1.0},
     "08_c_in_a_loop": {},
     "09_fine_tune": {"ITERATIONS": 5},
     "10_encoder_log_to_c": {},
@@ -24,6 +24,7 @@ REDUCED = {
     "13_own_mesh": {"STEPS": 6, "TURNS": 2},
     "14_bodies_that_touch": {"STEPS": 20, "CELLS": 12},
     "15_pressure_gripper": {"STEPS": 32, "RINGS": 2},
+    "16_down_the_stairs": {"STEPS": 60},
 }
 """Constants of the examples, and what they are here."""
 
