@@ -25,6 +25,8 @@ REDUCED = {
     "14_bodies_that_touch": {"STEPS": 20, "CELLS": 12},
     "15_pressure_gripper": {"STEPS": 32, "RINGS": 2},
     "16_down_the_stairs": {"STEPS": 60},
+    "17_stiffness_from_a_motion": {},
+    "18_tangle": {"STEPS": 40, "STRIPS": 3},
 }
 """Constants of the examples, and what they are here."""
 

@@ -14,7 +14,7 @@ from dln_jax.softbody.mesh import beam
 def two_blocks(tmp_path):
     """One block above another, 0.15 m apart."""
     block = beam(1.0, 0.3, 4, 2)
-    vertices = np.concatenate([block.vertices, [*block.vertices, [0.3, 0.45]]])
+    vertices = np.concatenate([block.vertices, block.vertices + np.array([0.3, 0.45])])
     elements = np.concatenate([block.elements, block.elements + len(block.vertices)])
     np.savez(tmp_path / "two.npz", vertices=vertices, elements=elements)
     return tmp_path / "two.npz"
