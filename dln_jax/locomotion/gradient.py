@@ -20,13 +20,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from dln_jax.locomotion.learning import (
     LANES,
@@ -43,12 +42,11 @@ from dln_jax.locomotion.learning import (
     make_policy,
 )
 from dln_jax.locomotion.task import EpisodeState, LocomotionTask, Walk, advance, beginning, chosen, observe, walk
+from dln_jax.locomotion.value import Window, make_value, targets
 from dln_jax.scale.mesh import shares, spread
 from dln_jax.types import InputError, require_positive
 
 Report = Callable[[int, Record], None]
-VALUE_WIDTH = 64
-"""Units of the two hidden layers of the value."""
 
 
 class GradientSettings(NamedTuple):
@@ -90,15 +88,6 @@ class GradientState(NamedTuple):
     seed: Int[Array, ""]
     updates: Int[Array, ""]
     skipped: Int[Array, ""]
-
-
-class Window(NamedTuple):
-    """Records of one lane, for the value."""
-
-    seen: Float[Array, "H_plus_1 o"]
-    reward: Float[Array, " H"]
-    alive: Float[Array, " H_plus_1"]
-    """1 before a fall, 0 after."""
 
 
 class TrainedPolicies(NamedTuple):
@@ -163,28 +152,6 @@ def learn_seeds(
     """Learns with several seeds by one compiled learner; `stored` are arguments of `learn` on checkpoints."""
     one = partial(learn, compiled, goal=goal, **stored)
     return TrainedPolicies(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
-
-
-def make_value(size: int) -> tuple[Callable[[Array], Parameters], Callable[[Parameters, Array], Array]]:
-    """Returns (init, apply) of the value of observations of this size."""
-
-    def network(seen: Float[Array, " o"]) -> Float[Array, ""]:
-        return hk.nets.MLP([VALUE_WIDTH, VALUE_WIDTH, 1], activation=jnp.tanh, name="value")(seen)[0]
-
-    transformed = hk.without_apply_rng(hk.transform(network))
-    return lambda key: transformed.init(key, jnp.zeros(size)), transformed.apply
-
-
-def targets(window: Window, values: Float[Array, " H_plus_1"], discount: float, trace: float) -> Float[Array, " H"]:
-    """TD(lambda) targets G_t of a window; `values` are V' of its observations, which count before a fall only."""
-    values = window.alive * values
-
-    def back(later: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
-        reward, value = at
-        target = reward + discount * ((1 - trace) * value + trace * later)
-        return target, target
-
-    return jax.lax.scan(back, values[-1], (window.alive[:-1] * window.reward, values[1:]), reverse=True)[1]
 
 
 def make_gradient_learner(

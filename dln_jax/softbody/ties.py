@@ -29,7 +29,8 @@ from dln_jax.types import InputError, Vector, require_positive
 Pose = Callable[[Vector], tuple[Float[Array, "dim dim"], Float[Array, " dim"]]]
 """q [d] -> rotation R and origin p in m of a frame in the world."""
 REACHED = 1e-9
-"""Distance from its frame at which a tied vertex is held back by contact, relative to the extent of the body."""
+"""Largest distance of a tied vertex from its place in the frame, relative to the extent of the body; one that contact
+holds back is farther away."""
 
 
 class Tie(NamedTuple):

@@ -17,9 +17,10 @@ from dln_jax.cli.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.frames import axes_of, fitted_frame, vertex_frame
-from dln_jax.locomotion.gradient import GradientSettings, Window, make_gradient_learner, targets
+from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task, walk
+from dln_jax.locomotion.value import Window, targets
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale.mesh import AXIS
 from dln_jax.softbody.mesh.mesh import make_mesh
