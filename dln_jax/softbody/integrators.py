@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Previous, State
-from dln_jax.solvers.elements.energies import Corners, ElementEnergy, local
+from dln_jax.solvers.elements.energies import Corners, ElementEnergy, local, of_corners
 from dln_jax.types import InputError
 
 
@@ -105,19 +105,21 @@ def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
     nodes, weights = np.polynomial.legendre.leggauss(dimension if solid else CONTACT_POINTS)
     nodes, weights = (1 + nodes) / 2, weights / 2
 
+    of_one = of_corners(element)
+
     def energy(x: Corners, start_and_data: tuple[Any, Any]) -> Float[Array, ""]:
         start, data = start_and_data
 
         def at(s: Any) -> Array:
             between = [[(1 - s) * a + s * b for a, b in zip(*pair, strict=True)] for pair in zip(start, x, strict=True)]
-            return element.energy(between, data)
+            return of_one(between, data)
 
         if solid:
             # Written out: the few points fuse with the arithmetic of the element.
             return jnp.asarray(sum(w / s * at(s) for s, w in zip(nodes.tolist(), weights.tolist(), strict=True)))
         return jnp.sum(weights / nodes * jax.vmap(at)(jnp.asarray(nodes, x[0][0].dtype)))
 
-    return element._replace(energy=energy)
+    return element._replace(energy=energy, weights=None)
 
 
 def averaged_data(element: ElementEnergy, start: Float[Array, "n dim"], data: Any) -> tuple[Any, Any]:

@@ -17,7 +17,7 @@ from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses
 from dln_jax.softbody.terms.term import Context, Term
 from dln_jax.solvers.elements.energies import ElementEnergy, value
-from dln_jax.solvers.elements.moving import Lists, MovingEnergy, lists_between, moving_value
+from dln_jax.solvers.elements.moving import Lists, MovingEnergy, lists_between, moving_gradient
 from dln_jax.types import InputError
 
 
@@ -184,7 +184,7 @@ def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
     """Returns the terms in the form of the solver."""
-    return tuple(ElementEnergy(term.energy, term.indices, term.unrolled) for term in scene.terms)
+    return tuple(ElementEnergy(term.energy, term.indices, term.unrolled, term.weights) for term in scene.terms)
 
 
 def prepare(
@@ -245,4 +245,4 @@ def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, contro
     """V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as from rest at x."""
     stored = value(element_energies(scene), x, prepare(scene, params, x, control=control))
     energies, data = contact_energies(scene), prepare_contacts(scene, params, x)
-    return stored + moving_value(energies, x, lists_between(energies, x, jnp.zeros_like(x), data), data)
+    return stored + moving_gradient(energies, x, lists_between(energies, x, jnp.zeros_like(x), data), data)[0]

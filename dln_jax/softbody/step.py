@@ -33,7 +33,7 @@ from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.elements.moving import Lists, lists_between, moving_value
+from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 from dln_jax.solvers.elements.selection import by_size, by_stiffness
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
@@ -76,7 +76,7 @@ class StepParts(NamedTuple):
     init: Callable[..., State]
     balance: Callable[..., Balanced]
     """balance(params, state, control, dt, x_after=None): x_after starts the search."""
-    forces: Callable[[State, Balanced], Float[Array, "n dim"]]
+    forces: Callable[[Balanced], Float[Array, "n dim"]]
     """Forces of the energies and of inertia on all vertices, in N: zero on free ones."""
     conclude: Callable[..., tuple[State, Info]]
     """conclude(params, state, balanced, dt): the state after the step, and the verdict."""
@@ -207,18 +207,23 @@ def step_parts(
         elif x_after is None:
             # The better of two starts: the present positions, or those of motion without forces.
             stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
-            start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
+            of_coast, of_stay = jax.vmap(lambda x: value(energies, x, data))(jnp.stack([coast, stay]))
+            start = jnp.where(of_coast < of_stay, coast, stay)
         else:
             start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
         balanced, outcome = solve(
             energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible
         )
+        if moving and x_after is not None:
+            # The search did not begin where the step does.
+            there = lists_between(moving, state.x, jnp.zeros_like(state.x), contact)
+            outcome = outcome._replace(lists=(there, outcome.lists[1]))
         return Balanced(balanced, outcome, at_start, data, contact)
 
-    def forces(state: State, balanced: Balanced) -> Float[Array, "n dim"]:
-        x, _, _, data, contact = balanced
-        lists = lists_between(moving, state.x, x - state.x, contact)
-        return -jax.grad(lambda x: value(energies, x, data) + moving_value(moving, x, lists, contact))(x)
+    def forces(balanced: Balanced) -> Float[Array, "n dim"]:
+        x, outcome, _, data, contact = balanced
+        slope = jax.grad(lambda x: value(energies, x, data))(x)
+        return -slope - moving_gradient(moving, x, outcome.lists[1], contact)[1] if moving else -slope
 
     def conclude(params: Params, state: State, balanced: Balanced, dt: Any) -> tuple[State, Info]:
         x, v = integrator.finish(state, balanced.x, dt)
@@ -234,19 +239,16 @@ def step_parts(
         # The verdict has no derivatives.
         params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
         balanced, outcome, at_start, (_, *data), contact = solution
-        lists = lists_between(moving, state.x, x - state.x, contact)
-
-        def contact_value(x: Array) -> Array:
-            return moving_value(moving, x, lists, contact)
-
-        work = work_of_held(scene.held, terms, data, balanced, x - state.x)
-        if moving and len(scene.held):
-            along_held = jnp.where(free, 0, x - state.x)
-            work += jax.jvp(contact_value, (balanced,), (along_held,))[1]
+        work, stored = work_of_held(scene.held, terms, data, balanced, x - state.x), 0.0
+        if moving:
+            lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *outcome.lists)
+            at_both = jax.vmap(lambda x, lists: moving_gradient(moving, x, lists, contact))
+            stored, slopes = at_both(jnp.stack([state.x, x]), lists)
+            work += jnp.vdot(slopes[1], jnp.where(free, 0, x - state.x))
         energies_of_step = energy_balance(
-            scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, contact_value
+            scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, stored
         )
-        info = _of_positions(scene, params, x, outcome, overlaps, contact, lists)
+        info = _of_positions(scene, params, x, outcome, overlaps, contact)
         return with_energies(info, energies_of_step, state.growth)
 
     return StepParts(init, balance, forces, conclude)
@@ -288,8 +290,7 @@ def static_solve(
     solve = partial(solve, moving=contact_energies(scene), moving_data=contact)
     x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
     overlaps = None if scene.contacts else count_overlaps(scene.mesh)
-    lists = lists_between(contact_energies(scene), x, jnp.zeros_like(x), contact)
-    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), overlaps, contact, lists)
+    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), overlaps, contact)
     return trusted(x, info.converged), info
 
 
@@ -321,7 +322,6 @@ def _of_positions(
     outcome: SolverInfo,
     overlaps: Callable[[Array], Array] | None,
     contact: Sequence[Any],
-    lists: Lists,
 ) -> Info:
     """Combines the solver's verdict with that on the positions: no element is inverted."""
     least = least_J(scene, params, x)
@@ -334,7 +334,7 @@ def _of_positions(
         outcome.definite,
         least_J=least,
         overlaps=pairs,
-        least_distance=least_distance(scene, x, lists, contact),
+        least_distance=least_distance(scene, x, outcome.lists[1], contact),
         overflow=outcome.overflow,
     )
 

@@ -127,8 +127,8 @@ def make_tied_step(
     def residual(q: Vector, params: Params, state: TiedState, tau: Vector, control: Any) -> Vector:
         h, target = integrator.target(state.robot, dt)
         _, qd = integrator.finish(state.robot, q, dt)
-        body, balanced = soft(params, state.body, q, control)
-        back = jax.vjp(partial(positions, params.rest), q)[1](forces(body, balanced)[tied])[0]
+        _, balanced = soft(params, state.body, q, control)
+        back = jax.vjp(partial(positions, params.rest), q)[1](forces(balanced)[tied])[0]
         return inverse_dynamics(q, qd, (q - target) / h**2) - tau - back
 
     def step(params: Params, state: TiedState, inputs: tuple[Any, Any]) -> tuple[TiedState, Info]:

@@ -39,6 +39,8 @@ class SolverInfo(NamedTuple):
     """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
     overflow: Bool[Array, ""] | None = None
     """Whether a list of moving elements was too short at a minimum; `None` without moving elements."""
+    lists: tuple[Any, Any] = ((), ())
+    """Moving elements at the start and at the minimum."""
 
 
 class _RootIterate(NamedTuple):

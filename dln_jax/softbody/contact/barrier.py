@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.contact.distances import Stencil, closest
+from dln_jax.softbody.contact.distances import Stencil, closest, summed
 
 MOLLIFIED = 1e-3
 """Squared sine of the angle between edges below which their contact is mollified (Li et al. 2020, section 5)."""
@@ -47,7 +47,7 @@ def barrier(D: Float[Array, "*pairs"], near: Float[Array, "*pairs"]) -> tuple[Ar
 def pair_gradient(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""], Float[Array, "k dim"]]:
     """Returns E in J and dE/dx in N of one pair."""
     delta, beta, *_ = closest(x, pair.stencil)
-    value, slope, _ = barrier(jnp.sum(delta**2), pair.near)
+    value, slope, _ = barrier(summed(delta**2), pair.near)
     along = 2 * slope * beta[:, None] * delta
     if x.shape == (4, 3):
         m, m_slope, _ = _mollifier(x, pair.parallel)
@@ -60,7 +60,7 @@ def pair_gradient(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""
 def pair_hessian(x: Float[Array, "k dim"], pair: Pair) -> Float[Array, "s s"]:
     """Returns d²E/dx² in N/m of one pair, s = k dim."""
     delta, beta, e, inverse = closest(x, pair.stencil)
-    value, slope, curvature = barrier(jnp.sum(delta**2), pair.near)
+    value, slope, curvature = barrier(summed(delta**2), pair.near)
     gradient = (2 * beta[:, None] * delta).reshape(-1)
     A = (beta[:, None] * e[:, None, :] + pair.stencil.directions[:, :, None] * delta).reshape(len(e), -1)
     of_distance = 2 * jnp.kron(beta[:, None] * beta, jnp.eye(x.shape[1], dtype=x.dtype))
@@ -76,7 +76,7 @@ def pair_hessian(x: Float[Array, "k dim"], pair: Pair) -> Float[Array, "s s"]:
 def normal_force(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""], Array, Array]:
     """Returns the force in N that pushes the primitives apart, its unit direction, and the weights of the vertices."""
     delta, weights, *_ = closest(x, pair.stencil)
-    D = jnp.sum(delta**2)
+    D = summed(delta**2)
     used = (pair.strength > 0) & (pair.near > D)
     safe = jnp.where(used, D, pair.near)
     slope = pair.strength * barrier(safe, pair.near)[1]
@@ -89,7 +89,7 @@ def normal_force(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""]
 def _mollifier(x: Float[Array, "4 3"], parallel: Float[Array, ""]) -> tuple[Array, Array, Array]:
     """Returns m, dm/dx [4, 3] and d²m/dx² [12, 12] for the edges of x = (a, b, c, d); m = 1 for other pairs."""
     u, v = x[1] - x[0], x[3] - x[2]
-    uu, uv, vv = jnp.sum(u * u), jnp.sum(u * v), jnp.sum(v * v)
+    uu, uv, vv = summed(u * u), summed(u * v), summed(v * v)
     mollified = parallel > 0
     scale = jnp.where(mollified, parallel, 1.0)
     ratio = (uu * vv - uv**2) / scale

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from dln_jax.softbody.contact.distances import EDGE_EDGE
+from dln_jax.softbody.contact.distances import EDGE_EDGE, summed
 
 REMAINING = 0.1
 """Fraction of its distance that a pair keeps in one step."""
@@ -22,7 +22,7 @@ _ITERATIONS = 200
 
 def speed_bound(p: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
     """l in m per unit of time for one pair of a kind of `distances`, whose vertices move by p."""
-    speed = jnp.sqrt(jnp.sum((p - p.mean(axis=0)) ** 2, axis=1))
+    speed = jnp.sqrt(summed((p - summed(p, axis=0) / len(p)) ** 2))
     first = jnp.arange(len(p)) < jnp.where((kind == EDGE_EDGE) & (len(p) == 4), 2, 1)
     return jnp.max(jnp.where(first, speed, 0)) + jnp.max(jnp.where(first, 0, speed))
 

@@ -11,8 +11,10 @@ With beta the weights of the vertices in delta and c_i those in e_i, the derivat
     dD/dx = 2 beta (x) delta,    d²D/dx² = 2 beta betaᵀ (x) I - 2 A G⁻¹ Aᵀ,    A_i = beta (x) e_i + c_i (x) delta.
 """
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -51,17 +53,26 @@ class Closest(NamedTuple):
 def closest(x: Float[Array, "k dim"], stencil: Stencil) -> Closest:
     """Returns the closest points of the features of a pair with vertices x."""
     w, e = _combined(stencil.offset, x), _combined(stencil.directions, x)
-    G = jnp.sum(e[:, None, :] * e[None, :, :], axis=-1) + jnp.diag(stencil.unused)
+    G = summed(e[:, None, :] * e[None, :, :]) + jnp.diag(stencil.unused)
     inverse = _inverse(G)
-    s = jnp.sum(inverse * jnp.sum(e * w, axis=-1), axis=-1)
-    delta = w - jnp.sum(s[:, None] * e, axis=0)
-    return Closest(delta, stencil.offset - jnp.sum(s[:, None] * stencil.directions, axis=0), e, inverse)
+    s = summed(inverse * summed(e * w))
+    delta = w - summed(s[:, None] * e, axis=0)
+    return Closest(delta, stencil.offset - summed(s[:, None] * stencil.directions, axis=0), e, inverse)
 
 
 def squared_distance(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
     """D in m² of a pair of a kind."""
     delta = closest(x, stencil_of(x, kind)).delta
-    return jnp.sum(delta**2)
+    return summed(delta**2)
+
+
+def summed(values: Array, axis: int = -1) -> Array:
+    """Returns the sum over a short axis, written out.
+
+    It becomes part of the arithmetic around it, where a reduction is compiled as a program of its own.
+    """
+    parts = [jax.lax.index_in_dim(values, i, axis, keepdims=False) for i in range(values.shape[axis])]
+    return functools.reduce(jnp.add, parts)
 
 
 def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
@@ -69,9 +80,9 @@ def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
     tables = _SPACE if x.shape[1] == 3 else _PLANE
     p, a, b = jnp.moveaxis(_combined(jnp.asarray(tables.segments, x.dtype)[kind], x), 1, 0)
     e, w = b - a, p - a
-    squared = jnp.sum(e**2, axis=-1)
-    s = jnp.sum(w * e, axis=-1) / jnp.where(squared > 0, squared, 1.0)
-    squares = jnp.sum((w - jnp.clip(s, 0.0, 1.0)[:, None] * e) ** 2, axis=-1)
+    squared = summed(e**2)
+    s = summed(w * e) / jnp.where(squared > 0, squared, 1.0)
+    squares = summed((w - jnp.clip(s, 0.0, 1.0)[:, None] * e) ** 2)
     side = jnp.argmin(squares)
     region = 3 * side + jnp.where(s <= 0, 0, jnp.where(s >= 1, 1, 2))[side]
     if tables.interior is not None:
@@ -86,7 +97,7 @@ def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
 
 def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
     """Whether |w - s e - t f| is smallest inside a triangle (s, t >= 0, s + t <= 1) or inside two edges (s, t <= 1)."""
-    ee, ef, ff, ew, fw = (jnp.sum(u * v) for u, v in ((e, e), (e, f), (f, f), (e, w), (f, w)))
+    ee, ef, ff, ew, fw = (summed(u * v) for u, v in ((e, e), (e, f), (f, f), (e, w), (f, w)))
     determinant = ee * ff - ef**2
     s, t = ff * ew - ef * fw, ee * fw - ef * ew
     largest = jnp.where(kind == POINT_TRIANGLE, s + t, jnp.maximum(s, t))
@@ -95,7 +106,7 @@ def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
 
 def _combined(weights: Float[Array, "*rows k"], x: Float[Array, "k dim"]) -> Float[Array, "*rows dim"]:
     # A sum and no matrix product, which would round to fewer digits on a GPU.
-    return jnp.sum(weights[..., None] * x, axis=-2)
+    return summed(weights[..., None] * x, axis=-2)
 
 
 def _inverse(G: Float[Array, "axes axes"]) -> Float[Array, "axes axes"]:

@@ -26,10 +26,10 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import determinant
-from dln_jax.softbody.terms.elasticity import deformation_gradient, rest_geometry
+from dln_jax.softbody.terms.elasticity import rest_geometry, shape_gradients
 from dln_jax.softbody.terms.gravity import gravity as weight
 from dln_jax.softbody.terms.springs import muscles as driven_springs
-from dln_jax.softbody.terms.strain_energies import squared_norm
+from dln_jax.softbody.terms.strain_energies import DeformationGradient, squared_norm
 from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Indices, Numbers, Term, material
 from dln_jax.types import InputError, Scalar
 
@@ -116,15 +116,14 @@ def _elements(mesh: Mesh, mu: Numbers, lam: Numbers) -> Term:
         gradients, _ = jax.vmap(rest_geometry)(context.rest[mesh.elements])
         return gradients, *(jnp.broadcast_to(value, count) for value in parameters)
 
-    def energy(x: Corners, element: tuple[Array, ...]) -> Scalar:
+    def energy(F: DeformationGradient, element: tuple[Array, ...]) -> Scalar:
         """½ mu (I1 - dim) - mu s(J) + ½ lambda s(J)², in J."""
-        gradients, mu, lam = element
-        F = deformation_gradient(x, gradients)
+        _, mu, lam = element
         change = determinant(F) - 1.0
         strain = change - 0.5 * change**2
         return 0.5 * mu * (squared_norm(F) - len(F)) - mu * strain + 0.5 * lam * strain**2
 
-    return Term("elastic", mesh.elements, energy, parameters, prepare)
+    return Term("elastic", mesh.elements, energy, parameters, prepare, weights=shape_gradients)
 
 
 def _ground(count: int, stiffness: Numbers, friction: Numbers, bumps: Bumps | None) -> Term:

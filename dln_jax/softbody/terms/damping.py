@@ -19,9 +19,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.elasticity import POISSON_BOUND, deformation_gradient, lame_parameters, rest_geometry
-from dln_jax.softbody.terms.strain_energies import green_strain, linear_energy
+from dln_jax.softbody.terms.elasticity import POISSON_BOUND, lame_parameters, rest_geometry, shape_gradients
+from dln_jax.softbody.terms.strain_energies import DeformationGradient, green_strain, linear_energy
 from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Numbers, Term, material
+from dln_jax.solvers.elements.energies import combinations
 from dln_jax.types import Scalar
 
 
@@ -79,15 +80,15 @@ def stiffness_damping(
 
     def prepare(parameters: StiffnessDamping, context: Context) -> tuple[Any, ...]:
         gradients, volumes = jax.vmap(rest_geometry)(context.rest[mesh.elements])
-        before = jax.vmap(lambda x, gradients: green_strain(deformation_gradient(x, gradients)))
+        before = jax.vmap(lambda x, gradients: green_strain(combinations(x, gradients)))
         mu, lam = lame_parameters(parameters.youngs_modulus, parameters.poisson_ratio)
         weights = parameters.time * volumes / context.dt
         return gradients, weights * mu, weights * lam, before(context.x[mesh.elements], gradients)
 
-    def energy(x: Corners, element: tuple[Any, ...]) -> Scalar:
-        gradients, mu, lam, before = element
-        after = green_strain(deformation_gradient(x, gradients))
+    def energy(F: DeformationGradient, element: tuple[Any, ...]) -> Scalar:
+        _, mu, lam, before = element
+        after = green_strain(F)
         change = [[now - then for now, then in zip(*rows, strict=True)] for rows in zip(after, before, strict=True)]
         return linear_energy(change, mu, lam)
 
-    return Term(name, mesh.elements, energy, parameters, prepare)
+    return Term(name, mesh.elements, energy, parameters, prepare, weights=shape_gradients)

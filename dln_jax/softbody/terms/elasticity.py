@@ -21,7 +21,7 @@ pressure that bending needs is missing and the beam is up to 1.6 times too soft.
 `mesh.barycentric_split` if nu is close to 1/2.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import cofactors, determinant, jacobians, reference_gradients
-from dln_jax.softbody.terms.strain_energies import StrainEnergy
+from dln_jax.softbody.terms.strain_energies import DeformationGradient, StrainEnergy
 from dln_jax.softbody.terms.term import Bound, Context, Corners, Numbers, Term, material
 from dln_jax.types import InputError, Scalar
 
@@ -91,9 +91,9 @@ def elastic(
         geometry = jax.vmap(rest_geometry if mesh.midsides is None else quadratic_geometry)(context.rest[mesh.nodes])
         return *geometry, jnp.broadcast_to(mu, count), jnp.broadcast_to(lam, count)
 
-    def energy(x: Corners, element: tuple[Array, ...]) -> Scalar:
-        gradients, volume, mu, lam = element
-        return volume * density(deformation_gradient(x, gradients), mu, lam)
+    def energy(F: DeformationGradient, element: tuple[Array, ...]) -> Scalar:
+        _, volume, mu, lam = element
+        return volume * density(F, mu, lam)
 
     def quadratic_energy(corners: Corners, element: tuple[Array, ...]) -> Scalar:
         x = jnp.asarray(corners)
@@ -108,7 +108,7 @@ def elastic(
         return stored + 0.5 * lam * jnp.sum(weights * (determinant(F) - 1.0)) ** 2 / weights.sum()
 
     if mesh.midsides is None:
-        return Term(name, mesh.elements, energy, parameters, prepare)
+        return Term(name, mesh.elements, energy, parameters, prepare, weights=shape_gradients)
     return Term(name, mesh.nodes, quadratic_energy, parameters, prepare, unrolled=False)
 
 
@@ -148,8 +148,6 @@ def quadratic_geometry(
     return by_reference @ inverse.swapaxes(1, 2), size / (len(size) * (2.0 if len(rows) == 2 else 6.0))
 
 
-def deformation_gradient(x: Corners, shape_gradients: Float[Array, "corners dim"]) -> list[list[Array]]:
-    """Rows of F = dx/dX."""
-    corners, axes = range(len(x)), range(len(x) - 1)
-    gradients = [[shape_gradients[k, j] for j in axes] for k in corners]
-    return [[jnp.asarray(sum(x[k][i] * gradients[k][j] for k in corners)) for j in axes] for i in axes]
+def shape_gradients(element: tuple[Any, ...]) -> Float[Array, "corners dim"]:
+    """Returns the gradients of the shape functions, the first of an element's data: F combines positions by them."""
+    return element[0]

@@ -16,9 +16,11 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.elasticity import deformation_gradient, quadratic_geometry, rest_geometry
+from dln_jax.softbody.terms.elasticity import quadratic_geometry, rest_geometry, shape_gradients
 from dln_jax.softbody.terms.springs import length_of
+from dln_jax.softbody.terms.strain_energies import DeformationGradient
 from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Numbers, Term, control_of, material
+from dln_jax.solvers.elements.energies import combinations
 from dln_jax.types import InputError, Scalar
 
 
@@ -92,24 +94,25 @@ def fibres(
         passive = parameters.stiffness
         return *geometry, unit, stress, None if passive is None else jnp.broadcast_to(passive, count)
 
-    def density(x: Corners, gradients: Array, element: tuple[Any, ...]) -> Scalar:
+    def density(F: DeformationGradient, element: tuple[Any, ...]) -> Scalar:
         unit, stress, passive = element
-        F = deformation_gradient(x, gradients)
         along = [sum(entry * unit[j] for j, entry in enumerate(row)) for row in F]
         stretch = length_of(jnp.asarray(sum(part**2 for part in along)), 0.0)
         return stress * stretch if passive is None else stress * stretch + 0.5 * passive * (stretch - 1) ** 2
 
-    def energy(x: Corners, element: tuple[Any, ...]) -> Scalar:
-        gradients, volume, *rest = element
-        return volume * density(x, gradients, tuple(rest))
+    def energy(F: DeformationGradient, element: tuple[Any, ...]) -> Scalar:
+        _, volume, *rest = element
+        return volume * density(F, tuple(rest))
 
     def quadratic_energy(x: Corners, element: tuple[Any, ...]) -> Scalar:
         gradients, weights, *rest = element
-        at_points = jax.vmap(lambda slopes: density(jnp.asarray(x), slopes, tuple(rest)))(gradients)
+        at_points = jax.vmap(lambda slopes: density(combinations(jnp.asarray(x), slopes), tuple(rest)))(gradients)
         return jnp.sum(weights * at_points)
 
-    linear, control = mesh.midsides is None, (number,) if activation is None else None
-    return Term(name, nodes, energy if linear else quadratic_energy, parameters, prepare, linear, control)
+    control = (number,) if activation is None else None
+    if mesh.midsides is None:
+        return Term(name, nodes, energy, parameters, prepare, control=control, weights=shape_gradients)
+    return Term(name, nodes, quadratic_energy, parameters, prepare, unrolled=False, control=control)
 
 
 def _directions(direction: Numbers, count: int, dimension: int) -> Float[Array, "*m dim"]:

@@ -1,6 +1,6 @@
 """Springs, and muscles: springs with a driven rest length."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from dln_jax.softbody.terms.term import (
     NOT_NEGATIVE,
     Context,
+    Corners,
     Corners,
     Indices,
     Numbers,
@@ -63,7 +64,7 @@ def springs(
             length = _rest_lengths(context, indices, softening)
         return jnp.broadcast_to(parameters.stiffness, count), jnp.broadcast_to(length, count)
 
-    return Term(name, indices, _energy(softening), parameters, prepare)
+    return Term(name, indices, _energy(softening), parameters, prepare, weights=_ends)
 
 
 def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name: str = "muscles") -> Term:
@@ -81,22 +82,27 @@ def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name
         length = actuation * _rest_lengths(context, indices, 0.0)
         return parameters.stiffness / length**2, length
 
-    return Term(name, indices, _energy(softening), parameters, prepare, control=(count,))
+    return Term(name, indices, _energy(softening), parameters, prepare, control=(count,), weights=_ends)
 
 
 def _energy(softening: float):
     if softening != 0.0:
         require_positive(softening=softening)
 
-    def energy(x: Corners, spring: tuple[Array, Array]) -> Scalar:
+    def energy(edge: Corners, spring: tuple[Array, Array]) -> Scalar:
         stiffness, rest_length = spring
-        squared = jnp.asarray(sum((end - start) ** 2 for start, end in zip(*x, strict=True)))
+        squared = jnp.asarray(sum(component**2 for (component,) in edge))
         deviation = (length_of(squared, softening) - rest_length) ** 2
         if softening == 0.0:
             deviation = jnp.where(squared > 0, deviation, squared + rest_length**2)
         return 0.5 * stiffness * deviation
 
     return energy
+
+
+def _ends(_: Any) -> list[list[float]]:
+    """Weights of a spring's ends in its edge."""
+    return [[-1.0], [1.0]]
 
 
 def length_of(squared_distance: Float[Array, "*m"], softening: float) -> Float[Array, "*m"]:

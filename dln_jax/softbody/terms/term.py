@@ -52,7 +52,7 @@ class Term(NamedTuple):
     """Vertices of the elements."""
     energy: Callable[[Corners, Any], Float[Array, ""]]
     """(positions x[k][i] of one element's vertices, its data) -> J. The positions are `Corners`, scalars: arithmetic of
-    scalars fuses over all elements, while slices and stacks of arrays do not."""
+    scalars fuses over all elements, while slices and stacks of arrays do not. With weights, combinations instead."""
     parameters: Any
     """Default parameters: a NamedTuple of arrays, SI units."""
     prepare: Callable[[Any, Context], Any]
@@ -61,6 +61,9 @@ class Term(NamedTuple):
     """False if the energy takes an array [k, dim] instead of scalars: compiles faster beyond a dozen unknowns."""
     control: tuple[int, ...] | None = None
     """Shape of the control that the preparation reads from its context; `None` for a term without."""
+    weights: Callable[[Any], Any] | None = None
+    """Data of one element -> w[k][j], if the energy takes y[i][j] = sum over vertices k of x[k][i] w[k][j] (rows of a
+    deformation gradient, an edge) in place of the positions. Its Hessian compiles and runs faster."""
 
 
 class Bound(NamedTuple):

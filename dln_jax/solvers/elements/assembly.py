@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, local
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, values_and_slopes
 from dln_jax.types import InputError
 
 
@@ -62,7 +62,7 @@ def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: An
         raise InputError(f"free has shape {free.shape}; expected one value per unknown, {(blocks, width)}")
     size = blocks * width
     rows_of, columns_of, corners = [], [], []
-    for number, (_, indices, _) in enumerate(energies):
+    for number, indices in enumerate(energy.indices for energy in energies):
         _require_indices(indices, blocks, number)
         unknowns = (indices[:, :, None] * width + np.arange(width)).reshape(len(indices), -1).T
         row, column = np.tril_indices(len(unknowns))
@@ -88,9 +88,9 @@ def value_and_gradient(
     """Returns E(x), and dE/dx with zeros where x is not free."""
     total, gradient = jnp.zeros((), x.dtype), jnp.zeros_like(x)
     for element, corners, of_elements in zip(energies, at.corners, data, strict=True):
-        values, gradients = jax.vmap(jax.value_and_grad(element.energy))(local(element, x), of_elements)
+        values, slopes = values_and_slopes(element, x, of_elements)
         total += values.sum()
-        gradient += assemble(corners, _components(gradients))
+        gradient += assemble(corners, slopes)
     return total, gradient if at.free.all() else jnp.where(at.free, gradient, 0)
 
 
@@ -134,13 +134,6 @@ def entries(at: Pattern, hessians: Sequence[Array]) -> Float[Array, " entries"]:
     """Returns the Hessian's lower triangle at `at.rows`, `at.columns`, from the Hessians of the elements."""
     flat = jnp.concatenate([*(h.reshape(-1) for h in hessians), jnp.zeros(1, hessians[0].dtype)])
     return jnp.concatenate([flat[of_group].sum(-1) for of_group in at.sources])
-
-
-def _components(of_corners: Any) -> Float[Array, "s m"]:
-    """Returns the result of `local`, or its gradient, component by component."""
-    if isinstance(of_corners, tuple):
-        return jnp.stack(jax.tree.leaves(of_corners))
-    return of_corners.reshape(len(of_corners), -1).T
 
 
 def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[np.ndarray, "keys terms"]:

@@ -7,7 +7,6 @@ positive semi-definite ones (always projecting costs several times the iteration
 moving elements are always projected, and these elements bound the steps.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elements.assembly import Pattern, entries, value_and_gradient
-from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians, project
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians, project, square
 from dln_jax.solvers.elements.line_search import Evaluated, line_search
-from dln_jax.solvers.elements.linear_solvers import LinearSolver
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, summed_products
 from dln_jax.solvers.elements.moving import (
     Lists,
     MovingEnergy,
@@ -27,13 +26,14 @@ from dln_jax.solvers.elements.moving import (
     longest_fraction,
     moving_gradient,
     moving_hessians,
+    moving_products,
     overflow,
 )
 from dln_jax.solvers.newton import SolverInfo
 
 # Gradients and energies below this many units of rounding are indistinguishable from zero.
 _ROUNDING_UNITS = 16
-# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn:
+# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, added in turn:
 # projected elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
 # How often a step whose list of elements overflows is shortened, eightfold.
@@ -58,6 +58,16 @@ class _MinimumIterate(NamedTuple):
     stuck: Bool[Array, ""]
     gap: Blocks | None
     """What fixed unknowns are away from their values, where they approach them; `None` without moving elements."""
+
+
+class _Attempt(NamedTuple):
+    """One direction of the search."""
+
+    direction: Blocks
+    descends: Bool[Array, ""]
+    number: Int[Array, ""]
+    hessians: tuple[Array, ...]
+    values: Float[Array, " entries"]
 
 
 def descend(
@@ -89,7 +99,7 @@ def descend(
         values = entries(at, hessians)
         # Contact forces on curved distances make Hessians indefinite in most steps, so that these are always projected.
         of_moving = moving_hessians(moving, x, state.lists, data[1], projected=True)
-        direction, forced = _direction(total, state, hessians, values, of_moving, data)
+        direction, forced = _direction(total, state, hessians, values, of_moving)
         lists, direction, limit = _allowed(total, x, direction, data, state.lists)
         slope = jnp.vdot(direction, gradient)
         # Terms that cancel in a row of the gradient are of the size of |H| |x|.
@@ -124,8 +134,8 @@ def descend(
     x, energy, slope = last.point
     residual = jnp.max(jnp.abs(slope) / scale, initial=0)
     converged = within(last) & jnp.isfinite(energy) & ~overflow(last.lists)
-    too_many = overflow(last.lists) if moving else None
-    return x, SolverInfo(residual, last.iterations, converged, None, last.unclear, too_many)
+    info = SolverInfo(residual, last.iterations, converged, None, last.unclear)
+    return x, info._replace(overflow=overflow(last.lists), lists=(lists, last.lists)) if moving else info
 
 
 def _direction(
@@ -134,14 +144,14 @@ def _direction(
     hessians: Sequence[Array],
     values: Array,
     of_moving: Sequence[Array],
-    data: Any,
 ) -> tuple[Blocks, Array]:
     """Returns Newton's direction, and whether it must be taken although it may raise the energy."""
-    x, _, right = state.point
+    right = state.point.gradient
     if state.gap is not None:
         # Fixed unknowns move by their gap; the free ones respond as the linearised forces say.
-        gradient = functools.partial(sum_and_gradient, total, data=data, lists=state.lists)
-        right += jax.jvp(lambda x: gradient(x)[1], (x,), (state.gap,))[1]
+        response = summed_products(total.energies, total.at, tuple(map(square, hessians)), state.gap)
+        response += moving_products(state.lists, of_moving, state.gap)
+        right += jnp.where(total.at.free, response, 0)
     direction = _descent_direction(total, hessians, values, right, of_moving, state.lists)
     if state.gap is None:
         return direction, jnp.asarray(False)
@@ -178,27 +188,28 @@ def _descent_direction(
     lists: Lists,
 ) -> Blocks:
     _, at, solver, moving = total
-    shifts = jnp.asarray(_SHIFTS, gradient.dtype)
+    shifts = jnp.asarray((0.0, *_SHIFTS), gradient.dtype)
 
-    def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
+    # A loop that usually runs once: factorisation and solve are compiled once, and under vmap a branch that projects
+    # would always be taken.
+    def failing(state: _Attempt) -> Array:
+        return ~state.descends & (state.number < len(shifts))
+
+    def attempt(state: _Attempt) -> _Attempt:
+        def projected(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
+            hessians = project(before[0], shifts[state.number])
+            return hessians, entries(at, hessians)
+
+        times = (state.number > 0).astype(int)
+        hessians, values = jax.lax.fori_loop(0, times, projected, (state.hessians, state.values))
         factor = solver.factorise(hessians, (values, lists, of_moving) if moving else values)
         direction = solver.search(factor, -gradient)
-        return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+        descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+        return _Attempt(direction, descends, state.number + 1, hessians, values)
 
-    # A loop that usually runs zero times: under vmap a branch would always be taken.
-    def failing(state: tuple[Blocks, Array, Array, tuple[Array, ...]]) -> Array:
-        _, descends, attempts, _ = state
-        return ~descends & (attempts < len(_SHIFTS))
-
-    def retry(state: tuple[Blocks, Array, Array, tuple[Array, ...]]) -> tuple[Blocks, Array, Array, tuple[Array, ...]]:
-        # The Hessians belong to the loop's state: the projection would be computed ahead of it, and always, otherwise.
-        _, _, attempts, hessians = state
-        projected = project(hessians, shifts[attempts])
-        return *towards(projected, entries(at, projected)), attempts + 1, hessians
-
-    start = (*towards(hessians, values), jnp.asarray(0), tuple(hessians))
-    direction, descends, _, _ = jax.lax.while_loop(failing, retry, start)
-    return jnp.where(descends, direction, -gradient)
+    start = _Attempt(-gradient, jnp.asarray(False), jnp.asarray(0), tuple(hessians), values)
+    last = jax.lax.while_loop(failing, attempt, start)
+    return jnp.where(last.descends, last.direction, -gradient)
 
 
 def lists_at(total: Sum, x: Blocks, data: Any) -> Lists:

@@ -7,7 +7,7 @@ the Hessian is sparse; `assembly` puts it together.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +19,8 @@ from dln_jax.solvers.lapack import cholesky, symmetric_eigen
 
 # Elements that are decomposed at a time, at most.
 _DECOMPOSED = 64
+# Largest Hessians of elements that are projected in one batch.
+_SMALL = 36
 
 Blocks = Float[Array, "n b"]
 Corners = Sequence[Sequence[Array]] | Float[Array, "k b"]
@@ -29,18 +31,56 @@ class ElementEnergy(NamedTuple):
     """A sum of one scalar function over elements."""
 
     energy: Callable[[Any, Any], Float[Array, ""]]
-    """(unknowns x[i][j] of one element, its data) -> energy."""
+    """(unknowns x[i][j] of one element, or their combinations, its data) -> energy."""
     indices: Int[np.ndarray, "m k"]
     """Blocks of unknowns of the elements; a block occurs at most once in an element."""
     unrolled: bool = False
     """Whether the energy takes scalars (`Corners`) instead of an array [k, b]. Arithmetic of scalars fuses over all
     elements and makes derivatives several times faster, for elements of up to a dozen unknowns."""
+    weights: Callable[[Any], Any] | None = None
+    """Data of one element -> w[k][j], if the energy takes the combinations y[i][j] = sum over corners k of x[k][i]
+    w[k][j], such as a deformation gradient or an edge: the Hessian by these has fewer columns. Only if unrolled."""
 
 
 def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:
     """Returns E(x)."""
-    terms = [jax.vmap(e.energy)(local(e, x), d).sum() for e, d in zip(energies, data, strict=True)]
+    terms = [_values(e, x, d).sum() for e, d in zip(energies, data, strict=True)]
     return sum(terms, jnp.zeros((), x.dtype))
+
+
+def _values(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, " m"]:
+    if not element.unrolled:
+        return jax.vmap(element.energy)(x[element.indices], data)
+    return _by_scalars(element.energy, *_arguments(element, x, data), x.shape[1], data)
+
+
+def values_and_slopes(element: ElementEnergy, x: Blocks, data: Any) -> tuple[Float[Array, " m"], Float[Array, "s m"]]:
+    """Returns the energies of all elements and their derivatives by the unknowns at the corners, s = k b."""
+    if not element.unrolled:
+        values, slopes = jax.vmap(jax.value_and_grad(element.energy))(x[element.indices], data)
+        return values, slopes.reshape(len(slopes), -1).T
+    y, w = _arguments(element, x, data)
+    values, slopes = _by_scalars(jax.value_and_grad(element.energy), y, w, x.shape[1], data)
+    slopes = jnp.stack(jax.tree.leaves(slopes))
+    if w is None:
+        return values, slopes
+    by_rows = slopes.reshape(x.shape[1], w.shape[1], -1)
+    by_corners = _added(by_rows[:, j] * w[:, None, j] for j in range(w.shape[1]))
+    return values, by_corners.reshape(-1, slopes.shape[1])
+
+
+def of_corners(element: ElementEnergy) -> Callable[[Any, Any], Float[Array, ""]]:
+    """Returns the energy as a function of the unknowns at the corners, (x[k][i] of one element, its data) -> energy."""
+    weights = element.weights
+    if weights is None:
+        return element.energy
+    return lambda x, data: element.energy(combinations(x, weights(data)), data)
+
+
+def combinations(x: Corners, weights: Any) -> list[list[Array]]:
+    """Returns y[i][j] = sum over corners k of x[k][i] w[k][j], of one element."""
+    corners, width, columns = range(len(x)), range(len(x[0])), range(len(weights[0]))
+    return [[jnp.asarray(sum(x[k][i] * weights[k][j] for k in corners)) for j in columns] for i in width]
 
 
 def local(element: ElementEnergy, x: Blocks) -> Any:
@@ -79,18 +119,46 @@ def _array_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array
 
 
 def _unrolled_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
-    def of_one(corners: Corners, data: Any) -> list[Array]:
-        scalars, structure = jax.tree.flatten(corners)
+    y, w = _arguments(element, x, data)
 
-        def gradient(*scalars: Array) -> list[Array]:
-            return jax.tree.leaves(jax.grad(element.energy)(structure.unflatten(scalars), data))
+    def slope(y: Float[Array, "s m"]) -> Float[Array, "s m"]:
+        return _by_scalars(jax.grad(element.energy), y, w, x.shape[1], data)
 
-        _, product = jax.linearize(gradient, *scalars)
-        one, zero = jnp.ones_like(scalars[0]), jnp.zeros_like(scalars[0])
-        columns = [product(*(one if i == j else zero for i in range(len(scalars)))) for j in range(len(scalars))]
-        return [columns[j][i] for i in range(len(scalars)) for j in range(i + 1)]
+    _, product = jax.linearize(slope, y)
+    # All columns of all elements at once, elements last: column by column it compiles several times longer.
+    unit = jnp.broadcast_to(jnp.eye(len(y), dtype=x.dtype)[:, :, None], (len(y), *y.shape))
+    whole = jax.vmap(product)(unit)
+    if w is not None:
+        # Sums over whole arrays: products of small matrices run several times slower.
+        (corners, columns, _), width = w.shape, x.shape[1]
+        split = whole.reshape(width, columns, width, columns, -1)
+        half = _added(split[:, :, :, None, j] * w[:, j] for j in range(columns))
+        full = _added(w[:, None, j, None, None] * half[:, j].swapaxes(1, 2) for j in range(columns))
+        whole = full.reshape(corners * width, corners * width, -1)
+    return whole[np.tril_indices(len(whole))]
 
-    return jnp.stack(jax.vmap(of_one)(local(element, x), data))
+
+def _arguments(element: ElementEnergy, x: Blocks, data: Any) -> tuple[Float[Array, "s m"], Array | None]:
+    """Returns the scalars that an unrolled energy takes, elements last, and the weights [k, j, m], if it has any."""
+    corners = jnp.stack([_take(x, corner).T for corner in element.indices.T])
+    weights = element.weights
+    if weights is None:
+        return corners.reshape(-1, corners.shape[2]), None
+    w = jnp.moveaxis(jax.vmap(lambda data: jnp.asarray(weights(data), x.dtype))(data), 0, -1)
+    y = _added(corner[:, None] * of for corner, of in zip(corners, w, strict=True))
+    return y.reshape(-1, y.shape[2]), w
+
+
+def _added(parts: Iterable[Array]) -> Array:
+    return functools.reduce(jnp.add, parts)
+
+
+def _by_scalars(function: Callable, y: Float[Array, "s m"], w: Array | None, width: int, data: Any) -> Any:
+    """Returns the function of the nested scalars and data of one element for all of them, with its trees stacked."""
+    columns = width if w is None else w.shape[1]
+    rows = [list(y[start : start + columns]) for start in range(0, len(y), columns)]
+    results = jax.vmap(function)(rows, data)
+    return jnp.stack(jax.tree.leaves(results)) if isinstance(results, list) else results
 
 
 def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
@@ -105,7 +173,17 @@ def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, 
     """
     whole = [jnp.where(jnp.isfinite(h), h, 0) for h in map(square, hessians)]
     largest = functools.reduce(jnp.maximum, [jnp.max(jnp.diagonal(h, axis1=1, axis2=2), initial=0) for h in whole])
-    return tuple(lower_triangles(_projected(h, shift * largest)) for h in whole)
+    # Small elements of all kinds form one batch, padded with zeros: one program instead of one for each kind.
+    small = [number for number, h in enumerate(whole) if h.shape[1] <= _SMALL]
+    if len(small) > 1:
+        width = max(whole[number].shape[1] for number in small)
+        padding = [((0, 0), *2 * [(0, width - whole[number].shape[1])]) for number in small]
+        batch = jnp.concatenate([jnp.pad(whole[number], pad) for number, pad in zip(small, padding, strict=True)])
+        parts = jnp.split(_projected(batch, shift * largest), np.cumsum([len(whole[n]) for n in small])[:-1])
+        done = {n: part[:, : whole[n].shape[1], : whole[n].shape[1]] for n, part in zip(small, parts, strict=True)}
+    else:
+        done = {}
+    return tuple(lower_triangles(done[n] if n in done else _projected(h, shift * largest)) for n, h in enumerate(whole))
 
 
 def _projected(hessians: Float[Array, "m s s"], shift: Float[Array, ""]) -> Float[Array, "m s s"]:

@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from dln_jax.solvers.elements.assembly import Pattern, entries, pattern
-from dln_jax.solvers.elements.descent import Sum, descend, lists_at, sum_and_gradient
+from dln_jax.solvers.elements.descent import Sum, descend, sum_and_gradient
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.moving import (
@@ -93,12 +93,12 @@ def minimise(
         if not definite:
             return x, info
         # For a matrix that is not positive definite, the factor and its solutions are not finite.
-        solved = total.solver.solve(_factor(total, x, data, lists_at(total, x, data)), jnp.ones_like(x))
+        solved = total.solver.solve(_factor(total, x, data, _lists_of(info)), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
 
     def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         x, info = minimum(*primals)
-        x_dot = _implicit_derivative(total, x, primals[1], *tangents[:2])
+        x_dot = _implicit_derivative(total, x, primals[1], _lists_of(info), *tangents[:2])
         x_dot = x_dot * jnp.where(info.converged, 1.0, jnp.nan).astype(x.dtype)
         return (x, info), (x_dot, jax.tree.map(no_tangent, info))
 
@@ -117,8 +117,12 @@ def no_tangent(leaf: Array) -> Any:
     return jnp.zeros_like(leaf) if floating else np.zeros(leaf.shape, jax.dtypes.float0)
 
 
-def _implicit_derivative(total: Sum, x: Blocks, data: Any, x0_dot: Any, data_dot: Any) -> Blocks:
-    at, solver, lists = total.at, total.solver, lists_at(total, x, data)
+def _lists_of(info: SolverInfo) -> Lists:
+    return jax.lax.stop_gradient(info.lists[1])
+
+
+def _implicit_derivative(total: Sum, x: Blocks, data: Any, lists: Lists, x0_dot: Any, data_dot: Any) -> Blocks:
+    at, solver = total.at, total.solver
     # Constant data are left out: their derivatives would only be multiplied by zero.
     leaves, structure = jax.tree.flatten(data)
     dots = jax.tree.leaves(data_dot, is_leaf=is_constant)

@@ -78,14 +78,6 @@ def overflow(lists: Lists) -> Bool[Array, ""]:
     return jnp.stack([jnp.asarray(False), *(elements.overflow for elements in lists)]).any()
 
 
-def moving_value(moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any]) -> Float[Array, ""]:
-    """Returns the sum of the energies at x."""
-    total = jnp.zeros((), x.dtype)
-    for m, at, of in zip(moving, lists, data, strict=True):
-        total += jax.vmap(m.gradient)(x[at.indices], m.describe(x, at, of))[0].sum()
-    return total
-
-
 def moving_gradient(
     moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any]
 ) -> tuple[Float[Array, ""], Blocks]:
@@ -106,6 +98,15 @@ def moving_hessians(
         jax.vmap(m.hessian)(x[at.indices], m.describe(x, at, of)) for m, at, of in zip(moving, lists, data, strict=True)
     )
     return tuple(map(_projected, hessians)) if projected else hessians
+
+
+def moving_products(lists: Lists, hessians: Sequence[Array], x: Blocks) -> Blocks:
+    """Returns the product of the sum of the Hessians with x."""
+    out = jnp.zeros_like(x)
+    for elements, blocks in zip(lists, hessians, strict=True):
+        at_corners = x[elements.indices].reshape(len(blocks), -1, 1)
+        out = out.at[elements.indices].add((blocks @ at_corners).reshape(*elements.indices.shape, -1))
+    return out
 
 
 def add_diagonals(diagonal: Blocks, lists: Lists, hessians: Sequence[Array]) -> Blocks:
@@ -188,10 +189,7 @@ def _iterative(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Patt
         hessians, (lists, moving), static = factor
 
         def product(x: Blocks) -> Blocks:
-            out = summed_products(energies, at, hessians, x)
-            for elements, blocks in zip(lists, moving, strict=True):
-                at_corners = x[elements.indices].reshape(len(blocks), -1, 1)
-                out = out.at[elements.indices].add((blocks @ at_corners).reshape(*elements.indices.shape, -1))
+            out = summed_products(energies, at, hessians, x) + moving_products(lists, moving, x)
             return jnp.where(at.free, out, 0)
 
         right = jnp.where(at.free, right, 0)

@@ -22,7 +22,7 @@ from scipy.sparse import bsr_array, coo_array, csr_array, tril
 from scipy.sparse.linalg import cg
 
 from dln_jax.solvers.elements.assembly import Pattern, entries
-from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, lower_triangles
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, lower_triangles, of_corners
 from dln_jax.solvers.elements.linear_solvers import (
     SEARCH_RESIDUAL,
     TILE,
@@ -168,6 +168,6 @@ def _element_hessian(element: ElementEnergy, x: Float[Array, "k b"], data: Any) 
 
     def column(direction: Float[Array, " s"]) -> Float[Array, " s"]:
         along = direction.reshape(x.shape)
-        return jax.jvp(lambda x: jax.grad(element.energy)(x, data), (x,), (along,))[1].reshape(-1)
+        return jax.jvp(lambda x: jax.grad(of_corners(element))(x, data), (x,), (along,))[1].reshape(-1)
 
     return jax.lax.map(column, jnp.eye(x.size, dtype=x.dtype))

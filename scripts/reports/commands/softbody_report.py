@@ -1,7 +1,7 @@
 """Measure soft bodies: closed forms, hard cases, gradients and speed, each number beside what one may expect.
 
 Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), and writes report.json. All of it
-is float64. Only `speed` and `rivals` depend on the machine. `rivals` measures the
+is float64. Only `speed`, `compilation` and `rivals` depend on the machine. `rivals` measures the
 other simulators that are installed (extra `[rivals]`), in minutes.
 """
 
@@ -13,7 +13,17 @@ from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, in_subjects, report_cases
-from scripts.reports.soft_bodies import contact, elements, gradients, motions, robustness, speed, statics, stiffness
+from scripts.reports.soft_bodies import (
+    compilation,
+    contact,
+    elements,
+    gradients,
+    motions,
+    robustness,
+    speed,
+    statics,
+    stiffness,
+)
 from scripts.reports.soft_bodies.rivals import cases as rivals
 
 MEASURES = {
@@ -34,6 +44,7 @@ MEASURES = {
         *(speed.creature, speed.beams, speed.backward, speed.solver_choice),
         *(stiffness.steps, stiffness.factorisation),
     ),
+    "compilation": (compilation.steps, compilation.gradient),
     "rivals": (rivals.swing, rivals.drop, rivals.hanging),
 }
 """Functions quick -> findings, by subject."""

@@ -11,13 +11,13 @@ from scripts.reports.case import named
 from scripts.reports.commands import softbody_report
 from scripts.reports.commands.softbody_report import cases
 
-# Speed and rivals depend on the machine.
+# Speed, compilation and rivals depend on the machine.
 # Cases that take minutes. In one of them, the twisted bar snaps in a step that reports that it has not converged.
 ELSEWHERE = ("folding-beam", "ring", "twisted-bar", "gradients", "stack")
 CASES = [
     case.name
     for case in cases()
-    if not case.name.startswith(("speed/", "rivals/", *(f"contact/{name}" for name in ELSEWHERE)))
+    if not case.name.startswith(("speed/", "compilation/", "rivals/", *(f"contact/{name}" for name in ELSEWHERE)))
 ]
 LONG = ("gradients/crawler", "hard/chain", "hard/materials", "references/orders", "references/elastica")
 LONG += (
