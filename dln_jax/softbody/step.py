@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from dln_jax.softbody.friction_iterations import friction_change, has_friction, iterated
 from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data
 from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import (
@@ -68,6 +69,8 @@ class Balanced(NamedTuple):
     """Data of the step's energies: inertia, and the terms, averaged if the integrator is."""
     contact: tuple[Any, ...]
     """Data of the contacts."""
+    friction_change: Float[Array, ""] | None = None
+    """As in `Info`."""
 
 
 class StepParts(NamedTuple):
@@ -92,6 +95,7 @@ def make_step(
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
     halvings: int = 0,
+    friction_iterations: int = 0,
 ) -> Stepper:
     """Returns (init, step) of a scene.
 
@@ -108,6 +112,9 @@ def make_step(
         definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
         halvings: take a step that does not converge again in parts, of dt/2^halvings at the shortest; `Info.substeps`
             reports their number. The step is compiled a second time for them.
+        friction_iterations: solve the step again this many times, with the normal forces and directions of friction of
+            the previous solution instead of those at the start of the step (`friction_iterations`).
+            `Info.friction_change` says how much another one would change.
 
     Raises:
         InputError: a number that is not positive, or halvings of a method of two steps.
@@ -117,7 +124,10 @@ def make_step(
         if integrator.two_steps:
             raise InputError("halvings got a method of two steps, which have one length; use another integrator")
     init, balance, _, conclude = step_parts(
-        scene, dt, integrator, tolerance, iterations, linear_solver=linear_solver, definite=definite
+        *(scene, dt, integrator, tolerance, iterations),
+        linear_solver=linear_solver,
+        definite=definite,
+        friction_iterations=friction_iterations,
     )
 
     def advance(
@@ -139,8 +149,11 @@ def step_parts(
     *,
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
+    friction_iterations: int = 0,
 ) -> StepParts:
     """Returns the parts of the step that `make_step` returns, which explains the arguments."""
+    if friction_iterations:
+        require_positive(friction_iterations=friction_iterations)
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
     if scene.contacts and (integrator.span != 1.0 or integrator.averaged):
@@ -156,6 +169,7 @@ def step_parts(
     at = pattern(energies, free.shape[0], free.shape[1], free)
     overlaps = None if scene.contacts else count_overlaps(scene.mesh)
     moving = contact_energies(scene)
+    iterating = friction_iterations > 0 and has_friction(scene)
     rest, masses = scene.params.rest, scene.params.masses
 
     def along(start: Array, data: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -195,28 +209,44 @@ def step_parts(
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
         # Averaged along the step, a linear force of half of its time is that of the mean velocity.
         elapsed = span / 2 if integrator.averaged else span
-        at_start = prepare(scene, params, state.x, dt=elapsed, control=control)
-        data = ((weights, target), *along(state.x, at_start))
+
+        def prepared(lag: Array | None) -> tuple[Any, Any, Any]:
+            at_start = prepare(scene, params, state.x, dt=elapsed, control=control, lag=lag)
+            contact = prepare_contacts(scene, params, state.x, dt=span, lag=lag)
+            return at_start, ((weights, target), *along(state.x, at_start)), contact
+
+        first = prepared(None)
+        data = first[1]
         carried = state.x + span * state.v
-        contact = prepare_contacts(scene, params, state.x, dt=span)
-        feasible = None
         if moving:
-            # Only known positions are known to be apart; held vertices approach their goals from there.
-            start = jnp.where(free, state.x, carried)
-            feasible = state.x if x_after is None else x_after
+            start = state.x if x_after is None else x_after
         elif x_after is None:
             # The better of two starts: the present positions, or those of motion without forces.
             stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
             start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
         else:
             start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
-        balanced, outcome = solve(
-            energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible
+
+        def solved(x: Array, parts: tuple[Any, Any, Any]) -> tuple[Array, SolverInfo]:
+            _, data, contact = parts
+            # Only known positions are known to be apart; held vertices approach their goals from there.
+            start, feasible = jnp.where(free, x, carried), x if moving else None
+            return solve(energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible)
+
+        if not iterating:
+            x, outcome = solved(start, first)
+            at_start, data, contact = first
+            return Balanced(x, outcome, at_start, data, contact)
+        # Forces that are averages along the step take the normal forces of its middle.
+        middle = 0.5 if integrator.averaged else 1.0
+        x, outcome, used, at_end = iterated(
+            solved, lambda x: prepared(state.x + middle * (x - state.x)), start, first, friction_iterations
         )
-        return Balanced(balanced, outcome, at_start, data, contact)
+        before, after = (([*data][1:], contact) for _, data, contact in (used, at_end))
+        return Balanced(x, outcome, *used, friction_change(scene, terms, x, before, after))
 
     def forces(state: State, balanced: Balanced) -> Float[Array, "n dim"]:
-        x, _, _, data, contact = balanced
+        x, _, _, data, contact, _ = balanced
         lists = lists_between(moving, state.x, x - state.x, contact)
         return -jax.grad(lambda x: value(energies, x, data) + moving_value(moving, x, lists, contact))(x)
 
@@ -233,7 +263,7 @@ def step_parts(
     def judged(params: Params, state: State, x: Array, v: Array, solution: Balanced) -> tuple[Info, Growth | None]:
         # The verdict has no derivatives.
         params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
-        balanced, outcome, at_start, (_, *data), contact = solution
+        balanced, outcome, at_start, (_, *data), contact, _ = solution
         lists = lists_between(moving, state.x, x - state.x, contact)
 
         def contact_value(x: Array) -> Array:
@@ -247,6 +277,7 @@ def step_parts(
             scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, contact_value
         )
         info = _of_positions(scene, params, x, outcome, overlaps, contact, lists)
+        info = info._replace(friction_change=solution.friction_change)
         return with_energies(info, energies_of_step, state.growth)
 
     return StepParts(init, balance, forces, conclude)

@@ -35,6 +35,11 @@ class Contact(NamedTuple):
     least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
     """(positions, elements and data of the barrier) -> smallest distance in m, at most the distance h."""
 
+    @property
+    def friction(self) -> tuple[MovingEnergy, ...]:
+        """The friction, if there is any."""
+        return self.energies[1:]
+
 
 def contact_parameters(distance: float, stiffness: Numbers, friction: Numbers | None) -> ContactParameters:
     """Returns validated parameters."""
