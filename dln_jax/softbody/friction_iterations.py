@@ -2,10 +2,10 @@
 
     x^(j+1) = argmin E(x; normal forces and directions of friction at x^(j)),    x^(0) = x_n
 
-are the friction iterations of Li et al. 2020 (Incremental Potential Contact, section 5.2). A fixed point obeys Coulomb's
-law with the normal forces at the end of the step. There is no guarantee of convergence, but the error usually falls by
-a constant factor in every iteration. Every solution starts the next search, which takes no Newton step once the forces
-have stopped changing.
+are the friction iterations of Li et al. 2020 (Incremental Potential Contact). A fixed point obeys Coulomb's law with
+the normal forces at the end of the step. There is no guarantee of convergence, but the error usually falls by a constant
+factor in every iteration. Every solution starts the next search, which takes no Newton step once the forces have
+stopped changing.
 
 The iterations are one loop of fixed length. Its derivative is that of the iterations that were taken, through the
 minimum of each, and exact whether or not the forces have stopped changing.
@@ -58,9 +58,7 @@ def iterated(
     (x, used, at_end), outcomes = jax.lax.scan(again, (start, first, first), None, length=count + 1)
     last = jax.tree.map(lambda values: values[-1], outcomes)
     overflow = None if outcomes.overflow is None else outcomes.overflow.any()
-    outcome = last._replace(
-        iterations=outcomes.iterations.sum(), converged=outcomes.converged.all(), overflow=overflow
-    )
+    outcome = last._replace(iterations=outcomes.iterations.sum(), converged=outcomes.converged.all(), overflow=overflow)
     return x, outcome, used, at_end
 
 

@@ -235,15 +235,14 @@ def step_parts(
 
         if not iterating:
             x, outcome = solved(start, first)
-            at_start, data, contact = first
-            return Balanced(x, outcome, at_start, data, contact)
+            return Balanced(x, outcome, *first)
         # Forces that are averages along the step take the normal forces of its middle.
         middle = 0.5 if integrator.averaged else 1.0
-        x, outcome, used, at_end = iterated(
+        x, outcome, (at_start, data, contact), (_, at_end, contact_at_end) = iterated(
             solved, lambda x: prepared(state.x + middle * (x - state.x)), start, first, friction_iterations
         )
-        before, after = (([*data][1:], contact) for _, data, contact in (used, at_end))
-        return Balanced(x, outcome, *used, friction_change(scene, terms, x, before, after))
+        change = friction_change(scene, terms, x, (data[1:], contact), (at_end[1:], contact_at_end))
+        return Balanced(x, outcome, at_start, data, contact, change)
 
     def forces(state: State, balanced: Balanced) -> Float[Array, "n dim"]:
         x, _, _, data, contact, _ = balanced

@@ -71,14 +71,14 @@ def test_a_block_that_lands_on_a_slope_obeys_coulombs_law_in_every_step(landing)
             if iterations:
                 assert float(info.friction_change) < 1e-8
     assert max(errors[12]) < 1e-6
-    # With the normal forces of the start, friction is missing in the first step and wrong by tens of percent later.
-    assert max(errors[0]) == pytest.approx(1.0) and max(errors[0][1:]) > 0.1
+    # With the normal forces of the start, friction is missing in the first step, and up to twice too strong later.
+    assert errors[0][0] == pytest.approx(1.0) and max(errors[0][1:]) > 1.0
 
 
 def test_a_block_sticks_on_a_slope_below_the_angle_of_friction_and_slides_above_it(landing):
     scene, init, programs = landing
     for angle in (0.4, 0.6):
-        params, state = inclined(scene, angle), init()
+        params, before, state = inclined(scene, angle), init(), init()
         for _ in range(120):
             before, (state, _) = state, programs[12](params, state)
         along, normal = forces_of_ground(scene, params, before, state)
@@ -94,7 +94,7 @@ def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_
     lower, upper = beam(0.8, 0.2, 4, 1), block(0.212)
     count = len(lower.vertices)
     mesh = make_mesh(
-        np.concatenate([lower.vertices, upper.vertices + [0.1, 0.0]]),
+        np.concatenate([lower.vertices, upper.vertices + np.array([0.1, 0.0])]),
         np.concatenate([lower.elements, upper.elements + count]),
     )
     above = np.arange(len(mesh.vertices)) >= count
@@ -115,7 +115,7 @@ def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_
             change = (np.asarray(scene.params.masses)[:, None] * np.asarray(state.v - before.v))[above].sum(axis=0)
             pairs = barrier[0].describe(x, lists[0], data[0])
             size, normal, _ = jax.vmap(normal_force)(x[lists[0].indices], pairs)
-            # Every pair of a vertex and an edge pushes the vertex by its normal, and the upper body slides to the right.
+            # The normal of a pair points from its edge to its vertex; the upper body slides to the right.
             turned = np.sign(np.asarray(normal)[:, 1:]) * np.stack([-normal[:, 1], normal[:, 0]], axis=1)
             expected = MU * (np.asarray(size)[:, None] * turned).sum(axis=0)
             if (largest := np.linalg.norm(expected)) > 1.0:
@@ -183,7 +183,7 @@ def test_derivatives_through_iterated_friction_of_bodies_agree_with_differences(
     lower, upper = beam(0.4, 0.2, 2, 1), block(0.215)
     count = len(lower.vertices)
     mesh = make_mesh(
-        np.concatenate([lower.vertices, upper.vertices + [0.1, 0.0]]),
+        np.concatenate([lower.vertices, upper.vertices + np.array([0.1, 0.0])]),
         np.concatenate([lower.elements, upper.elements + count]),
     )
     above = np.arange(len(mesh.vertices)) >= count

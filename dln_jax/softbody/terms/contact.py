@@ -10,10 +10,10 @@ computes no friction.
     D = mu lambda_n f(|u|),   u = (1 - n nᵀ)(x - x_n),   f(u) = u²/e - u³/(3 e²) for u < e,  u - e/3 beyond,
 
 after Li et al. 2020 (Incremental Potential Contact, section 5), with their constant chosen such that f(0) = 0, and
-normals n and normal forces lambda_n at the start of the step, or of the previous solution where `make_step` iterates. The force is mu lambda_n against the slip from the
-threshold speed e/dt on, and falls smoothly to zero below it: a block that "sticks" on a slope creeps at less than the
-threshold. f is twice continuously differentiable. The slip e must be well above the rounding of the positions: in
-float32, 1e-4 m for a body of a metre.
+normals n and normal forces lambda_n at the start of the step (or at the previous of several solutions of the step,
+`make_step`). The force is mu lambda_n against the slip from the threshold speed e/dt on, and falls smoothly to zero
+below it: a block that "sticks" on a slope creeps at less than the threshold. f is twice continuously differentiable.
+The slip e must be well above the rounding of the positions: in float32, 1e-4 m for a body of a metre.
 
 Contact damping adds the force c lambda (-d') to the normal force lambda = -k phi'(d), with c in s/m (Hunt and Crossley
 1975). It comes from the dissipation

@@ -22,7 +22,7 @@ GRAVITY = 9.81
 
 def two_blocks(dimension, *, gap=0.015):
     """Two quadratic blocks, the upper one shifted to the side."""
-    block = beam(0.4, 0.2, 2, 1) if dimension == 2 else box((0.4, 0.4, 0.2), (1, 1, 1))
+    block = beam(0.4, 0.2, 1, 1) if dimension == 2 else box((0.4, 0.4, 0.2), (1, 1, 1))
     offset = np.array([0.07, 0.2 + gap] if dimension == 2 else [0.07, 0.05, 0.2 + gap])
     vertices = np.concatenate([block.vertices, block.vertices + offset])
     return quadratic(make_mesh(vertices, np.concatenate([block.elements, block.elements + len(block.vertices)])))
@@ -49,7 +49,7 @@ def test_the_surface_holds_every_node_of_the_boundary_and_its_whole_area(dimensi
 def test_a_mid_side_node_that_bulges_into_another_body_is_a_crossing():
     mesh = two_blocks(2)
     x = mesh.vertices.copy()
-    middle = vertices_where(mesh, lambda x: (abs(x[:, 1] - 0.2) < 1e-9) & (abs(x[:, 0] - 0.1) < 1e-9))
+    middle = vertices_where(mesh, lambda x: (abs(x[:, 1] - 0.2) < 1e-9) & (abs(x[:, 0] - 0.2) < 1e-9))
     assert not crossings(mesh, x)
     x[middle, 1] += 0.03
     assert {vertex for pair in crossings(mesh, x) for edge in pair for vertex in edge} >= set(middle.tolist())
@@ -59,10 +59,11 @@ def test_a_mid_side_node_that_bulges_into_another_body_is_a_crossing():
 def test_a_quadratic_block_rests_on_another_which_carries_its_weight(dimension):
     mesh = two_blocks(dimension, gap=0.0085)
     held = vertices_where(mesh, lambda x: x[:, -1] < 0.201)
-    scene = scene_of(mesh, held=held, friction=0.3)
+    # Without friction, whose creep delays the rest.
+    scene = scene_of(mesh, held=held)
     init, step = make_step(scene, 0.1, tolerance=1e-9)
     step, state = jax.jit(step), init()
-    for _ in range(60):
+    for _ in range(50):
         state, info = step(scene.params, state)
         assert info.converged
         assert not crossings(mesh, np.asarray(state.x))
