@@ -2,9 +2,9 @@
 
     H p = -g,    x <- x + t p
 
-It uses the true Hessian of the static elements. Only if its factorisation fails are the element Hessians projected to
-positive semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). Those of
-moving elements are always projected, and these elements bound the steps.
+It uses the true Hessian. Only if its factorisation fails are the element Hessians projected to positive semi-definite
+ones, those of moving elements first: always projecting costs several times the iterations on badly deformed bodies, and
+ten times those of bodies that are pressed together. Moving elements also bound the steps.
 """
 
 import functools
@@ -28,12 +28,13 @@ from dln_jax.solvers.elements.moving import (
     moving_gradient,
     moving_hessians,
     overflow,
+    project_moving,
 )
 from dln_jax.solvers.newton import SolverInfo
 
 # Gradients and energies below this many units of rounding are indistinguishable from zero.
 _ROUNDING_UNITS = 16
-# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn:
+# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, added in turn:
 # projected elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
 # How often a step whose list of elements overflows is shortened, eightfold.
@@ -58,6 +59,17 @@ class _MinimumIterate(NamedTuple):
     stuck: Bool[Array, ""]
     gap: Blocks | None
     """What fixed unknowns are away from their values, where they approach them; `None` without moving elements."""
+
+
+class _Attempt(NamedTuple):
+    """One direction of the search."""
+
+    direction: Blocks
+    descends: Bool[Array, ""]
+    number: Int[Array, ""]
+    hessians: tuple[Array, ...]
+    values: Float[Array, " entries"]
+    of_moving: tuple[Array, ...]
 
 
 def descend(
@@ -87,8 +99,7 @@ def descend(
         x, energy, gradient = state.point
         hessians = element_hessians(total.energies, x, data[0])
         values = entries(at, hessians)
-        # Contact forces on curved distances make Hessians indefinite in most steps, so that these are always projected.
-        of_moving = moving_hessians(moving, x, state.lists, data[1], projected=True)
+        of_moving = moving_hessians(moving, x, state.lists, data[1])
         direction, forced = _direction(total, state, hessians, values, of_moving, data)
         lists, direction, limit = _allowed(total, x, direction, data, state.lists)
         slope = jnp.vdot(direction, gradient)
@@ -178,27 +189,34 @@ def _descent_direction(
     lists: Lists,
 ) -> Blocks:
     _, at, solver, moving = total
-    shifts = jnp.asarray(_SHIFTS, gradient.dtype)
+    shifts = jnp.asarray((*[0.0] * (2 if moving else 1), *_SHIFTS), gradient.dtype)
 
-    def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
-        factor = solver.factorise(hessians, (values, lists, of_moving) if moving else values)
-        direction = solver.search(factor, -gradient)
-        return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+    # A loop that usually runs once: factorisation and solve are compiled once, and under vmap a branch that projects
+    # would always be taken.
+    def failing(state: _Attempt) -> Array:
+        return ~state.descends & (state.number < len(shifts))
 
-    # A loop that usually runs zero times: under vmap a branch would always be taken.
-    def failing(state: tuple[Blocks, Array, Array, tuple[Array, ...]]) -> Array:
-        _, descends, attempts, _ = state
-        return ~descends & (attempts < len(_SHIFTS))
+    def attempt(state: _Attempt) -> _Attempt:
+        number = state.number
 
-    def retry(state: tuple[Blocks, Array, Array, tuple[Array, ...]]) -> tuple[Blocks, Array, Array, tuple[Array, ...]]:
-        # The Hessians belong to the loop's state: the projection would be computed ahead of it, and always, otherwise.
-        _, _, attempts, hessians = state
-        projected = project(hessians, shifts[attempts])
-        return *towards(projected, entries(at, projected)), attempts + 1, hessians
+        def project_static(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
+            hessians = project(before[0], shifts[number])
+            return hessians, entries(at, hessians)
 
-    start = (*towards(hessians, values), jnp.asarray(0), tuple(hessians))
-    direction, descends, _, _ = jax.lax.while_loop(failing, retry, start)
-    return jnp.where(descends, direction, -gradient)
+        times = (number > (1 if moving else 0)).astype(int)
+        hessians, values = jax.lax.fori_loop(0, times, project_static, (state.hessians, state.values))
+        of_moving, parts = state.of_moving, values
+        if moving:
+            once = (number == 1).astype(int)
+            of_moving = jax.lax.fori_loop(0, once, lambda _, before: project_moving(before), of_moving)
+            parts = (values, lists, of_moving)
+        direction = solver.search(solver.factorise(hessians, parts), -gradient)
+        descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+        return _Attempt(direction, descends, number + 1, hessians, values, of_moving)
+
+    start = _Attempt(-gradient, jnp.asarray(False), jnp.asarray(0), tuple(hessians), values, tuple(of_moving))
+    last = jax.lax.while_loop(failing, attempt, start)
+    return jnp.where(last.descends, last.direction, -gradient)
 
 
 def lists_at(total: Sum, x: Blocks, data: Any) -> Lists:
