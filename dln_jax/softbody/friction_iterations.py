@@ -3,9 +3,9 @@
     x^(j+1) = argmin E(x; normal forces and directions of friction at x^(j)),    x^(0) = x_n
 
 are the friction iterations of Li et al. 2020 (Incremental Potential Contact). A fixed point obeys Coulomb's law with
-the normal forces at the end of the step. There is no guarantee of convergence, but the error usually falls by a constant
-factor in every iteration. Every solution starts the next search, which takes no Newton step once the forces have
-stopped changing.
+the normal forces at the end of the step. There is no guarantee of convergence, but the error usually falls by a
+constant factor in every iteration. Every solution starts the next search, which takes no Newton step once the forces
+have stopped changing.
 
 The iterations are one loop of fixed length. Its derivative is that of the iterations that were taken, through the
 minimum of each, and exact whether or not the forces have stopped changing.
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import SoftScene
 from dln_jax.solvers.elements.energies import ElementEnergy, value
-from dln_jax.solvers.elements.moving import moving_gradient
+from dln_jax.solvers.elements.moving import MovingEnergy, moving_gradient
 from dln_jax.solvers.newton import SolverInfo
 
 
@@ -65,6 +65,7 @@ def iterated(
 def friction_change(
     scene: SoftScene,
     energies: Sequence[ElementEnergy],
+    touching: Sequence[MovingEnergy],
     x: Float[Array, "n dim"],
     before: tuple[Sequence[Any], Sequence[Any]],
     after: tuple[Sequence[Any], Sequence[Any]],
@@ -74,19 +75,20 @@ def friction_change(
     Args:
         scene: its terms and contacts.
         energies: of the terms.
+        touching: energies of the contacts.
         x: positions in m.
         before, after: data of the terms, and of the contacts' energies.
     """
     lagged = [number for number, term in enumerate(scene.terms) if term.lagged]
-    touching = [energy for contact in scene.contacts for energy in contact.energies]
-    sliding = [energy for contact in scene.contacts for energy in contact.friction]
+    rubs = [energy in contact.friction for contact in scene.contacts for energy in contact.energies]
+    sliding = [energy for energy, has in zip(touching, rubs, strict=True) if has]
 
     def forces(of_terms: Sequence[Any], of_contacts: Sequence[Any]) -> Array:
         slope = jnp.zeros_like(x)
         if lagged:
             chosen = [energies[number] for number in lagged], [of_terms[number] for number in lagged]
             slope += jax.grad(lambda x: value(chosen[0], x, chosen[1]))(x)
-        data = [of for energy, of in zip(touching, of_contacts, strict=True) if energy in sliding]
+        data = [of for of, has in zip(of_contacts, rubs, strict=True) if has]
         lists = tuple(energy.elements(x, slope, of) for energy, of in zip(sliding, data, strict=True))
         return slope + moving_gradient(sliding, x, lists, data)[1]
 

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.friction_iterations import friction_change, has_friction, iterated
-from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data
+from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data, averaged_moving
 from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import (
     Growth,
@@ -156,9 +156,14 @@ def step_parts(
         require_positive(friction_iterations=friction_iterations)
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
-    if scene.contacts and (integrator.span != 1.0 or integrator.averaged):
+    if scene.contacts and integrator.span != 1.0:
         raise InputError(
             "this integrator does not end where forces balance, which may push bodies through each other; "
+            "use BACKWARD_EULER, BDF2 or, with obstacles only, AVERAGE_VECTOR_FIELD"
+        )
+    if integrator.averaged and any(contact.changing for contact in scene.contacts):
+        raise InputError(
+            "forces between bodies cannot be averaged along the step, because the pairs that touch change; "
             "use BACKWARD_EULER or BDF2"
         )
     free = scene.free
@@ -168,7 +173,8 @@ def step_parts(
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *terms)
     at = pattern(energies, free.shape[0], free.shape[1], free)
     overlaps = None if scene.contacts else count_overlaps(scene.mesh)
-    moving = contact_energies(scene)
+    touching = contact_energies(scene)
+    moving = tuple(map(averaged_moving, touching)) if integrator.averaged else touching
     iterating = friction_iterations > 0 and has_friction(scene)
     rest, masses = scene.params.rest, scene.params.masses
 
@@ -212,7 +218,8 @@ def step_parts(
 
         def prepared(lag: Array | None) -> tuple[Any, Any, Any]:
             at_start = prepare(scene, params, state.x, dt=elapsed, control=control, lag=lag)
-            contact = prepare_contacts(scene, params, state.x, dt=span, lag=lag)
+            contact = prepare_contacts(scene, params, state.x, dt=elapsed, lag=lag)
+            contact = tuple((state.x, of) for of in contact) if integrator.averaged else contact
             return at_start, ((weights, target), *along(state.x, at_start)), contact
 
         first = prepared(None)
@@ -241,7 +248,7 @@ def step_parts(
         x, outcome, (at_start, data, contact), (_, at_end, contact_at_end) = iterated(
             solved, lambda x: prepared(state.x + middle * (x - state.x)), start, first, friction_iterations
         )
-        change = friction_change(scene, terms, x, (data[1:], contact), (at_end[1:], contact_at_end))
+        change = friction_change(scene, terms, moving, x, (data[1:], contact), (at_end[1:], contact_at_end))
         return Balanced(x, outcome, at_start, data, contact, change)
 
     def forces(state: State, balanced: Balanced) -> Float[Array, "n dim"]:
@@ -265,17 +272,19 @@ def step_parts(
         balanced, outcome, at_start, (_, *data), contact, _ = solution
         lists = lists_between(moving, state.x, x - state.x, contact)
 
+        stored = tuple(of for _, of in contact) if integrator.averaged else contact
+
         def contact_value(x: Array) -> Array:
-            return moving_value(moving, x, lists, contact)
+            return moving_value(touching, x, lists, stored)
 
         work = work_of_held(scene.held, terms, data, balanced, x - state.x)
         if moving and len(scene.held):
             along_held = jnp.where(free, 0, x - state.x)
-            work += jax.jvp(contact_value, (balanced,), (along_held,))[1]
+            work += jax.jvp(lambda x: moving_value(moving, x, lists, contact), (balanced,), (along_held,))[1]
         energies_of_step = energy_balance(
             scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, contact_value
         )
-        info = _of_positions(scene, params, x, outcome, overlaps, contact, lists)
+        info = _of_positions(scene, params, x, outcome, overlaps, stored, lists)
         info = info._replace(friction_change=solution.friction_change)
         return with_energies(info, energies_of_step, state.growth)
 

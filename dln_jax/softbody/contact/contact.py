@@ -34,6 +34,8 @@ class Contact(NamedTuple):
     """(parameters, context) -> data of the energies in a step."""
     least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
     """(positions, elements and data of the barrier) -> smallest distance in m, at most the distance h."""
+    changing: bool = True
+    """Whether the elements of the energies change."""
 
     @property
     def friction(self) -> tuple[MovingEnergy, ...]:

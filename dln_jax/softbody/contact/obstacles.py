@@ -234,7 +234,7 @@ def obstacle_contact(
     def least_distance(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
         return jnp.minimum(jnp.min(distances(x, data[0].shape)), data[0].contact.distance)
 
-    return Contact(name, parameters, tuple(energies), prepare, least_distance)
+    return Contact(name, parameters, tuple(energies), prepare, least_distance, changing=False)
 
 
 def _spline(values: Float[Array, "*outer k"], at: Float[Array, ""]) -> Float[Array, "*outer"]:
