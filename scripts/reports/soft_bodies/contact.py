@@ -46,7 +46,7 @@ def moved(body: Mesh, *offset: float) -> Mesh:
 def stack(quick: bool) -> Findings:
     """Five blocks (two in space) on a held one come to rest; the lowest joint carries the weight of all above it."""
     rows = _stack("stack/plane", 2, 5, 150 if quick else 400)
-    return Findings(rows if quick else rows + _stack("stack/space", 3, 2, 200))
+    return Findings(rows if quick else rows + _stack("stack/space", 3, 2, 600))
 
 
 def folding_beam(quick: bool) -> Findings:
