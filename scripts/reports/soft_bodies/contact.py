@@ -174,14 +174,14 @@ def bounce(quick: bool) -> Findings:
     exact, rows, failed = rebound(AVERAGE_VECTOR_FIELD, 1e-3 if quick else 2e-4)[1], [], 0
     for name, integrator, order in (("backward-euler", BACKWARD_EULER, 1), ("bdf2", BDF2, 2)):
         steps = (4e-3, 2e-3) if quick else (2e-3, 1e-3, 5e-4)
-        found = [rebound(integrator, dt) for dt in steps]
-        failed += sum(count for *_, count in found)
-        for dt, (lost, restitution, _) in zip(steps, found, strict=True):
+        motions = [rebound(integrator, dt) for dt in steps]
+        failed += sum(count for *_, count in motions)
+        for dt, (lost, restitution, _) in zip(steps, motions, strict=True):
             case = f"bounce/{name}/{1e3 * dt:g}-ms"
             rows.append(expect(case, "lost_energy", f"falls with dt, order {order}", lost, 0.5))
             rows.append(expect(case, "restitution", f"that of short steps, {exact:.4f}", restitution, 1.0))
         text = "an extrapolation to dt = 0 keeps the energy"
-        last, before = found[-1][0], found[-2][0]
+        last, before = motions[-1][0], motions[-2][0]
         rest = last - (before - last) / (2**order - 1)
         rows.append(expect(f"bounce/{name}", "lost_energy_for_short_steps", text, abs(rest), 0.02))
     for dt in (1e-2, 5e-3, 1e-3):
