@@ -18,7 +18,8 @@ force is the average along the step,
 
 and V is replaced by W(x) = ∫ V(x_n + s (x - x_n)) / s ds, whose gradient is -F. Gauss-Legendre quadrature with 2
 points in the plane and 3 in space is exact for the polynomials `stable_neo_hookean` and `st_venant_kirchhoff`; with
-`CONTACT_POINTS` it is nearly so for contact, friction and springs.
+`CONTACT_POINTS` it is nearly so for contact, friction and springs. Barriers of bodies need the pairs that are near
+anywhere between x_n and x, and are not averaged; those of obstacles are.
 """
 
 from collections.abc import Callable
@@ -30,7 +31,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Previous, State
-from dln_jax.solvers.elements.energies import Corners, ElementEnergy, local, of_corners
+from dln_jax.solvers.elements.energies import Blocks, Corners, ElementEnergy, local, of_corners
+from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError
 
 
@@ -125,3 +127,35 @@ def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
 def averaged_data(element: ElementEnergy, start: Float[Array, "n dim"], data: Any) -> tuple[Any, Any]:
     """Returns the data of `averaged`: the elements' positions at the start of the step, and their own data."""
     return local(element, start), data
+
+
+def averaged_moving(energy: MovingEnergy) -> MovingEnergy:
+    """Returns the energy W of elements that are always the same; its data are (start of the step, its own data)."""
+    nodes, weights = np.polynomial.legendre.leggauss(CONTACT_POINTS)
+    nodes, weights = (1 + nodes) / 2, weights / 2
+
+    def between(start: Blocks, x: Blocks) -> Float[Array, "points *shape"]:
+        at = jnp.asarray(nodes, x.dtype).reshape(-1, *[1] * x.ndim)
+        return start + at * (x - start)
+
+    def describe(x: Blocks, elements: Elements, data: tuple[Blocks, Any]) -> tuple[Array, Any]:
+        start, own = data
+        described = jax.vmap(lambda x: energy.describe(x, elements, own), out_axes=1)(between(start, x))
+        return start[elements.indices], described
+
+    def gradient(x: Float[Array, "k b"], data: tuple[Array, Any]) -> tuple[Array, Array]:
+        start, own = data
+        values, slopes = jax.vmap(energy.gradient)(between(start, x), own)
+        return jnp.sum(weights / nodes * values), jnp.tensordot(jnp.asarray(weights, x.dtype), slopes, axes=1)
+
+    def hessian(x: Float[Array, "k b"], data: tuple[Array, Any]) -> Array:
+        start, own = data
+        return jnp.tensordot(jnp.asarray(weights * nodes, x.dtype), jax.vmap(energy.hessian)(between(start, x), own), 1)
+
+    return MovingEnergy(
+        elements=lambda x, step, data: energy.elements(x, step, data[1]),
+        describe=describe,
+        gradient=gradient,
+        hessian=hessian,
+        longest=lambda x, step, elements, data: energy.longest(x, step, elements, data[1]),
+    )

@@ -188,10 +188,19 @@ def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
 
 
 def prepare(
-    scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf, control: Any = None
+    scene: SoftScene,
+    params: Params,
+    x: Float[Array, "n dim"],
+    *,
+    dt: Any = jnp.inf,
+    control: Any = None,
+    lag: Float[Array, "n dim"] | None = None,
 ) -> tuple[Any, ...]:
-    """Returns the data of all terms' elements for a step of dt in s that starts at x; by default for bodies at rest."""
-    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype))
+    """Returns the data of all terms' elements for a step of dt in s that starts at x; by default for bodies at rest.
+
+    Friction takes its normal forces at `lag`, by default at x.
+    """
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), lag=lag)
     controls = _by_term(scene, control)
     return tuple(
         term.prepare(params.terms[term.name], context._replace(control=controls(term.name))) for term in scene.terms
@@ -215,10 +224,15 @@ def _by_term(scene: SoftScene, control: Any) -> Callable[[str], Any]:
 
 
 def prepare_contacts(
-    scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf
+    scene: SoftScene,
+    params: Params,
+    x: Float[Array, "n dim"],
+    *,
+    dt: Any = jnp.inf,
+    lag: Float[Array, "n dim"] | None = None,
 ) -> tuple[Any, ...]:
-    """Returns the data of the contacts' energies for a step of dt in s that starts at x."""
-    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype))
+    """Returns the data of the contacts' energies for a step of dt in s that starts at x, as `prepare`."""
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), lag=lag)
     return tuple(data for contact in scene.contacts for data in contact.prepare(params.terms[contact.name], context))
 
 

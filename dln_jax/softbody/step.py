@@ -13,7 +13,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data
+from dln_jax.softbody.friction_iterations import friction_change, has_friction, iterated
+from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data, averaged_moving
 from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import (
     Growth,
@@ -68,6 +69,8 @@ class Balanced(NamedTuple):
     """Data of the step's energies: inertia, and the terms, averaged if the integrator is."""
     contact: tuple[Any, ...]
     """Data of the contacts."""
+    friction_change: Float[Array, ""] | None = None
+    """As in `Info`."""
 
 
 class StepParts(NamedTuple):
@@ -92,6 +95,7 @@ def make_step(
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
     halvings: int = 0,
+    friction_iterations: int = 0,
 ) -> Stepper:
     """Returns (init, step) of a scene.
 
@@ -108,6 +112,9 @@ def make_step(
         definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
         halvings: take a step that does not converge again in parts, of dt/2^halvings at the shortest; `Info.substeps`
             reports their number. The step is compiled a second time for them.
+        friction_iterations: solve the step again this many times, with the normal forces and directions of friction of
+            the previous solution instead of those at the start of the step (`friction_iterations`).
+            `Info.friction_change` says how much another one would change.
 
     Raises:
         InputError: a number that is not positive, or halvings of a method of two steps.
@@ -117,7 +124,10 @@ def make_step(
         if integrator.two_steps:
             raise InputError("halvings got a method of two steps, which have one length; use another integrator")
     init, balance, _, conclude = step_parts(
-        scene, dt, integrator, tolerance, iterations, linear_solver=linear_solver, definite=definite
+        *(scene, dt, integrator, tolerance, iterations),
+        linear_solver=linear_solver,
+        definite=definite,
+        friction_iterations=friction_iterations,
     )
 
     def advance(
@@ -139,13 +149,21 @@ def step_parts(
     *,
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
+    friction_iterations: int = 0,
 ) -> StepParts:
     """Returns the parts of the step that `make_step` returns, which explains the arguments."""
+    if friction_iterations:
+        require_positive(friction_iterations=friction_iterations)
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
-    if scene.contacts and (integrator.span != 1.0 or integrator.averaged):
+    if scene.contacts and integrator.span != 1.0:
         raise InputError(
             "this integrator does not end where forces balance, which may push bodies through each other; "
+            "use BACKWARD_EULER, BDF2 or, with obstacles only, AVERAGE_VECTOR_FIELD"
+        )
+    if integrator.averaged and any(contact.changing for contact in scene.contacts):
+        raise InputError(
+            "forces between bodies cannot be averaged along the step, because the pairs that touch change; "
             "use BACKWARD_EULER or BDF2"
         )
     free = scene.free
@@ -155,7 +173,9 @@ def step_parts(
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *terms)
     at = pattern(energies, free.shape[0], free.shape[1], free)
     overlaps = None if scene.contacts else count_overlaps(scene.mesh)
-    moving = contact_energies(scene)
+    touching = contact_energies(scene)
+    moving = tuple(map(averaged_moving, touching)) if integrator.averaged else touching
+    iterating = friction_iterations > 0 and has_friction(scene)
     rest, masses = scene.params.rest, scene.params.masses
 
     def along(start: Array, data: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -195,15 +215,18 @@ def step_parts(
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
         # Averaged along the step, a linear force of half of its time is that of the mean velocity.
         elapsed = span / 2 if integrator.averaged else span
-        at_start = prepare(scene, params, state.x, dt=elapsed, control=control)
-        data = ((weights, target), *along(state.x, at_start))
+
+        def prepared(lag: Array | None) -> tuple[Any, Any, Any]:
+            at_start = prepare(scene, params, state.x, dt=elapsed, control=control, lag=lag)
+            contact = prepare_contacts(scene, params, state.x, dt=elapsed, lag=lag)
+            contact = tuple((state.x, of) for of in contact) if integrator.averaged else contact
+            return at_start, ((weights, target), *along(state.x, at_start)), contact
+
+        first = prepared(None)
+        data = first[1]
         carried = state.x + span * state.v
-        contact = prepare_contacts(scene, params, state.x, dt=span)
-        feasible = None
         if moving:
-            # Only known positions are known to be apart; held vertices approach their goals from there.
-            start = jnp.where(free, state.x, carried)
-            feasible = state.x if x_after is None else x_after
+            start = state.x if x_after is None else x_after
         elif x_after is None:
             # The better of two starts: the present positions, or those of motion without forces.
             stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
@@ -211,17 +234,31 @@ def step_parts(
             start = jnp.where(of_coast < of_stay, coast, stay)
         else:
             start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
-        balanced, outcome = solve(
-            energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible
-        )
-        if moving and x_after is not None:
-            # The search did not begin where the step does.
+
+        def from_start(outcome: SolverInfo, contact: Any) -> SolverInfo:
+            """With the lists at the start of the step, if the search began elsewhere."""
             there = lists_between(moving, state.x, jnp.zeros_like(state.x), contact)
-            outcome = outcome._replace(lists=(there, outcome.lists[1]))
-        return Balanced(balanced, outcome, at_start, data, contact)
+            return outcome._replace(lists=(there, outcome.lists[1]))
+
+        def solved(x: Array, parts: tuple[Any, Any, Any]) -> tuple[Array, SolverInfo]:
+            _, data, contact = parts
+            # Only known positions are known to be apart; held vertices approach their goals from there.
+            start, feasible = jnp.where(free, x, carried), x if moving else None
+            return solve(energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible)
+
+        if not iterating:
+            x, outcome = solved(start, first)
+            return Balanced(x, outcome if x_after is None else from_start(outcome, first[2]), *first)
+        # Forces that are averages along the step take the normal forces of its middle.
+        middle = 0.5 if integrator.averaged else 1.0
+        x, outcome, (at_start, data, contact), (_, at_end, contact_at_end) = iterated(
+            solved, lambda x: prepared(state.x + middle * (x - state.x)), start, first, friction_iterations
+        )
+        change = friction_change(scene, terms, moving, x, (data[1:], contact), (at_end[1:], contact_at_end))
+        return Balanced(x, from_start(outcome, contact), at_start, data, contact, change)
 
     def forces(balanced: Balanced) -> Float[Array, "n dim"]:
-        x, outcome, _, data, contact = balanced
+        x, outcome, _, data, contact, _ = balanced
         slope = jax.grad(lambda x: value(energies, x, data))(x)
         return -slope - moving_gradient(moving, x, outcome.lists[1], contact)[1] if moving else -slope
 
@@ -238,17 +275,20 @@ def step_parts(
     def judged(params: Params, state: State, x: Array, v: Array, solution: Balanced) -> tuple[Info, Growth | None]:
         # The verdict has no derivatives.
         params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
-        balanced, outcome, at_start, (_, *data), contact = solution
+        balanced, outcome, at_start, (_, *data), contact, friction = solution
+        of_stored = tuple(of for _, of in contact) if integrator.averaged else contact
         work, stored = work_of_held(scene.held, terms, data, balanced, x - state.x), 0.0
         if moving:
             lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *outcome.lists)
-            at_both = jax.vmap(lambda x, lists: moving_gradient(moving, x, lists, contact))
-            stored, slopes = at_both(jnp.stack([state.x, x]), lists)
-            work += jnp.vdot(slopes[1], jnp.where(free, 0, x - state.x))
+            at_both = jax.vmap(lambda x, lists: moving_gradient(touching, x, lists, of_stored))
+            stored, (_, slope) = at_both(jnp.stack([state.x, x]), lists)
+            if integrator.averaged:
+                slope = moving_gradient(moving, balanced, outcome.lists[1], contact)[1]
+            work += jnp.vdot(slope, jnp.where(free, 0, x - state.x))
         energies_of_step = energy_balance(
             scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, stored
         )
-        info = _of_positions(scene, params, x, outcome, overlaps, contact)
+        info = _of_positions(scene, params, x, outcome, overlaps, of_stored)._replace(friction_change=friction)
         return with_energies(info, energies_of_step, state.growth)
 
     return StepParts(init, balance, forces, conclude)

@@ -208,6 +208,7 @@ def _together(first: Info, second: Info) -> Info:
         energy_at_hand=merged(jnp.maximum, "energy_at_hand"),
         least_J=merged(jnp.minimum, "least_J"),
         least_distance=merged(jnp.minimum, "least_distance"),
+        friction_change=merged(jnp.maximum, "friction_change"),
         overflow=merged(jnp.logical_or, "overflow"),
     )
 

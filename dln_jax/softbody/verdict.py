@@ -60,6 +60,10 @@ class Info(NamedTuple):
     """Number of parts that the step was divided into, 1 for a whole step; `None` without `halvings`."""
     least_distance: Float[Array, ""] | None = None
     """Smallest distance in m of two surfaces in contact, at most the distance within which contact acts."""
+    friction_change: Float[Array, ""] | None = None
+    """Largest change of the friction on a vertex, as force per mass in m/s², if it took its normal forces and
+    directions from the end of the step; `None` without friction or `friction_iterations`. It does not affect
+    `converged`."""
     overflow: Bool[Array, ""] | None = None
     """Whether the lists of pairs in contact were too short, which needs a larger `capacity`; such a step has not
     converged."""

@@ -4,7 +4,8 @@ The energies sum over all pairs of a vertex and an edge in the plane, or of a ve
 space, that share no vertex. Which pairs are near is found anew in every Newton step, in lists of fixed capacity, and
 continuous collision detection bounds the steps, so that no pair ever crosses.
 
-Friction is lagged: normal forces and tangent planes are those at the start of the time step,
+Friction is lagged: normal forces and tangent planes are those at the start of the time step, or of the previous
+solution of this step where `make_step` iterates,
 
     D = mu lambda f(|u|),    u = (1 - n nᵀ) sum_i w_i (x_i - x_i(start)),
 
@@ -204,15 +205,15 @@ def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
 def _lagged(
     barrier: MovingEnergy, friction: Array, data: Any, context: Context, threshold_speed: float
 ) -> tuple[Elements, tuple[Slip, Array]]:
-    """Returns the pairs that rub, with their normal forces at the start of the step."""
-    x = context.x
+    """Returns the pairs that rub, with their normal forces at the start of the step or where the context says."""
+    x = context.x if context.lag is None else context.lag
     elements = jax.lax.stop_gradient(barrier.elements(x, jnp.zeros_like(x), data))
     corners = x[elements.indices]
     force, normal, weights = jax.vmap(normal_force)(corners, barrier.describe(x, elements, data))
     # A static solve (dt infinite) has no velocities, hence no friction.
     moving = jnp.isfinite(context.dt)
     threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
-    start = jnp.einsum("mk,mki->mi", weights, corners)
+    start = jnp.einsum("mk,mki->mi", weights, context.x[elements.indices])
     largest = jnp.where(moving, friction * force, 0.0)
     return elements, (Slip(start, normal, largest, jnp.broadcast_to(threshold, force.shape)), weights)
 

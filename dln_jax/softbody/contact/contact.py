@@ -34,6 +34,13 @@ class Contact(NamedTuple):
     """(parameters, context) -> data of the energies in a step."""
     least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
     """(positions, elements and data of the barrier) -> smallest distance in m, at most the distance h."""
+    changing: bool = True
+    """Whether the elements of the energies change."""
+
+    @property
+    def friction(self) -> tuple[MovingEnergy, ...]:
+        """The friction, if there is any."""
+        return self.energies[1:]
 
 
 def contact_parameters(distance: float, stiffness: Numbers, friction: Numbers | None) -> ContactParameters:

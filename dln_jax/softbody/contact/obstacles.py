@@ -217,8 +217,8 @@ def obstacle_contact(
         data = (parameters, context.rest)
         if parameters.contact.friction is None:
             return (data,)
-        x = context.x[surface.vertices]
-        d, slope = jax.vmap(jax.value_and_grad(obstacle.distance), (0, None))(x, parameters.shape)
+        x, lagged = (at[surface.vertices] for at in (context.x, context.x if context.lag is None else context.lag))
+        d, slope = jax.vmap(jax.value_and_grad(obstacle.distance), (0, None))(lagged, parameters.shape)
         steep = jnp.linalg.norm(slope, axis=1)
         _, strength, near = describe(context.x, every, data)
         force = -2 * d * strength * barrier(d**2, near)[1] * steep
@@ -234,7 +234,7 @@ def obstacle_contact(
     def least_distance(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
         return jnp.minimum(jnp.min(distances(x, data[0].shape)), data[0].contact.distance)
 
-    return Contact(name, parameters, tuple(energies), prepare, least_distance)
+    return Contact(name, parameters, tuple(energies), prepare, least_distance, changing=False)
 
 
 def _spline(values: Float[Array, "*outer k"], at: Float[Array, ""]) -> Float[Array, "*outer"]:

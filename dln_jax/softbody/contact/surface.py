@@ -1,4 +1,8 @@
-"""The surface of a body in contact: its vertices, edges and triangles, and the areas that they stand for."""
+"""The surface of a body in contact: its vertices, edges and triangles, and the areas that they stand for.
+
+The facets of a quadratic mesh are divided at their mid-side nodes, into 2 edges in the plane and 4 triangles in space.
+All of its nodes are then in contact, on a surface that is linear between them.
+"""
 
 import itertools
 from typing import NamedTuple
@@ -8,6 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dln_jax.softbody.mesh.mesh import Mesh, boundary
+from dln_jax.softbody.mesh.surfaces import facet_nodes
+
+_PARTS = {3: ((0, 2), (2, 1)), 6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
+"""Parts of a quadratic facet by its number of nodes, oriented as the facet."""
 
 
 class Surface(NamedTuple):
@@ -26,6 +34,9 @@ class Surface(NamedTuple):
 def surface_of(mesh: Mesh) -> Surface:
     """Returns the boundary of a mesh."""
     facets = boundary(mesh)
+    if mesh.midsides is not None:
+        nodes = facet_nodes(mesh, facets)
+        facets = nodes[:, np.array(_PARTS[nodes.shape[1]])].reshape(-1, mesh.dimension)
     if mesh.dimension == 2:
         return Surface(np.unique(facets), np.sort(facets, axis=1), np.zeros((0, 3), int))
     pairs = facets[:, list(itertools.combinations(range(3), 2))].reshape(-1, 2)

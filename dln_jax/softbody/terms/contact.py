@@ -10,10 +10,10 @@ computes no friction.
     D = mu lambda_n f(|u|),   u = (1 - n nᵀ)(x - x_n),   f(u) = u²/e - u³/(3 e²) for u < e,  u - e/3 beyond,
 
 after Li et al. 2020 (Incremental Potential Contact, section 5), with their constant chosen such that f(0) = 0, and
-normals n and normal forces lambda_n at the start of the step. The force is mu lambda_n against the slip from the
-threshold speed e/dt on, and falls smoothly to zero below it: a block that "sticks" on a slope creeps at less than the
-threshold. f is twice continuously differentiable. The slip e must be well above the rounding of the positions: in
-float32, 1e-4 m for a body of a metre.
+normals n and normal forces lambda_n at the start of the step (or at the previous of several solutions of the step,
+`make_step`). The force is mu lambda_n against the slip from the threshold speed e/dt on, and falls smoothly to zero
+below it: a block that "sticks" on a slope creeps at less than the threshold. f is twice continuously differentiable.
+The slip e must be well above the rounding of the positions: in float32, 1e-4 m for a body of a metre.
 
 Contact damping adds the force c lambda (-d') to the normal force lambda = -k phi'(d), with c in s/m (Hunt and Crossley
 1975). It comes from the dissipation
@@ -192,7 +192,8 @@ def _contact(
         if parameters.damping is not None:
             braked = jax.vmap(distance)(tuple(x.T), near), parameters.damping * stiffness / context.dt
         if parameters.friction is not None:
-            depth, normal, steepness = touched(x, near)
+            lagged = x if context.lag is None else context.lag[indices[:, 0]]
+            depth, normal, steepness = touched(lagged, near)
             force = parameters.friction * (stiffness * penalty_force(depth, width) * steepness)
             # A static solve (dt infinite) has no velocities, hence no friction.
             moving = jnp.isfinite(context.dt)
@@ -210,7 +211,7 @@ def _contact(
             contact += weight * (lost - penalty(depth, width) * (depth - start))
         return contact if slip is None else contact + friction_energy(x[0], slip)
 
-    return Term(name, indices, energy, parameters, prepare)
+    return Term(name, indices, energy, parameters, prepare, lagged=parameters.friction is not None)
 
 
 def friction_energy(x: Any, slip: Slip) -> Scalar:

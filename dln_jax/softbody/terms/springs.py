@@ -10,7 +10,6 @@ from dln_jax.softbody.terms.term import (
     NOT_NEGATIVE,
     Context,
     Corners,
-    Corners,
     Indices,
     Numbers,
     Term,

@@ -41,6 +41,8 @@ class Context(NamedTuple):
     """Length of the step in s; infinite for a static solve."""
     control: Any = None
     """Control of the step for this term, if there is one: an array, in the scene's only actuator the whole control."""
+    lag: Float[Array, "n dim"] | None = None
+    """Positions in m at which friction takes its normal forces and directions; by default those at the start."""
 
 
 class Term(NamedTuple):
@@ -61,6 +63,8 @@ class Term(NamedTuple):
     """False if the energy takes an array [k, dim] instead of scalars: compiles faster beyond a dozen unknowns."""
     control: tuple[int, ...] | None = None
     """Shape of the control that the preparation reads from its context; `None` for a term without."""
+    lagged: bool = False
+    """Whether the preparation reads the lag of its context."""
     weights: Callable[[Any], Any] | None = None
     """Data of one element -> w[k][j], if the energy takes y[i][j] = sum over vertices k of x[k][i] w[k][j] (rows of a
     deformation gradient, an edge) in place of the positions. Its Hessian compiles and runs faster."""

@@ -2,9 +2,9 @@
 
     H p = -g,    x <- x + t p
 
-It uses the true Hessian of the static elements. Only if its factorisation fails are the element Hessians projected to
-positive semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). Those of
-moving elements are always projected, and these elements bound the steps.
+It uses the true Hessian. Only if its factorisation fails are the element Hessians projected to positive semi-definite
+ones, those of moving elements first: always projecting costs several times the iterations on badly deformed bodies, and
+ten times those of bodies that are pressed together. Moving elements also bound the steps.
 """
 
 from collections.abc import Sequence
@@ -28,6 +28,7 @@ from dln_jax.solvers.elements.moving import (
     moving_hessians,
     moving_products,
     overflow,
+    project_moving,
 )
 from dln_jax.solvers.newton import SolverInfo
 
@@ -68,6 +69,7 @@ class _Attempt(NamedTuple):
     number: Int[Array, ""]
     hessians: tuple[Array, ...]
     values: Float[Array, " entries"]
+    of_moving: tuple[Array, ...]
 
 
 def descend(
@@ -97,8 +99,7 @@ def descend(
         x, energy, gradient = state.point
         hessians = element_hessians(total.energies, x, data[0])
         values = entries(at, hessians)
-        # Contact forces on curved distances make Hessians indefinite in most steps, so that these are always projected.
-        of_moving = moving_hessians(moving, x, state.lists, data[1], projected=True)
+        of_moving = moving_hessians(moving, x, state.lists, data[1])
         direction, forced = _direction(total, state, hessians, values, of_moving)
         lists, direction, limit = _allowed(total, x, direction, data, state.lists)
         slope = jnp.vdot(direction, gradient)
@@ -188,7 +189,7 @@ def _descent_direction(
     lists: Lists,
 ) -> Blocks:
     _, at, solver, moving = total
-    shifts = jnp.asarray((0.0, *_SHIFTS), gradient.dtype)
+    shifts = jnp.asarray((*[0.0] * (2 if moving else 1), *_SHIFTS), gradient.dtype)
 
     # A loop that usually runs once: factorisation and solve are compiled once, and under vmap a branch that projects
     # would always be taken.
@@ -196,18 +197,24 @@ def _descent_direction(
         return ~state.descends & (state.number < len(shifts))
 
     def attempt(state: _Attempt) -> _Attempt:
-        def projected(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
-            hessians = project(before[0], shifts[state.number])
+        number = state.number
+
+        def project_static(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
+            hessians = project(before[0], shifts[number])
             return hessians, entries(at, hessians)
 
-        times = (state.number > 0).astype(int)
-        hessians, values = jax.lax.fori_loop(0, times, projected, (state.hessians, state.values))
-        factor = solver.factorise(hessians, (values, lists, of_moving) if moving else values)
-        direction = solver.search(factor, -gradient)
+        times = (number > (1 if moving else 0)).astype(int)
+        hessians, values = jax.lax.fori_loop(0, times, project_static, (state.hessians, state.values))
+        of_moving, parts = state.of_moving, values
+        if moving:
+            once = (number == 1).astype(int)
+            of_moving = jax.lax.fori_loop(0, once, lambda _, before: project_moving(before), of_moving)
+            parts = (values, lists, of_moving)
+        direction = solver.search(solver.factorise(hessians, parts), -gradient)
         descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
-        return _Attempt(direction, descends, state.number + 1, hessians, values)
+        return _Attempt(direction, descends, number + 1, hessians, values, of_moving)
 
-    start = _Attempt(-gradient, jnp.asarray(False), jnp.asarray(0), tuple(hessians), values)
+    start = _Attempt(-gradient, jnp.asarray(False), jnp.asarray(0), tuple(hessians), values, tuple(of_moving))
     last = jax.lax.while_loop(failing, attempt, start)
     return jnp.where(last.descends, last.direction, -gradient)
 

@@ -163,5 +163,5 @@ def _factor(total: Sum, x: Blocks, data: Any, lists: Lists) -> Any:
     values = entries(total.at, hessians)
     if not total.moving:
         return total.solver.factorise(hessians, values)
-    moving = moving_hessians(total.moving, x, lists, data[1], projected=False)
+    moving = moving_hessians(total.moving, x, lists, data[1])
     return total.solver.factorise(hessians, (values, lists, moving))

@@ -91,13 +91,17 @@ def moving_gradient(
 
 
 def moving_hessians(
-    moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any], *, projected: bool
+    moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any]
 ) -> tuple[Float[Array, "capacity s s"], ...]:
-    """Returns the Hessians of the elements, projected to positive semi-definite ones for a search direction."""
-    hessians = tuple(
+    """Returns the Hessians of the elements."""
+    return tuple(
         jax.vmap(m.hessian)(x[at.indices], m.describe(x, at, of)) for m, at, of in zip(moving, lists, data, strict=True)
     )
-    return tuple(map(_projected, hessians)) if projected else hessians
+
+
+def project_moving(hessians: Sequence[Float[Array, "capacity s s"]]) -> tuple[Float[Array, "capacity s s"], ...]:
+    """Projects Hessians to positive semi-definite ones."""
+    return tuple(map(_projected, hessians))
 
 
 def moving_products(lists: Lists, hessians: Sequence[Array], x: Blocks) -> Blocks:

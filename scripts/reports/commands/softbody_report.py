@@ -38,7 +38,7 @@ MEASURES = {
     "gradients": (gradients.crawler,),
     "contact": (
         *(contact.stack, contact.folding_beam, contact.impact, contact.sliding, contact.ring),
-        *(contact.twisted_bar, contact.gripper, contact.gradients),
+        *(contact.twisted_bar, contact.gripper, contact.bounce, contact.gradients),
     ),
     "speed": (
         *(speed.creature, speed.beams, speed.backward, speed.solver_choice),

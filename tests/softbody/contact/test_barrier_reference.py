@@ -35,7 +35,7 @@ def ours(mesh: Mesh, x: np.ndarray):
     value, gradient = moving_gradient(contact.energies, jnp.asarray(x), lists, data)
     hessian = jax.jacfwd(lambda x: moving_gradient(contact.energies, x, lists, data)[1])(jnp.asarray(x))
     (blocks, *_), (elements, *_) = (
-        moving_hessians(contact.energies, jnp.asarray(x), lists, data, projected=False),
+        moving_hessians(contact.energies, jnp.asarray(x), lists, data),
         lists,
     )
     d = x.shape[1]

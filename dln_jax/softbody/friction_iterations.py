@@ -1,0 +1,96 @@
+"""Repeated solution of a time step, so that friction takes its normal forces from the end of the step.
+
+    x^(j+1) = argmin E(x; normal forces and directions of friction at x^(j)),    x^(0) = x_n
+
+are the friction iterations of Li et al. 2020 (Incremental Potential Contact). A fixed point obeys Coulomb's law with
+the normal forces at the end of the step. There is no guarantee of convergence, but the error usually falls by a
+constant factor in every iteration. Every solution starts the next search, which takes no Newton step once the forces
+have stopped changing.
+
+The iterations are one loop of fixed length. Its derivative is that of the iterations that were taken, through the
+minimum of each, and exact whether or not the forces have stopped changing.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.scene import SoftScene
+from dln_jax.solvers.elements.energies import ElementEnergy, value
+from dln_jax.solvers.elements.moving import MovingEnergy, moving_gradient
+from dln_jax.solvers.newton import SolverInfo
+
+
+def has_friction(scene: SoftScene) -> bool:
+    """Whether a term or a contact of the scene has friction with lagged normal forces."""
+    return any(term.lagged for term in scene.terms) or any(contact.friction for contact in scene.contacts)
+
+
+def iterated(
+    solve: Callable[[Array, Any], tuple[Array, SolverInfo]],
+    prepared: Callable[[Array], Any],
+    start: Float[Array, "n dim"],
+    first: Any,
+    count: int,
+) -> tuple[Float[Array, "n dim"], SolverInfo, Any, Any]:
+    """Solves a step once, and `count` times again.
+
+    Args:
+        solve: (start of the search, data) -> solution and its outcome.
+        prepared: solution -> data with the normal forces there.
+        start: of the first search.
+        first: data with the normal forces at the start of the step.
+        count: at least 1.
+
+    Returns:
+        The last solution, the outcome of all (the sum of their iterations; converged if all are), the data of the last
+        solution, and the data with the normal forces there.
+    """
+
+    def again(carry: tuple[Array, Any, Any], _: None) -> tuple[tuple[Array, Any, Any], SolverInfo]:
+        start, _, data = carry
+        x, outcome = solve(start, data)
+        return (x, data, prepared(x)), outcome
+
+    (x, used, at_end), outcomes = jax.lax.scan(again, (start, first, first), None, length=count + 1)
+    last = jax.tree.map(lambda values: values[-1], outcomes)
+    overflow = None if outcomes.overflow is None else outcomes.overflow.any()
+    outcome = last._replace(iterations=outcomes.iterations.sum(), converged=outcomes.converged.all(), overflow=overflow)
+    return x, outcome, used, at_end
+
+
+def friction_change(
+    scene: SoftScene,
+    energies: Sequence[ElementEnergy],
+    touching: Sequence[MovingEnergy],
+    x: Float[Array, "n dim"],
+    before: tuple[Sequence[Any], Sequence[Any]],
+    after: tuple[Sequence[Any], Sequence[Any]],
+) -> Float[Array, ""]:
+    """Largest change of the friction at x, as force per mass in m/s², between two sets of normal forces.
+
+    Args:
+        scene: its terms and contacts.
+        energies: of the terms.
+        touching: energies of the contacts.
+        x: positions in m.
+        before, after: data of the terms, and of the contacts' energies.
+    """
+    lagged = [number for number, term in enumerate(scene.terms) if term.lagged]
+    rubs = [energy in contact.friction for contact in scene.contacts for energy in contact.energies]
+    sliding = [energy for energy, has in zip(touching, rubs, strict=True) if has]
+
+    def forces(of_terms: Sequence[Any], of_contacts: Sequence[Any]) -> Array:
+        slope = jnp.zeros_like(x)
+        if lagged:
+            chosen = [energies[number] for number in lagged], [of_terms[number] for number in lagged]
+            slope += jax.grad(lambda x: value(chosen[0], x, chosen[1]))(x)
+        data = [of for of, has in zip(of_contacts, rubs, strict=True) if has]
+        lists = tuple(energy.elements(x, slope, of) for energy, of in zip(sliding, data, strict=True))
+        return slope + moving_gradient(sliding, x, lists, data)[1]
+
+    change = jnp.abs(forces(*after) - forces(*before)) / scene.params.masses[:, None]
+    return jnp.max(jnp.where(scene.free, change, 0))
