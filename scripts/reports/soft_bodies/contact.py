@@ -151,9 +151,8 @@ def bounce(quick: bool) -> Findings:
     The exact motion keeps the energy. The ball rebounds more slowly than it came, because it vibrates afterwards.
     """
     ball = moved(disc(0.5, 3), 0.0, 0.53)
-    near = {"distance": 0.02, "stiffness": 1e5}
     material = elastic(ball, stable_neo_hookean, youngs_modulus=3e5, poisson_ratio=0.3)
-    ground = obstacle_contact(ball, half_space([0.0, 1.0]), **near)
+    ground = obstacle_contact(ball, half_space([0.0, 1.0]), distance=0.02, stiffness=1e5)
     scene = make_scene(ball, [material], masses=lumped_masses(ball, DENSITY), contacts=[ground])
     masses, seconds, speed = np.asarray(scene.params.masses), 0.3, 2.0
     brought = 0.5 * masses.sum() * speed**2
