@@ -65,13 +65,10 @@ def scene_of(body: Body) -> SoftScene:
 
 
 def motion(body: Body, integrator: str, dt: float) -> Run:
-    """A motion by one integrator with steps of dt in s."""
+    """A motion by one integrator with steps of dt in s; NaN if a step did not converge."""
     program = _program(body, integrator, dt)
     params = scene_of(body).params
-    run = measured(body, lambda: program(params)[0])
-    if not program(params)[1]:
-        run = run._replace(x=np.full_like(run.x, np.nan))
-    return run
+    return measured(body, lambda: jax.block_until_ready(program(params)))
 
 
 def motion_gradient(body: Body, integrator: str, dt: float) -> tuple[Run, float]:
@@ -80,7 +77,7 @@ def motion_gradient(body: Body, integrator: str, dt: float) -> tuple[Run, float]
 
     @jax.jit
     def slope(modulus: Any) -> Any:
-        height = lambda E: program(with_parameters(params, elastic={"youngs_modulus": E}))[0][-1, :, 2].mean()  # noqa: E731
+        height = lambda E: program(with_parameters(params, elastic={"youngs_modulus": E}))[-1, :, 2].mean()  # noqa: E731
         return jax.grad(height)(modulus)
 
     at = jnp.asarray(body.modulus)
@@ -110,7 +107,7 @@ def static_gradient(body: Body) -> tuple[Run, float]:
 
 
 def _program(body: Body, integrator: str, dt: float) -> Any:
-    """params -> (positions at the body's times, whether all steps converged), compiled."""
+    """params -> positions at the body's times, compiled."""
     scene = scene_of(body)
     init, step = make_step(scene, dt, INTEGRATORS[integrator])
     ends = np.round(body.times / dt).astype(int)
@@ -119,6 +116,6 @@ def _program(body: Body, integrator: str, dt: float) -> Any:
     @jax.jit
     def run(params: Params) -> Any:
         x, converged = rollout(partial(step, params), init(v=body.v), steps=int(ends[-1]), observe=observe)[1]
-        return x[ends - 1], converged.all()
+        return jnp.where(converged.all(), x[ends - 1], jnp.nan)
 
     return run
