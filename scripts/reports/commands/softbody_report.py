@@ -15,6 +15,7 @@ from dln_jax.precision import in_float64
 from scripts.reports.case import Case, in_subjects, report_cases
 from scripts.reports.soft_bodies import contact, elements, gradients, motions, robustness, speed, statics, stiffness
 from scripts.reports.soft_bodies.rivals import cases as rivals
+from scripts.reports.soft_bodies.rivals import finer, touching
 
 MEASURES = {
     "references": (
@@ -34,7 +35,7 @@ MEASURES = {
         *(speed.creature, speed.beams, speed.backward, speed.solver_choice),
         *(stiffness.steps, stiffness.factorisation),
     ),
-    "rivals": (rivals.swing, rivals.drop, rivals.hanging),
+    "rivals": (rivals.swing, rivals.drop, rivals.hanging, finer.mesh, finer.gradient, touching.blocks),
 }
 """Functions quick -> findings, by subject."""
 FIGURES = {elements.locking: elements.locking_figure, rivals.swing: rivals.figure}

@@ -35,7 +35,7 @@ from scripts.reports.soft_bodies.rivals.body import (
     smith,
 )
 
-FLOOR = 1e6
+FLOOR = 1e7
 """Stiffness of the floor, N/m for each vertex."""
 BARRIER = 1e4
 """Stiffness of the barrier between bodies, Pa."""
