@@ -26,8 +26,9 @@ TOOL = "0.42"
 """Colour for rigid bodies such as a palm."""
 _STONE = np.array([0.80, 0.78, 0.75])
 _LIGHT = np.array([-0.35, 0.80, -0.49])  # to the right, upwards, away from the viewer
+_PIECES = 24
 _DARKEST = 0.38
-"""Opacity of the shadow of a body on the ground."""
+"""Share of the light that a body on the ground takes from it."""
 
 
 class Slab(NamedTuple):
@@ -115,14 +116,17 @@ def _bodies(
     sides = axis.add_collection(PolyCollection([], linewidths=0.4, zorder=4))
     fronts = axis.add_collection(PolyCollection([], linewidths=0.4, zorder=5))
     outlines = axis.add_collection(PolyCollection([], linewidths=0.8, facecolors="none", zorder=6))
-    shift = depth * OBLIQUE
+    shift, lit_ground = depth * OBLIQUE, (_brightness(np.array([[0.0, 1.0, 0.0]])) * _STONE)[0]
 
     def show(k: int) -> None:
         at, rigid = x[k], slabs(k) if slabs else ()
         paint = np.broadcast_to(BODY if colours is None else colours(k) if callable(colours) else colours, (len(part), 3))
         tools = [(np.asarray(slab.outline), np.array(to_rgb(slab.colour))) for slab in rigid]
-        edges = np.concatenate([at[rim], *(np.stack([o, np.roll(o, -1, axis=0)], axis=1) for o, _ in tools)])
-        of_edges = np.concatenate([paint[owners], *(np.tile(colour, (len(o), 1)) for o, colour in tools)])
+        pieces = [_pieces(outline) for outline, _ in tools]
+        edges = np.concatenate([at[rim], *pieces])
+        of_edges = np.concatenate(
+            [paint[owners], *(np.tile(c, (len(own), 1)) for own, (_, c) in zip(pieces, tools, strict=True))]
+        )
         quads, lit = _side_faces(edges, of_edges, shift)
         sides.set(verts=quads, facecolor=lit, edgecolor=lit)
         flat = np.clip(_brightness(np.array([[0.0, 0.0, -1.0]])) * paint, 0, 1)
@@ -132,10 +136,19 @@ def _bodies(
         rims = [*(o for o, _ in tools), *at[rim]]
         outlines.set(verts=rims, edgecolor=0.55 * np.concatenate([*(c[None] for _, c in tools), paint[owners]]))
         dark = [_shadow(at[own], ground, shift) for own in members] + [_shadow(o, ground, shift) for o, _ in tools]
-        shadows.set_verts([quad for quads, _ in dark for quad in quads])
-        shadows.set_facecolor([(0.0, 0.0, 0.0, alpha) for quads, alpha in dark for _ in quads])
+        # The darkest is drawn last, so that shadows do not add up.
+        cast = [(quad, share) for quads, share in sorted(dark, key=lambda shadow: shadow[1]) for quad in quads]
+        shadows.set_verts([quad for quad, _ in cast])
+        shadows.set_facecolor([tuple((1.0 - share) * lit_ground) for _, share in cast])
 
     return show
+
+
+def _pieces(outline: np.ndarray) -> np.ndarray:
+    """The sides of an outline in short pieces [k, 2, 2], whose order in depth is then right."""
+    along = np.linspace(0.0, 1.0, _PIECES + 1)[None, :, None]
+    points = (1 - along) * outline[:, None] + along * np.roll(outline, -1, axis=0)[:, None]
+    return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 2)
 
 
 def _side_faces(edges: np.ndarray, paint: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,8 +185,8 @@ def _draw_ground(axis: Axes, ground: np.ndarray, depth: float, *, bottom: float)
     quads, lit = _side_faces(np.stack([ground[1:], ground[:-1]], axis=1), np.tile(_STONE, (len(ground) - 1, 1)), shift)
     axis.add_collection(PolyCollection(list(quads), facecolors=lit, edgecolors=lit, linewidths=0.4, zorder=1))
     front = np.concatenate([ground, [[ground[-1, 0], bottom], [ground[0, 0], bottom]]])
-    axis.add_collection(PolyCollection([front], facecolors=[0.84 * _STONE], edgecolors="none", zorder=2))
-    axis.plot(*ground.T, color=0.6 * _STONE, linewidth=0.8, zorder=2)
+    axis.add_collection(PolyCollection([front], facecolors=[0.84 * _STONE], edgecolors="none", zorder=7))
+    axis.plot(*ground.T, color=0.6 * _STONE, linewidth=0.8, zorder=7)
 
 
 def _draw_scale(axis: Axes, window: tuple[tuple[float, float], tuple[float, float]]) -> None:

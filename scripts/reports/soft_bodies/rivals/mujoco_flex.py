@@ -49,7 +49,9 @@ def model_of(body: Body, integrator: str, dt: float, solref: tuple[float, float]
         return spec.compile()
 
 
-def motion(body: Body, integrator: str, dt: float, solref: tuple[float, float] = (0.02, 1.0)) -> Run:
+def motion(
+    body: Body, integrator: str, dt: float, solref: tuple[float, float] = (0.02, 1.0), repetitions: int = 2
+) -> Run:
     """A motion with steps of dt in s."""
     model = model_of(body, integrator, dt, solref)
     free = np.setdiff1d(np.arange(len(body.mesh.vertices)), body.held)
@@ -65,4 +67,4 @@ def motion(body: Body, integrator: str, dt: float, solref: tuple[float, float] =
             out.append(x)
         return np.array(out)
 
-    return measured(body, run)
+    return measured(body, run, repetitions)

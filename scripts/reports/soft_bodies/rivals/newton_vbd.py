@@ -16,7 +16,7 @@ from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, Body, Run,
 VERSION = newton.__version__
 
 
-def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Run:
+def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3, repetitions: int = 2) -> Run:
     """A motion with steps of dt in s; the stiffness of contact in N/m is Newton's default."""
     mu, lam = body.lame
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
@@ -63,4 +63,4 @@ def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Ru
             out.append(now.particle_q.numpy().astype(float))
         return np.array(out)
 
-    return measured(body, run)
+    return measured(body, run, repetitions)

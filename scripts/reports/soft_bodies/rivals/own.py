@@ -64,11 +64,11 @@ def scene_of(body: Body) -> SoftScene:
     return make_scene(body.mesh, terms, density=DENSITY, held=body.held, contacts=contacts)
 
 
-def motion(body: Body, integrator: str, dt: float) -> Run:
+def motion(body: Body, integrator: str, dt: float, repetitions: int = 2) -> Run:
     """A motion by one integrator with steps of dt in s; NaN if a step did not converge."""
     program = _program(body, integrator, dt)
     params = scene_of(body).params
-    return measured(body, lambda: jax.block_until_ready(program(params)))
+    return measured(body, lambda: jax.block_until_ready(program(params)), repetitions)
 
 
 def motion_gradient(body: Body, integrator: str, dt: float) -> tuple[Run, float]:

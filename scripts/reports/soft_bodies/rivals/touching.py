@@ -25,18 +25,19 @@ STEP, NEAR = 2e-3, 5e-3
 
 
 def blocks(quick: bool) -> Findings:
-    """A block of 0.2 m rests on one of 0.4 m after 2 s, and hits it at 3 m/s; E = 1e5 Pa, nu = 0.3, no friction."""
-    rest, hit = resting(0.5 if quick else 2.0), hitting()
+    """A block of 0.2 m rests on one of 0.4 m after 1 s, and hits it at 3 m/s; E = 1e5 Pa, nu = 0.3, no friction."""
+    rest, hit = resting(0.5 if quick else 1.0), hitting()
     simulators, missing = rivals()
     rows = []
     for body, name in ((rest, "rest"), (hit, "hit")):
-        runs = {"dln_jax": own.motion(body, "backward-euler", STEP)}
+        once = {"repetitions": 1}
+        runs = {"dln_jax": own.motion(body, "backward-euler", STEP, **once)}
         if flex := simulators.get("mujoco_flex"):
-            runs["mujoco-discrete"] = flex.motion(body, "discrete", STEP)
-            runs["mujoco-stiff-contact"] = flex.motion(body, "discrete", STEP, (2 * STEP, 1.0))
+            runs["mujoco-discrete"] = flex.motion(body, "discrete", STEP, **once)
+            runs["mujoco-stiff-contact"] = flex.motion(body, "discrete", STEP, (2 * STEP, 1.0), **once)
         if vbd := simulators.get("newton_vbd"):
-            runs["newton-10"] = vbd.motion(body, STEP, 10)
-            runs["newton-50-stiff-contact"] = vbd.motion(body, STEP, 50, 1e5)
+            runs["newton-10"] = vbd.motion(body, STEP, 10, **once)
+            runs["newton-50-stiff-contact"] = vbd.motion(body, STEP, 50, 1e5, **once)
         for key, run in runs.items():
             rows += _rows(f"blocks-{name}/{key}", body, run, missing, resting=name == "rest")
     ours = {row.quantity: row.value for row in rows if row.case == "rivals/blocks-hit/dln_jax"}
