@@ -3,6 +3,7 @@
 A point (x, y) at depth s behind the front is drawn at (x, y) + s OBLIQUE, so that fronts keep their true shape.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -42,8 +43,8 @@ class Slab(NamedTuple):
 def write_slab_film(
     path: Path,
     mesh: Mesh,
-    positions: Float[np.ndarray, "T n 2"],
-    t: Float[np.ndarray, " T"],
+    positions: Float[np.ndarray, "T n dim"],
+    t: Float[np.ndarray, " times"],
     *,
     depth: float,
     ground: Float[np.ndarray, "g 2"],
@@ -120,7 +121,8 @@ def _bodies(
 
     def show(k: int) -> None:
         at, rigid = x[k], slabs(k) if slabs else ()
-        paint = np.broadcast_to(BODY if colours is None else colours(k) if callable(colours) else colours, (len(part), 3))
+        chosen = colours(k) if callable(colours) else BODY if colours is None else colours
+        paint = np.broadcast_to(chosen, (len(part), 3))
         tools = [(np.asarray(slab.outline), np.array(to_rgb(slab.colour))) for slab in rigid]
         pieces = [_pieces(outline) for outline, _ in tools]
         edges = np.concatenate([at[rim], *pieces])
@@ -138,7 +140,7 @@ def _bodies(
         dark = [_shadow(at[own], ground, shift) for own in members] + [_shadow(o, ground, shift) for o, _ in tools]
         # The darkest is drawn last, so that shadows do not add up.
         cast = [(quad, share) for quads, share in sorted(dark, key=lambda shadow: shadow[1]) for quad in quads]
-        shadows.set_verts([quad for quad, _ in cast])
+        shadows.set(verts=[quad for quad, _ in cast])
         shadows.set_facecolor([tuple((1.0 - share) * lit_ground) for _, share in cast])
 
     return show
@@ -156,7 +158,7 @@ def _side_faces(edges: np.ndarray, paint: np.ndarray, shift: np.ndarray) -> tupl
     along = edges[:, 1] - edges[:, 0]
     normal = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    order = np.argsort((edges.mean(axis=1) @ shift))
+    order = np.argsort(edges.mean(axis=1) @ shift)
     order = order[(normal[:, :2] @ shift)[order] > 0]
     quads = np.stack([edges[:, 0], edges[:, 1], edges[:, 1] + shift, edges[:, 0] + shift], axis=1)
     return quads[order], np.clip(_brightness(normal[order]) * paint[order], 0, 1)
@@ -170,7 +172,7 @@ def _shadow(x: np.ndarray, ground: np.ndarray, shift: np.ndarray) -> tuple[list[
     """The parts of the ground straight below a body, and how dark they are: less below a higher body."""
     (west, bottom), east = x.min(axis=0), x[:, 0].max()
     size, quads, top = float(np.ptp(x, axis=0).max()), [], -np.inf
-    for a, b in zip(ground[:-1], ground[1:], strict=True):
+    for a, b in itertools.pairwise(ground):
         ends = np.clip([west, east], *sorted((a[0], b[0])))
         if ends[0] < ends[1]:
             line = np.stack([ends, np.interp(ends, [a[0], b[0]], [a[1], b[1]])], axis=1)

@@ -83,7 +83,7 @@ assert not any(crossings(mesh, at) for at in x[::10])
 # The film shows the body as a slab, with its shadow.
 
 every = np.concatenate([mesh.vertices[None], x])
-line = np.array([end for left, right, top in zip(lefts, rights, tops, strict=True) for end in ((left, top), (right, top))])
+line = np.stack([np.stack([lefts, rights], axis=1).ravel(), np.repeat(tops[: len(lefts)], 2)], axis=1)
 line[[0, -1], 0] = -0.25, 1.75
 write_slab_film(
     Path("stairs.gif"),

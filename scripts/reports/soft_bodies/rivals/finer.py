@@ -45,7 +45,7 @@ def mesh(quick: bool) -> Findings:
                 if (vbd := simulators.get("newton_vbd")) and cells == 3:
                     runs[f"newton-10/linear/{cells}"] = body, vbd.motion(body, 0.002, 10)
             elif flex := simulators.get("mujoco_flex"):
-                runs[f"mujoco-kirchhoff-euler/linear/{cells}"] = body, flex.motion(body, "Euler", 0.003 / cells)
+                runs[f"mujoco-euler/linear/{cells}"] = body, flex.motion(body, "Euler", 0.003 / cells)
         if law == NEO_HOOKEAN:
             for cells in (1, 2):
                 body = cantilever(cells, quick=quick, order=2)

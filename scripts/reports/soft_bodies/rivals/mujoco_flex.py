@@ -40,7 +40,7 @@ def model_of(body: Body, integrator: str, dt: float, solref: tuple[float, float]
         flex.vertbody = [f"v{i}" for i in mine]
         flex.elem = np.searchsorted(mine, elements).ravel().tolist()
         flex.solref = solref
-        flex.margin = body.near
+        flex.margin = body.near / 2  # margins of two flexes add up
     if body.floor:
         floor = {"pos": [0.0, 0.0, -RADIUS], "size": [5.0, 5.0, 0.1], "condim": 1, "solref": solref}
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, **floor)

@@ -4,6 +4,7 @@
 Its material is Smith's law with the logarithm. The tape keeps the states of all steps.
 """
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,14 @@ from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, Body, Run,
 
 
 @wp.kernel
-def _same_material(parameters: wp.array[float], materials: wp.array2d[float]):  # noqa: ANN202
+def _same_material(parameters: wp.array[float], materials: wp.array2d[float]):
     place = wp.tid()
     materials[place, 0] = parameters[0]
     materials[place, 1] = parameters[1]
 
 
 @wp.kernel
-def _mean_height(q: wp.array[wp.vec3], mean: wp.array[float]):  # noqa: ANN202
+def _mean_height(q: wp.array[wp.vec3], mean: wp.array[float]):
     place = wp.tid()
     wp.atomic_add(mean, 0, q[place][2] / float(q.shape[0]))
 
@@ -61,7 +62,7 @@ def motion_gradient(body: Body, dt: float) -> tuple[Run, float]:
         mean.zero_()
         with wp.Tape() as tape:
             wp.launch(_same_material, model.tet_count, [parameters], [model.tet_materials])
-            for now, after in zip(states, states[1:], strict=False):
+            for now, after in itertools.pairwise(states):
                 now.clear_forces()
                 solver.step(now, after, control, None, dt)
             wp.launch(_mean_height, model.particle_count, [states[-1].particle_q], [mean])

@@ -1,11 +1,10 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 """tatva: operators of finite elements in JAX. It integrates energies and colours sparse Jacobians.
 
-Newton's method, SciPy's sparse LU and the adjoint equation are written here from these parts, as its documentation does.
+Newton's method with SciPy's sparse LU and the adjoint equation are written here from these parts, as in its examples.
 It has neither motions nor a solver of its own.
 """
 
-from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -63,12 +62,14 @@ def _programs(body: Body) -> tuple[Any, Any]:
 
     def solve(modulus: float) -> tuple[np.ndarray, Any, Any]:
         free = jnp.zeros(lifter.size_reduced)
+        force, matrix = both(free, modulus)
+        factors = splu(matrix.to_csr().tocsc())
         for _ in range(ITERATIONS):
-            force, matrix = both(free, modulus)
-            factors = splu(matrix.to_csr().tocsc())
             if np.abs(force).max() < TOLERANCE:
                 break
             free = free - factors.solve(np.asarray(force))
+            force, matrix = both(free, modulus)
+            factors = splu(matrix.to_csr().tocsc())
         return body.mesh.vertices + np.asarray(lifter.lift_from_zeros(free)).reshape(-1, 3), free, factors
 
     def slope(modulus: float) -> np.ndarray:

@@ -63,8 +63,9 @@ def depth(mesh: Mesh, x: np.ndarray) -> tuple[float, float]:
         mine = np.unique(mesh.elements[number_of == part])
         others, facets = mesh.elements[number_of != part], skin[~np.isin(skin[:, 0], mine)]
         points = np.intersect1d(mine, skin)
-        pairs = jnp.asarray(np.concatenate([x[points][:, None, None].repeat(len(facets), 1), *_corners(x, facets, len(points))], 2))
-        squares = jax.vmap(jax.vmap(lambda pair: squared_distance(pair, jnp.asarray(POINT_TRIANGLE))))(pairs)
+        of_points = np.repeat(x[points][:, None, None], len(facets), axis=1)
+        of_facets = np.repeat(x[facets][None], len(points), axis=0)
+        squares = _squares(jnp.asarray(np.concatenate([of_points, of_facets], axis=2)))
         distances = np.sqrt(np.asarray(squares)).min(axis=1)
         edges = np.swapaxes(x[others[:, 1:]] - x[others[:, :1]], 1, 2)
         place = np.einsum("mij,pmj->pmi", np.linalg.inv(edges), x[points][:, None] - x[others[:, 0]])
@@ -74,8 +75,8 @@ def depth(mesh: Mesh, x: np.ndarray) -> tuple[float, float]:
     return float(deepest), float(nearest)
 
 
-def _corners(x: np.ndarray, facets: np.ndarray, count: int) -> list[np.ndarray]:
-    return [x[facets][None].repeat(count, 0)]
+_squares = jax.jit(jax.vmap(jax.vmap(lambda pair: squared_distance(pair, jnp.asarray(POINT_TRIANGLE)))))
+"""Positions [points, facets, 4, 3] -> squared distances, m²."""
 
 
 def force_on_lower(body: Body, x: np.ndarray) -> float:
