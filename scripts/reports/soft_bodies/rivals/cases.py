@@ -21,15 +21,16 @@ from scripts.reports.soft_bodies.rivals.finer import cantilever
 from scripts.reports.soft_bodies.rivals.simulators import findings, number, rivals
 
 STEPS = (0.02, 0.01, 0.005, 0.002)
-LABELS = {
-    "backward-euler": "dln_jax, backward Euler",
-    "midpoint": "dln_jax, midpoint",
-    "mujoco-discrete": "MuJoCo, discrete",
-    "mujoco-euler": "MuJoCo, explicit Euler",
-    "newton-10": "Newton VBD, 10 sweeps",
-    "newton-50": "Newton VBD, 50 sweeps",
-    "newton-explicit": "Newton, explicit",
+LABELS: dict[str, tuple[str, str, int, tuple[float, float]]] = {
+    "backward-euler": ("dln_jax, backward Euler", style.SKY, 0, (8, 6)),
+    "midpoint": ("dln_jax, midpoint", style.BLUE, -1, (8, -4)),
+    "mujoco-discrete": ("MuJoCo, discrete", style.ORANGE, -1, (8, 0)),
+    "mujoco-euler": ("MuJoCo, explicit Euler", style.VERMILLION, 0, (-8, 0)),
+    "newton-10": ("Newton VBD, 10 sweeps", style.GREEN, -1, (8, 0)),
+    "newton-50": ("50 sweeps", "#44AA99", -1, (8, 0)),
+    "newton-explicit": ("Newton, explicit", style.PURPLE, -1, (8, -4)),
 }
+"""Label of a curve, its colour, the point at which it stands, and its offset from there in points."""
 
 
 def swing(quick: bool) -> Findings:
@@ -105,14 +106,19 @@ def hanging(quick: bool) -> Findings:
 
 
 def figure(curves: dict[str, Any]) -> Figure:
-    """Error against processor time per simulated second, each curve labelled at its end."""
+    """Error against processor time per simulated second, each curve with its label."""
     picture, [[axis]] = style.figure(1, 1, height=4.2)
-    for key, colour in style.colours_of(LABELS).items():
+    for key, (label, colour, place, offset) in LABELS.items():
         if key in curves:
-            seconds, errors = np.reshape(curves[key], (-1, 2)).T
-            axis.loglog(seconds, errors, "o-", color=colour, markersize=4, label=LABELS[key])
+            points = np.reshape(curves[key], (-1, 2))
+            points = points[np.isfinite(points).all(axis=1)]
+            ours = not key.startswith(("mujoco", "newton"))
+            axis.loglog(*points.T, "o-", color=colour, markersize=5, linewidth=2.2 if ours else 1.3)
+            look = {"color": colour, "fontsize": style.TEXT, "va": "center", "ha": "left" if offset[0] > 0 else "right"}
+            axis.annotate(label, points[place], offset, textcoords="offset points", annotation_clip=False, **look)
     axis.set(xlabel="processor time per simulated second, s", ylabel="relative error of the displacement")
-    style.legend(picture, *axis.get_legend_handles_labels(), loc="outside right upper")
+    low, high = axis.get_xlim()
+    axis.set_xlim(low / 8, high * 6)
     return picture
 
 
