@@ -22,13 +22,13 @@ from scripts.reports.soft_bodies.rivals.simulators import findings, number, riva
 
 STEPS = (0.02, 0.01, 0.005, 0.002)
 LABELS: dict[str, tuple[str, str, int, tuple[float, float]]] = {
-    "backward-euler": ("dln_jax, backward Euler", style.SKY, 0, (8, 6)),
-    "midpoint": ("dln_jax, midpoint", style.BLUE, -1, (8, -4)),
-    "mujoco-discrete": ("MuJoCo, discrete", style.ORANGE, -1, (8, 0)),
+    "backward-euler": ("dln_jax, backward Euler", style.SKY, 0, (-8, 6)),
+    "midpoint": ("dln_jax, midpoint", style.BLUE, -1, (8, -2)),
+    "mujoco-discrete": ("MuJoCo, discrete", style.ORANGE, 0, (-8, -6)),
     "mujoco-euler": ("MuJoCo, explicit Euler", style.VERMILLION, 0, (-8, 0)),
     "newton-10": ("Newton VBD, 10 sweeps", style.GREEN, -1, (8, 0)),
-    "newton-50": ("50 sweeps", "#44AA99", -1, (8, 0)),
-    "newton-explicit": ("Newton, explicit", style.PURPLE, -1, (8, -4)),
+    "newton-50": ("Newton VBD, 50 sweeps", "#44AA99", 0, (8, 2)),
+    "newton-explicit": ("Newton, explicit", style.PURPLE, -1, (-2, -13)),
 }
 """Label of a curve, its colour, the point at which it stands, and its offset from there in points."""
 
