@@ -206,5 +206,5 @@ def _draw_scale(axis: Axes, window: tuple[tuple[float, float], tuple[float, floa
 def _owners(mesh: Mesh, rim: Int[np.ndarray, "f 2"]) -> Int[np.ndarray, " f"]:
     """The element of every edge of the boundary."""
     sides = np.sort(mesh.elements[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    found = {tuple(side): number // 3 for number, side in enumerate(sides.tolist())}
-    return np.array([found[tuple(edge)] for edge in np.sort(rim, axis=1).tolist()])
+    elements = {tuple(side): number // 3 for number, side in enumerate(sides.tolist())}
+    return np.array([elements[tuple(edge)] for edge in np.sort(rim, axis=1).tolist()])
