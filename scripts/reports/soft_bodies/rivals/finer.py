@@ -66,17 +66,16 @@ def gradient(quick: bool) -> Findings:
         body = cantilever(3, quick=quick, law=law)
         up, down = (_height(body, factor) for factor in (1 + CHANGE, 1 - CHANGE))
         exact = (up - down) / (2 * CHANGE * body.modulus)
-        results = {
-            f"{rule}/{dt}": own.motion_gradient(body, rule, dt)
-            for rule, dt in (("midpoint", 0.01), ("midpoint", 0.005), ("backward-euler", 0.01))
-            if law == NEO_HOOKEAN or (rule, dt) == ("midpoint", 0.01)
-        }
-        explicit = simulators.get("newton_explicit")
-        if explicit and law == SMITH:
+        suffix = "" if law == NEO_HOOKEAN else "-smith"
+        steps = (("midpoint", 0.01), ("midpoint", 0.002), ("backward-euler", 0.01))[: 1 if suffix else 3]
+        results = {f"{rule}{suffix}/{dt}": own.motion_gradient(body, rule, dt) for rule, dt in steps}
+        if suffix and (explicit := simulators.get("newton_explicit")):
             results |= {f"newton-explicit/{dt}": explicit.motion_gradient(body, dt) for dt in (1e-3, 5e-4)}
-        for key, (run, value) in results.items():
+        for key, (run, value, differences) in results.items():
             case, text = f"gradient/{key}", f"of {exact:.4e} m/Pa by differences of the reference, {law}; {missing}"
             rows.append(number(case, "error", text.rstrip("; "), abs(value / exact - 1)))
+            text = "against differences of the same program"
+            rows.append(number(case, "error_of_differences", text, abs(value / differences - 1)))
             rows.append(number(case, "processor_seconds_per_second", law, run.seconds, "s"))
     return Findings(rows)
 

@@ -71,17 +71,20 @@ def motion(body: Body, integrator: str, dt: float, repetitions: int = 2) -> Run:
     return measured(body, lambda: jax.block_until_ready(program(params)), repetitions)
 
 
-def motion_gradient(body: Body, integrator: str, dt: float) -> tuple[Run, float]:
-    """Derivative of the mean height at the end by Young's modulus, in m/Pa, by reverse mode: time and value."""
+def motion_gradient(body: Body, integrator: str, dt: float, change: float = 1e-4) -> tuple[Run, float, float]:
+    """Derivative of the mean height at the end by Young's modulus, in m/Pa, by reverse mode.
+
+    Returns its time and value, and central differences of the same program for a relative change of the modulus.
+    """
     program, params = _program(body, integrator, dt), scene_of(body).params
 
-    @jax.jit
-    def slope(modulus: Any) -> Any:
-        height = lambda E: program(with_parameters(params, elastic={"youngs_modulus": E}))[-1, :, 2].mean()  # noqa: E731
-        return jax.grad(height)(modulus)
+    def height(modulus: Any) -> Any:
+        return program(with_parameters(params, elastic={"youngs_modulus": modulus}))[-1, :, 2].mean()
 
-    at = jnp.asarray(body.modulus)
-    return measured(body, lambda: jax.block_until_ready(slope(at))), float(slope(at))
+    at, slope = jnp.asarray(body.modulus), jax.jit(jax.grad(height))
+    differences = (height(at * (1 + change)) - height(at * (1 - change))) / (2 * change * at)
+    run = measured(body, lambda: jax.block_until_ready(slope(at)))
+    return run, float(run.x), float(differences)
 
 
 def static(body: Body) -> Run:
