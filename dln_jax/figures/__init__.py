@@ -8,11 +8,13 @@ from dln_jax.figures.joints import friction_curves
 from dln_jax.figures.phase_space import injection_figure, motion_figure
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
+from dln_jax.figures.soft_body_films import Slab, write_slab_film
 from dln_jax.figures.torques import force_decomposition, tip_paths, torque_bands, torque_by_joint
 from dln_jax.figures.training import training_curve
 
 __all__ = [
     "Moments",
+    "Slab",
     "cart_pole_drawing",
     "closed_loop_traces",
     "energies_against_time",
@@ -36,5 +38,6 @@ __all__ = [
     "write_closed_loop_gif",
     "write_frame_gif",
     "write_motion_gif",
+    "write_slab_film",
     "write_soft_body_gif",
 ]

@@ -4,6 +4,11 @@ Down the stairs
 
 A body from a mesh file falls down stairs. The stairs are rigid boxes with friction, and the body is in contact with
 them and with itself, by barriers that no step crosses.
+
+.. figure:: /stairs.gif
+   :alt: A soft ellipse tumbles down stairs
+
+   The film that this example writes, at a third of the speed.
 """
 
 from functools import partial
@@ -16,6 +21,7 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 
 from dln_jax.figures import style
+from dln_jax.figures.soft_body_films import write_slab_film
 from dln_jax.softbody import make_scene, make_step, rollout
 from dln_jax.softbody.contact import body_contact, box, crossings, obstacle_contact
 from dln_jax.softbody.mesh import disc, make_mesh, read_mesh, write_mesh
@@ -74,12 +80,29 @@ assert converged.all()
 assert not any(crossings(mesh, at) for at in x[::10])
 
 # %%
+# The film shows the body as a slab, with its shadow.
+
+every = np.concatenate([mesh.vertices[None], x])
+line = np.stack([np.stack([lefts, rights], axis=1).ravel(), np.repeat(tops[: len(lefts)], 2)], axis=1)
+line[[0, -1], 0] = -0.25, 1.75
+write_slab_film(
+    Path("stairs.gif"),
+    mesh,
+    every,
+    DT * np.arange(len(every)),
+    depth=0.22,
+    ground=line,
+    window=((-0.25, 1.75), (-0.14, 1.0)),
+    stride=2,
+    frames_per_second=50 / 3,
+)
+
+# %%
 # Four moments of the fall, the earliest palest, with the shadows on the stairs.
 
 figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
 for left, right, top in zip(lefts, rights, tops, strict=True):
     axes.add_patch(plt.Rectangle((left, -0.1), right - left, top + 0.1, color="0.82", linewidth=0))
-every = np.concatenate([mesh.vertices[None], x])
 for k in np.linspace(0, STEPS, 4).astype(int):
     alpha = 0.25 + 0.75 * k / STEPS
     corners = every[k]

@@ -7,12 +7,23 @@ from dln_jax.precision import in_float64
 from dln_jax.softbody.mesh.mesh import vertices_where
 from dln_jax.softbody.mesh.shapes import box
 from scripts.reports.soft_bodies.rivals import own
-from scripts.reports.soft_bodies.rivals.body import KIRCHHOFF, NEO_HOOKEAN, Body, reference_motion, relative_error
+from scripts.reports.soft_bodies.rivals.body import (
+    KIRCHHOFF,
+    NEO_HOOKEAN,
+    SMITH,
+    Body,
+    elastic_forces,
+    reference_motion,
+    relative_error,
+)
+from scripts.reports.soft_bodies.rivals.finer import cantilever
+from scripts.reports.soft_bodies.rivals.simulators import NEEDED, rivals
+from scripts.reports.soft_bodies.rivals.touching import depth, force_on_lower, hitting
 
 MESH = box((0.4, 0.2, 0.2), (2, 1, 1))
 
 
-@pytest.mark.parametrize("law", [NEO_HOOKEAN, KIRCHHOFF])
+@pytest.mark.parametrize("law", [NEO_HOOKEAN, KIRCHHOFF, pytest.param(SMITH, marks=pytest.mark.slow)])
 def test_explicit_reference_agrees_with_implicit_midpoint_steps(law):
     body = Body(MESH, vertices_where(MESH, lambda x: x[:, 0] == 0), 1e5, 0.3, np.array([0.1, 0.2]), law=law)
     reference = reference_motion(body, 4e-4)
@@ -32,3 +43,35 @@ def test_reference_of_a_fall_is_free_until_it_meets_the_floor():
         x[0] - mesh.vertices, np.tile([0.0, 0.0, -0.5 * 9.81 * 0.1**2], (len(mesh.vertices), 1)), atol=1e-9
     )
     assert x[1][:, 2].min() > -1e-3
+
+
+def test_laws_agree_at_small_strains():
+    body = cantilever(1)
+    x = body.mesh.vertices + 1e-6 * np.sin(7 * body.mesh.vertices[:, ::-1])
+    forces = [elastic_forces(body._replace(law=law))(x) for law in (NEO_HOOKEAN, KIRCHHOFF, SMITH)]
+    scale = np.abs(forces[0]).max()
+    for other in forces[1:]:
+        np.testing.assert_allclose(other, forces[0], atol=1e-4 * scale)
+
+
+def test_depth_of_blocks_that_overlap_and_distance_of_those_that_do_not():
+    body = hitting()
+    deepest, nearest = depth(body.mesh, body.mesh.vertices)
+    assert deepest == 0 and nearest == pytest.approx(6e-3)
+    upper = np.asarray(body.v)[:, 2] < 0
+    deepest, _ = depth(body.mesh, body.mesh.vertices - np.where(upper[:, None], [0.0, 0.0, 0.016], 0.0))
+    assert deepest == pytest.approx(0.01)
+
+
+def test_nothing_presses_on_a_block_that_rests_alone():
+    body = Body(MESH, vertices_where(MESH, lambda x: x[:, 2] == 0), 1e5, 0.3, np.ones(1))
+    x = in_float64(lambda: own.static(body))().x[0]
+    assert abs(force_on_lower(body, x)) < 1e-6 * 9.81 * 1000 * 0.4 * 0.2 * 0.2
+    assert np.abs(x - MESH.vertices).max() > 1e-4
+
+
+def test_missing_simulators_are_named_once():
+    simulators, missing = rivals()
+    for name, package in NEEDED.items():
+        assert (name in simulators) == (package not in missing)
+    assert missing.count("newton") <= 1

@@ -25,6 +25,7 @@ from scripts.reports.soft_bodies import (
     stiffness,
 )
 from scripts.reports.soft_bodies.rivals import cases as rivals
+from scripts.reports.soft_bodies.rivals import finer, touching
 
 MEASURES = {
     "references": (
@@ -45,7 +46,7 @@ MEASURES = {
         *(stiffness.steps, stiffness.factorisation),
     ),
     "compilation": (compilation.steps, compilation.gradient),
-    "rivals": (rivals.swing, rivals.drop, rivals.hanging),
+    "rivals": (rivals.swing, rivals.drop, rivals.hanging, finer.mesh, finer.gradient, touching.blocks),
 }
 """Functions quick -> findings, by subject."""
 FIGURES = {elements.locking: elements.locking_figure, rivals.swing: rivals.figure}

@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dln_jax.softbody.mesh.mesh import lumped_masses
+from dln_jax.softbody.mesh.mesh import components, lumped_masses
 from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, KIRCHHOFF, Body, Run, measured
 
 VERSION = mujoco.__version__
@@ -30,12 +30,17 @@ def model_of(body: Body, integrator: str, dt: float, solref: tuple[float, float]
         part.explicitinertial = True
         for axis in np.eye(3) if i not in held else ():
             part.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    flex = spec.add_flex(name="body", dim=3, radius=RADIUS, young=body.modulus, poisson=body.ratio, condim=1)
-    flex.elastic3d = int(body.law != KIRCHHOFF)
-    flex.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
-    flex.vertbody = [f"v{i}" for i in range(len(masses))]
-    flex.elem = body.mesh.elements.ravel().tolist()
-    flex.solref = solref
+    number = components(body.mesh)
+    for part in range(number.max() + 1):
+        elements = body.mesh.elements[number == part]
+        mine = np.unique(elements)
+        flex = spec.add_flex(name=f"body{part}", dim=3, radius=RADIUS, young=body.modulus, poisson=body.ratio, condim=1)
+        flex.elastic3d = int(body.law != KIRCHHOFF)
+        flex.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+        flex.vertbody = [f"v{i}" for i in mine]
+        flex.elem = np.searchsorted(mine, elements).ravel().tolist()
+        flex.solref = solref
+        flex.margin = body.near / 2  # margins of two flexes add up
     if body.floor:
         floor = {"pos": [0.0, 0.0, -RADIUS], "size": [5.0, 5.0, 0.1], "condim": 1, "solref": solref}
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, **floor)
@@ -44,7 +49,9 @@ def model_of(body: Body, integrator: str, dt: float, solref: tuple[float, float]
         return spec.compile()
 
 
-def motion(body: Body, integrator: str, dt: float, solref: tuple[float, float] = (0.02, 1.0)) -> Run:
+def motion(
+    body: Body, integrator: str, dt: float, solref: tuple[float, float] = (0.02, 1.0), repetitions: int = 2
+) -> Run:
     """A motion with steps of dt in s."""
     model = model_of(body, integrator, dt, solref)
     free = np.setdiff1d(np.arange(len(body.mesh.vertices)), body.held)
@@ -52,6 +59,7 @@ def motion(body: Body, integrator: str, dt: float, solref: tuple[float, float] =
 
     def run() -> np.ndarray:
         data, out = mujoco.MjData(model), []
+        data.qvel = (body.v + np.zeros_like(body.mesh.vertices))[free].ravel()
         for count in np.diff(ends, prepend=0):
             mujoco.mj_step(model, data, int(count))
             x = body.mesh.vertices.copy()
@@ -59,4 +67,4 @@ def motion(body: Body, integrator: str, dt: float, solref: tuple[float, float] =
             out.append(x)
         return np.array(out)
 
-    return measured(body, run)
+    return measured(body, run, repetitions)

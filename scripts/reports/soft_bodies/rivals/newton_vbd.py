@@ -16,7 +16,7 @@ from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, Body, Run,
 VERSION = newton.__version__
 
 
-def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Run:
+def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3, repetitions: int = 2) -> Run:
     """A motion with steps of dt in s; the stiffness of contact in N/m is Newton's default."""
     mu, lam = body.lame
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
@@ -33,8 +33,9 @@ def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Ru
         k_lambda=lam,
         k_damp=0.0,
         particle_radius=0.0,
-        add_surface_mesh_edges=False,
+        add_surface_mesh_edges=body.near > 0,
     )
+    builder.particle_qd = [wp.vec3(*v) for v in body.v + np.zeros_like(body.mesh.vertices)]
     for vertex in body.held:
         builder.particle_mass[vertex] = 0.0
     if body.floor:
@@ -42,7 +43,10 @@ def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Ru
     builder.color()
     model = builder.finalize(device="cpu")
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = stiffness, 0.0, 0.0
-    solver = newton.solvers.SolverVBD(model, iterations=iterations, particle_enable_tile_solve=False)
+    touching = {"particle_enable_self_contact": True, "particle_self_contact_margin": body.near}
+    touching |= {"particle_self_contact_gap": body.near}
+    options = {"iterations": iterations, "particle_enable_tile_solve": False, **(touching if body.near else {})}
+    solver = newton.solvers.SolverVBD(model, **options)
     pipeline = newton.CollisionPipeline(model)
     contacts, control = pipeline.contacts(), model.control()
     ends = np.round(body.times / dt).astype(int)
@@ -52,11 +56,11 @@ def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3) -> Ru
         for count in np.diff(ends, prepend=0):
             for _ in range(count):
                 now.clear_forces()
-                if body.floor:
+                if body.floor or body.near:
                     pipeline.collide(now, contacts)
                 solver.step(now, after, control, contacts, dt)
                 now, after = after, now
             out.append(now.particle_q.numpy().astype(float))
         return np.array(out)
 
-    return measured(body, run)
+    return measured(body, run, repetitions)
