@@ -27,6 +27,7 @@ from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.types import InputError
 
 WINDOW = 6
+STEPS = 10_000
 QUICK = GradientSettings(window=WINDOW, lanes=2, learning_rate=0.05, updates=4, value_fits=4)
 
 
@@ -42,7 +43,7 @@ def policy(task):
 
 @pytest.fixture(scope="module")
 def compiled(task, policy):
-    return compile_learner(task, make_gradient_learner(task, policy, QUICK))
+    return compile_learner(task, make_gradient_learner(task, policy, QUICK, steps=STEPS))
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def test_the_environment_passes_gymnasiums_checks(environment):
     check_env(environment, skip_render_check=True)
 
 
-def test_reward_is_the_displacement_less_the_posture(environment, task):
+def test_reward_is_the_displacement_up_to_a_speed_less_the_posture(environment, task):
     environment.reset(seed=0)
     rest = task.creature.mesh.vertices
     x, random = rest, np.random.default_rng(0)
@@ -71,7 +72,8 @@ def test_reward_is_the_displacement_less_the_posture(environment, task):
         a = linear[:, 0] / np.linalg.norm(linear[:, 0])
         posture = 1 - a[0] + 25 * max(0, 0.8 - after[:, 1].mean() / rest[:, 1].mean()) ** 2
         displacement = (after[:, 0].mean() - x[:, 0].mean()) / task.length
-        np.testing.assert_allclose(reward, displacement - task.upright * posture, rtol=1e-9, atol=1e-12)
+        worth = 0.04 * np.tanh(displacement / 0.04)
+        np.testing.assert_allclose(reward, worth - task.upright * posture, rtol=1e-9, atol=1e-12)
         assert not terminated and truncated == (count == EPISODE) and info["converged"]
         x = after
 
@@ -205,6 +207,7 @@ def test_updates_without_a_gradient_are_skipped_and_counted(compiled):
     [
         (("--steps", "0"), "steps is 0"),
         (("--upright", "-1"), "--upright is -1"),
+        (("--speed", "-1"), "--speed is -1"),
         (("--resume", "--out", "run"), "holds none"),
         (("--window", "0"), "window is 0"),
         (("--slope", "90"), "slope is 90"),
@@ -224,7 +227,7 @@ def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message
 def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy):
     mesh = Mesh(np.array(7 * jax.devices()[:1]), (AXIS,))
     with pytest.raises(InputError, match="creatures side by side cannot be split over 7 devices"):
-        make_gradient_learner(task, policy, QUICK, mesh=mesh)
+        make_gradient_learner(task, policy, QUICK, steps=STEPS, mesh=mesh)
 
 
 def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):
