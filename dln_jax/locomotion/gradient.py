@@ -126,6 +126,7 @@ def train(
     width: int = WIDTH,
     window: int | None = None,
     lanes: int | None = None,
+    initial: Parameters | None = None,
     directory: Path | None = None,
     resume: bool = False,
     mesh: Mesh | None = None,
@@ -140,6 +141,7 @@ def train(
         width: of the hidden layer of the policy.
         window: steps that gradients go back (default: 32).
         lanes: creatures side by side (default: 4).
+        initial: parameters of a policy of this width that is trained further (default: random ones).
         directory: where states are stored.
         resume: continue the runs stored there.
         mesh: devices that share the creatures simulated side by side.
@@ -149,7 +151,10 @@ def train(
         InputError: settings out of range, a stored run with others, or a mesh that does not divide the creatures.
     """
     settings = settings_of(window, lanes)
-    learner = make_gradient_learner(task, make_policy(task, width=width), settings, steps=goal.steps, mesh=mesh)
+    policy = make_policy(task, width=width)
+    if initial is not None:
+        policy = policy._replace(init=lambda _: initial)
+    learner = make_gradient_learner(task, policy, settings, steps=goal.steps, mesh=mesh)
     facts = {"creature": task.creature.name, "width": width, "episode": task.episode, "steps": goal.steps}
     facts |= {"upright": task.upright, "speed": task.speed, **task.variation._asdict(), **settings._asdict()}
     compiled = compile_learner(task, learner, mesh)

@@ -24,6 +24,7 @@ from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP, ground_height
+from dln_jax.training.locomotion_evaluation import judge
 from dln_jax.training.locomotion_options import LocomotionOptions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.parameter_files import save_tree
@@ -65,7 +66,7 @@ def announce(task: LocomotionTask) -> None:
 
 
 def trained(task: LocomotionTask, options: LocomotionOptions, mesh: Mesh | None, **stored: Any) -> TrainedPolicies:
-    """Trains all seeds; `stored` are the arguments of `train` on checkpoints."""
+    """Trains all seeds; `stored` are the arguments of `train` on initial parameters and checkpoints."""
 
     def run(seeds: Sequence[int], goal: Goal, report: Report) -> TrainedPolicies:
         sizes = {"width": options.width, "window": options.window, "lanes": options.lanes}
@@ -124,7 +125,10 @@ def write_run(
     seen = shown_walk(task, policies.policy, best.parameters, task.episode, start)
     numbers = metrics_of(task, policies, seen)
     if any(task.variation):
-        numbers |= numbers_of(perturbed_trials(task, policies.policy, best.parameters))
+        trials = perturbed_trials(task, policies.policy, best.parameters)
+        verdict = judge(trials)
+        numbers |= {**numbers_of(trials), "verdict": float(verdict.number)}
+        print(verdict.line)
     write_json(folder / "metrics.json", numbers)
     if figures:
         records = [seed.records for seed in policies.learned]

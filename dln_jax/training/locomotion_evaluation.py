@@ -9,7 +9,7 @@ import msgspec
 
 from dln_jax.files import as_type
 from dln_jax.locomotion.learning import Parameters, Policy, make_policy
-from dln_jax.locomotion.perturbed import Trials
+from dln_jax.locomotion.perturbed import STEPS, Trials
 from dln_jax.locomotion.task import LocomotionTask, creature_named, make_task
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.metrics.verdict import Verdict
@@ -28,6 +28,7 @@ class StoredPolicy(NamedTuple):
     task: LocomotionTask
     policy: Policy
     parameters: Parameters
+    width: int
 
 
 class _Settings(msgspec.Struct):
@@ -71,10 +72,25 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
     if changed:
         task = make_task(creature, variation=trained._replace(**changed), clock_period=model.clock_period)
     like = jax.eval_shape(policy.init, jax.random.key(0))
-    return StoredPolicy(task, policy, load_tree(folder, MODEL, like))
+    return StoredPolicy(task, policy, load_tree(folder, MODEL, like), model.settings.width)
 
 
-def judge(trials: Trials, steps: int) -> Verdict:
+def parameters_for(task: LocomotionTask, width: int, folder: Path) -> Parameters:
+    """Loads the parameters of a stored policy, to train it further on a task.
+
+    Raises:
+        InputError: as `load_policy`, or a policy of another creature, width or clock.
+    """
+    stored = load_policy(folder)
+    policies = ((task, width), (stored.task, stored.width))
+    sizes, own = ({"creature": t.creature.name, "width": w, "clock-period": t.clock_period} for t, w in policies)
+    for name, value in sizes.items():
+        if own[name] != value:
+            raise InputError(f"the policy in {folder} has {name} {own[name]}, not {value}; give --{name} {own[name]}")
+    return stored.parameters
+
+
+def judge(trials: Trials, steps: int = STEPS) -> Verdict:
     """Returns the verdict by the share of episodes without a fall; doubtful if one of them ends behind its start."""
     standing, count = trials.standing(steps), len(trials.steps)
     reason = f"{standing.sum()} of {count} episodes of {steps} steps end without a fall"

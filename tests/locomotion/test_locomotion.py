@@ -15,10 +15,11 @@ from small_creature import EPISODE, block_task
 
 from dln_jax.cli.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
+from dln_jax.locomotion import gradient
 from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.frames import axes_of, fitted_frame, vertex_frame
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
+from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task, walk
 from dln_jax.locomotion.value import Window, targets
 from dln_jax.locomotion.worlds import Variation
@@ -189,6 +190,23 @@ def test_an_interrupt_waits_for_the_checkpoint(compiled, tmp_path):
     assert len(json.loads((tmp_path / "parts" / "checkpoint-3.json").read_text())["records"]) == 1
     continued, whole = learned(compiled, tmp_path / "parts", resume=True), learned(compiled, tmp_path / "whole")
     assert same(continued.parameters, whole.parameters)
+
+
+def test_training_further_begins_at_the_stored_policy(task, policy, monkeypatch):
+    compiled, initial = [], policy.init(jax.random.key(9))
+    monkeypatch.setattr(gradient, "compile_learner", lambda task, learner, mesh: compiled.append(learner))
+    monkeypatch.setattr(gradient, "learn_seeds", lambda *_, **__: gradient.TrainedPolicies(policy, []))
+    gradient.train(task, seeds=[0], goal=Goal(1), width=3, initial=initial)
+    gradient.train(task, seeds=[0], goal=Goal(1), width=3)
+    further, new = (learner.parameters(learner.start(0)) for learner in compiled)
+    assert same(further, initial) and not same(new, initial)
+
+
+def test_selection_prefers_starts_that_succeed_and_then_distance():
+    records = [Record(1, 1.0, 9.0, 0, 0.5), Record(2, 2.0, 3.0, 0, 1.0), Record(3, 3.0, np.nan, 0, 1.0)]
+    learned = Learned({}, [*records, Record(4, 4.0, 5.0, 0, 1.0), Record(5, 5.0, 4.0, 0, 1.0)], 0.0)
+    assert learned.selected.steps == 4 and learned.distance == 5.0
+    assert Learned({}, records[2:], 0.0).selected is None
 
 
 def test_updates_without_a_gradient_are_skipped_and_counted(compiled):

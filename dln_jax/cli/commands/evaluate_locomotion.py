@@ -49,7 +49,7 @@ def main(options: Arguments) -> None:
     require_positive(**sizes)
     require_seed(options.seed)
     ground = {name: getattr(options, name) for name in ("start", "slope", "rough", "push")}
-    task, policy, parameters = load_policy(options.run, **ground)
+    task, policy, parameters, _ = load_policy(options.run, **ground)
     with command_folder(options, "evaluate_locomotion") as folder:
         trials = perturbed_trials(task, policy, parameters, **sizes, seed=options.seed)
         verdict, numbers = judge(trials, options.steps), numbers_of(trials, options.steps)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.cli.commands import evaluate_locomotion
+from dln_jax.cli.commands import evaluate_locomotion, train_locomotion
 from dln_jax.locomotion.learning import make_policy
 from dln_jax.locomotion.perturbed import Trials, numbers_of
 from dln_jax.locomotion.task import creature_named, make_task
@@ -55,6 +55,20 @@ def test_uphill_and_downhill_are_counted_apart_and_an_episode_that_fails_to_conv
     assert numbers["perturbed_starts_downhill"] == 3 and numbers["perturbed_without_fall_downhill"] == 1
     assert numbers["perturbed_distance_body_lengths_median_uphill"] == -1
     assert not [name for name in numbers_of(trials([1.0], [10], [0.0]), STEPS) if "hill" in name]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--creature", "biped", "--width", "5"), "has creature crawler, not biped; give --creature crawler"),
+        (("--width", "6", "--clock-period", "9"), "has width 5, not 6; give --width 5"),
+        (("--width", "5"), "has clock-period 9.0, not 16.0; give --clock-period 9.0"),
+    ],
+)
+def test_a_policy_of_another_shape_is_not_trained_further(run, capsys, tmp_path, arguments, message):
+    out = tmp_path / "out"
+    assert message in refused(capsys, train_locomotion, "--stored", run, *arguments, "--out", out)
+    assert not out.exists()
 
 
 @pytest.mark.slow
