@@ -53,7 +53,7 @@ LARGEST_CHANGE = 0.3
 """Of an actuation in one step, as published."""
 POSITION_UNIT = 0.1
 """Unit of observed positions, in body lengths."""
-UPRIGHT = 0.2
+UPRIGHT = 0.05
 """w, in body lengths per step."""
 SPEED = 0.04
 """s, in body lengths per step; 0 for no limit."""

@@ -20,7 +20,7 @@ class LocomotionOptions:
     """Environment steps of each seed (default: 400000)."""
     until: Unstated[float] = None
     """Body lengths at which a seed ends (default: no limit)."""
-    upright: float = 0.2
+    upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
     speed: float = 0.04
     """Speed far above which is hardly rewarded, body lengths per step; 0 for no limit."""
