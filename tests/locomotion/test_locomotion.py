@@ -202,6 +202,18 @@ def test_training_further_begins_at_the_stored_policy(task, policy, monkeypatch)
     assert same(further, initial) and not same(new, initial)
 
 
+def test_the_rate_falls_and_averages_follow_the_parameters(compiled):
+    def away(one, other):
+        return max(np.abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True))
+
+    state = compiled.learner.start(0)
+    after = compiled.improve(state)
+    assert 0 < away(after.averaged, after.parameters) < away(state.parameters, after.parameters)
+    counted = jax.tree.map(lambda a: a + 10**6 * (a.dtype.kind == "i"), state.optimiser)
+    late = compiled.improve(state._replace(optimiser=counted))
+    assert 0 < away(state.parameters, late.parameters) < 0.1 * away(state.parameters, after.parameters)
+
+
 def test_selection_prefers_starts_that_succeed_and_then_distance():
     records = [Record(1, 1.0, 9.0, 0, 0.5), Record(2, 2.0, 3.0, 0, 1.0), Record(3, 3.0, np.nan, 0, 1.0)]
     learned = Learned({}, [*records, Record(4, 4.0, 5.0, 0, 1.0), Record(5, 5.0, 4.0, 0, 1.0)], 0.0)

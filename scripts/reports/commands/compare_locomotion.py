@@ -42,7 +42,7 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     """Of each method, one after the other."""
     steps: Unstated[int] = None
     """Environment steps of each seed (default: 400000 by gradients, 500000 by evolution, 300000 by
-    ppo, 40000 by sac)."""
+    ppo, 20000 by sac)."""
     until: Unstated[float] = 6.0
     """Body lengths at which a seed ends (default: 6)."""
     start: float = 0.0

@@ -45,7 +45,7 @@ class SACSettings(NamedTuple):
     """Units of the two hidden layers of actor and critics."""
 
 
-STEPS = 40_000
+STEPS = 20_000
 """Environment steps by default."""
 
 
