@@ -29,13 +29,13 @@ class SACSettings(NamedTuple):
     steps: int = 80
     """Steps of each lane between two evaluations."""
     batch: int = 256
-    updates: int = 4
+    updates: int = 8
     """Gradient steps after every step of all lanes."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
     discount: float = 0.98
     following: float = 0.02
     """tau, share of the critics that their copies take over in an update."""
-    temperature: float = 1.0
+    temperature: float = 0.01
     """Initial weight of the entropy, which is adapted."""
     coherent: int = 0
     """Steps after which the noise of the actions, a function of the state (gSDE), is drawn anew; 0 for white noise."""
