@@ -12,7 +12,8 @@ V is fitted to TD(lambda) targets, made by a slowly following copy of itself:
     G_t = r_t + gamma ((1 - lambda) V'(o_t+1) + lambda G_t+1),    G_H = V'(o_H)
 
 A lane's gradient is clipped, and left out if it is not finite. The gradient is the mean over lanes in their order, so
-that it does not depend on their assignment to devices.
+that it does not depend on their assignment to devices. The learning rate falls along a cosine, and the policy that is
+evaluated and kept has running averages of the parameters: single updates throw a gait off balance and back.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,6 +41,7 @@ from dln_jax.locomotion.learning import (
     compile_learner,
     learn,
     make_policy,
+    rank,
 )
 from dln_jax.locomotion.task import EpisodeState, LocomotionTask, Walk, advance, beginning, chosen, observe, walk
 from dln_jax.locomotion.value import Window, make_value, targets
@@ -59,7 +61,11 @@ class GradientSettings(NamedTuple):
     deviation: float = 0.01
     """s, of the parameters."""
     learning_rate: float = 0.01
-    """Of Adam, for the policy."""
+    """Of Adam, for the policy, at first."""
+    last_rate: float = 0.03
+    """The last learning rate relative to the first."""
+    average: float = 0.99
+    """Weight of the earlier parameters in their running average after an update."""
     value_learning_rate: float = 0.002
     """Of Adam, for the value."""
     value_fits: int = 16
@@ -71,13 +77,17 @@ class GradientSettings(NamedTuple):
     following: float = 0.2
     """Share of the value that its copy takes over in an update."""
     updates: int = 5
-    """Between two evaluations."""
+    """Between two evaluations by an episode from rest."""
+    varied_updates: int = 100
+    """Between two evaluations by several starts, which take longer."""
 
 
 class GradientState(NamedTuple):
     """State of the learning."""
 
     parameters: Parameters
+    averaged: Parameters
+    """Running averages of the parameters."""
     optimiser: Any
     value: Parameters
     value_optimiser: Any
@@ -98,8 +108,8 @@ class TrainedPolicies(NamedTuple):
 
     @property
     def best(self) -> Learned:
-        """The seed with the longest distance."""
-        return max(self.learned, key=lambda seed: seed.distance if np.isfinite(seed.distance) else -np.inf)
+        """The seed whose selected policy was evaluated best."""
+        return max(self.learned, key=lambda seed: rank(seed.selected))
 
 
 def settings_of(window: int | None = None, lanes: int | None = None) -> GradientSettings:
@@ -116,6 +126,7 @@ def train(
     width: int = WIDTH,
     window: int | None = None,
     lanes: int | None = None,
+    initial: Parameters | None = None,
     directory: Path | None = None,
     resume: bool = False,
     mesh: Mesh | None = None,
@@ -130,6 +141,7 @@ def train(
         width: of the hidden layer of the policy.
         window: steps that gradients go back (default: 32).
         lanes: creatures side by side (default: 4).
+        initial: parameters of a policy of this width that is trained further (default: random ones).
         directory: where states are stored.
         resume: continue the runs stored there.
         mesh: devices that share the creatures simulated side by side.
@@ -139,9 +151,12 @@ def train(
         InputError: settings out of range, a stored run with others, or a mesh that does not divide the creatures.
     """
     settings = settings_of(window, lanes)
-    learner = make_gradient_learner(task, make_policy(task, width=width), settings, mesh=mesh)
-    facts = {"creature": task.creature.name, "width": width, "episode": task.episode, "upright": task.upright}
-    facts |= {**task.variation._asdict(), **settings._asdict()}
+    policy = make_policy(task, width=width)
+    if initial is not None:
+        policy = policy._replace(init=lambda _: initial)
+    learner = make_gradient_learner(task, policy, settings, steps=goal.steps, mesh=mesh)
+    facts = {"creature": task.creature.name, "width": width, "episode": task.episode, "steps": goal.steps}
+    facts |= {"upright": task.upright, "speed": task.speed, **task.variation._asdict(), **settings._asdict()}
     compiled = compile_learner(task, learner, mesh)
     return learn_seeds(compiled, seeds, goal, report, directory=directory, settings=facts, resume=resume)
 
@@ -159,9 +174,14 @@ def make_gradient_learner(
     policy: Policy,
     settings: GradientSettings = GradientSettings(),  # noqa: B008
     *,
+    steps: int,
     mesh: Mesh | None = None,
 ) -> Learner:
-    """Returns the learner; raises `InputError` for settings out of range, or a mesh that does not divide the lanes."""
+    """Returns the learner, whose learning rate falls over `steps` environment steps.
+
+    Raises:
+        InputError: settings out of range, or a mesh that does not divide the lanes.
+    """
     require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
     shares(mesh, settings.lanes, LANES)
     if settings.lanes % 2:
@@ -170,7 +190,9 @@ def make_gradient_learner(
         )
     lanes, window, discount = settings.lanes, settings.window, settings.discount
     clipped = optax.clip_by_global_norm(1.0)
-    optimiser = optax.adam(settings.learning_rate, b1=0.7, b2=0.95)
+    in_all = max(1, steps // (lanes * window))
+    rate = optax.cosine_decay_schedule(settings.learning_rate, in_all, settings.last_rate)
+    optimiser = optax.adam(rate, b1=0.7, b2=0.95)
     value_init, value_of = make_value(task.observation_size)
     value_optimiser = optax.adam(settings.value_learning_rate)
 
@@ -178,7 +200,8 @@ def make_gradient_learner(
         parameters, value = policy.init(jax.random.key(seed)), value_init(jax.random.fold_in(jax.random.key(seed), 1))
         places = jax.vmap(lambda key: beginning(task, key))(jax.random.split(jax.random.key(seed), lanes))
         moments, zero = (optimiser.init(parameters), value_optimiser.init(value)), jnp.asarray(0)
-        return GradientState(parameters, moments[0], value, moments[1], value, places, jnp.asarray(seed), zero, zero)
+        own = parameters, parameters, moments[0], value, moments[1], value, places
+        return GradientState(*own, jnp.asarray(seed), zero, zero)
 
     def loss(parameters: Parameters, value: Parameters, noise: Parameters, place: EpisodeState) -> tuple[Array, Any]:
         own = jax.tree.map(lambda p, eps: p + settings.deviation * eps, parameters, noise)
@@ -220,6 +243,9 @@ def make_gradient_learner(
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
         parameters, moments = chosen(finite.any(), (moved, moments), (state.parameters, state.optimiser))
+        # The first averages are of a few updates, so that they forget the initial parameters.
+        kept = jnp.minimum(settings.average, (1.0 + state.updates) / (10.0 + state.updates))
+        averaged = optax.incremental_update(parameters, state.averaged, 1.0 - kept)
 
         values = jax.vmap(jax.vmap(partial(value_of, state.followed)))(records.seen)
         aims = jax.vmap(partial(targets, discount=discount, trace=settings.trace))(records, values)
@@ -241,17 +267,16 @@ def make_gradient_learner(
         starts = jax.vmap(lambda key: beginning(task, key))(jax.random.split(for_starts, lanes))
         places = jax.vmap(chosen)(over, starts, ends)
         skipped = state.skipped + (~finite.all()).astype(state.skipped.dtype)
-        after = GradientState(
-            parameters, moments, value, value_moments, followed, places, state.seed, state.updates + 1, skipped
-        )
-        return after, None
+        learned = parameters, averaged, moments, value, value_moments, followed, places
+        return GradientState(*learned, state.seed, state.updates + 1, skipped), None
 
+    updates = settings.varied_updates if any(task.variation) else settings.updates
     return Learner(
         policy=policy,
         start=start,
-        improve=lambda state: jax.lax.scan(update, state, length=settings.updates)[0],
-        parameters=lambda state: state.parameters,
-        steps=settings.updates * lanes * window,
+        improve=lambda state: jax.lax.scan(update, state, length=updates)[0],
+        parameters=lambda state: state.averaged,
+        steps=updates * lanes * window,
     )
 
 

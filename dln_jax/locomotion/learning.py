@@ -5,7 +5,9 @@
 
 Layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. An environment step
 is one step of the simulator for one creature. A policy is evaluated after every call of `improve`, by one
-episode from rest or, if the task varies, by several starts; the steps of evaluations are counted separately.
+episode from rest or, if the task varies, by several starts on the steepest slopes that walk for the length of several
+episodes, because falls are rare. The steps of evaluations are counted separately. The policy that is kept is the one
+with most starts that succeed, and among those the one that goes farthest.
 """
 
 import math
@@ -42,7 +44,8 @@ WIDTH = 64
 """Hidden units of the policy."""
 VALIDATION = 2_000_000
 """Seed of the starts by which a policy is selected; neither learning nor `perturbed` draws them."""
-VALIDATION_STARTS = 8
+VALIDATION_STARTS, VALIDATION_EPISODES = 16, 5
+"""Starts, and the length of their walks in episodes."""
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
 LANES = "creatures side by side"
@@ -68,9 +71,18 @@ class Record(NamedTuple):
     seconds: float
     """Wall time so far: compilation, learning and evaluation, without interruptions."""
     distance: float
-    """Body lengths in one episode from rest."""
+    """Body lengths in one episode, before a fall: from rest, or the mean of several starts."""
     skipped: int
     """Updates skipped so far because a step of the simulator did not converge."""
+    succeeded: float = 0.0
+    """Share of the starts that end without a fall, and at least a body length ahead."""
+
+
+def rank(record: Record | None) -> tuple[float, float]:
+    """Key by which evaluations are compared: successful starts, then distance."""
+    if record is None or not math.isfinite(record.distance):
+        return -math.inf, -math.inf
+    return record.succeeded, record.distance
 
 
 class Learner(NamedTuple):
@@ -105,14 +117,19 @@ class Learned(NamedTuple):
     """Result of learning with one seed."""
 
     parameters: Parameters
-    """Parameters with the longest distance in an evaluation."""
+    """Parameters of the best evaluation."""
     records: list[Record]
     compile_seconds: float
 
     @property
+    def selected(self) -> Record | None:
+        """The best evaluation; `None` if none is finite."""
+        return max((r for r in self.records if math.isfinite(r.distance)), key=rank, default=None)
+
+    @property
     def distance(self) -> float:
-        """Longest distance in an evaluation, in body lengths."""
-        return max((r.distance for r in self.records if math.isfinite(r.distance)), default=math.nan)
+        """Distance of the best evaluation, in body lengths."""
+        return math.nan if self.selected is None else self.selected.distance
 
 
 class Goal(NamedTuple):
@@ -152,24 +169,33 @@ def compile_learner(task: LocomotionTask, learner: Learner, mesh: Mesh | None = 
 def compile_evaluation(
     task: LocomotionTask, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
 ) -> Callable[[Parameters], Any]:
-    """Parameters -> body lengths in one episode from rest, or the mean of several starts of the task's variation.
+    """Parameters -> `distance` and `succeeded` of a `Record`: of an episode from rest, or several varied starts.
 
     A start with a step that does not converge counts 0. Every device walks, and the first device's result counts.
     """
+    starts, episodes = (VALIDATION_STARTS, VALIDATION_EPISODES) if any(task.variation) else (1, 1)
+    longer = task._replace(episode=episodes * task.episode)
 
-    def distance(parameters: Parameters, ones: Array) -> Array:
-        def walked(start: EpisodeState | None) -> Array:
-            return run_episode(task, lambda observation: policy.apply(parameters, observation), start).distance
+    def evaluated(parameters: Parameters, ones: Float[Array, "1 1"]) -> Float[Array, "1 2"]:
+        def walked(start: EpisodeState | None) -> Float[Array, " 2"]:
+            walk = run_episode(longer, lambda observation: policy.apply(parameters, observation), start)
+            succeeded = (walk.steps >= longer.episode) & (walk.distance >= 1.0)
+            return jnp.stack([walk.distance / episodes, succeeded.astype(walk.distance.dtype)])
 
-        if not any(task.variation):
+        if starts == 1:
             return ones * walked(None)
-        keys = jax.random.split(jax.random.key(VALIDATION), VALIDATION_STARTS)
-        distances = jax.vmap(lambda key: walked(beginning(task, key)))(keys)
-        return ones * jnp.mean(jnp.nan_to_num(distances))
+        keys = jax.random.split(jax.random.key(VALIDATION), starts)
+        results = jax.vmap(lambda key: walked(beginning(task, key, steepest=True)))(keys)
+        return ones * jnp.nan_to_num(results).mean(axis=0)
 
     # Devices of different models may round differently, and must come to the same decisions.
-    evaluate = program(lambda parameters: spread(distance, mesh)(parameters, jnp.ones(1))[0], mesh)
+    evaluate = program(lambda parameters: spread(evaluated, mesh)(parameters, jnp.ones((1, 1)))[0], mesh)
     return evaluate.lower(parameters).compile(quick_compilation())
+
+
+def evaluation_steps(task: LocomotionTask) -> int:
+    """Environment steps of one evaluation."""
+    return task.episode * (VALIDATION_STARTS * VALIDATION_EPISODES if any(task.variation) else 1)
 
 
 def learn(
@@ -203,18 +229,18 @@ def learn(
     best, records = learner.parameters(state), []
     if resume and directory is not None and has_checkpoint(directory, name):
         (state, best), records = _restored(directory, name, identity, (state, best))
-    farthest = max((record.distance for record in records), default=-math.inf)
+    highest = max(map(rank, records), default=rank(None))
     before = records[-1].seconds if records else compiled.seconds
     began = time.perf_counter()
     while not (records and (records[-1].steps >= goal.steps or records[-1].distance >= goal.distance)):
         with held_back():
             state = compiled.improve(state)
-            distance = float(compiled.evaluate(learner.parameters(state)))
-            if distance > farthest:
-                farthest, best = distance, learner.parameters(state)
+            distance, succeeded = map(float, compiled.evaluate(learner.parameters(state)))
             steps = (records[-1].steps if records else 0) + learner.steps
             seconds = before + time.perf_counter() - began
-            records.append(Record(steps, seconds, distance, int(learner.skipped(state))))
+            records.append(Record(steps, seconds, distance, int(learner.skipped(state)), succeeded))
+            if rank(records[-1]) > highest:
+                highest, best = rank(records[-1]), learner.parameters(state)
             if directory is not None:
                 rows = [[value if math.isfinite(value) else None for value in record] for record in records]
                 stored = {**identity, "records": rows}
@@ -227,6 +253,6 @@ def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -
     manifest = checkpoints.load_manifest(directory, name)
     if manifest.get("settings") != finite_values(identity["settings"]):
         raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
-    rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int])
-    records = [Record(steps, seconds, math.nan if d is None else d, n) for steps, seconds, d, n in rows]
+    rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int, float])
+    records = [Record(steps, seconds, math.nan if d is None else d, *rest) for steps, seconds, d, *rest in rows]
     return checkpoints.load_tree(directory, name, like), records

@@ -3,8 +3,9 @@
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dln_jax.locomotion.learning import Parameters, Policy
 from dln_jax.locomotion.task import LocomotionTask, beginning, run_episode
@@ -26,6 +27,12 @@ class Trials(NamedTuple):
     """Body lengths before a fall; NaN if a step did not converge."""
     steps: Int[np.ndarray, " n"]
     """Steps before a fall, or all."""
+    ahead: Float[np.ndarray, " n"]
+    """Gravity along x, in m/s²: positive downhill, negative uphill, 0 on level ground."""
+
+    def standing(self, steps: int) -> Bool[np.ndarray, " n"]:
+        """Which episodes of this many steps end without a fall."""
+        return np.isfinite(self.distance) & (self.steps >= steps)
 
 
 def perturbed_trials(
@@ -42,7 +49,8 @@ def perturbed_trials(
 
     def trial(parameters: Parameters, key: jax.Array):
         start = beginning(task, key, steepest=True)
-        return run_episode(task, lambda seen: policy.apply(parameters, seen), start)
+        episode = run_episode(task, lambda seen: policy.apply(parameters, seen), start)
+        return *episode, jnp.asarray(0.0) if start.world.gravity is None else start.world.gravity[0]
 
     keys = jax.random.split(jax.random.key(seed), starts)
     program = jax.jit(lambda parameters: jax.lax.map(lambda key: trial(parameters, key), keys, batch_size=LANES))
@@ -50,9 +58,21 @@ def perturbed_trials(
 
 
 def numbers_of(trials: Trials, steps: int = STEPS) -> dict[str, float]:
-    """Metrics: episodes, those without a fall, and the distance of the median and of the worst episode."""
-    finite = np.isfinite(trials.distance)
-    reached = {"perturbed_distance_body_lengths_median": np.median, "perturbed_distance_body_lengths_least": np.min}
-    distances = {name: float(of(trials.distance[finite])) for name, of in reached.items() if finite.any()}
-    counts = {"perturbed_starts": len(finite), "perturbed_steps": steps}
-    return {**counts, "perturbed_without_fall": float(np.sum(finite & (trials.steps >= steps))), **distances}
+    """Metrics: episodes, those without a fall, and the distance of the median and of the worst episode.
+
+    On slopes also the episodes without a fall and the median distance downhill and uphill.
+    """
+    standing = trials.standing(steps)
+    numbers = {"perturbed_starts": float(len(standing)), "perturbed_steps": float(steps)}
+    groups = {"": np.ones_like(standing), "_downhill": trials.ahead > 0, "_uphill": trials.ahead < 0}
+    for name, group in groups.items():
+        if not group.any():
+            continue
+        finite = trials.distance[group & np.isfinite(trials.distance)]
+        if name:
+            numbers[f"perturbed_starts{name}"] = float(group.sum())
+        numbers[f"perturbed_without_fall{name}"] = float(standing[group].sum())
+        if len(finite):
+            numbers[f"perturbed_distance_body_lengths_median{name}"] = float(np.median(finite))
+            numbers[f"perturbed_distance_body_lengths_least{name}"] = float(finite.min())
+    return numbers

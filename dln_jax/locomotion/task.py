@@ -2,15 +2,16 @@
 
     observation = [((x - o) Rᵀ - rest) / (0.1 L), v Rᵀ / (L / 1 s), R u, R h (in space), actuation, c]
     actuation of a step = clip(actuation + clip(change, -0.3, 0.3), 0.25, 1)
-    reward of a step = change of mean x / L - w posture - (1 if fallen)
+    reward of a step = s tanh(change of mean x / (s L)) - w posture - (1 if fallen)
     posture = 1 - cos tilt + (max(0, 0.8 - y / y_rest) / 0.2)²
 
 A policy maps the observation to the change of the muscles' actuation, which begins at 1. It sees the body in its own
 frame, of origin o and axes R (`frames`), so that all places along the ground are equivalent. L is the body length, u
 points against gravity, and h is the horizontal direction nearest to x. c is a clock, sin and cos of 2 pi t / P at step
-t, and a period P of 0 leaves it out. The tilt is the angle between the body's up and the ground's normal, and y the
-mean height. A body that has tilted by more than 1 rad has fallen, which ends the episode, and distance after it does
-not count: tall bodies would go far by rolling.
+t, and a period P of 0 leaves it out. Speeds far above s are hardly rewarded, because a creature that runs as fast as it
+can falls on slopes downhill; s = 0 rewards all speeds alike. The tilt is the angle between the body's up and the
+ground's normal, and y the mean height. A body that has tilted by more than 1 rad has fallen, which ends the episode,
+and distance after it does not count: tall bodies would go far by rolling.
 """
 
 from collections.abc import Callable
@@ -54,6 +55,8 @@ POSITION_UNIT = 0.1
 """Unit of observed positions, in body lengths."""
 UPRIGHT = 0.05
 """w, in body lengths per step."""
+SPEED = 0.04
+"""s, in body lengths per step; 0 for no limit."""
 CROUCHED = 0.8
 """Mean height, relative to that at rest, below which crouching is penalised."""
 FALLEN = 1.0
@@ -80,6 +83,8 @@ class LocomotionTask(NamedTuple):
     """Steps."""
     upright: float
     """w of the reward, in body lengths per step."""
+    speed: float
+    """s of the reward, in body lengths per step; 0 for no limit."""
     variation: Variation
     """How episodes differ."""
     clock_period: float
@@ -137,6 +142,7 @@ def make_task(
     *,
     episode: int = EPISODE,
     upright: float = UPRIGHT,
+    speed: float = SPEED,
     variation: Variation = FLAT,
     frame: Frame | None = None,
     clock_period: float = CLOCK_PERIOD,
@@ -153,7 +159,7 @@ def make_task(
     scene = creature_scene(creature, bumps)
     frame = fitted_frame(vertices) if frame is None else frame
     stepper = make_step(scene, TIME_STEP)
-    return LocomotionTask(creature, scene, stepper, frame, length, episode, upright, variation, clock_period)
+    return LocomotionTask(creature, scene, stepper, frame, length, episode, upright, speed, variation, clock_period)
 
 
 def creature_named(name: str) -> Creature:
@@ -166,7 +172,7 @@ def creature_named(name: str) -> Creature:
 def beginning(task: LocomotionTask, key: Array | None = None, *, steepest: bool = False) -> EpisodeState:
     """Returns the rest shape at rest on level ground, or by a key a start that is perturbed by the task's variation.
 
-    With `steepest`, slopes are the largest ones, up or down, instead of uniform between them.
+    With `steepest`, all slopes are the largest ones, up or down.
     """
     state, world = task.stepper.init(), level_world(task.variation, task.creature.mesh.dimension)
     if key is not None:
@@ -206,7 +212,8 @@ def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"
     travelled = (state.x[:, 0].mean() - start.x[:, 0].mean()) / task.length
     cosine, lowered = _posture(task, state.x)
     tilt = jnp.arccos(jnp.clip(jax.lax.stop_gradient(cosine), -1.0, 1.0))
-    reward = travelled - task.upright * (1.0 - cosine + lowered**2) - FALL * (tilt > FALLEN)
+    worth = task.speed * jnp.tanh(travelled / task.speed) if task.speed else travelled
+    reward = worth - task.upright * (1.0 - cosine + lowered**2) - FALL * (tilt > FALLEN)
     after = EpisodeState(state, actuation, place.steps + 1, place.world)
     return after, Walk(state.x, actuation, info.converged, travelled, reward, tilt)
 

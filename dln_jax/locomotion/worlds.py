@@ -32,7 +32,7 @@ class Variation(NamedTuple):
     start: float = 0.0
     """Standard deviation of the vertices' initial positions, in m; that of their velocities is 10/s times as large."""
     slope: float = 0.0
-    """Largest slope, in degrees."""
+    """Largest slope, in degrees; half of all slopes have it, and the others are uniform below it."""
     rough: float = 0.0
     """Largest height of rough ground, in m."""
     push: float = 0.0
@@ -78,7 +78,7 @@ def drawn_world(variation: Variation, key: Array, level: World, length: float, *
     if gravity is not None:
         angle = math.radians(variation.slope)
         if not steepest:
-            angle = angle * jax.random.uniform(for_slope)
+            angle = angle * jnp.minimum(1.0, 2.0 * jax.random.uniform(for_slope))
         horizontal = _direction(for_direction, (), len(gravity) - 1)
         gravity = GRAVITY * jnp.append(jnp.sin(angle) * horizontal, -jnp.cos(angle))
     if bumps is not None:

@@ -17,13 +17,14 @@ from dln_jax.figures import style
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.gradient import Report, TrainedPolicies, settings_of, shown_walk, train
-from dln_jax.locomotion.learning import LANES, Goal, Record
+from dln_jax.locomotion.learning import LANES, Goal, Record, evaluation_steps
 from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
 from dln_jax.locomotion.task import LocomotionTask, Walk, beginning, creature_named, make_task
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP, ground_height
+from dln_jax.training.locomotion_evaluation import judge
 from dln_jax.training.locomotion_options import LocomotionOptions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.parameter_files import save_tree
@@ -46,10 +47,11 @@ def prepare(options: LocomotionOptions, mesh: Mesh | None) -> LocomotionTask:
         raise InputError(f"--clock-period is {options.clock_period}; expected a positive number, or 0 for no clock")
     require_positive_if_given(options, ["steps", "until", "window", "lanes"])
     require_seed(options.seed, options.seeds)
-    if not (math.isfinite(options.upright) and options.upright >= 0):
-        raise InputError(f"--upright is {options.upright}; expected 0 or a positive number")
+    for name in ("upright", "speed"):
+        if not (math.isfinite(value := getattr(options, name)) and value >= 0):
+            raise InputError(f"--{name} is {value}; expected 0 or a positive number")
     variation = Variation(options.start, options.slope, options.rough, options.push)
-    sizes = {"episode": options.episode, "clock_period": options.clock_period, "upright": options.upright}
+    sizes = {name: getattr(options, name) for name in ("episode", "clock_period", "upright", "speed")}
     task = make_task(creature_named(options.creature), variation=variation, **sizes)
     shares(mesh, settings_of(options.window, options.lanes).lanes, f"{LANES} (--lanes)")
     return task
@@ -64,7 +66,7 @@ def announce(task: LocomotionTask) -> None:
 
 
 def trained(task: LocomotionTask, options: LocomotionOptions, mesh: Mesh | None, **stored: Any) -> TrainedPolicies:
-    """Trains all seeds; `stored` are the arguments of `train` on checkpoints."""
+    """Trains all seeds; `stored` are the arguments of `train` on initial parameters and checkpoints."""
 
     def run(seeds: Sequence[int], goal: Goal, report: Report) -> TrainedPolicies:
         sizes = {"width": options.width, "window": options.window, "lanes": options.lanes}
@@ -84,7 +86,7 @@ def reported(
 
         def report(seed: int, at: Record) -> None:
             done = (seed - options.seed) * steps + min(at.steps, steps)
-            skipped = f", {at.skipped} skipped" if at.skipped else ""
+            skipped = f", {at.succeeded:.0%} of starts succeed" + (f", {at.skipped} skipped" if at.skipped else "")
             show(done, f"{method}, seed {seed}: {at.distance:.3f} body lengths{skipped}")
 
         seeds = range(options.seed, options.seed + options.seeds)
@@ -123,7 +125,10 @@ def write_run(
     seen = shown_walk(task, policies.policy, best.parameters, task.episode, start)
     numbers = metrics_of(task, policies, seen)
     if any(task.variation):
-        numbers |= numbers_of(perturbed_trials(task, policies.policy, best.parameters))
+        trials = perturbed_trials(task, policies.policy, best.parameters)
+        verdict = judge(trials)
+        numbers |= {**numbers_of(trials), "verdict": float(verdict.number)}
+        print(verdict.line)
     write_json(folder / "metrics.json", numbers)
     if figures:
         records = [seed.records for seed in policies.learned]
@@ -162,7 +167,7 @@ def metrics_of(task: LocomotionTask, policies: TrainedPolicies, seen: Walk) -> d
         "distance_body_lengths": best.distance,
         "distance_body_lengths_median": np.median([float(seed.distance) for seed in policies.learned]),
         "environment_steps": best.records[-1].steps,
-        "evaluation_steps": len(best.records) * task.episode,
+        "evaluation_steps": len(best.records) * evaluation_steps(task),
         "environment_steps_to_five_body_lengths": median_to_reach(records, GOAL, "steps"),
         "seconds_to_five_body_lengths": median_to_reach(records, GOAL, "seconds"),
         "compile_seconds": best.compile_seconds,

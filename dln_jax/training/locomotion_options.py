@@ -22,6 +22,8 @@ class LocomotionOptions:
     """Body lengths at which a seed ends (default: no limit)."""
     upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
+    speed: float = 0.04
+    """Speed far above which is hardly rewarded, body lengths per step; 0 for no limit."""
     clock_period: float = 16.0
     """Steps of 0.033 s of one turn of the policy's clock; 0 for no clock."""
     episode: int = 400

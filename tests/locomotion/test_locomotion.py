@@ -15,10 +15,11 @@ from small_creature import EPISODE, block_task
 
 from dln_jax.cli.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
+from dln_jax.locomotion import gradient
 from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.frames import axes_of, fitted_frame, vertex_frame
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
+from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task, walk
 from dln_jax.locomotion.value import Window, targets
 from dln_jax.locomotion.worlds import Variation
@@ -27,6 +28,7 @@ from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.types import InputError
 
 WINDOW = 6
+STEPS = 10_000
 QUICK = GradientSettings(window=WINDOW, lanes=2, learning_rate=0.05, updates=4, value_fits=4)
 
 
@@ -42,7 +44,7 @@ def policy(task):
 
 @pytest.fixture(scope="module")
 def compiled(task, policy):
-    return compile_learner(task, make_gradient_learner(task, policy, QUICK))
+    return compile_learner(task, make_gradient_learner(task, policy, QUICK, steps=STEPS))
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def test_the_environment_passes_gymnasiums_checks(environment):
     check_env(environment, skip_render_check=True)
 
 
-def test_reward_is_the_displacement_less_the_posture(environment, task):
+def test_reward_is_the_displacement_up_to_a_speed_less_the_posture(environment, task):
     environment.reset(seed=0)
     rest = task.creature.mesh.vertices
     x, random = rest, np.random.default_rng(0)
@@ -71,7 +73,8 @@ def test_reward_is_the_displacement_less_the_posture(environment, task):
         a = linear[:, 0] / np.linalg.norm(linear[:, 0])
         posture = 1 - a[0] + 25 * max(0, 0.8 - after[:, 1].mean() / rest[:, 1].mean()) ** 2
         displacement = (after[:, 0].mean() - x[:, 0].mean()) / task.length
-        np.testing.assert_allclose(reward, displacement - task.upright * posture, rtol=1e-9, atol=1e-12)
+        worth = 0.04 * np.tanh(displacement / 0.04)
+        np.testing.assert_allclose(reward, worth - task.upright * posture, rtol=1e-9, atol=1e-12)
         assert not terminated and truncated == (count == EPISODE) and info["converged"]
         x = after
 
@@ -189,6 +192,35 @@ def test_an_interrupt_waits_for_the_checkpoint(compiled, tmp_path):
     assert same(continued.parameters, whole.parameters)
 
 
+def test_training_further_begins_at_the_stored_policy(task, policy, monkeypatch):
+    compiled, initial = [], policy.init(jax.random.key(9))
+    monkeypatch.setattr(gradient, "compile_learner", lambda task, learner, mesh: compiled.append(learner))
+    monkeypatch.setattr(gradient, "learn_seeds", lambda *_, **__: gradient.TrainedPolicies(policy, []))
+    gradient.train(task, seeds=[0], goal=Goal(1), width=3, initial=initial)
+    gradient.train(task, seeds=[0], goal=Goal(1), width=3)
+    further, new = (learner.parameters(learner.start(0)) for learner in compiled)
+    assert same(further, initial) and not same(new, initial)
+
+
+def test_the_rate_falls_and_averages_follow_the_parameters(compiled):
+    def away(one, other):
+        return max(np.abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True))
+
+    state = compiled.learner.start(0)
+    after = compiled.improve(state)
+    assert 0 < away(after.averaged, after.parameters) < away(state.parameters, after.parameters)
+    counted = jax.tree.map(lambda a: a + 10**6 * (a.dtype.kind == "i"), state.optimiser)
+    late = compiled.improve(state._replace(optimiser=counted))
+    assert 0 < away(state.parameters, late.parameters) < 0.1 * away(state.parameters, after.parameters)
+
+
+def test_selection_prefers_starts_that_succeed_and_then_distance():
+    records = [Record(1, 1.0, 9.0, 0, 0.5), Record(2, 2.0, 3.0, 0, 1.0), Record(3, 3.0, np.nan, 0, 1.0)]
+    learned = Learned({}, [*records, Record(4, 4.0, 5.0, 0, 1.0), Record(5, 5.0, 4.0, 0, 1.0)], 0.0)
+    assert learned.selected.steps == 4 and learned.distance == 5.0
+    assert Learned({}, records[2:], 0.0).selected is None
+
+
 def test_updates_without_a_gradient_are_skipped_and_counted(compiled):
     state = compiled.learner.start(0)
     x = state.lanes.state.x
@@ -205,6 +237,7 @@ def test_updates_without_a_gradient_are_skipped_and_counted(compiled):
     [
         (("--steps", "0"), "steps is 0"),
         (("--upright", "-1"), "--upright is -1"),
+        (("--speed", "-1"), "--speed is -1"),
         (("--resume", "--out", "run"), "holds none"),
         (("--window", "0"), "window is 0"),
         (("--slope", "90"), "slope is 90"),
@@ -224,7 +257,7 @@ def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message
 def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy):
     mesh = Mesh(np.array(7 * jax.devices()[:1]), (AXIS,))
     with pytest.raises(InputError, match="creatures side by side cannot be split over 7 devices"):
-        make_gradient_learner(task, policy, QUICK, mesh=mesh)
+        make_gradient_learner(task, policy, QUICK, steps=STEPS, mesh=mesh)
 
 
 def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):

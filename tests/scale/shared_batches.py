@@ -86,7 +86,7 @@ def main(folder, name, *, whole):
     found = {"stiffness": stiffness(mesh), "value": value(mesh)}
     if whole:
         task, settings = block(), GradientSettings(window=3, lanes=4, updates=1)
-        gradient = make_gradient_learner(task, make_policy(task, width=2), settings, mesh=mesh)
+        gradient = make_gradient_learner(task, make_policy(task, width=2), settings, steps=1000, mesh=mesh)
         found |= {"gradient": walked(folder, "gradient", compile_learner(task, gradient, mesh))}
         found |= {"equation": equation(mesh)}
     arrays = {

@@ -8,9 +8,9 @@ and SAC the extra [rl].
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
-from dln_jax.cli.arguments import Unstated
+from dln_jax.cli.arguments import Unstated, choice, names_in
 from dln_jax.cli.options import Drawn, Folder, Scaled
 from dln_jax.cli.scaled import mesh_of
 from dln_jax.cli.stored_arguments import command_folder
@@ -31,6 +31,12 @@ from scripts.reports.locomotion import comparison, evolution, ppo, sac
 from scripts.reports.locomotion.comparison import comparison_rows
 from scripts.reports.rows import conditions, print_report, write_report
 
+RIVALS = {
+    "ppo": (ppo, ppo.train_by_ppo),
+    "sac": (sac, sac.train_by_sac),
+    "evolution": (evolution, evolution.train_by_evolution),
+}
+
 
 @dataclass(frozen=True)
 class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
@@ -38,11 +44,13 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
 
     MEASURES_COMPILATION: ClassVar = True
 
+    rivals: Annotated[str, choice(RIVALS, several=True)] = ",".join(RIVALS)
+    """Methods to compare with gradients, separated by commas."""
     seeds: int = 3
     """Of each method, one after the other."""
     steps: Unstated[int] = None
     """Environment steps of each seed (default: 400000 by gradients, 500000 by evolution, 300000 by
-    ppo, 60000 by sac)."""
+    ppo, 20000 by sac)."""
     until: Unstated[float] = 6.0
     """Body lengths at which a seed ends (default: 6)."""
     start: float = 0.0
@@ -55,11 +63,7 @@ def main(options: Arguments) -> None:
     """Trains by all methods, prints the comparison and writes it."""
     mesh, lanes = mesh_of(options), options.lanes
     task = prepare(options, mesh)
-    rivals = {
-        "ppo": (ppo, ppo.train_by_ppo),
-        "sac": (sac, sac.train_by_sac),
-        "evolution": (evolution, evolution.train_by_evolution),
-    }
+    rivals = {name: RIVALS[name] for name in names_in("--rivals", options.rivals, RIVALS)}
     for rival, _ in rivals.values():
         rival.check(lanes, mesh)
     settings: dict[str, Any] = {"gradient": settings_of(options.window, lanes)}
@@ -80,7 +84,7 @@ def main(options: Arguments) -> None:
             curves[method] = [seed.records for seed in policies.learned]
         rows = comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
         facts = conditions(
-            dtype="float64; the networks of ppo and sac float32",
+            dtype="float64; networks of ppo and sac float32",
             seeds=list(range(options.seed, options.seed + options.seeds)),
             settings={method: values._asdict() for method, values in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",

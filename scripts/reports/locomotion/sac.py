@@ -29,19 +29,23 @@ class SACSettings(NamedTuple):
     steps: int = 80
     """Steps of each lane between two evaluations."""
     batch: int = 256
-    updates: int = 4
+    updates: int = 8
     """Gradient steps after every step of all lanes."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
     discount: float = 0.98
     following: float = 0.02
     """tau, share of the critics that their copies take over in an update."""
+    temperature: float = 0.01
+    """Initial weight of the entropy, which is adapted."""
+    coherent: int = 0
+    """Steps after which the noise of the actions, a function of the state (gSDE), is drawn anew; 0 for white noise."""
     first: int = 2000
     """Environment steps of random actions."""
     width: int = 128
     """Units of the two hidden layers of actor and critics."""
 
 
-STEPS = 60_000
+STEPS = 20_000
 """Environment steps by default."""
 
 
@@ -107,8 +111,11 @@ def compile_sac(
             gamma=settings.discount,
             tau=settings.following,
             learning_starts=settings.first,
+            ent_coef=f"auto_{settings.temperature}",
+            use_sde=settings.coherent > 0,
+            sde_sample_freq=settings.coherent or -1,
             buffer_size=300_000,
-            policy_kwargs={"net_arch": [settings.width] * 2},
+            policy_kwargs={"net_arch": [settings.width] * 2, "clip_mean": 0.0},
             seed=seed,
             device="cpu",
         )

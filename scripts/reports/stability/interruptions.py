@@ -25,7 +25,7 @@ RUNS = {
     "adam": ("train_delan", "--optimizer", "adam", "--steps", "4000", "--width", "16"),
     "task": ("train_hnn_task", "--task", "spring", "--steps", "40"),
     "function": ("train_diffnet", "--samples", "6000", "--width", "8"),
-    "locomotion": ("train_locomotion", "--steps", "6000"),
+    "locomotion": ("train_locomotion", "--start", "0", "--steps", "6000"),
 }
 """Script and options of the runs, which are short but store several checkpoints."""
 TIMED = ("train_delan", "train_hnn_task")

@@ -662,6 +662,7 @@ OPTIONS = {
     "infinite noise": (train_diffnet, "--noise", "inf"),
     "infinite posture": (train_locomotion, "--upright", "inf"),
     "infinite posture of all": (compare_locomotion, "--upright", "inf"),
+    "unknown rival": (compare_locomotion, "--rivals", "ppo,dreams"),
     "infinite stiffness": (simulate, "--youngs-modulus", "inf"),
     "unknown report": (softbody_report, "--only", "teapot"),
     "unknown case": (stability, "--only", ","),

@@ -1,0 +1,105 @@
+"""Stored policies: loads that of a run of `train_locomotion`, and judges it on any ground."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import msgspec
+
+from dln_jax.files import as_type
+from dln_jax.locomotion.learning import Parameters, Policy, make_policy
+from dln_jax.locomotion.perturbed import STEPS, Trials
+from dln_jax.locomotion.task import LocomotionTask, creature_named, make_task
+from dln_jax.locomotion.worlds import Variation
+from dln_jax.metrics.verdict import Verdict
+from dln_jax.types import InputError
+from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree
+
+NAME = "locomotion-gradient"
+"""Name of the model in its manifest."""
+GOOD, REFUSED = 0.95, 0.5
+"""Share of episodes without a fall from which a policy is good, and below which it is refused."""
+
+
+class StoredPolicy(NamedTuple):
+    """A policy with a task of its creature."""
+
+    task: LocomotionTask
+    policy: Policy
+    parameters: Parameters
+    width: int
+
+
+class _Settings(msgspec.Struct):
+    width: int
+
+
+class _Model(msgspec.Struct):
+    name: str
+    creature: str
+    clock_period: float
+    variation: dict[str, float]
+    settings: _Settings
+
+
+class _Manifest(msgspec.Struct):
+    model: _Model
+
+
+def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
+    """Loads the policy of a run of `train_locomotion`.
+
+    Args:
+        folder: of the run.
+        variation: fields of `Variation` for the task, instead of those of the training; `None` for the training's.
+
+    Raises:
+        InputError: the folder holds no such policy, its files are damaged, or a field is out of range.
+    """
+    folder = Path(folder)
+    path = folder / f"{MODEL}.json"
+    model = as_type(load_manifest(folder, MODEL), _Manifest, name=str(path), remedy=REMEDY).model
+    if model.name != NAME:
+        raise InputError(f"{path} holds '{model.name:.60}'; expected a policy of train_locomotion, '{NAME}'")
+    changed = {name: value for name, value in variation.items() if value is not None}
+    try:
+        creature, trained = creature_named(model.creature), Variation(**model.variation)
+        task = make_task(creature, variation=trained, clock_period=model.clock_period)
+        policy = make_policy(task, width=model.settings.width)
+    except (InputError, TypeError) as error:
+        raise InputError(f"{path}: {error}; {REMEDY}") from None
+    if changed:
+        task = make_task(creature, variation=trained._replace(**changed), clock_period=model.clock_period)
+    like = jax.eval_shape(policy.init, jax.random.key(0))
+    return StoredPolicy(task, policy, load_tree(folder, MODEL, like), model.settings.width)
+
+
+def parameters_for(task: LocomotionTask, width: int, folder: Path) -> Parameters:
+    """Loads the parameters of a stored policy, to train it further on a task.
+
+    Raises:
+        InputError: as `load_policy`, or a policy of another creature, width or clock.
+    """
+    stored = load_policy(folder)
+    policies = ((task, width), (stored.task, stored.width))
+    sizes, own = ({"creature": t.creature.name, "width": w, "clock-period": t.clock_period} for t, w in policies)
+    for name, value in sizes.items():
+        if own[name] != value:
+            raise InputError(f"the policy in {folder} has {name} {own[name]}, not {value}; give --{name} {own[name]}")
+    return stored.parameters
+
+
+def judge(trials: Trials, steps: int = STEPS) -> Verdict:
+    """Returns the verdict by the share of episodes without a fall; doubtful if one of them ends behind its start."""
+    standing, count = trials.standing(steps), len(trials.steps)
+    reason = f"{standing.sum()} of {count} episodes of {steps} steps end without a fall"
+    if standing.sum() < REFUSED * count:
+        return Verdict("refused", reason, "train on this ground")
+    behind = int((trials.distance[standing] < 0).sum())
+    if behind:
+        return Verdict("doubtful", f"{reason}, but {behind} of them end behind their start", "train on this ground")
+    if standing.sum() < GOOD * count:
+        expected = math.ceil(GOOD * count)
+        return Verdict("doubtful", f"{reason}, expected {expected}", "train on this ground, or longer")
+    return Verdict("good", reason)

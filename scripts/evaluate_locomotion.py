@@ -1,0 +1,3 @@
+from dln_jax.__main__ import command
+
+command("evaluate_locomotion", "python -m scripts.evaluate_locomotion")
