@@ -23,7 +23,7 @@ from dln_jax.control.regulators import (
     time_varying_lqr,
     value,
 )
-from dln_jax.control.shooting import Shooting, shoot
+from dln_jax.control.shooting import Shooting, optimise, shoot
 from dln_jax.control.state_space import (
     Linearisation,
     error,
@@ -58,7 +58,7 @@ from dln_jax.control.tracking import (
     trusted,
     without_friction,
 )
-from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan, improve, mpc, optimise
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan, improve, mpc
 
 __all__ = [
     "ClosedLoopRun",
