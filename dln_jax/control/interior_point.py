@@ -29,10 +29,12 @@ MULTIPLIER_SPREAD = 1e10
 MOST_HALVINGS = 24
 FILTER = 64
 """Number of remembered pairs; the oldest are forgotten."""
-MOST_RESETS = 8
+SHORT, MOST_SHORT, MOST_RELEASES = 0.02, 4, 10
+"""Length below which a step counts as cut short by inequalities, number of such or failed steps in a row after which
+slacks are widened, and number of times that this is done."""
 END_COMPLIANCE = 1e-8
 """Compliance of the equations of the end in the linear systems; it does not change the solution."""
-ROUNDING = 1e-15
+ROUNDING = 2.2e-16
 
 
 class Iterate(NamedTuple):
@@ -72,7 +74,9 @@ class Search(NamedTuple):
     entries: Array
     largest: Array
     """Largest violation that is accepted."""
-    resets: Array
+    short: Array
+    """Number of short or failed steps in a row."""
+    releases: Array
     iterations: Array
     residuals: Residuals
     ending: Array
@@ -272,21 +276,42 @@ def search(
         pair = jnp.stack([(1 - VIOLATION_MARGIN) * violation, phi - BARRIER_MARGIN * violation])
         filtered = jnp.where(keep, search.filter.at[entries % FILTER].set(pair), search.filter)
         raised = jnp.maximum(jnp.maximum(damping, search.damping) * 10, FIRST_DAMPING)
-        stuck = ~good & (raised > MOST_DAMPING)
-        resets = search.resets + stuck
+        short = jnp.where(good & (first > SHORT), 0, search.short + 1)
+        release = (short >= MOST_SHORT) & ~done
+        releases = search.releases + release
         lost = ~jnp.isfinite(largest(plain))
-        conditions = [lost, done, resets > MOST_RESETS, search.iterations + 1 >= iterations]
+        conditions = [lost, done, releases > MOST_RELEASES, search.iterations + 1 >= iterations]
         outcomes = [Ending.NOT_FINITE, Ending.CONVERGED, Ending.NO_DESCENT, Ending.OUT_OF_ITERATIONS]
         ending = jnp.select(conditions, outcomes, Ending.UNDECIDED)
         at, values = jax.tree.map(
             lambda new, old: jnp.where(good & ~done, new, old), (new, at_new), (search.at, search.values)
         )
         used = jnp.where(damping > 0, damping, search.damping)
-        return Search(
-            at, values, change.K, barrier, jnp.where(good, used, jnp.where(stuck, 0.0, raised)),
-            jnp.where(good | stuck, 0.0, raised), filtered, jnp.where(stuck, 0, entries + keep), search.largest,
-            resets, search.iterations + ~done, plain, ending,
+        after = Search(
+            at, values, change.K, barrier, jnp.where(good, used, raised), jnp.where(good, 0.0, raised), filtered,
+            entries + keep, search.largest, short, releases, search.iterations + ~done, plain, ending,
         )  # fmt: skip
+        # The slacks as the whole step would leave them, negative where it is cut short.
+        wanted = jnp.max(jnp.where(present, -(search.at.s + step.s), 0.0), initial=0.0)
+        return jax.lax.cond(release, released, lambda after, _: after, after, wanted)
+
+    def released(search: Search, width: Array) -> Search:
+        """Widens the slacks, so that the inequalities are violated on the way, and starts anew."""
+        at = search.at
+        s = jnp.where(present, jnp.maximum(at.s, jnp.clip(width, 1e-1, 1e2)), at.s)
+        z = jnp.where(present, FIRST_BARRIER / s, 0.0)
+        y = at.y if elastic is None else jnp.where(elastic, FIRST_BARRIER / at.t, 0.0)
+        at = at._replace(prices=0 * at.prices, nu=0 * at.nu, s=s, z=z, y=y)
+        return _begun(search._replace(at=at))
+
+    def _begun(search: Search) -> Search:
+        barrier = jnp.full_like(search.barrier, FIRST_BARRIER)
+        largest = 1e4 * jnp.maximum(measure(search.at, search.values, barrier)[0], 1.0)
+        none = jnp.zeros_like(search.entries)
+        zero = jnp.zeros_like(barrier)
+        return search._replace(
+            barrier=barrier, damping=zero, least=zero, entries=none, short=none, largest=largest
+        )
 
     values = of.values(x, u)
     s = jnp.where(present, jnp.maximum(-values.c, 1e-2), 1.0)
@@ -302,10 +327,9 @@ def search(
     zero, none = jnp.zeros_like(barrier), jnp.asarray(0)
     start = Search(
         at, values, jnp.zeros((*u.shape, x.shape[1]), x.dtype), barrier, zero, zero, jnp.zeros((FILTER, 2), x.dtype),
-        none, 1e4 * jnp.maximum(measure(at, values, barrier)[0], 1.0), none, none, Residuals(zero, zero, zero),
-        jnp.asarray(Ending.UNDECIDED),
+        none, zero, none, none, none, Residuals(zero, zero, zero), jnp.asarray(Ending.UNDECIDED),
     )  # fmt: skip
-    return jax.lax.while_loop(lambda search: search.ending == Ending.UNDECIDED, body, start)
+    return jax.lax.while_loop(lambda search: search.ending == Ending.UNDECIDED, body, _begun(start))
 
 
 def _tied(at: Iterate, elastic: Array | None, barrier: Any) -> Array:

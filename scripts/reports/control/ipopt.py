@@ -7,7 +7,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from scripts.reports.control.plan_problems import Planned
+from scripts.reports.control.plan_problems import Planned, Steps, runge_kutta
 
 
 class RivalPlan(NamedTuple):
@@ -26,10 +26,11 @@ def ipopt(problem: Planned) -> Callable[[np.ndarray, np.ndarray], RivalPlan]:
     n, m, N = len(problem.x0), len(problem.limit), problem.steps
     X, U = ca.SX.sym("x", n, N + 1), ca.SX.sym("u", m, N)
     cost, g, low, high = ca.SX(0), [], [], []
+    step = runge_kutta(*problem.step) if isinstance(problem.step, Steps) else problem.step
     for k in range(N):
         x, u = X[:, k], U[:, k]
         cost += problem.cost(ca, x, u)
-        g.append(ca.vertcat(*problem.step(ca, x, u)) - X[:, k + 1])
+        g.append(ca.vertcat(*step(ca, x, u)) - X[:, k + 1])
         low, high = [*low, *[0.0] * n], [*high, *[0.0] * n]
         if problem.path:
             rows = problem.path(ca, x, u)

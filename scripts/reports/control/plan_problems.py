@@ -23,7 +23,7 @@ class Planned(NamedTuple):
     x0: Sequence[float]
     goal: Sequence[float]
     steps: int
-    step: Formula
+    step: "Formula | Steps"
     cost: Callable[..., Any]
     """(functions, x, u) -> cost of a step."""
     final_cost: Callable[..., Any]
@@ -40,8 +40,16 @@ class Planned(NamedTuple):
     """Size of the guesses' random parts, relative to the way to the goal and to the limits."""
 
 
+class Steps(NamedTuple):
+    """Rates of a plant, integrated by the classical Runge-Kutta method."""
+
+    rates: Formula
+    dt: float
+    substeps: int = 1
+
+
 def runge_kutta(rates: Formula, dt: float, substeps: int = 1) -> Formula:
-    """The step of the classical method."""
+    """The step of the classical method for CasADi."""
 
     def step(f: Any, x: Any, u: Any) -> list[Any]:
         x, h = [x[i] for i in rates_size(x)], dt / substeps
@@ -205,24 +213,24 @@ def problems() -> list[Planned]:
         return 0.05 * sum(0.02 * u[i] ** 2 + 0.1 * x[7 + i] ** 2 for i in range(7))
 
     return [
-        Planned("cart-pole", (0.0, pi, 0.0, 0.0), (0.0,) * 4, 50, runge_kutta(pole_rates, 0.04), *pole, (10.0,),
+        Planned("cart-pole", (0.0, pi, 0.0, 0.0), (0.0,) * 4, 50, Steps(pole_rates, 0.04), *pole, (10.0,),
                 (-0.5, *(-np.inf,) * 3), (0.5, *(np.inf,) * 3)),
-        Planned("acrobot", (0.0,) * 4, up, 60, runge_kutta(two_links((1,)), 0.04, 2), *acrobot, (6.0,)),
-        Planned("pendubot", (0.0,) * 4, up, 50, runge_kutta(two_links((0,)), 0.03, 2), *pendubot, (6.0,)),
+        Planned("acrobot", (0.0,) * 4, up, 60, Steps(two_links((1,)), 0.04, 2), *acrobot, (6.0,)),
+        Planned("pendubot", (0.0,) * 4, up, 50, Steps(two_links((0,)), 0.03, 2), *pendubot, (6.0,)),
         Planned("two-link-reach", (-0.5, 2.0, 0.0, 0.0), (1.5, 1.0, 0.0, 0.0), 50,
-                runge_kutta(two_links((0, 1), 0.0), 0.02), *reach, (2.0, 2.0)),
+                Steps(two_links((0, 1), 0.0), 0.02), *reach, (2.0, 2.0)),
         Planned("flexible-cart-pole", (0.0, 0.0, pi, 0.0, 0.0, 0.0), (0.0,) * 6, 50,
-                runge_kutta(flexible_rates, 0.04, 2), *flexible, (15.0,)),
+                Steps(flexible_rates, 0.04, 2), *flexible, (15.0,)),
         Planned("seven-axis-reach", arm_start, arm_goal, 30, jerkless_step, arm_cost,
                 lambda f, x: 200.0 * tip_error(f, x) + 5.0 * sum(x[7 + i] ** 2 for i in range(7)), (15.0,) * 7,
                 (*-joints, *(-2.0,) * 7), (*joints, *(2.0,) * 7), states=clear_of_sphere),
         Planned("quadrotor-wall", (-2.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0, 0.0, 0.0), 50,
-                runge_kutta(rotor_rates, 0.05), *rotor, (2.0, 2.0),
+                Steps(rotor_rates, 0.05), *rotor, (2.0, 2.0),
                 states=lambda f, x: [1.0 - (x[0] / 0.3) ** 2 / 1.0 - ((x[1] + 0.4) / 1.0) ** 2]),
         Planned("shortest-time", (0.0, 0.0, 0.05), (1.0, 0.0, 0.05), 40, timed_integrator, lambda f, x, u: x[2],
                 lambda f, x: 0.0 * x[0], (1.0,), (-np.inf, -np.inf, 1e-3), (np.inf, np.inf, 1.0),
                 end=lambda f, x: [x[0] - 1.0, x[1]], free=(False, False, True)),
-        Planned("hanging-start", (pi, 0.0), (pi, 0.0), 60, runge_kutta(pendulum_rates, 0.05), *hang, (2.5,), spread=0.01),
+        Planned("hanging-start", (pi, 0.0), (pi, 0.0), 60, Steps(pendulum_rates, 0.05), *hang, (2.5,), spread=0.01),
     ]  # fmt: skip
 
 
