@@ -11,6 +11,7 @@ from dln_jax.control.closed_loop import (
     stateless,
 )
 from dln_jax.control.observers import with_differences, with_prediction
+from dln_jax.control.plan_limits import free_time, with_limits_of, worst_violation
 from dln_jax.control.regulators import (
     Region,
     Regulator,
@@ -87,6 +88,7 @@ __all__ = [
     "field_of",
     "first_plan",
     "following",
+    "free_time",
     "friction_compensation",
     "gravity_compensation",
     "holding_controls",
@@ -115,6 +117,8 @@ __all__ = [
     "value",
     "where_finite",
     "with_differences",
+    "with_limits_of",
     "with_prediction",
     "without_friction",
+    "worst_violation",
 ]

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from dln_jax.control.riccati import Horizon
@@ -58,7 +59,7 @@ def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
         chosen = []
         for sign, limit in ((-1, lower), (1, upper)):
             # Limits that are traced may turn out infinite: their rows are masked.
-            traced = isinstance(limit, jax.core.Tracer)
+            traced = isinstance(limit, Tracer)
             index = np.arange(size) if traced else np.flatnonzero(np.broadcast_to(np.isfinite(limit), size))
             chosen.append((sign, jnp.broadcast_to(jnp.asarray(limit, float), size)[index], index))
         return chosen

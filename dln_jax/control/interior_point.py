@@ -24,6 +24,8 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-20, 1e12
 TO_BOUNDARY = 0.99
 """Share of the way to the boundary that a step may go, at least."""
 VIOLATION_MARGIN, BARRIER_MARGIN, ARMIJO = 1e-5, 1e-8, 1e-8
+SMALL_VIOLATION, LARGE_VIOLATION = 1e-4, 1e4
+"""Violations relative to the first: below one the barrier function has to fall, above the other no step is accepted."""
 MULTIPLIER_SPREAD = 1e10
 """Largest ratio of s z to μ, and of μ to s z."""
 MOST_HALVINGS = 24
@@ -111,7 +113,8 @@ def search(
 
     def measure(at: Iterate, values: Values, barrier: Array) -> tuple[Array, Array]:
         """Violation, and barrier function."""
-        violation = sum(jnp.sum(jnp.abs(r)) for r in (values.defects, values.h, gaps(at, values)))
+        every = [values.defects.ravel(), values.h, gaps(at, values)]
+        violation = jnp.sum(jnp.abs(jnp.concatenate(every)))
         phi = values.cost + jnp.sum(excess_cost(at.t)) - barrier * logs(at.s, present)
         if elastic is not None:
             phi = phi - barrier * logs(at.t, elastic)
@@ -171,14 +174,18 @@ def search(
         first = jnp.where(search.damping > 0, again, FIRST_DAMPING)
         growth = jnp.where(search.damping > 0, 8.0, 100.0)
 
-        def more(carry: tuple[Any, Array]) -> tuple[Any, Array]:
-            damping = jnp.where(carry[1] > 0, growth * carry[1], first)
-            return solve(damping), damping
+        def more(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+            _, damping, number = carry
+            raised = jnp.where(damping > 0, growth * damping, first)
+            damping = jnp.where(number == 0, search.least, raised)
+            return solve(damping), damping, number + 1
 
-        def wanted(carry: tuple[Any, Array]) -> Array:
+        def wanted(carry: tuple[Any, Array, Array]) -> Array:
             return ~carry[0][0].convex & (carry[1] < MOST_DAMPING)
 
-        return jax.lax.while_loop(wanted, more, (solve(search.least), search.least))
+        # Without a first solution, so that the step is compiled once.
+        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(solve, search.least))
+        return jax.lax.while_loop(wanted, more, (none, search.least, jnp.asarray(0)))[:2]
 
     def longest(value: Array, change: Array, mask: Array, share: Array) -> Array:
         fastest = jnp.max(jnp.where(mask, -change / value, 0.0), initial=0.0)
@@ -237,7 +244,7 @@ def search(
             at_new = of.values(new.x, new.u)
             violation_new, phi_new = measure(new, at_new, barrier)
             descends = (fall < 0) & (length * jnp.maximum(-fall, 0.0) ** 2.3 > violation**1.1)
-            descends &= violation <= 1e-4 * search.largest / 1e4
+            descends &= violation <= SMALL_VIOLATION / LARGE_VIOLATION * search.largest
             enough = phi_new <= phi + ARMIJO * length * fall + slack
             better = (violation_new <= (1 - VIOLATION_MARGIN) * violation) | (
                 phi_new <= phi - BARRIER_MARGIN * violation + slack
@@ -246,26 +253,26 @@ def search(
             good = jnp.where(descends, enough, better) & ~outside.any() & (violation_new <= search.largest)
             return new, at_new, (good | small) & jnp.isfinite(phi_new), descends & enough, violation_new
 
-        def corrected(carry: Any) -> Any:
-            """The second-order correction of the longest step."""
-            at_new, length = carry[1], carry[5]
-            summed = jax.tree.map(lambda before, after: length * before + after, values, at_new)
-            again = length * gap + gaps(carry[0], at_new)
-            other, other_step = change_at(at, slopes, curved, barrier, summed, again, damping)
-            other_length = longest_of(other_step)
-            found = judged(other, other_step, other_length)
-            return jax.tree.map(lambda new, old: jnp.where(found[2], new, old), (*found, length), carry)
-
-        def halve(carry: Any) -> Any:
-            length = carry[5] / 2
-            return (*judged(change, step, length), length)
-
         first = longest_of(step)
-        carry = (*judged(change, step, first), first)
-        carry = jax.lax.cond(~carry[2] & (carry[4] >= violation), corrected, lambda carry: carry, carry)
-        shortest = first * 2.0**-MOST_HALVINGS
-        carry = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[5] > shortest), halve, carry)
-        new, at_new, good, descended, _, _ = carry
+
+        def attempt(carry: Any) -> Any:
+            """The longest step, then its second-order correction where the violation rose, then shorter ones."""
+            (before, at_before, _, _, violation_before), length, number = carry
+            correct = (number == 1) & (violation_before >= violation)
+
+            def corrected() -> Any:
+                summed = jax.tree.map(lambda then, now: first * then + now, values, at_before)
+                return change_at(at, slopes, curved, barrier, summed, first * gap + gaps(before, at_before), damping)
+
+            other, other_step = jax.lax.cond(correct, corrected, lambda: (change, step))
+            length = jnp.where(correct | (number == 0), length, length / 2)
+            return judged(other, other_step, jnp.where(correct, longest_of(other_step), length)), length, number + 1
+
+        def unfinished(carry: Any) -> Array:
+            return ~carry[0][2] & (carry[1] > first * 2.0**-MOST_HALVINGS)
+
+        untried = (at, values, jnp.asarray(False), jnp.asarray(False), violation), first, jnp.asarray(0)
+        (new, at_new, good, descended, _), _, _ = jax.lax.while_loop(unfinished, attempt, untried)
         good &= change.convex
         new = new._replace(
             z=_guarded(new.z, new.s, barrier, present),
@@ -306,7 +313,7 @@ def search(
 
     def _begun(search: Search) -> Search:
         barrier = jnp.full_like(search.barrier, FIRST_BARRIER)
-        largest = 1e4 * jnp.maximum(measure(search.at, search.values, barrier)[0], 1.0)
+        largest = LARGE_VIOLATION * jnp.maximum(measure(search.at, search.values, barrier)[0], 1.0)
         none = jnp.zeros_like(search.entries)
         zero = jnp.zeros_like(barrier)
         return search._replace(

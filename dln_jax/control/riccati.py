@@ -7,7 +7,7 @@ conditions stage by stage (Rao, Wright and Rawlings 1998). All its pivots are po
 minimum, which is the test of inertia of an interior-point method.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,8 +41,8 @@ class HorizonSolution(NamedTuple):
     """Whether the program has one minimum."""
 
 
-def least_cost(horizon: Horizon, free: Bool[Array, " n"] | None = None) -> HorizonSolution:
-    """Returns the solution; traceable. `free` marks the components of the first state that are unknowns."""
+def least_cost(horizon: Horizon, free: Any = None) -> HorizonSolution:
+    """Returns the solution; traceable. `free` [n] marks the components of the first state that are unknowns."""
     n = horizon.missed.shape[1]
 
     def back(
@@ -60,6 +60,7 @@ def least_cost(horizon: Horizon, free: Bool[Array, " n"] | None = None) -> Horiz
     (g0, S0, convex), (k, K, g, S) = jax.lax.scan(back, end, horizon[:4], reverse=True)
     start = jnp.zeros_like(g0)
     if free is not None:
+        free = jnp.asarray(free)
         block = jnp.where(free[:, None] & free, S0, jnp.eye(n, dtype=S0.dtype))
         solved, definite = _definite_solve(block, jnp.where(free, -g0, 0.0)[:, None])
         start, convex = solved[:, 0], convex & definite

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.conditions import Conditions, conditions
@@ -71,6 +72,7 @@ def shoot(
     iterations: int = 300,
     tolerance: float = 1e-8,
     exact: bool = True,
+    starts: tuple[Any, Any] | None = None,
 ) -> Shooting:
     """Returns a locally optimal trajectory near a guess, by multiple shooting; traceable.
 
@@ -84,15 +86,25 @@ def shoot(
             guess are at most 100. Stationarity and complementarity are divided by a hundredth of the mean multiplier
             if that is above one.
         exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: the least
+            cost of those within the constraints, or else the least violation.
 
     Raises:
-        InputError: shapes that do not agree, settings that are not positive, or crossed limits.
+        InputError: shapes that do not agree, settings that are not positive, crossed limits, or a start outside the
+            limits of the states or their constraints.
     """
+    if starts is not None:
+
+        def one(states: Array, u: Array) -> Shooting:
+            return shoot(problem, x, states, u, iterations=iterations, tolerance=tolerance, exact=exact)
+
+        return _best(jax.vmap(one)(*_with_first((states, u), starts)), tolerance)
     x, states, u = (jnp.asarray(array, float) for array in (x, states, u))
     if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
         raise InputError(
             f"x has shape {x.shape}, states {states.shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]"
         )
+    _require_start(problem, x)
     inside = _inside(states, problem.lower_x, problem.upper_x, "states")
     first = x if problem.free is None else jnp.where(jnp.asarray(problem.free), inside[0], x)
     u = _inside(u, problem.lower, problem.upper, "controls")
@@ -100,7 +112,14 @@ def shoot(
 
 
 def optimise(
-    problem: TrajectoryProblem, x: Any, u: Any, *, iterations: int = 300, tolerance: float = 1e-8, exact: bool = True
+    problem: TrajectoryProblem,
+    x: Any,
+    u: Any,
+    *,
+    iterations: int = 300,
+    tolerance: float = 1e-8,
+    exact: bool = True,
+    starts: Any = None,
 ) -> Plan:
     """Returns a locally optimal plan from initial controls, by single shooting; traceable.
 
@@ -113,9 +132,24 @@ def optimise(
         iterations: largest number of iterations.
         tolerance: as for `shoot`.
         exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        starts: more guesses [G, N, m], as for `shoot`.
+
+    Raises:
+        InputError: as for `shoot`.
     """
+    plan = _single(problem, x, u, iterations, tolerance, exact) if starts is None else _best(
+        jax.vmap(lambda u: _single(problem, x, u, iterations, tolerance, exact))(*_with_first((u,), (starts,))),
+        tolerance,
+    )  # fmt: skip
+    return plan.plan._replace(u=jnp.clip(plan.plan.u, problem.lower, problem.upper))
+
+
+def _single(
+    problem: TrajectoryProblem, x: Any, u: Any, iterations: int, tolerance: float, exact: bool
+) -> Shooting:
     u = _inside(jnp.asarray(u, float), problem.lower, problem.upper, "controls")
     plan = first_plan(problem, x, u)
+    _require_start(problem, jnp.asarray(x, float))
 
     def motion(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
         """The motion under the gains of the step."""
@@ -129,8 +163,7 @@ def optimise(
         last, (x, u) = jax.lax.scan(step, first, (at.x[:-1], at.u, change.dx[:-1], change.du, change.K))
         return jnp.concatenate([x, last[None]]), u
 
-    plan = _solved(problem, plan.x, plan.u, motion, iterations, tolerance, exact).plan
-    return plan._replace(u=jnp.clip(plan.u, problem.lower, problem.upper))
+    return _solved(problem, plan.x, plan.u, motion, iterations, tolerance, exact)
 
 
 def _solved(
@@ -138,35 +171,74 @@ def _solved(
     exact: bool,
 ) -> Shooting:  # fmt: skip
     require_positive(iterations=iterations, tolerance=tolerance)
-    shape, one = (*u.shape[:1], x.shape[1], u.shape[1]), jnp.ones((), x.dtype)
+    shape = len(u), x.shape[1], u.shape[1]
 
-    def largest(slopes: Any) -> Array:
-        return jnp.max(jnp.abs(jnp.append(slopes.cost.ravel(), slopes.end_cost)))
+    def cost(x: Array, u: Array) -> Array:
+        return jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1])
 
-    unscaled = conditions(problem, shape, one, exact)
-    scale = jnp.maximum(largest(unscaled.slopes(x, u)) / LARGEST_GRADIENT, 1.0)
+    gradients = jax.grad(cost, argnums=(0, 1))(x, u)
+    scale = jnp.maximum(jnp.max(jnp.abs(jnp.concatenate([g.ravel() for g in gradients]))) / LARGEST_GRADIENT, 1.0)
     scale = jnp.where(jnp.isfinite(scale), scale, 1.0)
     of = conditions(problem, shape, 1 / scale, exact)
-    soft = None if problem.soft is None else tuple(weight / scale for weight in problem.soft)
+    soft = None if problem.soft is None else (problem.soft[0] / scale, problem.soft[1] / scale)
     last = search(of, trial, x, u, soft=soft, free=problem.free, iterations=iterations, tolerance=tolerance)
-    return _result(problem, of, last, scale)
+    return _result(of, last, scale, tolerance)
 
 
-def _result(problem: TrajectoryProblem, of: Conditions, last: Search, scale: Array) -> Shooting:
+def _result(of: Conditions, last: Search, scale: Array, tolerance: float) -> Shooting:
     at, values, residuals = last.at, last.values, last.residuals
     excess = jnp.max(jnp.where(of.kinds.present, values.c, -jnp.inf), initial=0.0)
+    violation = jnp.maximum(excess, jnp.max(jnp.abs(values.h), initial=0.0))
+    given_up = (last.ending == Ending.NO_DESCENT) | (last.ending == Ending.OUT_OF_ITERATIONS)
+    outside = jnp.maximum(violation, residuals.feasibility) > jnp.sqrt(tolerance)
+    ending = jnp.where(given_up & outside, Ending.VIOLATED, last.ending)
     plan = Plan(
-        at.u, at.x, last.K, scale * values.cost, jnp.asarray(FIRST_DAMPING, at.u.dtype), jnp.asarray(True), last.ending
+        at.u, at.x, last.K, scale * values.cost, jnp.asarray(FIRST_DAMPING, at.u.dtype), jnp.asarray(True), ending
     )
     return Shooting(
         plan, scale * at.prices, scale * at.nu, scale * at.z, jnp.max(jnp.abs(values.defects)),
-        jnp.maximum(excess, jnp.max(jnp.abs(values.h), initial=0.0)), *residuals, scale, last.iterations, last.ending,
+        violation, *residuals, scale, last.iterations, ending,
     )  # fmt: skip
+
+
+def _with_first(first: tuple[Any, ...], more: tuple[Any, ...]) -> list[Array]:
+    """Stacks a guess and more of its kind."""
+    pairs = [(jnp.asarray(one, float), jnp.asarray(others, float)) for one, others in zip(first, more, strict=True)]
+    if any(others.shape[1:] != one.shape for one, others in pairs):
+        shapes = [others.shape for _, others in pairs]
+        raise InputError(f"starts have shapes {shapes}; expected that of the guess after an axis of guesses")
+    return [jnp.concatenate([one[None], others]) for one, others in pairs]
+
+
+def _best(solutions: Shooting, tolerance: float) -> Shooting:
+    """The solution of least cost within the constraints; where there is none, that of least violation."""
+    off = jnp.maximum(solutions.violation, solutions.feasibility)
+    # Soft constraints may be violated where all conditions hold.
+    inside = (solutions.ending == Ending.CONVERGED) | (off <= jnp.sqrt(tolerance))
+    best = jnp.where(inside.any(), *(jnp.argmin(jnp.where(jnp.isfinite(key), key, jnp.inf)) for key in (
+        jnp.where(inside, solutions.plan.cost, jnp.inf), off)))  # fmt: skip
+    return jax.tree.map(lambda leaf: leaf[best], solutions)
+
+
+def _require_start(problem: TrajectoryProblem, x: Array) -> None:
+    """Raises `InputError` for a known start outside its limits, which no control changes."""
+    known = [x, problem.lower_x, problem.upper_x]
+    if any(isinstance(value, Tracer) for value in known) or not np.isfinite(x).all():
+        return
+    fixed = np.ones(len(x), bool) if problem.free is None else ~np.asarray(problem.free)
+    for word, limit, sign in (("below its lower", problem.lower_x, -1), ("above its upper", problem.upper_x, 1)):
+        limit = np.broadcast_to(np.asarray(limit, float), x.shape)
+        for i in np.flatnonzero(fixed & (sign * (np.asarray(x) - limit) > 0))[:1]:
+            raise InputError(f"state {i} starts at {x[i]:.6g}, {word} limit of {limit[i]:.6g}; start inside the limits")
+    if problem.states is not None and fixed.all():
+        for i, excess in enumerate(np.asarray(jax.jit(problem.states)(x))):
+            if excess > 0:
+                raise InputError(f"constraint {i} on the states is {excess:.6g} at the start; expected zero or less")
 
 
 def _inside(guess: Array, lower: Any, upper: Any, name: str) -> Array:
     """Moves a guess inside its limits, by a hundredth of their distance."""
-    if not any(isinstance(limit, jax.core.Tracer) for limit in (lower, upper)):
+    if not any(isinstance(limit, Tracer) for limit in (lower, upper)):
         low, high = np.broadcast_arrays(np.asarray(lower, float), np.asarray(upper, float))
         if crossed := np.flatnonzero(~(low < high)).tolist():
             raise InputError(f"limits {crossed} of the {name} are not in order; expected lower < upper")

@@ -80,7 +80,8 @@ def pole_rates(f: Any, x: Any, u: Any) -> list[Any]:
 
 def two_links(motors: tuple[int, ...], gravity: float = GRAVITY) -> Formula:
     """The board's double pendulum (design C.1), hanging at zero, with motors at some joints."""
-    m1, m2, l1, r1, r2, i1, i2 = 0.5234602302310271, 0.6255677234174437, 0.2, 0.2, 0.25569305436052964, 0.0318871996, 0.0508698481
+    m1, m2, l1, r1, r2 = 0.5234602302310271, 0.6255677234174437, 0.2, 0.2, 0.25569305436052964
+    i1, i2 = 0.031887199591513114, 0.05086984812807257
 
     def rates(f: Any, x: Any, u: Any) -> list[Any]:
         tau = [0.0, 0.0]
@@ -116,7 +117,8 @@ def rotor_rates(f: Any, x: Any, u: Any) -> list[Any]:
     """A quadrotor in the plane: 0.5 kg, 0.01 kg m², arms of 0.2 m; controls are the deviations of both thrusts."""
     mass, inertia, arm = 0.5, 0.01, 0.2
     lift = u[0] + u[1] + mass * GRAVITY
-    return [x[3], x[4], x[5], -lift * f.sin(x[2]) / mass, lift * f.cos(x[2]) / mass - GRAVITY, arm * (u[1] - u[0]) / inertia]
+    force = -lift * f.sin(x[2]), lift * f.cos(x[2])
+    return [x[3], x[4], x[5], force[0] / mass, force[1] / mass - GRAVITY, arm * (u[1] - u[0]) / inertia]
 
 
 def timed_integrator(f: Any, x: Any, u: Any) -> list[Any]:
@@ -161,7 +163,8 @@ def clear_of_sphere(f: Any, x: Any) -> list[Any]:
     """RADIUS² - distance² of wrist, tip and the middle of the forearm."""
     elbow, wrist, tip = arm_points(f, x)
     middle = [(a + b) / 2 for a, b in zip(elbow, wrist, strict=True)]
-    return [RADIUS**2 - sum((p - o) ** 2 for p, o in zip(point, OBSTACLE, strict=True)) for point in (middle, wrist, tip)]
+    points = middle, wrist, tip
+    return [RADIUS**2 - sum((p - o) ** 2 for p, o in zip(point, OBSTACLE, strict=True)) for point in points]
 
 
 def tip_error(f: Any, x: Any) -> Any:
@@ -169,7 +172,7 @@ def tip_error(f: Any, x: Any) -> Any:
     return sum((p - o) ** 2 for p, o in zip(arm_points(f, x)[2], (0.5, 0.4, 0.4), strict=True))
 
 
-def jerkless_step(f: Any, x: Any, u: Any) -> list[Any]:
+def accelerated(f: Any, x: Any, u: Any) -> list[Any]:
     """Seven joints with the accelerations as controls, 50 ms."""
     h = 0.05
     return [x[i] + h * x[7 + i] + h**2 / 2 * u[i] for i in range(7)] + [x[7 + i] + h * u[i] for i in range(7)]
@@ -221,12 +224,12 @@ def problems() -> list[Planned]:
                 Steps(two_links((0, 1), 0.0), 0.02), *reach, (2.0, 2.0)),
         Planned("flexible-cart-pole", (0.0, 0.0, pi, 0.0, 0.0, 0.0), (0.0,) * 6, 50,
                 Steps(flexible_rates, 0.04, 2), *flexible, (15.0,)),
-        Planned("seven-axis-reach", arm_start, arm_goal, 30, jerkless_step, arm_cost,
+        Planned("seven-axis-reach", arm_start, arm_goal, 30, accelerated, arm_cost,
                 lambda f, x: 200.0 * tip_error(f, x) + 5.0 * sum(x[7 + i] ** 2 for i in range(7)), (15.0,) * 7,
                 (*-joints, *(-2.0,) * 7), (*joints, *(2.0,) * 7), states=clear_of_sphere),
         Planned("quadrotor-wall", (-2.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0, 0.0, 0.0), 50,
                 Steps(rotor_rates, 0.05), *rotor, (2.0, 2.0),
-                states=lambda f, x: [1.0 - (x[0] / 0.3) ** 2 / 1.0 - ((x[1] + 0.4) / 1.0) ** 2]),
+                states=lambda f, x: [1.0 - (x[0] / 0.3) ** 2 - (x[1] + 0.4) ** 2]),
         Planned("shortest-time", (0.0, 0.0, 0.05), (1.0, 0.0, 0.05), 40, timed_integrator, lambda f, x, u: x[2],
                 lambda f, x: 0.0 * x[0], (1.0,), (-np.inf, -np.inf, 1e-3), (np.inf, np.inf, 1.0),
                 end=lambda f, x: [x[0] - 1.0, x[1]], free=(False, False, True)),
@@ -235,7 +238,7 @@ def problems() -> list[Planned]:
 
 
 def guesses(problem: Planned) -> list[tuple[np.ndarray, np.ndarray]]:
-    """States [N+1, n] and controls [N, m] of all guesses: a straight line at rest, then lines with smooth random parts."""
+    """States [N+1, n] and controls [N, m]: a straight line at rest, then lines with smooth random parts."""
     random, N = np.random.default_rng(0), problem.steps
     x0, goal, limit = (np.asarray(a, float) for a in (problem.x0, problem.goal, problem.limit))
     line = np.linspace(x0, goal, N + 1)
