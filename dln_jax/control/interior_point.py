@@ -143,7 +143,13 @@ def search(
         return jnp.maximum(jnp.maximum(*residuals[:2]), residuals[2])
 
     def change_at(
-        at: Iterate, slopes: Slopes, curved: tuple[Array, Array], barrier: Array, missed: Values, gap: Array, damping: Any
+        at: Iterate,
+        slopes: Slopes,
+        curved: tuple[Array, Array],
+        barrier: Array,
+        missed: Values,
+        gap: Array,
+        damping: Any,
     ) -> tuple[HorizonSolution, Iterate]:
         """Returns the Newton step as a solution of the program, and as a change of the iterate."""
         stiff = at.z / at.s
@@ -316,9 +322,7 @@ def search(
         largest = LARGE_VIOLATION * jnp.maximum(measure(search.at, search.values, barrier)[0], 1.0)
         none = jnp.zeros_like(search.entries)
         zero = jnp.zeros_like(barrier)
-        return search._replace(
-            barrier=barrier, damping=zero, least=zero, entries=none, short=none, largest=largest
-        )
+        return search._replace(barrier=barrier, damping=zero, least=zero, entries=none, short=none, largest=largest)
 
     values = of.values(x, u)
     s = jnp.where(present, jnp.maximum(-values.c, 1e-2), 1.0)

@@ -86,8 +86,8 @@ def shoot(
             guess are at most 100. Stationarity and complementarity are divided by a hundredth of the mean multiplier
             if that is above one.
         exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
-        starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: the least
-            cost of those within the constraints, or else the least violation.
+        starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: the
+            least cost within the constraints, or else the least violation.
 
     Raises:
         InputError: shapes that do not agree, settings that are not positive, crossed limits, or a start outside the
@@ -144,9 +144,7 @@ def optimise(
     return plan.plan._replace(u=jnp.clip(plan.plan.u, problem.lower, problem.upper))
 
 
-def _single(
-    problem: TrajectoryProblem, x: Any, u: Any, iterations: int, tolerance: float, exact: bool
-) -> Shooting:
+def _single(problem: TrajectoryProblem, x: Any, u: Any, iterations: int, tolerance: float, exact: bool) -> Shooting:
     u = _inside(jnp.asarray(u, float), problem.lower, problem.upper, "controls")
     plan = first_plan(problem, x, u)
     _require_start(problem, jnp.asarray(x, float))
