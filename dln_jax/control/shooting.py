@@ -19,8 +19,9 @@ from jax import Array
 from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
+from dln_jax.control.barrier import Iterate
 from dln_jax.control.conditions import Conditions, conditions
-from dln_jax.control.interior_point import Iterate, Search, search, straight
+from dln_jax.control.interior_point import Search, search, straight
 from dln_jax.control.riccati import HorizonSolution
 from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, first_plan
 from dln_jax.solvers.ending import Ending

@@ -22,8 +22,8 @@ REASONS = {
     Ending.OUT_OF_ITERATIONS: "used up its iterations before it reached the tolerance; allow more, or start closer",
     Ending.NO_DESCENT: "found no step that improves; scale the problem, or start closer",
     Ending.NOT_FINITE: "met a number that is not finite; start closer, or bound the states and controls",
-    Ending.VIOLATED: "ended where constraints are violated (`control.worst_violation` names the worst); start closer, or "
-    "make them soft for the plan that violates them least",
+    Ending.VIOLATED: "ended where constraints are violated (`control.worst_violation` names the worst); start closer, "
+    "or make them soft",
     Ending.UNDECIDED: "has not ended: a single iteration cannot tell",
 }
 

@@ -44,7 +44,7 @@ def ipopt(problem: Planned) -> Callable[[np.ndarray, np.ndarray], RivalPlan]:
         g, low, high = [*g, *rows], [*low, *[0.0] * len(rows)], [*high, *[0.0] * len(rows)]
     lower = np.broadcast_to(np.asarray(problem.lower_x, float), (N + 1, n)).copy()
     upper = np.broadcast_to(np.asarray(problem.upper_x, float), (N + 1, n)).copy()
-    fixed = ~np.asarray(problem.free if problem.free is not None else [False] * n)
+    fixed = np.logical_not(problem.free if problem.free is not None else [False] * n)
     lower[0, fixed] = upper[0, fixed] = np.asarray(problem.x0)[fixed]
     limit = np.tile(problem.limit, N)
     lbx, ubx = np.append(lower.ravel(), -limit), np.append(upper.ravel(), limit)

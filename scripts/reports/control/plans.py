@@ -96,7 +96,11 @@ def between_knots(problem: Planned, planned: TrajectoryProblem, solution: Shooti
     move = integrated(lambda x, u: jnp.stack(step.rates(jnp, x, u)), step.dt / FINE)
 
     def excess(x: Array, u: Array) -> Array:
-        after = jax.lax.scan(lambda x, _: (move(x, u),) * 2, x, length=FINE)[1]
+        def substep(x: Array, _: None) -> tuple[Array, Array]:
+            new = move(x, u)
+            return new, new
+
+        after = jax.lax.scan(substep, x, length=FINE)[1]
         off = jnp.maximum(jnp.max(planned.lower_x - after), jnp.max(after - planned.upper_x))
         return off if planned.states is None else jnp.maximum(off, jnp.max(jax.vmap(planned.states)(after)))
 
@@ -141,17 +145,17 @@ def plans(quick: bool) -> Findings:
         results, compile_seconds = compared(problem, 2 if quick else len(guesses(problem)))
         every += results
         case, words = f"plans/{problem.name}", f"of {len(results)} guesses"
-        numbers = Compared(*(np.array(column) for column in zip(*results, strict=True)))
-        for quantity, share in (("converged", numbers.converged), ("as_low", numbers.as_low), ("lower", numbers.lower)):
-            rows.append(Row(case, f"{quantity}_share", float(np.mean(share)), expected=words))
-        rows.append(Row(case, "iterations_median", float(np.median(numbers.iterations))))
-        rows.append(Row(case, "ipopt_iterations_median", float(np.median(numbers.ipopt_iterations))))
-        ours, rival = (1e3 * float(np.median(times)) for times in (numbers.seconds, numbers.ipopt_seconds))
+        numbers = {name: np.array([result[i] for result in results]) for i, name in enumerate(Compared._fields)}
+        for quantity in ("converged", "as_low", "lower"):
+            rows.append(Row(case, f"{quantity}_share", float(np.mean(numbers[quantity])), expected=words))
+        rows.append(Row(case, "iterations_median", float(np.median(numbers["iterations"]))))
+        rows.append(Row(case, "ipopt_iterations_median", float(np.median(numbers["ipopt_iterations"]))))
+        ours, rival = (1e3 * float(np.median(times)) for times in (numbers["seconds"], numbers["ipopt_seconds"]))
         rows.append(expect(case, "cpu_median_ms", "not above IPOPT's", ours, rival, "ms", reference=rival))
         rows.append(Row(case, "compile_cpu_seconds", compile_seconds, "s"))
-        rows.append(Row(case, "between_knots_violation_worst", float(np.max(numbers.between))))
-    total, words = Compared(*zip(*every, strict=True)), f"of {len(every)} plans"
-    rows.append(expect("plans/all", "as_low_share", words, np.mean(total.as_low), SHARE, at_least=True))
-    rows.append(Row("plans/all", "converged_share", float(np.mean(total.converged)), expected=words))
-    rows.append(expect("plans/all", "wrongly_converged", words, sum(total.wrong), 0))
+        rows.append(Row(case, "between_knots_violation_worst", float(np.max(numbers["between"]))))
+    words, as_low = f"of {len(every)} plans", float(np.mean([result.as_low for result in every]))
+    rows.append(expect("plans/all", "as_low_share", words, as_low, SHARE, at_least=True))
+    rows.append(Row("plans/all", "converged_share", float(np.mean([r.converged for r in every])), expected=words))
+    rows.append(expect("plans/all", "wrongly_converged", words, sum(result.wrong for result in every), 0))
     return Findings(rows)
