@@ -51,26 +51,30 @@ def to_one(x):
 
 
 @functools.cache
-def with_a_speed_limit():
-    """From rest to rest over one metre, at most 0.6 m/s, as a path constraint and as a limit of the state."""
+def with_a_speed_limit(kind):
+    """From rest to rest over one metre, at most 0.6 m/s: by a limit, a hard or a soft constraint."""
     problem = BLOCK._replace(end=to_one)
-    by_limit = problem._replace(upper_x=np.array([np.inf, 0.6]))
     by_constraint = problem._replace(states=lambda x: x[1:] - 0.6, soft=None)
-    by_price = by_constraint._replace(soft=(1e2, 0.0))
-    start = np.zeros(2)
-    return [shoot(each, start, *STILL) for each in (by_limit, by_constraint, by_price)]
+    kinds = {
+        "limit": problem._replace(upper_x=np.array([np.inf, 0.6])),
+        "constraint": by_constraint,
+        "price": by_constraint._replace(soft=(1e2, 0.0)),
+    }
+    return shoot(kinds[kind], np.zeros(2), *STILL)
 
 
-def test_active_constraints_are_met_exactly_by_limits_constraints_and_prices_alike():
-    for solution in with_a_speed_limit():
-        assert solution.converged and solution.violation < 1e-7
-        speed = np.asarray(solution.plan.x[1:, 1])
-        assert speed.max() == pytest.approx(0.6, abs=1e-7) and (speed > 0.6 - 1e-6).sum() > 3
-        np.testing.assert_allclose(solution.plan.u, with_a_speed_limit()[0].plan.u, atol=1e-5)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["limit", "constraint", "price"])
+def test_active_constraints_are_met_exactly_by_limits_constraints_and_prices_alike(kind):
+    solution = with_a_speed_limit(kind)
+    assert solution.converged and solution.violation < 1e-7
+    speed = np.asarray(solution.plan.x[1:, 1])
+    assert speed.max() == pytest.approx(0.6, abs=1e-7) and (speed > 0.6 - 1e-6).sum() > 3
+    np.testing.assert_allclose(solution.plan.u, with_a_speed_limit("constraint").plan.u, atol=1e-5)
 
 
 def test_pressures_are_complementary_and_close_the_lagrangian():
-    solution = with_a_speed_limit()[1]
+    solution = with_a_speed_limit("constraint")
     x, u, prices = solution.plan.x, solution.plan.u, np.asarray(solution.multipliers)
     pressure = np.asarray(solution.pressures)[1:]  # of x_1 to x_N
     assert (pressure >= 0).all()
@@ -93,7 +97,7 @@ def test_ipopt_reaches_the_same_plan():
     quiet = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     solver = ca.nlpsol("s", "ipopt", {"x": ca.vertcat(ca.vec(X), U), "f": DT * ca.sumsqr(U), "g": g}, quiet)
     rival = solver(x0=0, lbg=low, ubg=np.zeros(equal + N + 1))
-    solution = with_a_speed_limit()[1]
+    solution = with_a_speed_limit("constraint")
     assert float(solution.plan.cost) == pytest.approx(float(rival["f"]), rel=1e-7)
     np.testing.assert_allclose(np.asarray(rival["x"]).ravel()[-N:], solution.plan.u[:, 0], atol=1e-4)
 
@@ -110,6 +114,7 @@ def test_a_soft_constraint_gives_way_where_its_price_is_low():
     assert float(solution.violation) == pytest.approx(20 / 24 - 0.5, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_an_infeasible_problem_says_which_constraint_and_by_how_much():
     """With 0.1 m/s² the mass gets 0.2 m far in 2 s."""
     problem = BLOCK._replace(lower=-0.1, upper=0.1, end=lambda x: x[:1] - 1.0)
@@ -122,18 +127,20 @@ def test_an_infeasible_problem_says_which_constraint_and_by_how_much():
     assert worst_violation(soft, solution.plan) == "inequality 0 of the end is violated by 0.8"
 
 
+@pytest.mark.slow
 def test_single_shooting_meets_constraints_of_states_too():
     problem = BLOCK._replace(end=to_one, upper_x=np.array([np.inf, 0.6]))
     plan = optimise(problem, np.zeros(2), np.zeros((N, 1)))
     assert plan.converged
-    np.testing.assert_allclose(plan.u, with_a_speed_limit()[0].plan.u, atol=1e-5)
+    np.testing.assert_allclose(plan.u, with_a_speed_limit("constraint").plan.u, atol=1e-5)
     assert worst_violation(problem, plan) == "all constraints hold within 1e-06"
 
 
+@pytest.mark.slow
 def test_more_guesses_keep_the_best():
     """A well of depth one at -1 and of depth two at 2, whose hill holds what starts on its left."""
     well = lambda x: (x[0] + 1) ** 2 * (x[0] - 2) ** 2 - x[0]  # noqa: E731
-    problem = BLOCK._replace(final_cost=well)
+    problem = BLOCK._replace(cost=lambda x, u: 1e-3 * u @ u, final_cost=well)
     left, right = (np.tile([end, 0.0], (N + 1, 1)) for end in (-1.0, 2.0))
     alone = shoot(problem, np.array([-1.0, 0.0]), left, STILL[1])
     both = shoot(problem, np.array([-1.0, 0.0]), left, STILL[1], starts=(right[None], STILL[1][None]))
