@@ -109,7 +109,7 @@ class Conditions(NamedTuple):
     values: Callable[[Array, Array], Values]
     slopes: Callable[[Array, Array], Slopes]
     curvatures: Callable[[Array, Array, Array, Array, Array], tuple[Array, Array]]
-    """(x, u, λ, z, ν) -> Hessians of L by steps [N, n+m, n+m] and of the end [n, n]."""
+    """(x, u, prices, z, nu) -> Hessians of L by steps [N, n+m, n+m] and of the end [n, n]."""
     kinds: Kinds
 
 
