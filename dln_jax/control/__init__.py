@@ -11,6 +11,7 @@ from dln_jax.control.closed_loop import (
     stateless,
 )
 from dln_jax.control.observers import with_differences, with_prediction
+from dln_jax.control.plan_limits import free_time, with_limits_of, worst_violation
 from dln_jax.control.regulators import (
     Region,
     Regulator,
@@ -23,7 +24,7 @@ from dln_jax.control.regulators import (
     time_varying_lqr,
     value,
 )
-from dln_jax.control.shooting import Shooting, shoot
+from dln_jax.control.shooting import Shooting, optimise, shoot
 from dln_jax.control.state_space import (
     Linearisation,
     error,
@@ -58,7 +59,7 @@ from dln_jax.control.tracking import (
     trusted,
     without_friction,
 )
-from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan, improve, mpc, optimise
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan, improve, mpc
 
 __all__ = [
     "ClosedLoopRun",
@@ -87,6 +88,7 @@ __all__ = [
     "field_of",
     "first_plan",
     "following",
+    "free_time",
     "friction_compensation",
     "gravity_compensation",
     "holding_controls",
@@ -115,6 +117,8 @@ __all__ = [
     "value",
     "where_finite",
     "with_differences",
+    "with_limits_of",
     "with_prediction",
     "without_friction",
+    "worst_violation",
 ]

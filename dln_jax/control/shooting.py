@@ -1,38 +1,34 @@
-"""Optimal trajectories by multiple shooting: the states at all knots are unknowns, and steps may be implicit.
+"""Optimal trajectories with constraints, by multiple and by single shooting with one interior-point method.
 
-    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   lower <= u_k <= upper
+    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 
-The defect of a step, d_k = f(x_k, u_k) - x_{k+1}, vanishes only at the solution. A guess need not be a motion, and an
-unstable system does not multiply its errors over the horizon (Bock and Plitt 1984).
-
-Sequential quadratic programming: all steps are expanded at once, and `constrained_lq` solves for the changes of states
-and controls. They are shortened until cost + nu |defects|_1 falls enough, with nu above the multipliers (Nocedal and
-Wright 2006, section 18.3). A full step may instead lower the augmented Lagrangian, because near a solution the first
-merit function can refuse steps that lead there (Maratos). Negative curvature of the costs is dropped. Through steps
-that are `integrated` by implicit methods, derivatives are those of the implicit function theorem.
+`shoot` takes the states at all knots as unknowns. The defect of a step, f(x_k, u_k) - x_{k+1}, vanishes only at the
+solution: a guess need not be a motion, and an unstable system does not multiply its errors over the horizon (Bock and
+Plitt 1984). `optimise` moves the controls alone: each trial is a motion under the gains of the step. Both use all
+curvature, that of the steps included; through steps that are `integrated` by implicit methods, derivatives are those of
+the implicit function theorem.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.control.constrained_lq import Horizon, least_cost
-from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, expand
+from dln_jax.control.barrier import Iterate
+from dln_jax.control.conditions import Conditions, conditions
+from dln_jax.control.interior_point import Search, search, straight
+from dln_jax.control.riccati import HorizonSolution
+from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, first_plan
 from dln_jax.solvers.ending import Ending
-from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, require_positive
 
-SHORTEST = 2.0**-12
-"""Shortest step length that is tried."""
-ENOUGH = 1e-4
-"""Required share of the decrease that the slope predicts (Armijo)."""
-ABOVE = 2.0
-"""Ratio of nu to the largest multiplier."""
-CLOSE = 1e-2
-"""Relative predicted decrease below which a full step counts as close, so that the steps' curvature is used."""
+LARGEST_GRADIENT = 100.0
+"""The cost is scaled such that its derivatives at the guess are not larger."""
 
 
 class Shooting(NamedTuple):
@@ -42,34 +38,30 @@ class Shooting(NamedTuple):
     """Plan for `mpc` and for feedback along it; its states are the knots, a motion to within the defect."""
     multipliers: Float[Array, "N n"]
     """Derivatives of the cost to go by the states at the ends of the steps."""
+    end_multipliers: Float[Array, " q"]
+    """Of the equations of the end."""
+    pressures: Float[Array, " M"]
+    """Multipliers of the inequalities, not negative, in the order of `control.conditions`."""
     defect: Float[Array, ""]
     """Largest |f(x_k, u_k) - x_{k+1}|, in the states' units."""
-    promised: Float[Array, ""]
-    """Predicted decrease of the cost by the last change, relative to the cost."""
+    violation: Float[Array, ""]
+    """Largest excess of an inequality or equation of the end, soft ones included."""
+    stationarity: Float[Array, ""]
+    """Largest derivative of the Lagrangian, for the cost divided by `scale`."""
+    feasibility: Float[Array, ""]
+    """Largest residual of all constraints with their slacks."""
+    complementarity: Float[Array, ""]
+    """Largest product of a slack and its multiplier."""
+    scale: Float[Array, ""]
+    """Number by which the cost was divided."""
     iterations: Int[Array, ""]
     ending: Int[Array, ""]
     """An `Ending`."""
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether defects and predicted decrease are within the tolerance; `solvers.ending.reason` says why not."""
+        """Whether all conditions of an optimum hold within the tolerance; `solvers.ending.reason` says why not."""
         return self.ending == Ending.CONVERGED
-
-
-class _Knots(NamedTuple):
-    x: Array
-    u: Array
-    K: Array
-    cost: Array
-    missed: Array
-    """[N, n], the defects."""
-    multipliers: Array
-    promised: Array
-    close: Array
-    """Whether the last change was a full step with a small predicted decrease."""
-    better: Array
-    iterations: Array
-    done: Array
 
 
 def shoot(
@@ -78,130 +70,180 @@ def shoot(
     states: Any,
     u: Any,
     *,
-    iterations: int = 100,
-    tolerance: float = 1e-9,
-    exact: bool = False,
+    iterations: int = 300,
+    tolerance: float = 1e-8,
+    exact: bool = True,
+    starts: tuple[Any, Any] | None = None,
 ) -> Shooting:
-    """Returns the optimal trajectory near a guess; traceable.
+    """Returns a locally optimal trajectory near a guess, by multiple shooting; traceable.
 
     Args:
         problem: to solve.
         x: initial state [n].
         states: guess [N+1, n], whose first is replaced by the initial state; it need not be a motion.
-        u: guess [N, m]; clipped to the limits.
+        u: guess [N, m].
         iterations: largest number of iterations.
-        tolerance: of the defects, relative to 1 + |x|, and of the cost.
-        exact: whether to use all curvature close to the optimum, including that of the steps: quadratic convergence,
-            for more derivatives. Otherwise the method is Gauss-Newton.
+        tolerance: of stationarity, feasibility and complementarity, with the cost scaled so that its derivatives at the
+            guess are at most 100. Stationarity and complementarity are divided by a hundredth of the mean multiplier
+            if that is above one.
+        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: the
+            least cost within the constraints, or else the least violation.
 
     Raises:
-        InputError: shapes that do not agree, or settings that are not positive.
+        InputError: shapes that do not agree, settings that are not positive, crossed limits, or a start outside the
+            limits of the states or their constraints.
     """
-    require_positive(iterations=iterations, tolerance=tolerance)
+    if starts is not None:
+
+        def one(states: Array, u: Array) -> Shooting:
+            return shoot(problem, x, states, u, iterations=iterations, tolerance=tolerance, exact=exact)
+
+        return _best(jax.vmap(one)(*_with_first((states, u), starts)), tolerance)
     x, states, u = (jnp.asarray(array, float) for array in (x, states, u))
     if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
         raise InputError(
             f"x has shape {x.shape}, states {states.shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]"
         )
-    states, u = states.at[0].set(x), jnp.clip(u, problem.lower, problem.upper)
-    cost, missed = _judge(problem, states, u)
-    no = jnp.asarray(False)
-    knots = _Knots(
-        states, u, jnp.zeros((*u.shape, x.shape[0]), u.dtype), cost, missed, jnp.zeros_like(missed),
-        jnp.zeros_like(cost), no, ~no, jnp.asarray(0), no,
+    _require_start(problem, x)
+    inside = _inside(states, problem.lower_x, problem.upper_x, "states")
+    first = x if problem.free is None else jnp.where(jnp.asarray(problem.free), inside[0], x)
+    u = _inside(u, problem.lower, problem.upper, "controls")
+    return _solved(problem, inside.at[0].set(first), u, straight, iterations, tolerance, exact)
+
+
+def optimise(
+    problem: TrajectoryProblem,
+    x: Any,
+    u: Any,
+    *,
+    iterations: int = 300,
+    tolerance: float = 1e-8,
+    exact: bool = True,
+    starts: Any = None,
+) -> Plan:
+    """Returns a locally optimal plan from initial controls, by single shooting; traceable.
+
+    The plan's `ending` states why it ended; all conditions of an optimum hold within the tolerance if it converged.
+
+    Args:
+        problem: to solve.
+        x: initial state [n].
+        u: initial controls [N, m].
+        iterations: largest number of iterations.
+        tolerance: as for `shoot`.
+        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        starts: more guesses [G, N, m], as for `shoot`.
+
+    Raises:
+        InputError: as for `shoot`.
+    """
+    plan = _single(problem, x, u, iterations, tolerance, exact) if starts is None else _best(
+        jax.vmap(lambda u: _single(problem, x, u, iterations, tolerance, exact))(*_with_first((u,), (starts,))),
+        tolerance,
     )  # fmt: skip
-
-    def going(knots: _Knots) -> Array:
-        return (knots.iterations < iterations) & ~knots.done & knots.better & jnp.isfinite(knots.cost)
-
-    last = jax.lax.while_loop(going, lambda knots: _iterate(problem, knots, tolerance, exact), knots)
-    outcomes = [Ending.CONVERGED, Ending.NOT_FINITE, Ending.NO_DESCENT]
-    ending = jnp.select([last.done, ~jnp.isfinite(last.cost), ~last.better], outcomes, Ending.OUT_OF_ITERATIONS)
-    plan = Plan(last.u, last.x, last.K, last.cost, jnp.asarray(FIRST_DAMPING, u.dtype), ~no, ending)
-    defect = jnp.max(jnp.abs(last.missed))
-    return Shooting(plan, last.multipliers, defect, last.promised, last.iterations, ending)
+    return plan.plan._replace(u=jnp.clip(plan.plan.u, problem.lower, problem.upper))
 
 
-def _iterate(problem: TrajectoryProblem, knots: _Knots, tolerance: float, exact: bool) -> _Knots:
-    """Evaluates the knots and improves them."""
-    n = knots.x.shape[1]
-    horizon = _expand(problem, knots, exact)
-    change = least_cost(horizon)
-    linear = jnp.sum(horizon.gradients[:, :n] * change.dx[:-1]) + jnp.sum(horizon.gradients[:, n:] * change.du)
-    linear = linear + horizon.end_gradient @ change.dx[-1]
-    largest = jnp.max(jnp.abs(knots.missed))
-    done = (largest <= tolerance * (1 + jnp.max(jnp.abs(knots.x)))) & (
-        jnp.abs(linear) <= tolerance * jnp.abs(knots.cost)
+def _single(problem: TrajectoryProblem, x: Any, u: Any, iterations: int, tolerance: float, exact: bool) -> Shooting:
+    u = _inside(jnp.asarray(u, float), problem.lower, problem.upper, "controls")
+    plan = first_plan(problem, x, u)
+    _require_start(problem, jnp.asarray(x, float))
+
+    def motion(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
+        """The motion under the gains of the step."""
+
+        def step(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+            about, u, dx, du, K = stage
+            u = u + length * (du - K @ dx) + K @ (x - about)
+            return problem.step(x, u), (x, u)
+
+        first = at.x[0] + length * change.dx[0]
+        last, (x, u) = jax.lax.scan(step, first, (at.x[:-1], at.u, change.dx[:-1], change.du, change.K))
+        return jnp.concatenate([x, last[None]]), u
+
+    return _solved(problem, plan.x, plan.u, motion, iterations, tolerance, exact)
+
+
+def _solved(
+    problem: TrajectoryProblem, x: Array, u: Array, trial: Callable[..., Any], iterations: int, tolerance: float,
+    exact: bool,
+) -> Shooting:  # fmt: skip
+    require_positive(iterations=iterations, tolerance=tolerance)
+    shape = len(u), x.shape[1], u.shape[1]
+
+    def cost(x: Array, u: Array) -> Array:
+        return jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1])
+
+    gradients = jax.grad(cost, argnums=(0, 1))(x, u)
+    scale = jnp.maximum(jnp.max(jnp.abs(jnp.concatenate([g.ravel() for g in gradients]))) / LARGEST_GRADIENT, 1.0)
+    scale = jnp.where(jnp.isfinite(scale), scale, 1.0)
+    of = conditions(problem, shape, 1 / scale, exact)
+    soft = None if problem.soft is None else (problem.soft[0] / scale, problem.soft[1] / scale)
+    last = search(of, trial, x, u, soft=soft, free=problem.free, iterations=iterations, tolerance=tolerance)
+    return _result(of, last, scale, tolerance)
+
+
+def _result(of: Conditions, last: Search, scale: Array, tolerance: float) -> Shooting:
+    at, values, residuals = last.at, last.values, last.residuals
+    excess = jnp.max(jnp.where(of.kinds.present, values.c, -jnp.inf), initial=0.0)
+    violation = jnp.maximum(excess, jnp.max(jnp.abs(values.h), initial=0.0))
+    given_up = (last.ending == Ending.NO_DESCENT) | (last.ending == Ending.OUT_OF_ITERATIONS)
+    outside = jnp.maximum(violation, residuals.feasibility) > jnp.sqrt(tolerance)
+    ending = jnp.where(given_up & outside, Ending.VIOLATED, last.ending)
+    plan = Plan(
+        at.u, at.x, last.K, scale * values.cost, jnp.asarray(FIRST_DAMPING, at.u.dtype), jnp.asarray(True), ending
     )
-    nu = ABOVE * jnp.max(jnp.abs(change.multipliers))
-    rho = nu / (1 + jnp.max(jnp.abs(knots.x)))
-
-    def merits(cost: Array, missed: Array) -> Array:
-        of_lagrangian = cost + jnp.sum(change.multipliers * missed) + rho / 2 * jnp.sum(missed**2)
-        return jnp.stack([cost + nu * jnp.sum(jnp.abs(missed)), of_lagrangian])
-
-    now = merits(knots.cost, knots.missed)
-    priced = jnp.sum(change.multipliers * knots.missed) + rho * jnp.sum(knots.missed**2)
-    slopes = linear - jnp.stack([nu * jnp.sum(jnp.abs(knots.missed)), priced])
-
-    def judged(length: Array) -> tuple[Array, Array, Array, Array]:
-        cost, missed = _judge(problem, knots.x + length * change.dx, knots.u + length * change.du)
-        fell = merits(cost, missed) <= now + ENOUGH * length * slopes
-        # At the solution, the remaining gain is below the rounding of the cost.
-        return length, cost, missed, done | fell[0] | (fell[1] & (length == 1))
-
-    def too_long(trial: tuple[Array, Array, Array, Array]) -> Array:
-        return ~trial[3] & (trial[0] > SHORTEST)
-
-    twice = jnp.asarray(2.0, knots.u.dtype), knots.cost, knots.missed, jnp.asarray(False)
-    length, cost, missed, better = jax.lax.while_loop(too_long, lambda trial: judged(trial[0] / 2), twice)
-    new = knots._replace(x=knots.x + length * change.dx, u=knots.u + length * change.du, cost=cost, missed=missed)
-    kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), new, knots)
-    close = better & (length == 1) & (jnp.abs(linear) <= CLOSE * jnp.abs(knots.cost))
-    # A step that fails with all curvature is retried without.
-    return kept._replace(
-        K=change.K, multipliers=change.multipliers, promised=-linear / jnp.abs(knots.cost), close=close,
-        better=better | knots.close, iterations=knots.iterations + 1, done=done,
+    return Shooting(
+        plan, scale * at.prices, scale * at.nu, scale * at.z, jnp.max(jnp.abs(values.defects)),
+        violation, *residuals, scale, last.iterations, ending,
     )  # fmt: skip
 
 
-def _judge(problem: TrajectoryProblem, x: Array, u: Array) -> tuple[Array, Array]:
-    """Returns the cost, and the defects [N, n]."""
-    missed = jax.vmap(problem.step)(x[:-1], u) - x[1:]
-    return jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1]), missed
+def _with_first(first: tuple[Any, ...], more: tuple[Any, ...]) -> list[Array]:
+    """Stacks a guess and more of its kind."""
+    pairs = [(jnp.asarray(one, float), jnp.asarray(others, float)) for one, others in zip(first, more, strict=True)]
+    if any(others.shape[1:] != one.shape for one, others in pairs):
+        shapes = [others.shape for _, others in pairs]
+        raise InputError(f"starts have shapes {shapes}; expected that of the guess after an axis of guesses")
+    return [jnp.concatenate([one[None], others]) for one, others in pairs]
 
 
-def _expand(problem: TrajectoryProblem, knots: _Knots, exact: bool) -> Horizon:
-    """Returns the quadratic program at the knots."""
-    n = knots.x.shape[1]
-    horizon = expand(problem, knots.x, knots.u, knots.missed)
-    curvatures = _not_negative(horizon.curvatures, horizon.end_curvature)
-    if exact:
-
-        def of_lagrangian() -> tuple[Array, Array]:
-            both = jnp.concatenate([knots.x[:-1], knots.u], axis=1)
-            prices = _adjoint(horizon.slopes[:, :, :n], horizon.gradients[:, :n], horizon.end_gradient)
-            bent = jax.vmap(jax.hessian(lambda xu, price: price @ problem.step(xu[:n], xu[n:])))(both, prices)
-            return horizon.curvatures + bent, horizon.end_curvature
-
-        curvatures = jax.lax.cond(knots.close, of_lagrangian, lambda: curvatures)
-    return horizon._replace(curvatures=curvatures[0], end_curvature=curvatures[1])
+def _best(solutions: Shooting, tolerance: float) -> Shooting:
+    """The solution of least cost within the constraints; where there is none, that of least violation."""
+    off = jnp.maximum(solutions.violation, solutions.feasibility)
+    # Soft constraints may be violated where all conditions hold.
+    inside = (solutions.ending == Ending.CONVERGED) | (off <= jnp.sqrt(tolerance))
+    best = jnp.where(inside.any(), *(jnp.argmin(jnp.where(jnp.isfinite(key), key, jnp.inf)) for key in (
+        jnp.where(inside, solutions.plan.cost, jnp.inf), off)))  # fmt: skip
+    return jax.tree.map(lambda leaf: leaf[best], solutions)
 
 
-def _adjoint(slopes: Array, gradients: Array, end: Array) -> Array:
-    """Multipliers [N, n] from the derivatives of the steps and of the costs by the states."""
+def _require_start(problem: TrajectoryProblem, x: Array) -> None:
+    """Raises `InputError` for a known start outside its limits, which no control changes."""
+    known = [x, problem.lower_x, problem.upper_x]
+    if any(isinstance(value, Tracer) for value in known) or not np.isfinite(x).all():
+        return
+    fixed = np.ones(len(x), bool) if problem.free is None else ~np.asarray(problem.free)
+    for word, limit, sign in (("below its lower", problem.lower_x, -1), ("above its upper", problem.upper_x, 1)):
+        limit = np.broadcast_to(np.asarray(limit, float), x.shape)
+        for i in np.flatnonzero(fixed & (sign * (np.asarray(x) - limit) > 0))[:1]:
+            raise InputError(f"state {i} starts at {x[i]:.6g}, {word} limit of {limit[i]:.6g}; start inside the limits")
+    if problem.states is not None and fixed.all():
+        for i, excess in enumerate(np.asarray(jax.jit(problem.states)(x))):
+            if excess > 0:
+                raise InputError(f"constraint {i} on the states is {excess:.6g} at the start; expected zero or less")
 
-    def back(after: Array, stage: tuple[Array, Array]) -> tuple[Array, Array]:
-        slope, gradient = stage
-        return gradient + slope.T @ after, after
 
-    return jax.lax.scan(back, end, (slopes, gradients), reverse=True)[1]
-
-
-def _not_negative(curvatures: Array, end: Array) -> tuple[Array, Array]:
-    """Sets negative eigenvalues of the Hessians to zero."""
-    n = len(end)
-    every = jnp.concatenate([curvatures, jnp.zeros_like(curvatures[:1]).at[0, :n, :n].set(end)])
-    sizes, axes = jax.vmap(symmetric_eigen)(every)
-    kept = jnp.einsum("kij,kj,klj->kil", axes, jnp.maximum(sizes, 0.0), axes)
-    return kept[:-1], kept[-1, :n, :n]
+def _inside(guess: Array, lower: Any, upper: Any, name: str) -> Array:
+    """Moves a guess inside its limits, by a hundredth of their distance."""
+    if not any(isinstance(limit, Tracer) for limit in (lower, upper)):
+        low, high = np.broadcast_arrays(np.asarray(lower, float), np.asarray(upper, float))
+        if crossed := np.flatnonzero(~(low < high)).tolist():
+            raise InputError(f"limits {crossed} of the {name} are not in order; expected lower < upper")
+    low, high = (jnp.asarray(limit, guess.dtype) for limit in (lower, upper))
+    margin = jnp.minimum(1e-2 * (high - low), jnp.inf)
+    one_low, one_high = (1e-2 * jnp.maximum(1.0, jnp.abs(limit)) for limit in (low, high))
+    low = jnp.where(jnp.isfinite(low), low + jnp.minimum(one_low, margin), low)
+    high = jnp.where(jnp.isfinite(high), high - jnp.minimum(one_high, margin), high)
+    return jnp.clip(guess, low, high)

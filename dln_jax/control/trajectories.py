@@ -17,7 +17,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.control.constrained_lq import Horizon
 from dln_jax.control.state_space import where_finite
 from dln_jax.solvers.elimination import solve
 from dln_jax.solvers.ending import Ending
@@ -42,6 +41,24 @@ class TrajectoryProblem(NamedTuple):
     lower: Any = -jnp.inf
     """Lower limits of the controls, [m] or one for all."""
     upper: Any = jnp.inf
+    lower_x: Any = -jnp.inf
+    """Lower limits of the states x_1 to x_N, [n] or one for all; hard, like those of the controls."""
+    upper_x: Any = jnp.inf
+    path: Callable[[Array, Array], Array] | None = None
+    """(x, u) -> [p], not above zero at every step, such as limits of a torque that depends on the state."""
+    states: Callable[[Array], Array] | None = None
+    """x -> [r], not above zero at x_1 to x_N, such as distances to obstacles with their sign reversed."""
+    end_below: Callable[[Array], Array] | None = None
+    """x_N -> [e], not above zero."""
+    end: Callable[[Array], Array] | None = None
+    """x_N -> [q], zero; always hard."""
+    soft: tuple[float, float] | None = (1e3, 1e3)
+    """Weights (w_1, w_2) of w_1 t + w_2 t² / 2 for the excess t of `path`, `states` and `end_below`; None: hard.
+
+    The excess is zero where constraints can be met at a price per unit below w_1.
+    """
+    free: Any = None
+    """Mask [n] of the components of the first state that are unknowns, such as a duration; by default none."""
 
 
 class Plan(NamedTuple):
@@ -79,11 +96,6 @@ def first_plan(problem: TrajectoryProblem, x: Any, u: Any) -> Plan:
 
 def improve(problem: TrajectoryProblem, plan: Plan, *, step_lengths: Any = STEP_LENGTHS) -> Plan:
     """Runs one iteration and takes the best of some step lengths [L]; the cost never rises."""
-    return _improved(problem, plan, step_lengths)[0]
-
-
-def _improved(problem: TrajectoryProblem, plan: Plan, step_lengths: Any) -> tuple[Plan, Array]:
-    """Returns the plan after an iteration, and the decrease of the cost at the first step length."""
     k, K = _backward(problem, plan)
     lengths = jnp.asarray(step_lengths, plan.u.dtype)
     x, u, costs = jax.vmap(lambda length: _follow(problem, plan.x[0], plan._replace(u=plan.u + length * k, K=K)))(
@@ -96,42 +108,7 @@ def _improved(problem: TrajectoryProblem, plan: Plan, step_lengths: Any) -> tupl
     less_damping, more_damping = jnp.maximum(plan.damping / 10, MIN_DAMPING), plan.damping * 10
     new = Plan(u[best], x[best], K, costs[best], less_damping, better, undecided)
     kept = plan._replace(K=K, damping=jnp.minimum(more_damping, MAX_DAMPING), better=better, ending=undecided)
-    return jax.tree.map(lambda new, old: jnp.where(better, new, old), new, kept), plan.cost - costs[0]
-
-
-def optimise(problem: TrajectoryProblem, x: Any, u: Any, *, iterations: int = 200, tolerance: float = 1e-9) -> Plan:
-    """Iterates from initial controls until the relative decrease of the cost is small, or no step is better.
-
-    The plan's `ending` states which. Without a lower cost it has converged only if a full step changes nothing either.
-
-    Args:
-        problem: to solve.
-        x: initial state [n].
-        u: initial controls [N, m].
-        iterations: largest number of iterations.
-        tolerance: relative change of the cost.
-    """
-    require_positive(iterations=iterations, tolerance=tolerance)
-    plan = first_plan(problem, x, u)
-
-    def ending(number: Array, plan: Plan, fell: Array) -> Array:
-        conditions = [
-            ~jnp.isfinite(plan.cost) & (number > 0),
-            (jnp.abs(fell) <= tolerance * jnp.abs(plan.cost)) & (number > 0),
-            ~plan.better & (plan.damping >= MAX_DAMPING),
-            number >= iterations,
-        ]
-        outcomes = [Ending.NOT_FINITE, Ending.CONVERGED, Ending.NO_DESCENT, Ending.OUT_OF_ITERATIONS]
-        return jnp.select(conditions, outcomes, Ending.UNDECIDED)
-
-    def iterate(carry: tuple[Array, Plan, Array]) -> tuple[Array, Plan, Array]:
-        number, plan, _ = carry
-        new, by_whole_step = _improved(problem, plan, STEP_LENGTHS)
-        return number + 1, new, jnp.where(new.better, plan.cost - new.cost, by_whole_step)
-
-    start = (jnp.asarray(0), plan, jnp.asarray(jnp.inf, plan.u.dtype))
-    last = jax.lax.while_loop(lambda carry: ending(*carry) == Ending.UNDECIDED, iterate, start)
-    return last[1]._replace(ending=ending(*last))
+    return jax.tree.map(lambda new, old: jnp.where(better, new, old), new, kept)
 
 
 def mpc(
@@ -174,28 +151,18 @@ def _follow(problem: TrajectoryProblem, x: Array, plan: Plan) -> tuple[Array, Ar
     return jnp.concatenate([states, last[None]]), u, jnp.sum(costs) + problem.final_cost(last)
 
 
-def expand(problem: TrajectoryProblem, x: Array, u: Array, missed: Array) -> Horizon:
-    """Expands the steps to first and the costs to second order at states [N+1, n] and controls [N, m].
-
-    `missed` [N, n] are the defects of the steps. The result's limits are those of the change of the controls.
-    """
-    n, both = x.shape[1], jnp.concatenate([x[:-1], u], axis=1)
+def _backward(problem: TrajectoryProblem, plan: Plan) -> tuple[Array, Array]:
+    """Returns k [N, m] and K [N, m, n]."""
+    n, both = plan.x.shape[1], jnp.concatenate([plan.x[:-1], plan.u], axis=1)
 
     def of_both(function: Callable[..., Any]) -> Callable[[Array], Any]:
         return lambda xu: function(xu[:n], xu[n:])
 
     cost, limits = of_both(problem.cost), (problem.lower, problem.upper)
-    low, high = (jnp.broadcast_to(jnp.asarray(limit, u.dtype), u.shape) - u for limit in limits)
-    return Horizon(
-        jax.vmap(jax.jacfwd(of_both(problem.step)))(both), missed, jax.vmap(jax.grad(cost))(both),
-        jax.vmap(jax.hessian(cost))(both), jax.grad(problem.final_cost)(x[-1]), jax.hessian(problem.final_cost)(x[-1]),
-        low, high,
-    )  # fmt: skip
-
-
-def _backward(problem: TrajectoryProblem, plan: Plan) -> tuple[Array, Array]:
-    """Returns k [N, m] and K [N, m, n]."""
-    n, horizon = plan.x.shape[1], expand(problem, plan.x, plan.u, jnp.zeros_like(plan.x[1:]))
+    low, high = (jnp.broadcast_to(jnp.asarray(limit, plan.u.dtype), plan.u.shape) - plan.u for limit in limits)
+    slopes = jax.vmap(jax.jacfwd(of_both(problem.step)))(both)
+    stages = slopes, jax.vmap(jax.grad(cost))(both), jax.vmap(jax.hessian(cost))(both), low, high
+    end = jax.grad(problem.final_cost)(plan.x[-1]), jax.hessian(problem.final_cost)(plan.x[-1])
 
     def back(value: tuple[Array, Array], stage: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         g, H = value
@@ -208,8 +175,7 @@ def _backward(problem: TrajectoryProblem, plan: Plan) -> tuple[Array, Array]:
         H = Qxx + K.T @ Quu @ K + K.T @ Qux + Qux.T @ K
         return (g, (H + H.T) / 2), (k, K)
 
-    stages = horizon.slopes, horizon.gradients, horizon.curvatures, horizon.low, horizon.high
-    _, (k, K) = jax.lax.scan(back, (horizon.end_gradient, horizon.end_curvature), stages, reverse=True)
+    _, (k, K) = jax.lax.scan(back, end, stages, reverse=True)
     return k, K
 
 

@@ -14,6 +14,7 @@ class Ending(IntEnum):
     NO_DESCENT = 2
     NOT_FINITE = 3
     UNDECIDED = 4
+    VIOLATED = 5
 
 
 REASONS = {
@@ -21,6 +22,8 @@ REASONS = {
     Ending.OUT_OF_ITERATIONS: "used up its iterations before it reached the tolerance; allow more, or start closer",
     Ending.NO_DESCENT: "found no step that improves; scale the problem, or start closer",
     Ending.NOT_FINITE: "met a number that is not finite; start closer, or bound the states and controls",
+    Ending.VIOLATED: "ended where constraints are violated (`control.worst_violation` names the worst); start closer, "
+    "or make them soft",
     Ending.UNDECIDED: "has not ended: a single iteration cannot tell",
 }
 

@@ -53,12 +53,13 @@ def total(problem, x, u):
 
 @pytest.mark.parametrize("limit", [0.3, 0.8])
 def test_limits_hold_and_the_rest_is_stationary(limit):
-    plan = solver(1e-14)(limit, START, np.zeros((N, 2)))
+    plan = solver(1e-9)(limit, START, np.zeros((N, 2)))
     slope = np.asarray(jax.jit(jax.grad(functools.partial(total, LINEAR, START)))(plan.u))
     u = np.asarray(plan.u)
-    assert np.abs(u).max() <= limit and (np.abs(u) == limit).any() and (np.abs(u) < limit).any()
-    np.testing.assert_allclose(slope[np.abs(u) < limit], 0.0, atol=1e-6)
-    assert (slope[u == limit] < 0).all() and (slope[u == -limit] > 0).all()
+    inside = np.abs(u) < limit - 1e-6
+    assert np.abs(u).max() <= limit and inside.any() and not inside.all()
+    np.testing.assert_allclose(slope[inside], 0.0, atol=1e-6)
+    assert (slope[~inside] * u[~inside] < 0).all()
 
 
 @pytest.mark.slow

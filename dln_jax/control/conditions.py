@@ -1,0 +1,196 @@
+"""The conditions of an optimal trajectory: constraints as one vector, derivatives by stages, residuals.
+
+    L = sum_k l(x_k, u_k) + l_N(x_N) + sum_k λ_{k+1}·(f(x_k, u_k) - x_{k+1}) + z·c + ν·h(x_N),   c <= 0, h = 0
+
+c stacks limits of controls, path constraints, limits of states and constraints on states, first of the steps, then of
+the end. The limits and constraints of a fixed first state are left out: no control changes them.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+from jaxtyping import Bool, Float
+
+from dln_jax.control.riccati import Horizon
+from dln_jax.control.trajectories import TrajectoryProblem
+
+Rows = Callable[..., Array]
+
+
+class Values(NamedTuple):
+    """A trajectory's cost and constraints."""
+
+    cost: Float[Array, ""]
+    c: Float[Array, " M"]
+    """Inequalities, negative inside."""
+    defects: Float[Array, "N n"]
+    h: Float[Array, " q"]
+    """Equations of the end."""
+
+
+class Slopes(NamedTuple):
+    """First derivatives."""
+
+    steps: Float[Array, "N n n+m"]
+    cost: Float[Array, "N n+m"]
+    end_cost: Float[Array, " n"]
+    rows: Float[Array, "N P n+m"]
+    end_rows: Float[Array, "E n"]
+    h: Float[Array, "q n"]
+
+
+class Kinds(NamedTuple):
+    """Masks of the inequalities."""
+
+    present: Bool[Array, " M"]
+    """Limits that are finite, at states that are unknowns."""
+    soft: Bool[Array, " M"]
+
+
+def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
+    """Returns y -> distances beyond the finite limits, and the mask of those that are."""
+
+    def sides(size: int) -> list[tuple[int, Any, np.ndarray]]:
+        chosen = []
+        for sign, limit in ((-1, lower), (1, upper)):
+            # Limits that are traced may turn out infinite: their rows are masked.
+            traced = isinstance(limit, Tracer)
+            index = np.arange(size) if traced else np.flatnonzero(np.broadcast_to(np.isfinite(limit), size))
+            chosen.append((sign, jnp.broadcast_to(jnp.asarray(limit, float), size)[index], index))
+        return chosen
+
+    def rows(y: Array) -> Array:
+        finite = [(sign, jnp.where(jnp.isfinite(limit), limit, 0.0), i) for sign, limit, i in sides(len(y))]
+        return jnp.concatenate([sign * (y[index] - limit) for sign, limit, index in finite])
+
+    return rows, lambda size: jnp.concatenate([jnp.isfinite(limit) for _, limit, _ in sides(size)])
+
+
+def constraints(problem: TrajectoryProblem, n: int, m: int) -> tuple[Rows, Rows, Callable[[int], Kinds]]:
+    """Returns (x, u) -> rows [P] of a step, x -> rows [E] of the end, and N -> the masks of all M rows."""
+    of_u, finite_u = _beyond(problem.lower, problem.upper)
+    of_x, finite_x = _beyond(problem.lower_x, problem.upper_x)
+
+    def on_state(x: Array) -> list[Array]:
+        return [of_x(x), *([problem.states(x)] if problem.states else [])]
+
+    def step_rows(x: Array, u: Array) -> Array:
+        return jnp.concatenate([of_u(u), *([problem.path(x, u)] if problem.path else []), *on_state(x)])
+
+    def end_rows(x: Array) -> Array:
+        return jnp.concatenate([*on_state(x), *([problem.end_below(x)] if problem.end_below else [])])
+
+    def size(function: Any, *shapes: int) -> int:
+        return jax.eval_shape(function, *(jnp.zeros(shape) for shape in shapes)).shape[0] if function else 0
+
+    def kinds(steps: int) -> Kinds:
+        limits_u, limits_x = finite_u(m), finite_x(n)
+        path, states, end = size(problem.path, n, m), size(problem.states, n), size(problem.end_below, n)
+        yes, no = (lambda number: jnp.ones(number, bool)), (lambda number: jnp.zeros(number, bool))
+        present = jnp.concatenate([limits_u, yes(path), limits_x, yes(states)])
+        soft = jnp.concatenate([no(len(limits_u)), yes(path), no(len(limits_x)), yes(states)])
+        present, soft = jnp.tile(present, (steps, 1)), jnp.tile(soft, (steps, 1))
+        present = present.at[0, len(limits_u) + path :].set(False)
+        end_present = jnp.concatenate([limits_x, yes(states + end)])
+        end_soft = jnp.concatenate([no(len(limits_x)), yes(states + end)])
+        return Kinds(*(jnp.concatenate([a.ravel(), b]) for a, b in ((present, end_present), (soft, end_soft))))
+
+    return step_rows, end_rows, kinds
+
+
+class Conditions(NamedTuple):
+    """Functions of a trajectory x [N+1, n], u [N, m], whose cost is multiplied by a scale."""
+
+    values: Callable[[Array, Array], Values]
+    slopes: Callable[[Array, Array], Slopes]
+    curvatures: Callable[[Array, Array, Array, Array, Array], tuple[Array, Array]]
+    """(x, u, prices, z, nu) -> Hessians of L by steps [N, n+m, n+m] and of the end [n, n]."""
+    kinds: Kinds
+
+
+def conditions(problem: TrajectoryProblem, shape: tuple[int, int, int], scale: Array, exact: bool) -> Conditions:
+    """Returns the functions for N steps of n states and m controls; Gauss-Newton unless `exact`: costs curve alone."""
+    steps, n, m = shape
+    step_rows, end_rows, kinds = constraints(problem, n, m)
+    equal = problem.end if problem.end is not None else (lambda x: jnp.zeros(0, x.dtype))
+
+    def of_both(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda xu, *rest: function(xu[:n], xu[n:], *rest)
+
+    def cost(x: Array, u: Array) -> Array:
+        return scale * problem.cost(x, u)
+
+    def end_cost(x: Array) -> Array:
+        return scale * problem.final_cost(x)
+
+    def values(x: Array, u: Array) -> Values:
+        rows = jax.vmap(step_rows)(x[:-1], u)
+        defects = jax.vmap(problem.step)(x[:-1], u) - x[1:]
+        total = jnp.sum(jax.vmap(cost)(x[:-1], u)) + end_cost(x[-1])
+        return Values(total, jnp.concatenate([rows.ravel(), end_rows(x[-1])]), defects, equal(x[-1]))
+
+    def slopes(x: Array, u: Array) -> Slopes:
+        both = jnp.concatenate([x[:-1], u], axis=1)
+        return Slopes(
+            jax.vmap(jax.jacfwd(of_both(problem.step)))(both), jax.vmap(jax.grad(of_both(cost)))(both),
+            jax.grad(end_cost)(x[-1]), jax.vmap(jax.jacfwd(of_both(step_rows)))(both), jax.jacfwd(end_rows)(x[-1]),
+            jax.jacfwd(equal)(x[-1]),
+        )  # fmt: skip
+
+    def of_stage(x: Array, u: Array, price: Array, z: Array) -> Array:
+        return cost(x, u) + price @ problem.step(x, u) + z @ step_rows(x, u) if exact else cost(x, u)
+
+    def of_end(x: Array, z: Array, nu: Array) -> Array:
+        return end_cost(x) + z @ end_rows(x) + nu @ equal(x) if exact else end_cost(x)
+
+    def curvatures(x: Array, u: Array, prices: Array, z: Array, nu: Array) -> tuple[Array, Array]:
+        both, (by_step, at_end) = jnp.concatenate([x[:-1], u], axis=1), split(z, steps, end_size)
+        return jax.vmap(jax.hessian(of_both(of_stage)))(both, prices, by_step), jax.hessian(of_end)(x[-1], at_end, nu)
+
+    end_size = jax.eval_shape(end_rows, jnp.zeros(n)).shape[0]
+    return Conditions(values, slopes, curvatures, kinds(steps))
+
+
+def split(rows: Array, steps: int, end_size: int) -> tuple[Array, Array]:
+    """Splits a vector [M] into the rows of the steps [N, P] and those of the end [E]."""
+    cut = len(rows) - end_size
+    return rows[:cut].reshape(steps, -1), rows[cut:]
+
+
+def along(slopes: Slopes, dx: Array, du: Array) -> tuple[Array, Array, Array]:
+    """Directional derivatives of the cost, of c [M] and of h [q]."""
+    both = jnp.concatenate([dx[:-1], du], axis=1)
+    of_cost = jnp.sum(slopes.cost * both) + slopes.end_cost @ dx[-1]
+    rows = jnp.einsum("kpi,ki->kp", slopes.rows, both)
+    return of_cost, jnp.concatenate([rows.ravel(), slopes.end_rows @ dx[-1]]), slopes.h @ dx[-1]
+
+
+def stationarity(slopes: Slopes, prices: Array, z: Array, nu: Array, free: Any) -> Array:
+    """Gradient of L by all unknowns; a fixed first state has none."""
+    n, steps = slopes.steps.shape[1], len(slopes.steps)
+    by_step, at_end = split(z, steps, len(slopes.end_rows))
+    both = slopes.cost + jnp.einsum("kij,ki->kj", slopes.steps, prices) + jnp.einsum("kpj,kp->kj", slopes.rows, by_step)
+    end = slopes.end_cost + slopes.end_rows.T @ at_end + slopes.h.T @ nu
+    by_x = jnp.concatenate([both[:, :n], end[None]]).at[1:].add(-prices)
+    first = by_x[0] * (0.0 if free is None else jnp.asarray(free))
+    return jnp.concatenate([by_x.at[0].set(first).ravel(), both[:, n:].ravel()])
+
+
+def program(
+    slopes: Slopes, curvatures: tuple[Array, Array], gradient: Array, weight: Array, missed: Array, damping: Any
+) -> Horizon:
+    """The quadratic program of a step, with `gradient` and `weight` [M] on the inequalities' rows, and damping."""
+    n, steps = slopes.steps.shape[1], len(slopes.steps)
+    (by_step, at_end), (stiff, stiff_end) = (split(rows, steps, len(slopes.end_rows)) for rows in (gradient, weight))
+    of_steps = curvatures[0] + jnp.einsum("kpi,kp,kpj->kij", slopes.rows, stiff, slopes.rows)
+    of_end = curvatures[1] + slopes.end_rows.T @ (stiff_end[:, None] * slopes.end_rows)
+    return Horizon(
+        slopes.steps, missed, slopes.cost + jnp.einsum("kpj,kp->kj", slopes.rows, by_step),
+        of_steps + damping * jnp.eye(of_steps.shape[1]), slopes.end_cost + slopes.end_rows.T @ at_end,
+        of_end + damping * jnp.eye(n),
+    )  # fmt: skip
