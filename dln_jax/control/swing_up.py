@@ -28,7 +28,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.regulators import Regulator, lqr, regulated, switched, value
-from dln_jax.control.state_space import Law, field_of, holding_controls, linearise, where_finite
+from dln_jax.control.state_space import Law, Linearisation, field_of, holding_controls, linearise, where_finite
 from dln_jax.control.tracking import GAIN, definite, friction_compensation, without_friction
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.solvers.elimination import solve
@@ -169,6 +169,17 @@ class SwingUp(NamedTuple):
         return float(jnp.max(jnp.abs(self.equilibrium)))
 
 
+class Upright(NamedTuple):
+    """A checked model with its own equilibrium near the goal, and what a swing-up needs of both."""
+
+    model: Dynamics
+    """With friction, if it has any."""
+    parts: Parts
+    B: Float[np.ndarray, "d m"]
+    at: Linearisation
+    """At the equilibrium, without friction."""
+
+
 def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> Vector:
     """Posture [d] nearest to a goal with zero force at the passive joints, by Newton's method over these.
 
@@ -223,6 +234,25 @@ def swing_up(
         InputError: a model without energies, with a mass matrix that is not definite, without an equilibrium near the
             goal, or with one that the limits cannot hold or no feedback stabilises.
     """
+    upright = upright_of(
+        model, actuation, goal, postures=postures, lower=lower, upper=upper, tolerance=tolerance
+    )  # fmt: skip
+    with jax.ensure_compile_time_eval():
+        regulator = lqr(upright.at.A, upright.at.B, numbers.state_cost, numbers.control_cost)
+    return SwingUp(law_at(upright, joints, numbers, regulator), upright.at.x, upright.at.u, regulator)
+
+
+def upright_of(
+    model: Dynamics | PlainDynamics,
+    actuation: Any,
+    goal: Any,
+    *,
+    postures: Any,
+    lower: Any = -jnp.inf,
+    upper: Any = jnp.inf,
+    tolerance: float = 1e-6,
+) -> Upright:
+    """Checks a model and computes its equilibrium near the goal; arguments and errors as for `swing_up`."""
     parts, B = parts_of(actuation), np.asarray(actuation, float)
     # Values that depend on the model only are computed now, even if gains or the level are being traced.
     with jax.ensure_compile_time_eval():
@@ -246,13 +276,17 @@ def swing_up(
                 "choose another goal, or a stronger motor"
             )
         x = jnp.concatenate([home, jnp.zeros_like(home)])
-        at = linearise(field_of(whole, B), x, controls, tolerance=np.inf)
-        regulator = lqr(at.A, at.B, numbers.state_cost, numbers.control_cost)
+        return Upright(model, parts, B, linearise(field_of(whole, B), x, controls, tolerance=np.inf))
+
+
+def law_at(upright: Upright, joints: tuple[JointKind, ...], numbers: SwingUpNumbers, regulator: Regulator) -> Law:
+    """The law x -> u of a swing-up to an equilibrium; gains, level, kick and regulator may be traced."""
+    parts, (home, _) = upright.parts, jnp.split(upright.at.x, 2)
     # Motors are ordered by columns of the matrix, active joints by coordinates.
-    to_controls = jnp.linalg.pinv(B[np.array(parts.active)])
-    shaped = energy_shaping(conservative, parts, home, numbers.gains)
-    near = regulated(regulator, x, controls, joints)
-    cost = value(regulator, x, joints)
+    to_controls = jnp.linalg.pinv(upright.B[np.array(parts.active)])
+    shaped = energy_shaping(without_friction(upright.model), parts, home, numbers.gains)
+    near = regulated(regulator, upright.at.x, upright.at.u, joints)
+    cost = value(regulator, upright.at.x, joints)
 
     def far(x: Array) -> Array:
         q, qd = jnp.split(x, 2)
@@ -263,9 +297,11 @@ def swing_up(
 
     law = switched(far, near, cost, numbers.level)
     if numbers.compensation == 0:
-        return SwingUp(law, x, controls, regulator)
-    friction = friction_compensation(model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation)
-    return SwingUp(lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2)), x, controls, regulator)
+        return law
+    friction = friction_compensation(
+        upright.model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation
+    )  # fmt: skip
+    return lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2))
 
 
 def _with_energy(model: Dynamics | PlainDynamics) -> Dynamics:
