@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.plants.explore import Exploration, Explored, explore
+from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
-from dln_jax.control.plants.tune import Tuned, controller_of, tune
+from dln_jax.control.plants.tuning import Tuned, controller_of, tune
 from dln_jax.data.encoders import noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, prepare
@@ -55,8 +55,8 @@ def learn_to_swing_up(
         f"explored: {len(recording.t) / plant.layout.rate:.3g} s in {len(recording.label)} episodes, "
         f"{len(explored.stopped)} stopped"
     )
-    prepared = prepare(recording)
-    fitted = identified(prepared.train, plant.layout.needs)
+    prepared = prepare(recording, chain=True)
+    fitted = identified(prepared.train, plant.layout.needs, chain=True)
     say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     hardware = Hardware(encoder_noise=noise, delay=prepared.delay)
@@ -71,7 +71,7 @@ def learn_to_swing_up(
 def model_of(recording: Trajectories) -> Dynamics:
     """The identified model of a recording of q and commanded torques."""
     assert recording.needs is not None  # explored
-    return identified(prepare(recording).train, recording.needs).dynamics
+    return identified(prepare(recording, chain=True).train, recording.needs, chain=True).dynamics
 
 
 def try_plant(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import ClosedLoopRun, Hardware
-from dln_jax.control.plants.explore import Exploration
+from dln_jax.control.plants.exploring import Exploration
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun

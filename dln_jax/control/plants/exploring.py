@@ -19,7 +19,7 @@ from dln_jax.control.observers import with_differences
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, compiled, run
 from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of
-from dln_jax.control.plants.tune import cutoff_for
+from dln_jax.control.plants.tuning import cutoff_for
 from dln_jax.control.swing_up import energy_shaping, upright_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics
