@@ -9,6 +9,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -27,6 +28,8 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 DAMPING = 0.15
 """Damping of the blind episodes' spring over its stiffness, s."""
+FITTED_EVERY = 2
+"""Number of later episodes after which the model is fitted again."""
 SHORTEST = 1.0
 """Shortest episode that is kept, s."""
 
@@ -85,22 +88,21 @@ def explore(
     seconds = exploration.seconds / len(stages)
     runs: list[PlantRun] = []
     stopped: list[str] = []
-    weaker, blind, fitted = 1.0, compiled(_blind(inner), inner), None
-
-    for number in range(len(stages)):
-        act, noise = blind, exploration.blind[min(number, len(exploration.blind) - 1)]
-        first = number == len(exploration.blind)
-        if number >= len(exploration.blind):
-            if first or (number - len(exploration.blind)) % 2 == 0:
-                fitted = _energy_law(inner, fit, runs) or fitted
-            if fitted is not None:
-                act, noise = fitted, exploration.noise
+    weaker, blind, shaped = 1.0, compiled(_blind(inner), inner), None
+    for number, stage in enumerate(stages):
+        later = number - len(exploration.blind)
+        if later >= 0 and later % FITTED_EVERY == 0:
+            shaped = _energy_law(inner, fit, runs) or shaped
+        if later >= 0 and shaped is not None:
+            act, noise = shaped, exploration.noise
+        else:
+            act, noise = blind, exploration.blind[min(number, len(exploration.blind) - 1)]
         samples = round(seconds * layout.rate)
         signal = smooth_noise((samples, layout.actuation.shape[1]), rate=layout.rate, bandwidth=exploration.bandwidth,
                               random=random)  # fmt: skip
         size = weaker * noise * used.control[:, 1]
-        memory = (_rates(inner).start, jnp.asarray(size * signal), jnp.asarray(float(stages[number])))
-        (one,) = run([plant], act, jnp_batched(memory), seconds=seconds)
+        memory = (_rates(inner).start, jnp.asarray(size * signal), jnp.asarray(stage))
+        (one,) = run([plant], act, jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], memory), seconds=seconds)
         if one.stopped:
             weaker /= 2
             stopped.append(one.stopped)
@@ -112,13 +114,6 @@ def explore(
             f"least {SHORTEST:g} s: widen its limits or weaken its motors"
         )
     return Explored(recording_of(runs, layout), tuple(stopped))
-
-
-def jnp_batched(memory: Any) -> Any:
-    """A memory as a batch of one."""
-    import jax
-
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], memory)
 
 
 def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
@@ -170,7 +165,7 @@ def _spring(layout: Layout, centre: np.ndarray) -> Callable[[Array], Array]:
 
 def _blind(layout: Layout) -> Controller:
     spring, size = _spring(layout, layout.hanging), layout.limits.control[:, 1]
-    return _with(lambda x, _: -size * spring(x), layout)
+    return _with(lambda x, _: jnp.asarray(-size * spring(x)), layout)
 
 
 def _energy_law(layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun]) -> Any:

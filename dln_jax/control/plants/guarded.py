@@ -62,7 +62,9 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
                 return f"'{name}' is at {q[k]:.4g}, outside {lower:.4g} to {upper:.4g}"
             ahead = q[k] + limits.stopping * rates[k]
             if not lower <= ahead <= upper:
-                return f"'{name}' moves from {q[k]:.4g} at {rates[k]:.4g}/s towards its limits {lower:.4g} to {upper:.4g}"
+                return (
+                    f"'{name}' moves from {q[k]:.4g} at {rates[k]:.4g}/s towards its limits {lower:.4g} to {upper:.4g}"
+                )
             if abs(rates[k]) > limits.rate[k]:
                 return f"'{name}' moves at {abs(rates[k]):.4g}/s, faster than {limits.rate[k]:.4g}/s"
         return ""

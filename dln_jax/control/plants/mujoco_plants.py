@@ -50,8 +50,8 @@ def mujoco_plant(
         seed: of the starts and the noise.
 
     Raises:
-        InputError: MuJoCo is missing or refuses the model; a joint that is no hinge or slide, or not in the file; motors
-            without limits; a plant without a motor or a passive joint, or whose passive joints no gravity moves; a
+        InputError: MuJoCo is missing or refuses the model; a joint that is no hinge or slide, or not in the file;
+            motors without limits; a plant without a motor or a passive joint, or whose passive joints no gravity moves; a
             sample that is not a whole number of steps.
     """
     mujoco, model = _model(source)
@@ -64,8 +64,8 @@ def mujoco_plant(
         raise InputError(f"the plant has {len(names)} joint(s); expected 2 to {MOST_JOINTS}, one of them passive")
     joints = [kinds[int(kind)] for kind in model.jnt_type]
     driven = _numbers(actuated, names) if len(actuated) else sorted(_actuators(mujoco, model))
-    rate = 1 / model.opt.timestep if rate is None else rate
-    steps = 1 / (rate * model.opt.timestep)
+    per_second = float(1 / model.opt.timestep if rate is None else rate)
+    steps = 1 / (per_second * model.opt.timestep)
     if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
         raise InputError(f"a sample has {steps:.4g} steps of {model.opt.timestep:g} s; expected a whole number")
     data = mujoco.MjData(model)
@@ -75,14 +75,12 @@ def mujoco_plant(
         goal, hanging = highest if goal is None else goal, lowest if hanging is None else hanging
     size = _control(mujoco, model, driven, names) if control is None and driven else control
     described = layout(
-        joints, driven, goal=goal, hanging=hanging, rate=rate, control=size, position=ranges, speed=speed, names=names
+        joints, driven, goal=goal, hanging=hanging, rate=per_second, control=size, position=ranges, speed=speed, names=names
     )  # fmt: skip
     return _plant(mujoco, model, data, described, round(steps), hardware, seed)
 
 
-def _plant(
-    mujoco: Any, model: Any, data: Any, described: Layout, steps: int, hardware: Hardware, seed: int
-) -> Plant:
+def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, hardware: Hardware, seed: int) -> Plant:
     B = described.actuation
     warnings = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
@@ -112,7 +110,7 @@ def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
     chosen = []
     for joint in actuated:
         number = int(joint) if isinstance(joint, int) or (str(joint).isdigit() and joint not in names) else None
-        if number is None and joint not in names or number is not None and number >= len(names):
+        if (number is None and joint not in names) or (number is not None and number >= len(names)):
             raise InputError(
                 f"there is no joint '{joint}'; the joints are {', '.join(f'{k} {name}' for k, name in enumerate(names))}"
             )
@@ -161,7 +159,11 @@ def _extremes(
         return float(data.energy[0])
 
     choices = [
-        [x for x in (0.0, *(2 * np.pi * k / TURNS for k in range(1 - TURNS // 2, TURNS // 2 + 1) if k)) if low <= x <= high]
+        [
+            x
+            for x in (0.0, *(2 * np.pi * k / TURNS for k in range(1 - TURNS // 2, TURNS // 2 + 1) if k))
+            if low <= x <= high
+        ]
         if kind == "revolute"
         else [float(np.clip(0.0, low, high))]
         for kind, (low, high) in zip(joints, ranges, strict=True)
@@ -172,7 +174,9 @@ def _extremes(
     energies = np.array([potential(q) for q in grid])
     size = float(np.ptp(energies))
     for k in sorted(set(range(len(joints))) - set(driven)):
-        moved = [abs(potential(q + np.pi / 2 * np.eye(len(joints))[k]) - e) for q, e in zip(grid, energies, strict=True)]
+        moved = [
+            abs(potential(q + np.pi / 2 * np.eye(len(joints))[k]) - e) for q, e in zip(grid, energies, strict=True)
+        ]
         if not max(moved) > LEVEL * max(size, 1e-12):
             raise InputError(f"gravity does not move the passive joint {k}; expected a plant that hangs and stands")
     postures = []

@@ -128,7 +128,8 @@ def tune(
     if not good.any():
         raise InputError(
             f"none of {trials} trials of {len(settings)} sets of gains swings the model up within {seconds:g} s and the "
-            "limits (" + f"{np.isfinite(times).mean():.0%} of the starts came up); a stronger motor, wider limits, more "
+            "limits ("
+            + f"{np.isfinite(times).mean():.0%} of the starts came up); a stronger motor, wider limits, more "
             "seconds or a better model may"
         )
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(FINALISTS, int(good.sum()))]

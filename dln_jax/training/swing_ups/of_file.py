@@ -93,7 +93,7 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
     return metrics
 
 
-def _traces(runs: Sequence[PlantRun], plant: Plant):  # noqa: ANN202
+def _traces(runs: Sequence[PlantRun], plant: Plant):
     """Figure of some runs; the measurements stand for the states."""
     layout, d = plant.layout, len(plant.layout.joints)
     y = np.stack([one.y for one in runs])

@@ -96,7 +96,7 @@ def test_wrapped_angles_become_continuous():
 def test_a_start_outside_the_limits_is_refused():
     puppet = Puppet()
     puppet.q = np.array([0.7, 0.0])
-    with pytest.raises(InputError, match="'rail' is at 0.7.*the start is outside"):
+    with pytest.raises(InputError, match=r"'rail' is at 0\.7.*the start is outside"):
         puppet.plant().reset()
     puppet.q = np.zeros(3)
     with pytest.raises(InputError, match="expected 2 coordinates"):

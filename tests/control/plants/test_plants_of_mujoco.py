@@ -12,6 +12,7 @@ ROD = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2" contype=
 CART_POLE = f"""<mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0" range="-.5 .5" limited="true"/>
 <geom type="box" size=".05 .05 .05" mass="1"/><body><joint name="hinge" axis="0 1 0"/>{ROD}</body></body></worldbody>
 <actuator><motor joint="rail" gear="2" ctrllimited="true" ctrlrange="-5 5"/></actuator></mujoco>"""
+SLIDE = 'type="slide" axis="1 0 0" range="-.5 .5" limited="true"'
 TWO_LINKS = f"""<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/>{ROD}<body pos="0 0 -.3">
 <joint name="elbow" axis="0 1 0"/>{ROD}</body></body></worldbody></mujoco>"""
 
@@ -65,7 +66,7 @@ def test_the_energy_of_an_idle_plant_is_kept_and_controls_act_late():
         (TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'), [0], 1.0, "gravity does not move the passive joint 1"),
         ("<mujoco><worldbody><body/></mujoco>", [0], 1.0, "MuJoCo refuses the model"),
         (f"<mujoco><worldbody><body><joint/>{ROD}</body></worldbody></mujoco>", [0], 1.0, "has 1 joint"),
-        (CART_POLE.replace('type="slide" axis="1 0 0" range="-.5 .5" limited="true"', 'type="ball"'), [1], 1.0, "neither"),
+        (CART_POLE.replace(SLIDE, 'type="ball"'), [1], 1.0, "neither a hinge"),
     ],
     ids=["name", "number", "actuated", "none", "limit", "gravity", "xml", "single", "ball"],
 )  # fmt: skip
