@@ -48,6 +48,9 @@ class EnergyGains(NamedTuple):
     """1/s²."""
     derivative: float
     """1/s."""
+    total: Any = None
+    """Whether the energy is that of the whole plant, as for acrobots (Spong), and the coupling that of the goal; 0 or
+    1, possibly traced. `None`: the energy of the passive part, as for poles on a driven base."""
 
 
 class Parts(NamedTuple):
@@ -122,11 +125,16 @@ def energy_shaping(
     """
     plant, (active, passive) = _with_energy(plant), map(np.array, parts)
     forces, energy = partial_linearisation(plant, parts), passive_energy(plant, parts, goal)
-    home = jnp.asarray(goal, float)[active]
+    goal = jnp.asarray(goal, float)
+    home = goal[active]
 
     def law(q: Vector, qd: Vector) -> Array:
-        coupling = plant.mass_matrix(q)[np.ix_(active, passive)]
-        pumping = gains.energy * (energy(q, qd) - surplus) * (coupling @ qd[passive])
+        coupling, error = plant.mass_matrix(q)[np.ix_(active, passive)], energy(q, qd) - surplus
+        if gains.total is not None:
+            whole = plant.energy(q, qd) - plant.energy(goal, jnp.zeros_like(qd)) - surplus
+            at_goal = plant.mass_matrix(goal)[np.ix_(active, passive)]
+            coupling, error = jnp.where(gains.total, at_goal, coupling), jnp.where(gains.total, whole, error)
+        pumping = gains.energy * error * (coupling @ qd[passive])
         a = pumping - gains.proportional * (q[active] - home) - gains.derivative * qd[active]
         return forces(q, qd, a)
 

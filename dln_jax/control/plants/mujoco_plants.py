@@ -51,8 +51,8 @@ def mujoco_plant(
 
     Raises:
         InputError: MuJoCo is missing or refuses the model; a joint that is no hinge or slide, or not in the file;
-            motors without limits; a plant without a motor or a passive joint, or whose passive joints no gravity moves; a
-            sample that is not a whole number of steps.
+            motors without limits; a plant without a motor or a passive joint, or whose passive joints no gravity moves;
+            a sample that is not a whole number of steps.
     """
     mujoco, model = _model(source)
     names = joint_names(model)
@@ -75,7 +75,8 @@ def mujoco_plant(
         goal, hanging = highest if goal is None else goal, lowest if hanging is None else hanging
     size = _control(mujoco, model, driven, names) if control is None and driven else control
     described = layout(
-        joints, driven, goal=goal, hanging=hanging, rate=per_second, control=size, position=ranges, speed=speed, names=names
+        joints, driven, goal=goal, hanging=hanging, rate=per_second, control=size, position=ranges, speed=speed,
+        names=names,
     )  # fmt: skip
     return _plant(mujoco, model, data, described, round(steps), hardware, seed)
 
@@ -158,14 +159,9 @@ def _extremes(
         mujoco.mj_energyPos(model, data)
         return float(data.energy[0])
 
+    turns = 2 * np.pi / TURNS * np.arange(1 - TURNS // 2, TURNS // 2 + 1)
     choices = [
-        [
-            x
-            for x in (0.0, *(2 * np.pi * k / TURNS for k in range(1 - TURNS // 2, TURNS // 2 + 1) if k))
-            if low <= x <= high
-        ]
-        if kind == "revolute"
-        else [float(np.clip(0.0, low, high))]
+        [turn for turn in turns if low <= turn <= high] if kind == "revolute" else [float(np.clip(0.0, low, high))]
         for kind, (low, high) in zip(joints, ranges, strict=True)
     ]
     grid = sorted(map(np.array, itertools.product(*choices)), key=lambda q: float(np.abs(q).sum()))

@@ -35,8 +35,8 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "damping": (0.3, 1.5),
     "reach": (0.2, 4.0),
     "rates": (0.1, 1.0),
-    "effort": (0.05, 5.0),
-    "catch": (0.3, 4.0),
+    "effort": (0.05, 100.0),
+    "catch": (0.3, 10.0),
     "kick": (0.2, 1.0),
 }
 """Range of every number; draws are uniform in its logarithm."""
@@ -96,10 +96,11 @@ def scales_of(upright: Upright, layout: Layout) -> Scales:
 
 
 def gains_of(scales: Scales, numbers: Mapping[str, Any]) -> EnergyGains:
-    """Gains of the energy law from the numbers "energy", "stiffness" and "damping"."""
+    """Gains of the energy law from the numbers "energy", "stiffness" and "damping", and perhaps "total"."""
     stiffness = numbers["stiffness"] * scales.fall
     unit = scales.acceleration / (scales.energy * scales.coupling * scales.speed)
-    return EnergyGains(numbers["energy"] * unit, stiffness**2, 2 * numbers["damping"] * stiffness)
+    gains = EnergyGains(numbers["energy"] * unit, stiffness**2, 2 * numbers["damping"] * stiffness)
+    return gains._replace(total=numbers.get("total"))
 
 
 def swing_up_numbers(

@@ -118,7 +118,7 @@ def tune(
         return np.asarray(result)[:count].reshape(len(chosen), len(errors), starts)
 
     for _ in range(ROUNDS):
-        drawn = [dict(zip(RANGES, row, strict=True)) for row in _draws(random, sets)]
+        drawn = _draws(random, sets)
         fresh = [swing_up_numbers(upright, layout, scales, numbers) for numbers in drawn]
         settings += fresh
         times = np.concatenate([times, tried(fresh, (0.0,), STARTS)[:, 0]])
@@ -127,10 +127,9 @@ def tune(
     good = np.isfinite(times).all(axis=1)
     if not good.any():
         raise InputError(
-            f"none of {trials} trials of {len(settings)} sets of gains swings the model up within {seconds:g} s and the "
-            "limits ("
-            + f"{np.isfinite(times).mean():.0%} of the starts came up); a stronger motor, wider limits, more "
-            "seconds or a better model may"
+            f"none of {len(settings)} sets of gains swings the model up within {seconds:g} s and its limits in "
+            f"{trials} trials, of which {np.isfinite(times).mean():.0%} came up; a stronger motor, wider limits, more "
+            "time or a better model may"
         )
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(FINALISTS, int(good.sum()))]
     starts = max(STARTS, lanes // (FINALISTS * len(ERRORS)))
@@ -191,9 +190,11 @@ def _traced(numbers: SwingUpNumbers) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf, float), (numbers.gains, numbers.level, numbers.kick))
 
 
-def _draws(random: np.random.Generator, count: int) -> np.ndarray:
+def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:
+    """Sets of numbers, alternately with the energy of the passive part and of the whole plant."""
     low, high = np.log(np.array(list(RANGES.values()))).T
-    return np.exp(random.uniform(low, high, size=(count, len(RANGES))))
+    rows = np.exp(random.uniform(low, high, size=(count, len(RANGES))))
+    return [{**dict(zip(RANGES, row, strict=True)), "total": float(k % 2)} for k, row in enumerate(rows)]
 
 
 def _spread(layout: Layout) -> np.ndarray:

@@ -35,8 +35,12 @@ class Learned(NamedTuple):
 
 
 def learn_to_swing_up(
-    plant: Plant, exploration: Exploration = Exploration(), *, seed: int = 0, say: Callable[[str], None] = lambda _: None
-) -> Learned:  # fmt: skip
+    plant: Plant,
+    exploration: Exploration = Exploration(),  # noqa: B008
+    *,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda _: None,
+) -> Learned:
     """Explores a plant, learns its model and tunes its law.
 
     Args:

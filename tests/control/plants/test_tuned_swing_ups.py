@@ -103,7 +103,7 @@ def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
 
 @pytest.mark.slow
 def test_a_motor_that_is_too_weak_is_refused_with_the_number_of_trials():
-    with pytest.raises(InputError, match="none of 16 sets .* in 32 trials, of which 0% came up"):
+    with pytest.raises(InputError, match=r"none of 16 sets .* in 32 trials, of which 0% came up"):
         tune(model(), rail(control=0.01), sets=4, seconds=2.0)
 
 
