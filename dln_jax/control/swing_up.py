@@ -159,6 +159,8 @@ class SwingUpNumbers(NamedTuple):
     """Kick in N m or N on a plant at rest far from the goal, towards the active joints' goal."""
     still: float = 0.05
     """Largest measured rate that counts as rest, 1/s or m/s."""
+    surplus: Any = 0.0
+    """Target energy above that of the goal, J, which compensates losses of the passive joints."""
 
 
 class SwingUp(NamedTuple):
@@ -292,7 +294,9 @@ def law_at(upright: Upright, joints: tuple[JointKind, ...], numbers: SwingUpNumb
     parts, (home, _) = upright.parts, jnp.split(upright.at.x, 2)
     # Motors are ordered by columns of the matrix, active joints by coordinates.
     to_controls = jnp.linalg.pinv(upright.B[np.array(parts.active)])
-    shaped = energy_shaping(without_friction(upright.model), parts, home, numbers.gains)
+    shaped = energy_shaping(
+        without_friction(upright.model), parts, home, numbers.gains, surplus=numbers.surplus
+    )  # fmt: skip
     near = regulated(regulator, upright.at.x, upright.at.u, joints)
     cost = value(regulator, upright.at.x, joints)
 

@@ -112,9 +112,8 @@ def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
     for joint in actuated:
         number = int(joint) if isinstance(joint, int) or (str(joint).isdigit() and joint not in names) else None
         if (number is None and joint not in names) or (number is not None and number >= len(names)):
-            raise InputError(
-                f"there is no joint '{joint}'; the joints are {', '.join(f'{k} {name}' for k, name in enumerate(names))}"
-            )
+            known = ", ".join(f"{place} {name}" for place, name in enumerate(names))
+            raise InputError(f"there is no joint '{joint}'; the joints are {known}")
         chosen.append(names.index(str(joint)) if number is None else number)
     return sorted(set(chosen))
 

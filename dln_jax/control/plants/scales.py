@@ -9,7 +9,8 @@ accelerate the active joints by a. Then
 
 with the limits u of the controls, and errors s that are worth as much: `PASSIVE` for passive angles, `reach` for an
 active angle in rad, `reach` g / lambda² for a rail, or half the rail if that is shorter. On the surface of the catch
-region the regulator asks for at most `catch` times what the motors have.
+region the regulator asks for at most `catch` times what the motors have. The energy law aims `surplus` E above the
+goal, because friction takes energy away on the way up.
 """
 
 from collections.abc import Mapping
@@ -30,14 +31,15 @@ PASSIVE = 0.2
 CIRCLE = 65
 """Postures of a full turn."""
 RANGES: Mapping[str, tuple[float, float]] = {
-    "energy": (0.5, 20.0),
-    "stiffness": (0.15, 1.5),
+    "energy": (1.0, 20.0),
+    "stiffness": (0.2, 1.0),
     "damping": (0.3, 1.5),
-    "reach": (0.2, 4.0),
-    "rates": (0.1, 1.0),
-    "effort": (0.05, 100.0),
-    "catch": (0.3, 10.0),
-    "kick": (0.2, 1.0),
+    "reach": (0.15, 3.0),
+    "rates": (0.3, 4.0),
+    "effort": (2.0, 300.0),
+    "catch": (0.5, 6.0),
+    "kick": (0.3, 1.0),
+    "surplus": (0.01, 0.5),
 }
 """Range of every number; draws are uniform in its logarithm."""
 USUAL = {name: float(np.sqrt(low * high)) for name, (low, high) in RANGES.items()}
@@ -121,6 +123,7 @@ def swing_up_numbers(
     smoothing = SMOOTHING * scales.fall * scales.sizes[active]
     settings = SwingUpNumbers(
         gains_of(scales, numbers), Q, R, level, smoothing, kick=numbers["kick"] * float(largest.min()),
+        surplus=numbers["surplus"] * scales.energy,
         compensation=GAIN if has_friction(upright) else 0.0,
     )  # fmt: skip
     return settings, regulator

@@ -164,8 +164,8 @@ def trial_of(
     plain = swing_up_numbers(upright, layout, scales_of(upright, layout), {name: 1.0 for name in RANGES})[0]
 
     def trial(settings: Any, start: Array, strength: Array, key: Array) -> Array:
-        (gains, level, kick), regulator = settings
-        numbers = plain._replace(gains=gains, level=level, kick=kick)
+        (gains, level, kick, surplus), regulator = settings
+        numbers = plain._replace(gains=gains, level=level, kick=kick, surplus=surplus)
         controller = controller_of(law_at(upright, layout.joints, numbers, regulator), layout)
         run = simulate(
             lambda x, u: field(x, strength * u), controller, jnp.concatenate([start, jnp.zeros(d)]),
@@ -187,7 +187,9 @@ def trial_of(
 
 
 def _traced(numbers: SwingUpNumbers) -> Any:
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float), (numbers.gains, numbers.level, numbers.kick))
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf, float), (numbers.gains, numbers.level, numbers.kick, numbers.surplus)
+    )
 
 
 def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:

@@ -64,7 +64,7 @@ def rotary_pendulum(sizes: int, seed: int) -> Plant:
 
 
 def gymnasium_acrobot(sizes: int, seed: int) -> Plant:
-    """The acrobot of Gymnasium, 1 m and 1 kg a link, with any torque up to 20 N m, at 100 Hz; noise of 1 mrad."""
+    """The acrobot of Gymnasium, 1 m and 1 kg a link, with any torque up to 20 N m, at 200 Hz, with encoders."""
     from gymnasium.envs.classic_control import AcrobotEnv
 
     class Torque:
@@ -72,13 +72,14 @@ def gymnasium_acrobot(sizes: int, seed: int) -> Plant:
             return torque
 
     env: Any = AcrobotEnv()
-    env.dt, env.AVAIL_TORQUE = 0.01, Torque()
+    env.dt, env.AVAIL_TORQUE = 0.005, Torque()
     noise = np.random.default_rng([sizes, seed])
 
     def coordinates(seen: Any) -> np.ndarray:
-        return np.arctan2(seen[[1, 3]], seen[[0, 2]]) + 1e-3 * noise.normal(size=2)
+        q = np.arctan2(seen[[1, 3]], seen[[0, 2]]) + 2e-4 * noise.normal(size=2)
+        return TURN * np.round(q / TURN)
 
-    described = layout(("revolute", "revolute"), [1], goal=(np.pi, 0), hanging=(0, 0), rate=100.0, control=20.0)
+    described = layout(("revolute", "revolute"), [1], goal=(np.pi, 0), hanging=(0, 0), rate=200.0, control=20.0)
     return gymnasium_plant(env, described, coordinates, action=lambda u: float(u[0]), seed=seed)
 
 

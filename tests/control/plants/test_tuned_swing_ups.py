@@ -34,7 +34,7 @@ def rail(control=8.0, half=0.8, rate=100.0):
 
 
 def model(**sizes):
-    return dynamics(cart_pole(**{**SIZES, **sizes}, friction=0.02).closed_form)
+    return dynamics(cart_pole(**{**SIZES, **sizes}, friction=0.002).closed_form)
 
 
 def upright(plant, model):
