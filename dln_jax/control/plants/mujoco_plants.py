@@ -73,7 +73,8 @@ def mujoco_plant(
     if goal is None or hanging is None:
         lowest, highest = _extremes(mujoco, model, data, joints, driven, ranges)
         goal, hanging = highest if goal is None else goal, lowest if hanging is None else hanging
-    size = _control(mujoco, model, driven, names) if control is None and driven else control
+    passive = len(driven) < len(joints)  # else the layout is refused
+    size = _control(mujoco, model, driven, names) if control is None and passive else control
     described = layout(
         joints, driven, goal=goal, hanging=hanging, rate=per_second, control=size, position=ranges, speed=speed,
         names=names,
