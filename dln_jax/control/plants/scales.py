@@ -81,7 +81,8 @@ def scales_of(upright: Upright, layout: Layout) -> Scales:
     M = np.asarray(jax.jit(model.mass_matrix)(jnp.asarray(home)))
     weight = jax.jit(jax.jacfwd(lambda q: model.inverse_dynamics(q, rest, rest)))(jnp.asarray(home))
     pull = np.asarray(weight)[np.ix_(passive, passive)]
-    fall = float(np.sqrt(max(np.linalg.eigvals(-np.linalg.solve(M[np.ix_(passive, passive)], pull)).real)))
+    stiffness = max(np.linalg.eigvals(-np.linalg.solve(M[np.ix_(passive, passive)], pull)).real)
+    fall = float(np.sqrt(max(stiffness, 0.0)))
     energies = jax.jit(jax.vmap(lambda q: passive_energy(model, upright.parts, home)(q, rest)))(circle(layout))
     energy = -float(np.min(energies))
     if not (fall > 0 and energy > 0):
