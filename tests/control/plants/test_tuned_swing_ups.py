@@ -62,7 +62,7 @@ def test_plants_of_one_shape_get_the_same_law_in_their_own_units():
     assert other.level == pytest.approx(one.level, rel=1e-6) and other.kick == pytest.approx(3 * one.kick)
     # k E M_ap qd_p is an acceleration, where E and M_ap grow by c each.
     assert other.gains.energy == pytest.approx(one.gains.energy / 9, rel=1e-6)
-    np.testing.assert_allclose(other.gains[1:], one.gains[1:], rtol=1e-6)
+    np.testing.assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
 
 
 def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_limit():
