@@ -97,7 +97,9 @@ def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
     assert 0 < tuned.worked <= 1 and tuned.margin >= 0 and tuned.trials >= 64
     plants = [plant_of(model(), plant, hardware=lab, seed=seed) for seed in range(4)]
     act = compiled(controller_of(tuned.law, plant), plant)
-    trials = judged_runs(run(plants, act, start_of(controller_of(tuned.law, plant), 4), seconds=6.0), plant, seconds=6)
+    trials = judged_runs(
+        run(plants, act, start_of(controller_of(tuned.law, plant), 4), seconds=6.0), plant, seconds=6.0
+    )
     assert trials.up.all() and not trials.stopped
 
 
