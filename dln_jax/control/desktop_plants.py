@@ -103,7 +103,7 @@ NAMES = {**{name: name for name in PLANTS}, "furuta": "rotary-pendulum"}
 def desktop_plant(name: str) -> DesktopPlant:
     """Returns the plant of this name; `InputError` lists the names."""
     if name not in NAMES:
-        raise InputError(f"plant is {name!r:.40}; choose from {', '.join(NAMES)}")
+        raise InputError(f"plant is {name!r:.40}; choose from {', '.join(NAMES)}, or a file")
     return PLANTS[NAMES[name]]()
 
 

@@ -45,7 +45,7 @@ def simulate_in_mujoco(
             another size; a sample that is not a whole number of steps; settings as for `simulate`.
     """
     require_positive(seconds=seconds, rate=rate)
-    mujoco, model = _compiled(model)
+    mujoco, model = compiled_model(model)
     data, x = mujoco.MjData(model), np.asarray(x, float)
     if model.nq != model.nv or x.shape != (2 * model.nv,):
         raise InputError(f"x has shape {x.shape} for {model.nv} degrees of freedom; expected hinges, slides and [2 d]")
@@ -82,7 +82,8 @@ def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: in
     return x if np.isfinite(x).all() else np.full_like(x, np.nan)
 
 
-def _compiled(model: Any) -> tuple[Any, Any]:
+def compiled_model(model: Any) -> tuple[Any, Any]:
+    """MuJoCo, and its model of MJCF text or the model itself; raises `InputError` if either is missing or wrong."""
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:

@@ -28,7 +28,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.regulators import Regulator, lqr, regulated, switched, value
-from dln_jax.control.state_space import Law, field_of, holding_controls, linearise, where_finite
+from dln_jax.control.state_space import Law, Linearisation, field_of, holding_controls, linearise, where_finite
 from dln_jax.control.tracking import GAIN, definite, friction_compensation, without_friction
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.solvers.elimination import solve
@@ -48,6 +48,9 @@ class EnergyGains(NamedTuple):
     """1/s²."""
     derivative: float
     """1/s."""
+    total: Any = None
+    """Whether the energy is that of the whole plant, as for acrobots (Spong), and the coupling that of the goal; 0 or
+    1, possibly traced. `None`: the energy of the passive part, as for poles on a driven base."""
 
 
 class Parts(NamedTuple):
@@ -122,11 +125,16 @@ def energy_shaping(
     """
     plant, (active, passive) = _with_energy(plant), map(np.array, parts)
     forces, energy = partial_linearisation(plant, parts), passive_energy(plant, parts, goal)
-    home = jnp.asarray(goal, float)[active]
+    goal = jnp.asarray(goal, float)
+    home = goal[active]
 
     def law(q: Vector, qd: Vector) -> Array:
-        coupling = plant.mass_matrix(q)[np.ix_(active, passive)]
-        pumping = gains.energy * (energy(q, qd) - surplus) * (coupling @ qd[passive])
+        coupling, error = plant.mass_matrix(q)[np.ix_(active, passive)], energy(q, qd) - surplus
+        if gains.total is not None:
+            whole = plant.energy(q, qd) - plant.energy(goal, jnp.zeros_like(qd)) - surplus
+            at_goal = plant.mass_matrix(goal)[np.ix_(active, passive)]
+            coupling, error = jnp.where(gains.total, at_goal, coupling), jnp.where(gains.total, whole, error)
+        pumping = gains.energy * error * (coupling @ qd[passive])
         a = pumping - gains.proportional * (q[active] - home) - gains.derivative * qd[active]
         return forces(q, qd, a)
 
@@ -151,6 +159,8 @@ class SwingUpNumbers(NamedTuple):
     """Kick in N m or N on a plant at rest far from the goal, towards the active joints' goal."""
     still: float = 0.05
     """Largest measured rate that counts as rest, 1/s or m/s."""
+    surplus: Any = 0.0
+    """Target energy above that of the goal, J, which compensates losses of the passive joints."""
 
 
 class SwingUp(NamedTuple):
@@ -167,6 +177,17 @@ class SwingUp(NamedTuple):
     def offset(self) -> float:
         """Largest coordinate of the equilibrium, rad or m, where the goal is zero."""
         return float(jnp.max(jnp.abs(self.equilibrium)))
+
+
+class Upright(NamedTuple):
+    """A checked model with its own equilibrium near the goal, and what a swing-up needs of both."""
+
+    model: Dynamics
+    """With friction, if it has any."""
+    parts: Parts
+    B: Float[np.ndarray, "d m"]
+    at: Linearisation
+    """At the equilibrium, without friction."""
 
 
 def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> Vector:
@@ -223,6 +244,25 @@ def swing_up(
         InputError: a model without energies, with a mass matrix that is not definite, without an equilibrium near the
             goal, or with one that the limits cannot hold or no feedback stabilises.
     """
+    upright = upright_of(
+        model, actuation, goal, postures=postures, lower=lower, upper=upper, tolerance=tolerance
+    )  # fmt: skip
+    with jax.ensure_compile_time_eval():
+        regulator = lqr(upright.at.A, upright.at.B, numbers.state_cost, numbers.control_cost)
+    return SwingUp(law_at(upright, joints, numbers, regulator), upright.at.x, upright.at.u, regulator)
+
+
+def upright_of(
+    model: Dynamics | PlainDynamics,
+    actuation: Any,
+    goal: Any,
+    *,
+    postures: Any,
+    lower: Any = -jnp.inf,
+    upper: Any = jnp.inf,
+    tolerance: float = 1e-6,
+) -> Upright:
+    """Checks a model and computes its equilibrium near the goal; arguments and errors as for `swing_up`."""
     parts, B = parts_of(actuation), np.asarray(actuation, float)
     # Values that depend on the model only are computed now, even if gains or the level are being traced.
     with jax.ensure_compile_time_eval():
@@ -246,13 +286,19 @@ def swing_up(
                 "choose another goal, or a stronger motor"
             )
         x = jnp.concatenate([home, jnp.zeros_like(home)])
-        at = linearise(field_of(whole, B), x, controls, tolerance=np.inf)
-        regulator = lqr(at.A, at.B, numbers.state_cost, numbers.control_cost)
+        return Upright(model, parts, B, linearise(field_of(whole, B), x, controls, tolerance=np.inf))
+
+
+def law_at(upright: Upright, joints: tuple[JointKind, ...], numbers: SwingUpNumbers, regulator: Regulator) -> Law:
+    """The law x -> u of a swing-up to an equilibrium; gains, level, kick and regulator may be traced."""
+    parts, (home, _) = upright.parts, jnp.split(upright.at.x, 2)
     # Motors are ordered by columns of the matrix, active joints by coordinates.
-    to_controls = jnp.linalg.pinv(B[np.array(parts.active)])
-    shaped = energy_shaping(conservative, parts, home, numbers.gains)
-    near = regulated(regulator, x, controls, joints)
-    cost = value(regulator, x, joints)
+    to_controls = jnp.linalg.pinv(upright.B[np.array(parts.active)])
+    shaped = energy_shaping(
+        without_friction(upright.model), parts, home, numbers.gains, surplus=numbers.surplus
+    )  # fmt: skip
+    near = regulated(regulator, upright.at.x, upright.at.u, joints)
+    cost = value(regulator, upright.at.x, joints)
 
     def far(x: Array) -> Array:
         q, qd = jnp.split(x, 2)
@@ -263,9 +309,11 @@ def swing_up(
 
     law = switched(far, near, cost, numbers.level)
     if numbers.compensation == 0:
-        return SwingUp(law, x, controls, regulator)
-    friction = friction_compensation(model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation)
-    return SwingUp(lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2)), x, controls, regulator)
+        return law
+    friction = friction_compensation(
+        upright.model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation
+    )  # fmt: skip
+    return lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2))
 
 
 def _with_energy(model: Dynamics | PlainDynamics) -> Dynamics:

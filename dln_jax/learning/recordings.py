@@ -75,13 +75,16 @@ class PreparedRecording(NamedTuple):
     """Cut-off frequency of the filter, Hz."""
 
 
-def prepare(recording: Trajectories, *, delay: int | None = None, validation: int | None = None) -> PreparedRecording:
+def prepare(
+    recording: Trajectories, *, delay: int | None = None, validation: int | None = None, chain: bool = False
+) -> PreparedRecording:
     """Computes rates and acting torques, and splits the episodes into those to fit and one for validation.
 
     Args:
         recording: several episodes, with the needs of the plant.
         delay: delay of the torques in samples (default: estimated).
         validation: index of the validation episode (default: the middle one).
+        chain: as for `identified`.
 
     Raises:
         InputError: a recording without needs or with only one episode.
@@ -96,7 +99,7 @@ def prepare(recording: Trajectories, *, delay: int | None = None, validation: in
     if held_out not in present:
         raise InputError(f"validation is {held_out}; expected one of the episodes {present.tolist()}")
     if delay is None:
-        delay = delay_of_torques(build(_linear(recording.needs)), recording, most=MOST_DELAY)
+        delay = delay_of_torques(build(_linear(recording.needs, chain)), recording, most=MOST_DELAY)
     chosen = smooth(driven_torques(recording, delay=delay))
     rest = np.setdiff1d(present, held_out)
     return PreparedRecording(select(chosen.data, rest), select(chosen.data, [held_out]), delay, chosen.cutoff)
@@ -106,13 +109,28 @@ def _described(name: str, needs: Needs, **keywords: Any) -> Description:
     return describe(name, precision="f64", needs=needs._replace(joint_friction=LAWS, friction=False), **keywords)
 
 
-def _linear(needs: Needs) -> Description:
-    return _described("trigonometric", needs, degree=[DEGREES[joint] for joint in needs.joints])
+def _linear(needs: Needs, chain: bool) -> Description:
+    degree = [DEGREES[joint] for joint in needs.joints]
+    if not chain:
+        return _described("trigonometric", needs, degree=degree)
+    of_potential = [min(n, 1) for n in degree]
+    return _described("trigonometric", needs, degree=[0, *degree[1:]], potential_degree=of_potential)
 
 
-def identified(data: Trajectories, needs: Needs) -> FittedPlant:
-    """Fits the trigonometric model with viscous and dry friction; raises the errors of `fit_momentum`."""
-    description = _linear(needs)
+def identified(data: Trajectories, needs: Needs, *, chain: bool = False) -> FittedPlant:
+    """Fits the trigonometric model with viscous and dry friction.
+
+    Args:
+        data: with rates, and torques as they acted.
+        needs: needs of the plant.
+        chain: whether the plant is a chain of rigid bodies on a fixed base, in relative coordinates: its mass matrix
+            does not depend on the first one, and its potential has degree 1 in every angle. Fewer parameters need
+            fewer motions.
+
+    Raises:
+        InputError: as for `fit_momentum`.
+    """
+    description = _linear(needs, chain)
     model, windows = build(description), cut_momentum_windows(data)
     plant = FittedPlant(description, fit_momentum(model, data).parameters)
     for _ in range(ROUNDS - 1):

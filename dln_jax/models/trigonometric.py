@@ -53,7 +53,13 @@ class Basis(NamedTuple):
     """db/dq [d, B]."""
 
 
-def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype: DTypeLike = jnp.float64) -> Model:
+def make_trigonometric(
+    needs: Needs,
+    *,
+    degree: int | tuple[int, ...] = 1,
+    potential_degree: int | tuple[int, ...] | None = None,
+    dtype: DTypeLike = jnp.float64,
+) -> Model:
     """Returns the (init, energies) pair of a trigonometric Lagrangian.
 
     `init` ignores its key: M = 1, V = 0, no friction. The number of parameters grows as (2 degree + 1)^d d²/2.
@@ -61,17 +67,18 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
     Args:
         degree: degree of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential
             has at least degree 2 (a linear spring).
+        potential_degree: degree of the potential, if it is another: M of a chain on a fixed base does not depend on its
+            first joint, but V does.
 
     Raises:
         InputError: a degree that is not a whole number >= 0, a wrong number of degrees, or a basis that is too large to
             fit.
     """
     d = needs.degrees_of_freedom
-    degrees = (degree,) * d if isinstance(degree, int) else tuple(degree)
-    if len(degrees) != d or not all(isinstance(n, int) and n >= 0 for n in degrees):
-        raise InputError(f"degree is {degree}; expected a whole number >= 0, or one for each of the {d} joints")
+    degrees = _per_joint("degree", degree, d)
+    of_potential = degrees if potential_degree is None else _per_joint("potential_degree", potential_degree, d)
     mass_basis = functools.partial(basis, needs.joints, degrees)
-    spring_degrees = potential_degrees(needs.joints, degrees)
+    spring_degrees = potential_degrees(needs.joints, of_potential)
     potential_basis = functools.partial(basis, needs.joints, spring_degrees)
     rows, columns = np.tril_indices(d)
     # (i, j) and (j, i) of M read the same row of coefficients.
@@ -96,6 +103,13 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
         )
 
     return Model(init, lambda parameters: _closed_form(parameters, entry, mass_basis, potential_basis))
+
+
+def _per_joint(name: str, degree: int | tuple[int, ...], d: int) -> tuple[int, ...]:
+    degrees = (degree,) * d if isinstance(degree, int) else tuple(degree)
+    if len(degrees) != d or not all(isinstance(n, int) and n >= 0 for n in degrees):
+        raise InputError(f"{name} is {degree}; expected a whole number >= 0, or one for each of the {d} joints")
+    return degrees
 
 
 def potential_degrees(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> tuple[int, ...]:

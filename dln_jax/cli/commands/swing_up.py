@@ -5,23 +5,37 @@ model explores; only q and the commanded torques are recorded. Models: delan (a 
 friction), identified (linear in its parameters), analytic (the nominal dimensions, no friction), known (the plant
 itself). All use the same energy law, regulator and friction compensation, with the same gains. A run folder gets
 data.npz, the model, metrics.json, config.json, and a figure and an animation of the runs.
+
+--plant also takes an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
+passive joint. MuJoCo simulates it, with encoders and torques that act a sample late. It is explored without a model of
+it, the model is identified, and trials of the model choose all gains (law.json).
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
-from dln_jax.cli.arguments import choice
+from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.options import Drawn, Folder
+from dln_jax.errors import InputError
+
+FILES = (".xml", ".mjcf", ".urdf")
+"""Suffixes of robots' files."""
 
 
 @dataclass(frozen=True)
 class Arguments(Folder, Drawn):
     """Plant, model, and where the results go."""
 
-    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta"))] = "rotary-pendulum"
-    """The plant; furuta is another name of the rotary pendulum."""
-    model: Annotated[str, choice(("delan", "identified", "analytic", "known"))] = "delan"
-    """The model from which the controller is designed."""
+    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta", "FILE"))] = "rotary-pendulum"
+    """The plant; furuta is another name of the rotary pendulum. FILE is the path of an MJCF or URDF file."""
+    actuated: Unstated[str] = None
+    """Joints of the file with a motor, by name or number from 0, with commas between them (default: those on which an
+    actuator acts)."""
+    control: Unstated[float] = None
+    """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
+    model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None
+    """The model from which the controller is designed (default: delan; of a file, identified)."""
     seconds_of_data: float = 30.0
     """Seconds of motion to learn from, at 500 Hz, including an episode for validation."""
     starts: int = 100
@@ -33,9 +47,24 @@ class Arguments(Folder, Drawn):
 def main(options: Arguments) -> None:
     """Explores the plant, learns the model, swings up and writes the run folder."""
     from dln_jax.cli.stored_arguments import command_folder
-    from dln_jax.training.swing_ups.run import asked, swing_up
+    from dln_jax.training.swing_ups import of_file, run
 
-    task = asked(options.plant, options.model, options.seconds_of_data, options.starts, options.seed)
+    file = Path(options.plant)
+    if not (file.suffix.lower() in FILES or file.is_file()):
+        if options.actuated is not None or options.control is not None:
+            raise InputError(f"--actuated and --control belong to a file; --plant is {options.plant!r:.40}")
+        model = options.model or "delan"
+        task = run.asked(options.plant, model, options.seconds_of_data, options.starts, options.seed)
+        with command_folder(options, "swing_up") as folder:
+            run.swing_up(task, folder, figures=options.figures)
+            print(f"run folder: {folder}")
+        return
+    if options.model not in (None, "identified"):
+        raise InputError(f"--model is {options.model!r:.40}; the model of a file is identified")
+    actuated = options.actuated.split(",") if options.actuated else ()
+    of_plant = of_file.asked(
+        file, actuated, options.control, options.seconds_of_data, options.starts, options.seed
+    )  # fmt: skip
     with command_folder(options, "swing_up") as folder:
-        swing_up(task, folder, figures=options.figures)
+        of_file.swing_up_file(of_plant, folder, figures=options.figures)
         print(f"run folder: {folder}")

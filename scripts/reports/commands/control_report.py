@@ -1,4 +1,4 @@
-"""Measure controllers: swing-ups, a public board, learned models, value functions, tracking, plans, and C.
+"""Measure controllers: swing-ups, a board, learned models, foreign plants, value functions, tracking, plans, and C.
 
 Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), writes report.json, and draws
 figures.
@@ -17,6 +17,7 @@ from dln_jax.precision import in_float64
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.control import (
     energy_laws,
+    foreign_plants,
     laws_in_c,
     learned,
     mpc,
@@ -37,6 +38,7 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
     **{f"board/{name}-energy": partial(energy_laws.board, motor) for name, motor in MOTORS.items()},
     **{f"board/{name}-planned": partial(planned.by_plan, motor) for name, motor in MOTORS.items()},
     **learned.CASES,
+    **foreign_plants.CASES,
     **equation.CASES,
     "value/pendulum": fits.pendulum,
     "value/cart-pole": fits.cart_pole,

@@ -27,7 +27,9 @@ def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--plant", "acrobot"), "choose from"),
+        (("--plant", "acrobot"), "choose from cart-pole, rotary-pendulum, furuta, or a file"),
+        (("--plant", "none.xml", "--actuated", "1"), "none.xml"),
+        (("--plant", "furuta", "--actuated", "1"), "belong to a file"),
         (("--model", "feed-forward"), "choose from"),
         (("--seconds-of-data", 1), "expected at least 4 s"),
         (("--starts", 0), "starts is 0"),
@@ -37,4 +39,29 @@ def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
 )
 def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, swing_up, *arguments, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--actuated", "wrist"), "no joint 'wrist'; the joints are 0 shoulder, 1 elbow"),
+        (("--actuated", "0,1"), "all 2 joints have a motor"),
+        ((), "no joint has a motor"),
+        (("--actuated", "elbow"), "states no limit of the motor of joint 'elbow'"),
+        (("--actuated", 1, "--control", -1), "control is [-1.0]"),
+        (("--actuated", 1, "--control", 5, "--seconds-of-data", 4), "expected at least 12 s"),
+        (("--actuated", 1, "--control", 5, "--model", "known"), "the model of a file is identified"),
+    ],
+    ids=["name", "all", "none", "limit", "negative", "seconds", "model"],
+)
+def test_mistakes_with_a_file_are_one_line_and_leave_nothing(capsys, tmp_path, arguments, message):
+    pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
+    rod = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2"/>'
+    links = (
+        f'<joint name="shoulder" axis="0 1 0"/>{rod}<body pos="0 0 -.3"><joint name="elbow" axis="0 1 0"/>{rod}</body>'
+    )
+    file = tmp_path / "mine.xml"
+    file.write_text(f"<mujoco><worldbody><body>{links}</body></worldbody></mujoco>")
+    assert message in refused(capsys, swing_up, "--plant", file, *arguments, "--out", tmp_path / "run")
     assert not (tmp_path / "run").exists()

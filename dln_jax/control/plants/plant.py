@@ -1,0 +1,128 @@
+"""A plant to swing up, of any origin: four callables, and what has to be known about it beforehand.
+
+The callables are impure, as hardware is. `act` commands the controls and returns at the next sample, which a simulated
+plant reaches at once; `guarded` stops a plant at its limits, and `run` closes the loop.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.control.swing_up import parts_of
+from dln_jax.types import InputError, JointKind, Needs, require_positive
+
+
+class Limits(NamedTuple):
+    """Limits of safe operation; the plant stops where it leaves them."""
+
+    control: Float[np.ndarray, "m 2"]
+    """Lower and upper limits of the motors, N m or N; finite."""
+    position: Float[np.ndarray, "d 2"]
+    """Lower and upper limits of the coordinates, such as the ends of a rail, rad or m; infinite for none."""
+    rate: Float[np.ndarray, " d"]
+    """Largest rates, 1/s or m/s; infinite for none."""
+    stopping: float = 0.0
+    """Time ahead for which the present rate must not lead out of the positions, s: what a brake needs."""
+
+
+class Layout(NamedTuple):
+    """What is known of a plant before it has moved: no mass, no length."""
+
+    joints: tuple[JointKind, ...]
+    actuation: Float[np.ndarray, "d m"]
+    """tau = actuation u; every motor drives one coordinate."""
+    goal: Float[np.ndarray, " d"]
+    """Posture to hold, an equilibrium up to some hundredths of a radian."""
+    hanging: Float[np.ndarray, " d"]
+    """Posture in which the plant comes to rest, and starts."""
+    rate: float
+    """Samples per second, Hz."""
+    limits: Limits
+    names: tuple[str, ...] = ()
+
+    @property
+    def needs(self) -> Needs:
+        """Terms that a model of the plant needs."""
+        return Needs(joints=self.joints, actuation=tuple(map(tuple, np.asarray(self.actuation, float).tolist())))
+
+
+class Plant(NamedTuple):
+    """A plant as four callables."""
+
+    layout: Layout
+    reset: Callable[[], None]
+    """Brings the plant to rest near hanging."""
+    read: Callable[[], Any]
+    """() -> measured coordinates [d]; angles may be wrapped."""
+    act: Callable[[Any], None]
+    """Controls u [m] -> nothing, at the time of the next sample."""
+    time: Callable[[], float]
+    """() -> time in s, by the plant's clock."""
+
+
+def layout(
+    joints: Sequence[str],
+    actuated: Sequence[int],
+    *,
+    goal: Any,
+    hanging: Any,
+    rate: float,
+    control: Any,
+    position: Any = None,
+    speed: Any = np.inf,
+    stopping: float = 0.0,
+    names: Sequence[str] = (),
+) -> Layout:
+    """Returns a checked layout.
+
+    Args:
+        joints: kinds, "revolute" or "prismatic" [d].
+        actuated: numbers of the coordinates with a motor, from 0.
+        goal: posture to hold [d], rad or m.
+        hanging: posture of rest [d].
+        rate: of the samples, Hz.
+        control: largest size of the controls, one for all motors or one each, N m or N.
+        position: limits [d, 2], rad or m; by default none.
+        speed: largest rates, one for all or one each, 1/s or m/s.
+        stopping: as `Limits.stopping`.
+        names: of the coordinates; by default joint_0, joint_1, ...
+
+    Raises:
+        InputError: shapes that do not agree, a motor at a coordinate that is not there, no motor, no passive
+            coordinate, limits that are not positive, or a posture outside the limits.
+    """
+    require_positive(rate=rate)
+    d, chosen = len(joints), sorted(set(actuated))
+    names = tuple(names) or tuple(f"joint_{k}" for k in range(d))
+    if any(not 0 <= k < d for k in chosen):
+        raise InputError(f"actuated is {list(actuated)}; expected numbers of coordinates from 0 to {d - 1}")
+    if not chosen or len(chosen) == d:
+        which = "no joint has a motor" if not chosen else f"all {d} joints have a motor, and none is passive"
+        raise InputError(f"{which}; a swing-up needs a plant with a motor and with a joint without one")
+    B = np.eye(d)[:, chosen]
+    parts_of(B)
+    size = _sized("control", control, len(chosen))
+    if not (np.isfinite(size) & (size > 0)).all():
+        raise InputError(f"control is {size.tolist()}; expected finite, positive limits of the motors, N m or N")
+    ranges = np.tile([-np.inf, np.inf], (d, 1)) if position is None else np.asarray(position, float)
+    if ranges.shape != (d, 2) or not (ranges[:, 0] < ranges[:, 1]).all():
+        raise InputError(f"position is {ranges.tolist()}; expected lower and upper limits of {d} coordinates")
+    rates = _sized("speed", speed, d)
+    if not (rates > 0).all() or not stopping >= 0:
+        raise InputError(f"speed is {rates.tolist()} and stopping {stopping}; expected positive limits, and a time")
+    needs = Needs(joints=tuple(joints))  # checks the kinds
+    postures = {"goal": _sized("goal", goal, d), "hanging": _sized("hanging", hanging, d)}
+    for name, q in postures.items():
+        if not np.isfinite(q).all() or (q < ranges[:, 0]).any() or (q > ranges[:, 1]).any():
+            raise InputError(f"{name} is {q.tolist()}, outside the limits {ranges.tolist()}; choose a posture within")
+    limits = Limits(np.stack([-size, size], axis=1), ranges, rates, stopping)
+    return Layout(needs.joints, B, postures["goal"], postures["hanging"], float(rate), limits, names)
+
+
+def _sized(name: str, value: Any, size: int) -> np.ndarray:
+    try:
+        return np.array(np.broadcast_to(np.asarray(value, float), size))
+    except ValueError:
+        raise InputError(f"{name} is {value}; expected a number, or {size} numbers") from None

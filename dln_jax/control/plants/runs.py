@@ -1,0 +1,124 @@
+"""Closed loop of plants that are callables: one plant, or several in step, which share every call of the controller."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dln_jax.control.closed_loop import Controller
+from dln_jax.control.plants.guarded import Stopped, guarded
+from dln_jax.control.plants.plant import Layout, Plant
+from dln_jax.control.state_space import saturated
+from dln_jax.types import require_positive
+
+TOLERANCE = 0.2
+"""Largest distance of every angle from the goal that counts as up, rad."""
+HELD = 1.0
+"""Time for which a plant has to stay up until the end, s."""
+
+Act = Callable[[Any, Any, Any], tuple[Any, Any]]
+"""(memories, t, measurements [n, d]) -> (memories, controls [n, m]), compiled."""
+
+
+class PlantRun(NamedTuple):
+    """What was measured and commanded in N samples; fewer than asked for if the plant was stopped."""
+
+    t: Float[np.ndarray, " N"]
+    y: Float[np.ndarray, "N d"]
+    u: Float[np.ndarray, "N m"]
+    """Commands, within the limits."""
+    stopped: str = ""
+    """Why it was stopped; empty if it was not."""
+
+
+def compiled(controller: Controller, layout: Layout) -> Act:
+    """Compiles a controller for a batch of memories, with its controls within the limits."""
+    lower, upper = layout.limits.control.T
+
+    def act(memory: Any, t: Any, y: Any) -> tuple[Any, Any]:
+        memory, u = controller.act(memory, t, y)
+        return memory, saturated(u, lower, upper)
+
+    return jax.jit(jax.vmap(act, in_axes=(0, None, 0)))
+
+
+def run(plants: Sequence[Plant], act: Act, memories: Any, *, seconds: float) -> list[PlantRun]:
+    """Resets plants of one layout and runs them in step.
+
+    Args:
+        plants: one or several; they are guarded.
+        act: of `compiled`.
+        memories: of the controller before the first sample, one for each plant along the leading axis.
+        seconds: duration.
+
+    Raises:
+        InputError: a start outside the limits, or an answer of another shape.
+    """
+    require_positive(seconds=seconds)
+    layout, safe = plants[0].layout, [guarded(plant) for plant in plants]
+    d, m = layout.actuation.shape
+    samples, count = round(seconds * layout.rate), len(plants)
+    y, u, t = np.zeros((samples, count, d)), np.zeros((samples, count, m)), np.arange(samples) / layout.rate
+    lengths, reasons = np.full(count, samples), [""] * count
+    for plant in safe:
+        plant.reset()
+    going = list(range(count))
+    for k in range(samples):
+        going = _each(going, k, lengths, reasons, lambda i: y[k].__setitem__(i, safe[i].read()))  # noqa: B023
+        if not going:
+            break
+        memories, controls = act(memories, t[k], jnp.asarray(y[k]))
+        u[k] = controls
+        going = _each(going, k, lengths, reasons, lambda i: safe[i].act(u[k, i]))  # noqa: B023
+    for i in going:
+        plants[i].act(np.zeros(m))
+    return [PlantRun(t[:n], y[:n, i], u[:n, i], reasons[i]) for i, n in enumerate(lengths)]
+
+
+def _each(going: list[int], k: int, lengths: Any, reasons: list[str], do: Callable[[int], Any]) -> list[int]:
+    """Calls `do` for the plants that run; returns those that still do."""
+    left = []
+    for i in going:
+        try:
+            do(i)
+            left.append(i)
+        except Stopped as stopped:
+            lengths[i], reasons[i] = k, str(stopped)
+    return left
+
+
+def start_of(controller: Controller, count: int) -> Any:
+    """Memories of `count` equal controllers."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (count, *jnp.shape(leaf))), controller.start)
+
+
+class Trials(NamedTuple):
+    """Swing-ups of n starts."""
+
+    seconds: Float[np.ndarray, " n"]
+    """Time after which the plant stays up until the end, s; infinite if it does not."""
+    stopped: tuple[str, ...]
+    """Reasons of the starts that were stopped."""
+
+    @property
+    def up(self) -> Bool[np.ndarray, " n"]:
+        """Starts that end up."""
+        return np.isfinite(self.seconds)
+
+
+def judged_runs(runs: Sequence[PlantRun], layout: Layout, *, seconds: float) -> Trials:
+    """Judges runs: every angle within `TOLERANCE` of the goal for the last `HELD` seconds, and never stopped."""
+    angles = np.array([kind == "revolute" for kind in layout.joints])
+
+    def time_up(one: PlantRun) -> float:
+        if one.stopped:
+            return np.inf
+        off = np.abs(np.remainder(one.y - layout.goal + np.pi, 2 * np.pi) - np.pi)[:, angles].max(axis=1)
+        away = np.flatnonzero(~(off <= TOLERANCE))
+        last = 0.0 if not len(away) else (away[-1] + 1) / layout.rate
+        return last if last <= seconds - HELD else np.inf
+
+    return Trials(np.array([time_up(one) for one in runs]), tuple(one.stopped for one in runs if one.stopped))

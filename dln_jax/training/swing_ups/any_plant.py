@@ -1,0 +1,101 @@
+"""The route of a swing-up for any plant: explore, learn, tune, and try from many starts."""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.control.closed_loop import Hardware
+from dln_jax.control.plants.exploring import Exploration, Explored, explore
+from dln_jax.control.plants.plant import Plant
+from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
+from dln_jax.control.plants.tuning import Tuned, controller_of, tune
+from dln_jax.data.encoders import noise_of
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, prepare
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.types import require_positive
+
+SECONDS = 10.0
+"""Duration of a trial, s."""
+
+
+class Learned(NamedTuple):
+    """A plant's model and law, and the recording that they come from."""
+
+    explored: Explored
+    prepared: PreparedRecording
+    fitted: FittedPlant
+    tuned: Tuned
+    hardware: Hardware
+    """As estimated from the recording: the delay, and the noise of the measurements."""
+    seconds: float
+    """Time for all steps, s."""
+
+
+def learn_to_swing_up(
+    plant: Plant,
+    exploration: Exploration = Exploration(),  # noqa: B008
+    *,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda _: None,
+) -> Learned:
+    """Explores a plant, learns its model and tunes its law.
+
+    Args:
+        plant: any; it is guarded.
+        exploration: settings.
+        seed: of the noise and of the trials.
+        say: is told every step in a line.
+
+    Raises:
+        InputError: as for `explore`, `prepare`, `identified` and `tune`.
+    """
+    began = time.perf_counter()
+    explored = explore(plant, model_of, exploration, seed=seed)
+    recording = explored.recording
+    say(
+        f"explored: {len(recording.t) / plant.layout.rate:.3g} s in {len(recording.label)} episodes, "
+        f"{len(explored.stopped)} stopped"
+    )
+    prepared = prepare(recording, chain=True)
+    fitted = identified(prepared.train, plant.layout.needs, chain=True)
+    say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
+    noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
+    hardware = Hardware(encoder_noise=noise, delay=prepared.delay)
+    tuned = tune(fitted.dynamics, plant.layout, hardware, seed=seed)
+    say(
+        f"tuned: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin {tuned.margin:.0%}, up in "
+        f"{tuned.seconds:.2f} s"
+    )
+    return Learned(explored, prepared, fitted, tuned, hardware, time.perf_counter() - began)
+
+
+def model_of(recording: Trajectories) -> Dynamics:
+    """The identified model of a recording of q and commanded torques."""
+    assert recording.needs is not None  # explored
+    return identified(prepare(recording, chain=True).train, recording.needs, chain=True).dynamics
+
+
+def try_plant(
+    make: Callable[[int], Plant], tuned: Tuned, *, starts: int = 100, seed: int = 1000, seconds: float = SECONDS
+) -> tuple[Trials, list[PlantRun]]:
+    """Swings up plants from many starts, in step.
+
+    Args:
+        make: seed -> a simulated plant with its own start and noise.
+        tuned: the law.
+        starts: number of plants.
+        seed: of the first plant; the others follow.
+        seconds: duration.
+
+    Raises:
+        InputError: as for `run`.
+    """
+    require_positive(starts=starts)
+    plants = [make(seed + number) for number in range(starts)]
+    layout = plants[0].layout
+    controller = controller_of(tuned.law, layout)
+    runs = run(plants, compiled(controller, layout), start_of(controller, starts), seconds=seconds)
+    return judged_runs(runs, layout, seconds=seconds), runs

@@ -1,0 +1,106 @@
+"""Swings up a plant that is given as a file, with a model learned from its motions and gains chosen by trials."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.control.closed_loop import ClosedLoopRun, Hardware
+from dln_jax.control.plants.exploring import Exploration
+from dln_jax.control.plants.mujoco_plants import mujoco_plant
+from dln_jax.control.plants.plant import Plant
+from dln_jax.control.plants.runs import PlantRun
+from dln_jax.data import schema
+from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
+from dln_jax.files import write_figure, write_json
+from dln_jax.training.swing_ups.any_plant import SECONDS, learn_to_swing_up, try_plant
+from dln_jax.training.swing_ups.run import LEAST_SECONDS
+from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.zoo.run import save
+
+LEAST = 3 * LEAST_SECONDS
+"""Shortest data, s: six episodes of two seconds."""
+ENCODER_STEP = 2 * np.pi / 4096
+"""Resolution of the simulated encoders, rad; 0.1 mm of a rail has the size of a thousandth of a turn."""
+
+
+class FileTask(NamedTuple):
+    """The checked arguments of a swing-up of a file."""
+
+    make: Callable[[int], Plant]
+    """Seed of start and noise -> plant."""
+    exploration: Exploration
+    starts: int
+    seed: int
+
+
+def asked(
+    file: Path, actuated: Sequence[str], control: float | None, seconds_of_data: float, starts: int, seed: int
+) -> FileTask:  # fmt: skip
+    """Checks the arguments of a command before anything is written; raises as `mujoco_plant`."""
+    require_positive(starts=starts)
+    require_seed(seed)
+    if not LEAST <= seconds_of_data < np.inf:
+        raise InputError(f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST:g} s: six episodes")
+    hardware = Hardware(encoder_step=ENCODER_STEP, delay=1)
+
+    def make(number: int) -> Plant:
+        return mujoco_plant(file, actuated, control=control, hardware=hardware, seed=number)
+
+    slides = np.array([kind == "prismatic" for kind in make(0).layout.joints])
+    hardware = hardware._replace(encoder_step=np.where(slides, 1e-4, ENCODER_STEP))
+    return FileTask(make, Exploration(seconds=seconds_of_data), starts, seed)
+
+
+def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, float]:
+    """Explores, learns, tunes, swings up and writes the results; returns the metrics."""
+    plant = task.make(task.seed)
+    layout = plant.layout
+    driven = [name for name, row in zip(layout.names, layout.actuation, strict=True) if row.any()]
+    print(f"joints {', '.join(layout.names)}, motor at {', '.join(driven)}; goal {np.round(layout.goal, 4).tolist()}")
+    learned = learn_to_swing_up(plant, task.exploration, seed=task.seed, say=print)
+    for reason in learned.explored.stopped:
+        print(f"stopped: {reason}")
+    schema.save(folder / "data.npz", learned.explored.recording)
+    save(folder, *learned.fitted)
+    trials, runs = try_plant(task.make, learned.tuned, starts=task.starts, seed=task.seed + 1000)
+    seconds, tuned = trials.seconds[trials.up], learned.tuned
+    median, worst = (float(np.median(seconds)), float(np.max(seconds))) if len(seconds) else (np.inf, np.inf)
+    metrics = {
+        "success_share": float(trials.up.mean()),
+        "stopped": float(len(trials.stopped)),
+        "median_seconds": median,
+        "worst_seconds": worst,
+        "tuning_trials": float(tuned.trials),
+        "tuning_worked_share": tuned.worked,
+        "tuning_margin": tuned.margin,
+        "learning_seconds": learned.seconds,
+    }
+    gains = {**tuned.numbers.gains._asdict(), "level": tuned.numbers.level, "kick": tuned.numbers.kick}
+    write_json(folder / "metrics.json", metrics)
+    write_json(
+        folder / "law.json",
+        {name: float(value) for name, value in gains.items()} | {"K": np.asarray(tuned.regulator.K).tolist()},
+    )
+    print(
+        f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s: median {median:.2f} s, worst "
+        f"{worst:.2f} s"
+    )
+    complete = [one for one in runs if not one.stopped][:MOST_SHOWN]
+    if figures and complete:
+        write_figure(folder / "swing-ups.png", _traces(complete, plant))
+    return metrics
+
+
+def _traces(runs: Sequence[PlantRun], plant: Plant):
+    """Figure of some runs; the measurements stand for the states."""
+    layout, d = plant.layout, len(plant.layout.joints)
+    y = np.stack([one.y for one in runs])
+    x = np.concatenate([y, np.zeros_like(y)], axis=2)
+    u = np.stack([one.u for one in runs])
+    shown = ClosedLoopRun(runs[0].t, x, u[:, :-1], y)  # type: ignore[arg-type]
+    return closed_loop_traces(
+        shown, layout.joints, names=layout.names, goal=np.concatenate([layout.goal, np.zeros(d)]),
+        limits=tuple(layout.limits.control.T),
+    )  # fmt: skip

@@ -1,0 +1,124 @@
+"""Gains come from the scales of a model and from trials, and a plant that none of them swings up is refused."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control.closed_loop import Hardware
+from dln_jax.control.plants import (
+    Exploration,
+    compiled,
+    controller_of,
+    explore,
+    judged_runs,
+    layout,
+    plant_of,
+    run,
+    start_of,
+    tune,
+)
+from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of, swing_up_numbers
+from dln_jax.control.swing_up import upright_of
+from dln_jax.learning.recordings import identified, prepare
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.scenes.poles import cart_pole
+from dln_jax.types import InputError
+
+SIZES = {"cart_mass": 0.6, "pole_mass": 0.15, "length": 0.25}
+
+
+def rail(control=8.0, half=0.8, rate=100.0):
+    limits = [[-half, half], [-np.inf, np.inf]]
+    postures = {"goal": (0, 0), "hanging": (0, np.pi)}
+    return layout(("prismatic", "revolute"), [0], **postures, rate=rate, control=control, position=limits)
+
+
+def model(**sizes):
+    return dynamics(cart_pole(**{**SIZES, **sizes}, friction=0.002).closed_form)
+
+
+def upright(plant, model):
+    return upright_of(model, plant.actuation, plant.goal, postures=circle(plant))
+
+
+def test_scales_of_a_cart_pole_have_closed_forms():
+    scales = scales_of(upright(rail(), model()), rail())
+    m, l, g = SIZES["pole_mass"], SIZES["length"], 9.81
+    assert scales.fall == pytest.approx(np.sqrt(g / l))
+    assert scales.energy == pytest.approx(2 * m * g * l, rel=1e-6)
+    assert scales.speed == pytest.approx(2 * np.sqrt(g / l), rel=1e-6)
+    assert scales.coupling == pytest.approx(m * l)
+    assert scales.acceleration == pytest.approx(8.0 / SIZES["cart_mass"])
+    np.testing.assert_allclose(scales.sizes, [l, 1.0])
+
+
+def test_plants_of_one_shape_get_the_same_law_in_their_own_units():
+    """Masses and forces c times as large leave accelerations, and the regulator's feedback grows as the force."""
+    small, large = upright(rail(), model()), upright(rail(24.0), model(cart_mass=1.8, pole_mass=0.45))
+    (one, first), (other, second) = (
+        swing_up_numbers(at, plant, scales_of(at, plant), USUAL) for at, plant in ((small, rail()), (large, rail(24.0)))
+    )
+    np.testing.assert_allclose(second.K, 3 * np.asarray(first.K), rtol=1e-6)
+    assert other.level == pytest.approx(one.level, rel=1e-6) and other.kick == pytest.approx(3 * one.kick)
+    # k E M_ap qd_p is an acceleration, where E and M_ap grow by c each.
+    assert other.gains.energy == pytest.approx(one.gains.energy / 9, rel=1e-6)
+    np.testing.assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
+
+
+def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_limit():
+    plant = rail()
+    at = upright(plant, model())
+    numbers, regulator = swing_up_numbers(at, plant, scales_of(at, plant), {**USUAL, "catch": 1.0})
+    directions = np.random.default_rng(0).normal(size=(20000, 4)) @ np.linalg.inv(np.linalg.cholesky(regulator.S))
+    sizes = np.sqrt(np.einsum("ni,ij,nj->n", directions, regulator.S, directions))
+    asked = np.abs((np.sqrt(numbers.level) * directions / sizes[:, None]) @ np.asarray(regulator.K).T).max()
+    assert 0.97 * 8.0 < asked <= 8.0 + 1e-9
+
+
+def test_a_goal_from_which_nothing_falls_is_refused():
+    plant = rail()
+    down = plant._replace(goal=plant.hanging, hanging=plant.goal)
+    with pytest.raises(InputError, match="do not fall from the goal"):
+        scales_of(upright(down, model()), down)
+
+
+def test_gains_are_those_of_the_module_s_equations():
+    scales = scales_of(upright(rail(), model()), rail())
+    gains = gains_of(scales, {"energy": 2.0, "stiffness": 0.5, "damping": 1.0})
+    at_most = gains.energy * scales.energy * scales.coupling * scales.speed
+    assert at_most == pytest.approx(2 * scales.acceleration)
+    assert gains.derivative == pytest.approx(2 * np.sqrt(gains.proportional))
+
+
+@pytest.mark.slow
+def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
+    plant, lab = rail(), Hardware(encoder_step=1e-4, delay=1)
+    tuned = tune(model(), plant, lab, sets=32, seconds=6.0)
+    assert 0 < tuned.worked <= 1 and tuned.margin >= 0 and tuned.trials >= 64
+    plants = [plant_of(model(), plant, hardware=lab, seed=seed) for seed in range(4)]
+    act = compiled(controller_of(tuned.law, plant), plant)
+    trials = judged_runs(
+        run(plants, act, start_of(controller_of(tuned.law, plant), 4), seconds=6.0), plant, seconds=6.0
+    )
+    assert trials.up.all() and not trials.stopped
+
+
+@pytest.mark.slow
+def test_a_motor_that_is_too_weak_is_refused_with_the_number_of_trials():
+    with pytest.raises(InputError, match=r"none of 16 sets .* in 32 trials, of which 0% came up"):
+        tune(model(), rail(control=0.01), sets=4, seconds=2.0)
+
+
+@pytest.mark.slow
+def test_a_plant_is_identified_from_motions_that_no_model_planned():
+    plant = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4, delay=1))
+
+    def fit(recording):
+        return identified(prepare(recording, chain=True).train, plant.layout.needs, chain=True).dynamics
+
+    explored = explore(plant, fit, Exploration(seconds=12.0))
+    recording = explored.recording
+    assert np.abs(recording.tau[:, 0]).max() <= 0.8 * 8.0 and (recording.tau[:, 1] == 0).all()
+    assert np.abs(recording.q[:, 0]).max() <= 0.8
+    truth = model().mass_matrix(jnp.zeros(2))
+    np.testing.assert_allclose(fit(recording).mass_matrix(jnp.zeros(2)), truth, rtol=0.05)
