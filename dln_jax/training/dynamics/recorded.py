@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.cli.arguments import names_listed, refuse_given, require_positive_if_given
-from dln_jax.cli.encoders import checked, fitted_torque, needs_from_option, preparation, smoothed
+from dln_jax.cli.encoders import checked, facts, fitted_torque, needs_from_option, preparation, smoothed
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
@@ -51,16 +51,17 @@ def read(options: Options) -> Recorded:
     """Reads and checks the data and robot that the arguments name, before anything is written."""
     scene = scene_named(options.scene) if options.scene else None
     labels = tuple(options.test.split(",")) if options.test else None
+    robot = robot_of(options)
     if options.data is None:
-        refuse_given(options, ["rate", "units"], "for a file: add --data")
+        refuse_given(options, ["rate", "units", "joints", "topics", "torque_factor"], "for a file: add --data")
     if options.data is not None:
-        data, name = schema.load(options.data, rate=options.rate, units=options.units), str(options.data)
+        names = () if robot is None else robot.tree.names
+        data, name = schema.load(options.data, **facts(options), robot=names), str(options.data)
     else:
         scene = scene or two_link_arm()
         data, name = default_data(scene), f"default data of {scene.name}"
         if labels is None and scene.name == "two-link-arm":
             labels = CHARACTERS_TEST
-    robot = robot_of(options)
     if robot is not None:
         data = with_joints(data, robot.tree.names)
     needs, origin = stated_needs(options, scene, data, robot)

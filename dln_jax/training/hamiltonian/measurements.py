@@ -4,7 +4,9 @@ Motions with noisy states are fitted through an integrator, weighted by that noi
 noise, a fit of the rates is sufficient.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,10 +52,8 @@ class Stated(NamedTuple):
     """Labels of the test trajectories, separated by commas, or an npz file with test trajectories."""
     noise: tuple[float, ...] | None = None
     """Standard deviation of q, one for all or one each; or, if the file has p, of q and then p (default: estimated)."""
-    rate: float | None = None
-    """Sampling rate for a file without t, Hz."""
-    units: str | None = None
-    """Units of CSV titles without one."""
+    file: Mapping[str, Any] = MappingProxyType({})
+    """Keywords of `data.schema.load`."""
 
 
 class Trust(NamedTuple):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.cli.arguments import names_in, names_listed, numbers_of, require_positive_if_given
-from dln_jax.cli.encoders import checked, fitted_torque, preparation, smoothed
+from dln_jax.cli.encoders import checked, facts, fitted_torque, preparation, smoothed
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
@@ -73,7 +73,7 @@ def prepare(options: Options) -> Case:
     require_laws(laws, "--friction")
     require_positive_if_given(options, ["velocity_scale"])
     try:
-        data = with_joints(schema.load(options.data, rate=options.rate, units=options.units), robot.tree.names)
+        data = with_joints(schema.load(options.data, **facts(options), robot=robot.tree.names), robot.tree.names)
     except InputError as error:
         raise InputError(str(error) if str(options.data) in str(error) else f"{options.data}: {error}") from None
     if "tau" in data.estimated:
