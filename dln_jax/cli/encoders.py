@@ -30,6 +30,11 @@ def facts(options: Logged) -> dict[str, Any]:
     return {"rate": options.rate, "units": options.units, "torque_factor": factor, **names}
 
 
+def without_torque(data: Trajectories) -> str:
+    """Remarks on how a file without torques was read, for the end of a message; empty if there are none."""
+    return f" ({'; '.join(data.remarks)})" if data.remarks else ""
+
+
 def _factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
     option = "--torque-factor"
     if "=" in text:

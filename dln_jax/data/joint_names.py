@@ -95,7 +95,9 @@ def _common_ending(first: str, second: str) -> int:
     return count
 
 
-def factors(stated: float | int | Sequence[float | int] | Mapping[str, float | int], names: Sequence[str]) -> list[float]:
+def factors(
+    stated: float | int | Sequence[float | int] | Mapping[str, float | int], names: Sequence[str]
+) -> list[float]:
     """Factor of every joint's torque, from one number, one per joint, or numbers by name (1 for other joints).
 
     Raises:

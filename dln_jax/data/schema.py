@@ -163,7 +163,8 @@ def scaled(arrays: dict[str, Any], torque_factor: Any) -> dict[str, Any]:
     if torque_factor is None:
         return arrays
     if np.ndim(arrays.get("tau")) != 2:
-        raise InputError("--torque-factor scales tau, which the file lacks; leave it out")
+        why = "".join(f"; {remark}" for remark in arrays.get("remarks", ()))
+        raise InputError(f"--torque-factor scales tau, which the file lacks; leave it out{why}")
     count = np.shape(arrays["tau"])[1]
     names = np.asarray(arrays.get("joint_names", [str(joint + 1) for joint in range(count)])).astype(str).tolist()
     numbers = joint_names.factors(torque_factor, names)

@@ -157,7 +157,9 @@ def test_bags_that_cannot_be_used_are_refused_in_one_line(tmp_path):
     t = np.arange(20) / 100
     bag = write_bag(tmp_path / "bag", {"/joint_states": rows(t), "/other": rows(t)}, others=["/rosout"])
     empty = write_bag(tmp_path / "empty", {}, others=["/rosout"])
-    apart = write_bag(tmp_path / "apart", {"/a": rows(t, tau=False), "/b": [state(9 + s, NAMES, tau=[1, 2]) for s in t]})
+    apart = write_bag(
+        tmp_path / "apart", {"/a": rows(t, tau=False), "/b": [state(9 + s, NAMES, tau=[1, 2]) for s in t]}
+    )
     uneven = write_bag(tmp_path / "uneven", {"/a": [state(s, NAMES, [1.0, 2.0], [1.0]) for s in t]})
     half = write_bag(tmp_path / "half", {"/a": [state(s, NAMES, *motion(s)[:2], [1.0, np.nan]) for s in t]})
     for name in ("junk.db3", "junk.mcap", "junk.bag"):

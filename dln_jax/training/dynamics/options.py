@@ -26,7 +26,7 @@ class Plant:
     model: str | None = None
     """What is learned."""
     data: Unstated[Path] = None
-    """Trajectories, npz or CSV (default: the embedded letters, or states of --scene)."""
+    """Trajectories, npz, CSV or ROS bag (default: the embedded letters, or states of --scene)."""
     test: Unstated[str] = None
     """Labels of test trajectories, comma separated (default: e,q,v, else every sixth, else blocks of time)."""
     scene: Unstated[str] = None

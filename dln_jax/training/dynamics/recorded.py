@@ -5,7 +5,15 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.cli.arguments import names_listed, refuse_given, require_positive_if_given
-from dln_jax.cli.encoders import checked, facts, fitted_torque, needs_from_option, preparation, smoothed
+from dln_jax.cli.encoders import (
+    checked,
+    facts,
+    fitted_torque,
+    needs_from_option,
+    preparation,
+    smoothed,
+    without_torque,
+)
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
@@ -72,7 +80,7 @@ def read(options: Options) -> Recorded:
     if "tau" in data.estimated:
         raise InputError(
             f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
-            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}"
+            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}{without_torque(data)}"
         )
     if robot is not None and needs.joints != robot.tree.joints:
         raise InputError(

@@ -66,7 +66,7 @@ class RecordedOptions(Checked):
     """Recorded motions."""
 
     data: Unstated[Path] = None
-    """Trajectories as npz or CSV."""
+    """Trajectories as npz, CSV or ROS bag."""
 
 
 @dataclass(frozen=True)

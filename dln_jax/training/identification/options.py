@@ -19,7 +19,7 @@ class Robot:
     robot: Path
     """URDF or MJCF file: the kinematics, and values to start from. It is not changed."""
     data: Path
-    """Trajectories as npz or CSV, with tau; joint_names, if present, are matched with the robot's."""
+    """Trajectories as npz, CSV or ROS bag, with tau; joint names, if present, are matched with the robot's."""
     test: Unstated[str] = None
     """Labels of held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
     blocks of time)."""

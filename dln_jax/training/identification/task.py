@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.cli.arguments import names_in, names_listed, numbers_of, require_positive_if_given
-from dln_jax.cli.encoders import checked, facts, fitted_torque, preparation, smoothed
+from dln_jax.cli.encoders import checked, facts, fitted_torque, preparation, smoothed, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
@@ -77,7 +77,9 @@ def prepare(options: Options) -> Case:
     except InputError as error:
         raise InputError(str(error) if str(options.data) in str(error) else f"{options.data}: {error}") from None
     if "tau" in data.estimated:
-        raise InputError(f"{options.data}: the data have no tau; identification takes measured torques")
+        raise InputError(
+            f"{options.data}: the data have no tau; identification takes measured torques{without_torque(data)}"
+        )
     filtered = smoothed(options, data)
     lines = (*preparation(data, filtered), *checked(options, data, options.data, robot=robot, without=SETTLED))
     labels = [label.strip() for label in options.test.split(",")] if options.test else None
