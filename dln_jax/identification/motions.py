@@ -6,8 +6,8 @@
             + share * |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.weighted`)
 
 The simulated motion is driven by tau(t - delay) + e_w. Starts and constant torques are eliminated window by window
-(Kaufman's derivative, `learning.motions`). No acceleration is needed: forces that no log records, such as vibration of a
-belt, enter torques of filtered motions but hardly move a joint.
+(Kaufman's derivative, `learning.motions`). No acceleration is needed: forces that no log records, such as the vibration
+of a belt, enter torques of filtered motions but hardly move a joint.
 
 The residual is linearised at theta, which gives equations of the same kind as those of torques. The least-squares
 problems with physically consistent bodies are those of `consistent`, one a round; a step is halved until the sum

@@ -80,7 +80,8 @@ def read(options: Options) -> Recorded:
     if "tau" in data.estimated:
         raise InputError(
             f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
-            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}{without_torque(data)}"
+            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}"
+            f"{without_torque(data)}"
         )
     if robot is not None and needs.joints != robot.tree.joints:
         raise InputError(
