@@ -19,6 +19,7 @@ from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split, with_joints
+from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL
@@ -58,7 +59,8 @@ class Recorded(NamedTuple):
 def read(options: Options) -> Recorded:
     """Reads and checks the data and robot that the arguments name, before anything is written."""
     scene = scene_named(options.scene) if options.scene else None
-    labels = tuple(options.test.split(",")) if options.test else None
+    parts = options.test if is_cut(options.test) else None
+    labels = None if parts or not options.test else [label.strip() for label in options.test.split(",")]
     robot = robot_of(options)
     if options.data is None:
         refuse_given(options, ["rate", "units", "joints", "topics", "torque_factor"], "for a file: add --data")
@@ -68,8 +70,8 @@ def read(options: Options) -> Recorded:
     else:
         scene = scene or two_link_arm()
         data, name = default_data(scene), f"default data of {scene.name}"
-        if labels is None and scene.name == "two-link-arm":
-            labels = CHARACTERS_TEST
+        if labels is None and not parts and scene.name == "two-link-arm":
+            labels = list(CHARACTERS_TEST)
     if robot is not None:
         data = with_joints(data, robot.tree.names)
     needs, origin = stated_needs(options, scene, data, robot)
@@ -89,8 +91,8 @@ def read(options: Options) -> Recorded:
         )
     data = data._replace(needs=needs)
     rubbing = bool(needs.friction or needs.joint_friction)
-    cut = labels is None and len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES
-    settled = (*["split"] * cut, *["friction"] * rubbing)
+    cut = labels is None and (parts or len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES)
+    settled = (*["split"] * bool(cut), *["friction"] * rubbing)
     findings = [] if options.data is None else checked(options, data, options.data, robot=robot, without=settled)
     filtered = smoothed(options, data)
     lines = [*preparation(data, filtered), *findings]
@@ -98,7 +100,9 @@ def read(options: Options) -> Recorded:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)
     recordings = len(np.unique(data.trajectory))
-    if cut and recordings < LEAST_TRAJECTORIES:
+    if parts:
+        data, labels = stated_test(data, parts)
+    elif cut and recordings < LEAST_TRAJECTORIES:
         data = in_blocks(data, BLOCKS)
     parents = parents_of(options, needs.degrees_of_freedom)
     sets = split(data, test=labels, seed=options.seed)

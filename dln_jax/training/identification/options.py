@@ -21,8 +21,8 @@ class Robot:
     data: Path
     """Trajectories as npz, CSV or ROS bag, with tau; joint names, if present, are matched with the robot's."""
     test: Unstated[str] = None
-    """Labels of held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
-    blocks of time)."""
+    """Held-out trajectories: labels, comma separated; last:30% of every trajectory; or blocks, of ten blocks of time
+    (default: the third of every five; of one trajectory, of ten blocks of time)."""
     lock: Unstated[str] = None
     """Joints that do not move; "*finger*" names all with finger in their name (default: all move)."""
     friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = "viscous,coulomb,offset"

@@ -13,6 +13,7 @@ from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select, with_joints
+from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.friction import FrictionShape, require_laws, shape_of
 from dln_jax.mechanics.trees import tree_to_json
@@ -82,15 +83,13 @@ def prepare(options: Options) -> Case:
         )
     filtered = smoothed(options, data)
     lines = (*preparation(data, filtered), *checked(options, data, options.data, robot=robot, without=SETTLED))
-    labels = [label.strip() for label in options.test.split(",")] if options.test else None
     if filtered is not None:
-        labels = labels and labels_of_parts(filtered.data, labels)
-        data = filtered.data._replace(joint_names=data.joint_names)
+        data = filtered.data
+    sets = held_out(data, options.test or None, in_parts=filtered is not None)
     needs = robot.tree.needs._replace(joint_friction=cast(tuple[FrictionLaw, ...], laws))
     scale = {} if options.velocity_scale is None else {"velocity_scale": options.velocity_scale}
     description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **scale)
     noise = noises(options.noise, robot.tree.degrees_of_freedom)
-    sets = split(data, labels)
     torque = fitted_torque(filtered)
     files = {"robot_file": options.robot.name, "data_file": options.data.name}
     case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque, **files)
@@ -134,11 +133,19 @@ def for_residual(train: Trajectories) -> tuple[Trajectories, Trajectories]:
     return select(train, np.setdiff1d(present, chosen)), select(train, chosen)
 
 
+def held_out(data: Trajectories, test: str | None, *, in_parts: bool) -> Sets:
+    """Training and held-out data as --test states them; `in_parts` if a filter cut trajectories at gaps."""
+    if not is_cut(test):
+        labels = stated_test(data, test)[1]
+        return split(data, labels_of_parts(data, labels) if in_parts and labels else labels)
+    return split(*stated_test(data, test))._replace(blocks=True)
+
+
 def split(data: Trajectories, test: list[str] | None) -> Sets:
     """Training and held-out trajectories, or blocks of time if there is only one trajectory."""
     if len(np.unique(data.trajectory)) == 1:
         if test is not None:
-            raise InputError("--test names trajectories, and the data have one only; leave it out for blocks of time")
+            raise InputError("--test names trajectories, and the data have one only; give last:30%, or leave it out")
         return split(in_blocks(data, BLOCKS), None)._replace(blocks=True)
     present = np.unique(data.trajectory)
     held = present[HELD_OUT] if len(present) > 2 else present[-1:]
