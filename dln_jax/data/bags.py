@@ -48,7 +48,6 @@ class Messages(NamedTuple):
 
     series: dict[tuple[str, str], Series]
     """By field and joint."""
-    count: int
     remarks: tuple[str, ...]
 
 
@@ -215,7 +214,7 @@ def _series(topic: str, rows: Iterator[tuple[int, Any]]) -> Messages:
         remarks.append(f"{topic}: {repeated} messages repeat a stamp (the first is kept)")
     if reversed_:
         remarks.append(f"{topic}: {reversed_} messages are earlier than the one before (sorted by stamp)")
-    return Messages(series, len(received), tuple(remarks))
+    return Messages(series, tuple(remarks))
 
 
 def _messages(path: Path, topics: Sequence[str]) -> dict[str, Iterator[tuple[int, Any]]]:

@@ -84,8 +84,7 @@ def cut_motions(data: Trajectories, length: int) -> MotionWindows:
         ]
     )
     t = data.t[indices]
-    parts = (array[indices] for array in (data.q, data.qd, data.tau, slope))
-    return MotionWindows(t - t[:, :1], *parts, weight)
+    return MotionWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], slope[indices], weight)
 
 
 def linearise(model: Model, like: Parameters) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
@@ -126,9 +125,26 @@ def linearise(model: Model, like: Parameters) -> Callable[..., tuple[np.ndarray,
                 rows = np.minimum(np.arange(first, first + CHUNK), count - 1)  # one shape, so one program
                 chunk = tuple(jnp.asarray(array[rows]) for array in windows)
                 parts.append([np.asarray(part) for part in every(unknowns, noise_q, noise_tau, chunk)])
-        return tuple(np.concatenate(part)[:count] for part in zip(*parts, strict=True))
+        left, slopes = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
+        return left, slopes
 
     return linearised
+
+
+def distances(
+    linearised: Callable, start: Float[np.ndarray, " P"], noise_tau: Float[np.ndarray, " d"], windows: MotionWindows
+) -> Float[np.ndarray, " d"]:
+    """Root mean square distance of every joint's simulated motion from the measured one, rad or m, by two rounds.
+
+    The first round has a thousandth of the spread of q as noise; each moves the compromise between starts and torques.
+    """
+    d = windows.q.shape[2]
+    noise = spread = np.maximum(1e-3 * windows.q.reshape(-1, d).std(axis=0), np.finfo(float).tiny)
+    for _ in range(2):
+        left = linearised(start, 0.0, noise, noise_tau, windows)[0][:, : windows.q[0].size]
+        sizes = np.sum(left.reshape(-1, d) ** 2, axis=0) / windows.weight.sum()
+        noise = np.maximum(noise * np.sqrt(sizes), 1e-3 * spread)
+    return noise
 
 
 def fit_motions(
@@ -139,8 +155,8 @@ def fit_motions(
     start: Float[np.ndarray, " P"],
     windows: MotionWindows,
     *,
-    noise_q: Float[np.ndarray, " d"],
     noise_tau: Float[np.ndarray, " d"],
+    noise_q: Float[np.ndarray, " d"] | None = None,
     torques: Float[np.ndarray, "K P_and_1"] | None = None,
     share: float = 1.0,
     delay: bool = True,
@@ -156,8 +172,9 @@ def fit_motions(
         prior: values that undetermined directions keep.
         start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
         windows: from `cut_motions`.
-        noise_q: standard deviation of q, forces that were not recorded included, rad or m.
         noise_tau: standard deviation of a window's constant torque, N m or N.
+        noise_q: standard deviation of q, forces that were not recorded included, rad or m (default: the root mean
+            square distance of the motions simulated with the initial parameters).
         torques: triangular factor of the torques' equations in units of noise.
         share: weight of the torques.
         delay: whether to fit a delay of the torques.
@@ -167,8 +184,11 @@ def fit_motions(
     Raises:
         InputError: a noise or share that is not positive, or a start whose motions are not finite.
     """
-    require_positive(share=share, noise_q=float(np.min(noise_q)), noise_tau=float(np.min(noise_tau)))
+    require_positive(share=share, noise_tau=float(np.min(noise_tau)))
     linearised = linearise(model, known) if linearised is None else linearised
+    if noise_q is None:
+        noise_q = distances(linearised, start, noise_tau, windows)
+    require_positive(noise_q=float(np.min(noise_q)))
     P = len(start)
     wider = Columns((*columns.names, "delay"), (*columns.kinds, "signed"), (*columns.joints, 0))
     fixed = np.zeros((0, P + 2)) if torques is None else np.sqrt(share) * np.insert(torques, P, 0.0, axis=1)
@@ -191,7 +211,8 @@ def fit_motions(
     if not np.isfinite(total):
         raise InputError("motions simulated with the fit of torques are not finite; record faster, or filter less")
     before, done, converged = distance(left), 0, False
-    for done in range(1, ROUNDS + 1):
+    while done < ROUNDS and not converged:
+        done += 1
         J, r = slopes.reshape(-1, P + 1), left.ravel()
         rows = np.concatenate([np.column_stack([J, J @ x - r]), fixed])
         triangle = triangular_factor(rows[:, :-1], rows[:, -1])
@@ -206,9 +227,6 @@ def fit_motions(
         if not (np.isfinite(total) and total < was):
             left, slopes, total = at(x)
             converged = True  # no step lowers the sum
-            break
-        x = candidate
-        if was - total < SETTLED * was:
-            converged = True
-            break
+        else:
+            x, converged = candidate, was - total < SETTLED * was
     return MotionFit(x[:-1], TYPICAL_DELAY * float(x[-1]), before, distance(left), done, converged)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.options import Drawn, Filtered, Folder
@@ -29,6 +29,10 @@ class Robot:
     """Friction laws whose coefficients are identified (default: viscous,coulomb,offset)."""
     velocity_scale: Unstated[float] = None
     """Velocity at which dry friction has three quarters of its force, rad/s or m/s (default: fitted for each joint)."""
+    by: Literal["torques", "motions", "both"] = "torques"
+    """What is fitted: torques of filtered motions, motions simulated with the torques (output error), or both."""
+    window: Unstated[float] = None
+    """Length of the simulated windows of --by motions and both, s (default: 0.3)."""
     uncertainty: bool = True
     """Estimate the uncertainty of the torques, and flag states out of distribution."""
     residual: bool = False

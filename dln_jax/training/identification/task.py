@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.arguments import names_in, names_listed, numbers_of, require_positive_if_given
+from dln_jax.cli.arguments import names_in, names_listed, numbers_of, refuse_given, require_positive_if_given
 from dln_jax.cli.encoders import checked, facts, fitted_torque, preparation, smoothed, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
@@ -18,6 +18,7 @@ from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.friction import FrictionShape, require_laws, shape_of
 from dln_jax.mechanics.trees import tree_to_json
 from dln_jax.models.model import Parameters
+from dln_jax.training.identification.motions import MotionSets, lightly_filtered
 from dln_jax.training.identification.options import IDENTIFIED, NO_FRICTION, Options
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
@@ -59,6 +60,8 @@ class Case(NamedTuple):
     """The torques that the fit and its uncertainty bands refer to."""
     robot_file: str = ""
     data_file: str = ""
+    motions: MotionSets | None = None
+    """Motions to fit and to predict, with --by motions or both."""
 
     @property
     def laws(self) -> tuple[FrictionLaw, ...]:
@@ -83,17 +86,25 @@ def prepare(options: Options) -> Case:
         )
     filtered = smoothed(options, data)
     lines = (*preparation(data, filtered), *checked(options, data, options.data, robot=robot, without=SETTLED))
+    require_positive_if_given(options, ["window"])
+    light = None
+    if options.by == "torques":
+        refuse_given(options, ["window"], "for --by motions or both")
+    else:
+        light = lightly_filtered(data, filtered)
     if filtered is not None:
         data = filtered.data
-    sets = held_out(data, options.test or None, in_parts=filtered is not None)
+    sets, motions = held_out(data, options.test or None, in_parts=filtered is not None), None
+    if light is not None:
+        motions = MotionSets(*held_out(light, options.test or None, in_parts=filtered is not None)[:2])
     needs = robot.tree.needs._replace(joint_friction=cast(tuple[FrictionLaw, ...], laws))
     scale = {} if options.velocity_scale is None else {"velocity_scale": options.velocity_scale}
     description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **scale)
     noise = noises(options.noise, robot.tree.degrees_of_freedom)
     torque = fitted_torque(filtered)
-    files = {"robot_file": options.robot.name, "data_file": options.data.name}
-    case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque, **files)
-    return with_description(case)
+    case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque)
+    named = {"robot_file": options.robot.name, "data_file": options.data.name}
+    return with_description(case._replace(motions=motions, **named))
 
 
 def with_description(case: Case, **changes: Any) -> Case:
