@@ -9,6 +9,9 @@ The simulated motion is driven by tau(t - delay) + e_w. Starts and constant torq
 (Kaufman's derivative, `learning.motions`). No acceleration is needed: forces that no log records, such as the vibration
 of a belt, enter torques of filtered motions but hardly move a joint.
 
+Windows in which something unusual happened, such as a touch, are off by far more than others. A window whose residual
+is longer than the median counts by the median over its length (Huber), with weights from the previous fit.
+
 The residual is linearised at theta, which gives equations of the same kind as those of torques. The least-squares
 problems with physically consistent bodies are those of `consistent`, one a round; a step is halved until the sum
 decreases (consistent bodies form a convex set).
@@ -40,6 +43,8 @@ ROUNDS, SETTLED = 12, 1e-4
 """Largest number of linearisations, and the relative decrease of the sum at which they stop."""
 CHUNK = 64
 """Windows that are linearised at a time."""
+REWEIGHTINGS = 2
+"""Number of times that windows are weighted by their distance and the fit is repeated."""
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""
 TYPICAL_DELAY = 1e-3
@@ -206,27 +211,40 @@ def fit_motions(
     def distance(left: np.ndarray) -> float:
         return float(np.linalg.norm(left[:, :motions]) / measured)
 
-    x = np.append(start, 0.0)
-    left, slopes, total = at(x)
-    if not np.isfinite(total):
-        raise InputError("motions simulated with the fit of torques are not finite; record faster, or filter less")
-    before, done, converged = distance(left), 0, False
-    while done < ROUNDS and not converged:
-        done += 1
-        J, r = slopes.reshape(-1, P + 1), left.ravel()
-        rows = np.concatenate([np.column_stack([J, J @ x - r]), fixed])
-        triangle = triangular_factor(rows[:, :-1], rows[:, -1])
-        target = fit_consistent(triangle, wider, prior, regularisation=regularisation)
-        length, was = 1.0, total
-        while True:
-            candidate = x + length * (target.theta - x)
-            left, slopes, total = at(candidate)
-            if (np.isfinite(total) and total < was) or length < SHORTEST_STEP:
-                break
-            length /= 2
-        if not (np.isfinite(total) and total < was):
-            left, slopes, total = at(x)
-            converged = True  # no step lowers the sum
-        else:
-            x, converged = candidate, was - total < SETTLED * was
-    return MotionFit(x[:-1], TYPICAL_DELAY * float(x[-1]), before, distance(left), done, converged)
+    def descended(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, bool]:
+        left, slopes, total = at(x)
+        if not np.isfinite(total):
+            raise InputError("motions simulated with the initial fit are not finite; record faster, or filter less")
+        done, converged = 0, False
+        while done < ROUNDS and not converged:
+            done += 1
+            J, r = slopes.reshape(-1, P + 1), left.ravel()
+            rows = np.concatenate([np.column_stack([J, J @ x - r]), fixed])
+            triangle = triangular_factor(rows[:, :-1], rows[:, -1])
+            target = fit_consistent(triangle, wider, prior, regularisation=regularisation)
+            length, was = 1.0, total
+            while True:
+                candidate = x + length * (target.theta - x)
+                left, slopes, total = at(candidate)
+                if (np.isfinite(total) and total < was) or length < SHORTEST_STEP:
+                    break
+                length /= 2
+            if np.isfinite(total) and total < was:
+                x, converged = candidate, was - total < SETTLED * was
+            else:
+                left, slopes, total = at(x)
+                converged = True  # no step lowers the sum
+        return x, left, done, converged
+
+    x, equal, rounds, converged = np.append(start, 0.0), windows, 0, False
+    before = distance(at(x)[0])
+    for weighting in range(1 + REWEIGHTINGS):
+        if weighting:
+            windows = equal
+            norms = np.linalg.norm(at(x)[0], axis=1)
+            usual = np.minimum(1.0, np.median(norms) / np.maximum(norms, np.finfo(float).tiny))
+            windows = equal._replace(weight=equal.weight * usual[:, None])
+        x, _, done, converged = descended(x)
+        rounds += done
+    windows = equal
+    return MotionFit(x[:-1], TYPICAL_DELAY * float(x[-1]), before, distance(at(x)[0]), rounds, converged)

@@ -21,6 +21,8 @@ from dln_jax.types import InputError
 WINDOW = 0.3
 """Length of a window, s. Of 0.1 and 0.3 s, the longer one predicted held-out motions of a recorded double pendulum
 longer."""
+PUSH = 0.1
+"""Standard deviation of a window's constant torque over that of a sample's torque error, which cancels in part."""
 LIGHTER, NYQUIST, STEP = 5.0, 0.4, 0.01
 """Cut-off of the motions' q over that of the torques', its limit over the sampling rate, and their time step, s."""
 HORIZON, EVERY = 2.2, 0.5
@@ -83,7 +85,7 @@ def fit_by(
         torques = equations.weighted(compact, noise)
     fit = fit_motions(
         model, known, solution.columns, solution.known, solution.theta, cut_motions(sets.train, length),
-        noise_tau=solution.fit.noise, torques=torques, linearised=linearise(model, known),
+        noise_tau=PUSH * solution.fit.noise, torques=torques, linearised=linearise(model, known),
     )  # fmt: skip
     kept = solution.consistent._replace(theta=fit.theta, converged=fit.converged)
     return solution._replace(consistent=kept), fit
