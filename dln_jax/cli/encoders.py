@@ -41,7 +41,7 @@ def _factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
         pairs = [entry.partition("=") for entry in text.split(",")]
         return {name.strip(): numbers_of(f"{option} {name.strip()}", number, [1])[0] for name, _, number in pairs}
     numbers = numbers_of(option, text)
-    return numbers if len(numbers) > 1 else numbers[0]
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def smoothed(options: Filtered, data: Trajectories) -> Smoothed | None:
