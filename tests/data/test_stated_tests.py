@@ -34,7 +34,7 @@ def test_one_trajectory_suffices_for_both():
         sets = split(cut, test=labels)
         assert len(sets.test.t) == tested * 200 and len(sets.validation.t) and len(sets.train.t) > 100
         known = held_out(data(200), text, in_parts=False)
-        assert known.blocks and len(known.test.t) == {"last:20%": 40, "blocks": 40}[text]
+        assert len(known.test.t) == {"last:20%": 40, "blocks": 40}[text]
         fitted, test = parted("measured", data(200), "log", text)
         assert len(fitted.t) + len(test.t) == 200 and len(test.t) == tested * 200
 

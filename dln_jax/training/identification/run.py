@@ -61,7 +61,7 @@ def announce(case: Case) -> Iterator[str]:
     """Lines on the robot, the data and the assumptions made."""
     train, test, blocks = case.sets
     yield f"{case.robot_file}: {len(case.names)} joints, {', '.join(case.names)}"
-    kind = "parts of trajectories, cut by time" if blocks else "trajectories"
+    kind = "blocks of time of the one trajectory" if blocks else "trajectories or parts of them"
     yield f"{case.data_file}: {len(train.t)} samples fitted, {len(test.t)} held out ({kind})"
     if train.joint_names is None:
         yield "the data name no joints: taken to be in this order (key joint_names)"

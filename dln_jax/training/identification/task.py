@@ -149,7 +149,7 @@ def held_out(data: Trajectories, test: str | None, *, in_parts: bool) -> Sets:
     if not is_cut(test):
         labels = stated_test(data, test)[1]
         return split(data, labels_of_parts(data, labels) if in_parts and labels else labels)
-    return split(*stated_test(data, test))._replace(blocks=True)
+    return split(*stated_test(data, test))
 
 
 def split(data: Trajectories, test: list[str] | None) -> Sets:
