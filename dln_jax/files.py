@@ -77,6 +77,14 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def is_folder(path: Path) -> bool:
+    """Whether the folder exists; False for a name that the system does not allow."""
+    try:
+        return path.is_dir()
+    except OSError:
+        return False
+
+
 def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
     """Reads the JSON object in a file.
 

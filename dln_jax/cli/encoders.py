@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.cli.arguments import refuse_given
-from dln_jax.cli.options import Checked, Filtered
+from dln_jax.cli.arguments import names_listed, numbers_of, refuse_given
+from dln_jax.cli.options import Checked, Filtered, Logged
 from dln_jax.data.checks import quick
 from dln_jax.data.encoders import Smoothed, smooth
 from dln_jax.data.robots import Robot
@@ -21,6 +21,27 @@ FILTERED = (
     "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated",
 )  # fmt: skip
 """Checks for faults that filtering q replaces or repairs."""
+
+
+def facts(options: Logged) -> dict[str, Any]:
+    """Keywords of `data.schema.load` that the options state."""
+    factor = None if options.torque_factor is None else _factor(options.torque_factor)
+    names = {"joints": names_listed(options.joints), "topics": names_listed(options.topics)}
+    return {"rate": options.rate, "units": options.units, "torque_factor": factor, **names}
+
+
+def without_torque(data: Trajectories) -> str:
+    """Remarks on how a file without torques was read, for the end of a message; empty if there are none."""
+    return f" ({'; '.join(data.remarks)})" if data.remarks else ""
+
+
+def _factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
+    option = "--torque-factor"
+    if "=" in text:
+        pairs = [entry.partition("=") for entry in text.split(",")]
+        return {name.strip(): numbers_of(f"{option} {name.strip()}", number, [1])[0] for name, _, number in pairs}
+    numbers = numbers_of(option, text)
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def smoothed(options: Filtered, data: Trajectories) -> Smoothed | None:
@@ -41,20 +62,21 @@ def smoothed(options: Filtered, data: Trajectories) -> Smoothed | None:
 
 
 def preparation(data: Trajectories, filtered: Smoothed | None) -> list[str]:
-    """Lines that state where rates and torques come from, and how noisy they are."""
+    """Lines that state how the file was read, where rates and torques come from, and how noisy they are."""
+    lines = list(data.remarks)
     if filtered is None:
         estimated = [key for key in data.estimated if key != "tau"]
-        lines = [f"not in the data: {', '.join(data.estimated)}"] if data.estimated else []
+        lines += [f"not in the data: {', '.join(data.estimated)}"] if data.estimated else []
         if estimated:
-            lines[0] += "; rates are raw finite differences, which amplify noise: --cutoff auto filters q first"
+            lines[-1] += "; rates are raw finite differences, which amplify noise: --cutoff auto filters q first"
         return lines
     kept = f"{filtered.rate / filtered.decimate:.4g} Hz in {filtered.parts} parts"
     how = "given" if filtered.choice is None else "chosen from the spectra of q"
-    lines = [
+    lines.append(
         f"rates: q is not filtered, as its noise is too small; derivatives of splines, {kept}"
         if np.isinf(filtered.cutoff)
         else f"rates: q filtered without delay at {filtered.cutoff:.3g} Hz ({how}), {kept}"
-    ]
+    )
     torque = "filtered alike" if filtered.filtered_torque else "not filtered"
     sizes = [", ".join(f"{number:.2g}" for number in noise) for noise in (filtered.noise_q, filtered.noise_tau)]
     lines.append(f"noise of q {sizes[0]}; of tau {sizes[1]} ({torque})")

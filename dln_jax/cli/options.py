@@ -83,6 +83,13 @@ class Logged:
     """Sampling rate of a file without t, Hz."""
     units: Unstated[Literal["si", "degrees"]] = None
     """CSV: units of columns whose titles state none."""
+    joints: Unstated[str] = None
+    """Joints to keep, in this order, or LOG=NAME to rename one, comma separated (default: all; names that differ from
+    the robot's by one prefix or ending are matched)."""
+    topics: Unstated[str] = None
+    """ROS bag: topics of joint states, comma separated (default: the only one)."""
+    torque_factor: Unstated[str] = None
+    """Factor of tau, such as N m per A where currents were logged: one number, one per joint, or NAME=NUMBER."""
 
 
 @dataclass(frozen=True)

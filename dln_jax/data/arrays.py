@@ -8,8 +8,9 @@ losses would be infinite or zero although every single number is finite.
 import math
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import jax.numpy as jnp
@@ -17,14 +18,18 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.files import is_file
+from dln_jax.files import is_file, is_folder
 from dln_jax.sizes import LARGEST, SMALLEST
 from dln_jax.types import InputError
 
 Data = TypeVar("Data")
+Reader = Callable[[Path], tuple[dict[str, Any], list[str]]]
+"""Reader of a file of another format: arrays by key, and the names of what it does not read."""
 
 MOST_BYTES = 4 * 2**30
 """Limit on all arrays of one file, since a small archive may expand a thousandfold."""
+FOLDER = "/"
+"""Key of the reader of folders."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 """Header readers for the format versions in which NumPy writes numbers and strings."""
 MOST_TIMES_TYPICAL = 1e20
@@ -37,7 +42,7 @@ def load_file(
     from_arrays: Callable[[dict[str, Any]], Data],
     keys: Sequence[str],
     *,
-    table: Callable[[Path], tuple[dict[str, Any], list[str]]] | None = None,
+    readers: Mapping[str, Reader] = MappingProxyType({}),
 ) -> Data:
     """Reads the arrays with these keys, if present, and passes them to `from_arrays`, which checks them.
 
@@ -45,19 +50,21 @@ def load_file(
         path: path of an npz file.
         from_arrays: converts arrays by key into the result.
         keys: keys to read.
-        table: reader for files whose name ends in .csv; returns the arrays by key and the columns it does not read.
+        readers: readers of other formats, by the ending of the name such as ".csv"; that of folders is `FOLDER`.
 
     Raises:
         InputError: the file is missing, is not an npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
-            `from_arrays` or `table` rejects its contents (the message then starts with the path).
+            `from_arrays` or a reader rejects its contents (the message then starts with the path).
     """
     path = Path(path)
-    if not is_file(path):
-        kinds = "an npz file" if table is None else "an npz or CSV file"
+    folder = FOLDER in readers and is_folder(path)
+    if not is_file(path) and not folder:
+        kinds = "an npz or CSV file, or a ROS bag" if readers else "an npz file"
         raise InputError(f"{path!s:.200}: no such file; give the path of {kinds}")
     unread: list[str] = []
     try:
-        arrays, unread = table(path) if table and path.suffix.lower() == ".csv" else _read(path, keys)
+        reader = readers.get(FOLDER if folder else path.suffix.lower())
+        arrays, unread = _read(path, keys) if reader is None else reader(path)
         return from_arrays(arrays)
     except InputError as error:
         names = f" (keys that are not read: {', '.join(unread)[:200]})" if unread else ""

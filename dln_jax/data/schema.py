@@ -1,4 +1,4 @@
-"""Schema of trajectory files (npz or CSV): how they are read, checked and written.
+"""Schema of trajectory files (npz, CSV, ROS bags): how they are read, checked and written.
 
 Samples of all trajectories are concatenated on axis 0.
 
@@ -17,16 +17,16 @@ Samples of all trajectories are concatenated on axis 0.
 
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from dln_jax.data import csv_tables
-from dln_jax.data.arrays import load_file, numeric
+from dln_jax.data import bags, csv_tables, joint_names
+from dln_jax.data.arrays import FOLDER, load_file, numeric
 from dln_jax.data.stated_needs import needs_from_text
-from dln_jax.files import is_file, writing
+from dln_jax.files import is_file, is_folder, writing
 from dln_jax.types import InputError, Needs, require_positive
 
 Data = TypeVar("Data")
@@ -57,6 +57,8 @@ class Trajectories(NamedTuple):
     joint_names: np.ndarray | None = None
     estimated: tuple[str, ...] = ()
     """Keys that were absent: rates estimated by finite differences, torques set to zero."""
+    remarks: tuple[str, ...] = ()
+    """How the file was read: joints matched or left out, repaired stamps, and the clock of a bag."""
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -64,28 +66,111 @@ class Trajectories(NamedTuple):
         return self.q.shape[1]
 
 
-def load(path: str | Path, *, rate: float | int | None = None, units: str | None = None) -> Trajectories:
-    """Reads and checks an npz or CSV file; never unpickles.
+def load(
+    path: str | Path,
+    *,
+    rate: float | int | None = None,
+    units: str | None = None,
+    joints: Sequence[str] = (),
+    topics: Sequence[str] = (),
+    torque_factor: float | int | Sequence[float | int] | Mapping[str, float | int] | None = None,
+    robot: Sequence[str] = (),
+) -> Trajectories:
+    """Reads and checks an npz file, a CSV file or a ROS bag; never unpickles.
 
     Args:
-        path: path of the file; CSV if its name ends in .csv (see `data.csv_tables`).
+        path: path of the file; CSV if its name ends in .csv (see `data.csv_tables`), a bag if it ends in .db3, .mcap or
+            .bag or is a folder (see `data.bags`).
         rate: sampling rate of all trajectories, Hz, for a file without t.
         units: units of CSV titles without one, "si" or "degrees".
+        joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joint_names.chosen`).
+        topics: topics of joint states in a bag; by default the only one.
+        torque_factor: factor of tau, N m per A for currents: one number, one for each joint, or numbers by name.
+        robot: names of the robot's joints. Of a bag, only the joints that match them are read; `splits.with_joints`
+            brings them into this order.
 
     Raises:
-        InputError: the file is missing, is not an npz, holds pickled objects, is malformed CSV, or breaks the schema.
+        InputError: the file is missing, is not of its format, holds pickled objects, breaks the schema, or lacks a
+            stated joint or topic.
     """
-    return load_arrays(path, from_arrays, rate=rate, units=units)
+    stated = {"joints": joints, "topics": topics, "torque_factor": torque_factor, "robot": robot}
+    return load_arrays(path, from_arrays, rate=rate, units=units, **stated)
 
 
 def load_arrays(
-    path: str | Path, from_arrays: Callable[[dict[str, Any]], Data], *, rate: float | int | None, units: str | None
+    path: str | Path,
+    from_arrays: Callable[[dict[str, Any]], Data],
+    *,
+    rate: float | int | None = None,
+    units: str | None = None,
+    joints: Sequence[str] = (),
+    topics: Sequence[str] = (),
+    torque_factor: Any = None,
+    robot: Sequence[str] = (),
 ) -> Data:
     """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors as `load`."""
-    if units is not None and Path(path).suffix.lower() != ".csv":
-        raise InputError(f"{path!s:.200}: units are for CSV; the arrays of an npz file are in SI units")
-    table = functools.partial(csv_tables.read, units=units)
-    return load_file(path, lambda arrays: from_arrays(with_times(arrays, rate)), KEYS, table=table)
+    suffix, folder = Path(path).suffix.lower(), is_folder(Path(path))
+    if units is not None and suffix != ".csv":
+        raise InputError(f"{path!s:.200}: units are for CSV; npz files and bags are in SI units")
+    if topics and not (folder or suffix in bags.SUFFIXES):
+        raise InputError(f"{path!s:.200}: --topics is for ROS bags; leave it out")
+
+    def choose(own: Sequence[str]) -> Sequence[str]:
+        kept = joint_names.chosen(own, joints)
+        if not robot:
+            return kept.own
+        by_name = dict(zip(kept.names, kept.own, strict=True))
+        return [by_name[name] for name in joint_names.matched(kept.names, robot).values()]
+
+    of_bags = functools.partial(bags.read, topics=topics, choose=choose)
+    of_csv = functools.partial(csv_tables.read, units=units)
+    readers = {".csv": of_csv, **dict.fromkeys((*bags.SUFFIXES, FOLDER), of_bags)}
+
+    def completed(arrays: dict[str, Any]) -> Data:
+        return from_arrays(scaled(with_chosen(with_times(arrays, rate), joints), torque_factor))
+
+    return load_file(path, completed, KEYS, readers=readers)
+
+
+def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]:
+    """Selects, orders and renames the joints as stated (see `data.joint_names.chosen`).
+
+    Raises:
+        InputError: joints are stated, but the file names none; or as `chosen`.
+    """
+    if not joints:
+        return arrays
+    names = np.asarray(arrays.get("joint_names", ()))
+    if names.ndim != 1 or not names.size or names.dtype.kind not in "US":
+        raise InputError("--joints needs the joints' names, which the file lacks; add joint_names, or names in titles")
+    own = names.tolist()
+    # A bag has been read for the joints of a robot alone.
+    stated = [entry for entry in joints if "remarks" not in arrays or entry.partition("=")[0].strip() in own]
+    kept = joint_names.chosen(own, stated)
+    places = [own.index(name) for name in kept.own]
+    if "needs" in arrays and places != list(range(len(own))):
+        raise InputError("--joints selects or reorders joints, but the file has needs for its own; leave --joints out")
+    columns = {key: np.asarray(arrays[key])[:, places] for key in PER_JOINT if np.ndim(arrays.get(key)) == 2}
+    return {**arrays, **columns, "joint_names": np.array(kept.names)}
+
+
+def scaled(arrays: dict[str, Any], torque_factor: Any) -> dict[str, Any]:
+    """Multiplies tau by the stated factors (see `data.joint_names.factors`).
+
+    Raises:
+        InputError: there is no tau, or as `factors`.
+    """
+    if torque_factor is None:
+        return arrays
+    if np.ndim(arrays.get("tau")) != 2:
+        why = "".join(f"; {remark}" for remark in arrays.get("remarks", ()))
+        raise InputError(f"--torque-factor scales tau, which the file lacks; leave it out{why}")
+    count = np.shape(arrays["tau"])[1]
+    names = np.asarray(arrays.get("joint_names", [str(joint + 1) for joint in range(count)])).astype(str).tolist()
+    numbers = joint_names.factors(torque_factor, names)
+    listed = ", ".join(f"{name} {number:.4g}" for name, number in zip(names, numbers, strict=True))
+    remarks = (*arrays.get("remarks", ()), f"tau is that of the log times {listed}")
+    return {**arrays, "tau": np.asarray(arrays["tau"]) * numbers, "remarks": remarks}
 
 
 def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
@@ -146,8 +231,9 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
         )
     names = _joint_names(arrays["joint_names"], q.shape[1]) if "joint_names" in arrays else None
     return Trajectories(
-        t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=estimated, **checked
-    )
+        t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=estimated,
+        remarks=tuple(arrays.get("remarks", ())), **checked,
+    )  # fmt: skip
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
@@ -167,7 +253,7 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
     arrays: dict[str, Any] = {
         key: value
         for key, value in data._asdict().items()
-        if value is not None and key not in ("needs", "estimated", *data.estimated)
+        if value is not None and key not in ("needs", "estimated", "remarks", *data.estimated)
     }
     if data.needs is not None:
         arrays["needs"] = np.array(json.dumps(data.needs._asdict()))

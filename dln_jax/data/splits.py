@@ -4,13 +4,13 @@ Splits are by trajectory, never by sample, since neighbouring samples of a traje
 """
 
 import hashlib
-import reprlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from dln_jax.data.joint_names import matched
 from dln_jax.data.schema import PER_JOINT, Trajectories
 from dln_jax.types import InputError, require_positive, require_seed
 
@@ -47,24 +47,30 @@ def every(data: Trajectories, step: int) -> Trajectories:
 
 
 def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
-    """Reorders the columns of the data to these joints; data without joint names stay unchanged.
+    """Selects, orders and renames the columns of the data as these joints; data without joint names stay unchanged.
+
+    Remarks say which names were matched (see `data.joint_names.matched`), and how far joints moved that are left out.
 
     Raises:
-        InputError: the number of joints differs, or the names do.
+        InputError: the names do not match; or there are none, and the number of joints differs.
     """
     d = data.degrees_of_freedom
-    if len(names) != d:
-        raise InputError(f"the data have {d} joints, the robot {len(names)}: {reprlib.repr(', '.join(names))}")
+    if d < len(names) or (data.joint_names is None and d != len(names)):
+        raise InputError(f"the data have {d} joints, the robot {len(names)}: {', '.join(names):.200}")
     if data.joint_names is None:
         return data
     own = data.joint_names.tolist()
-    if missing := [name for name in names if name not in own]:
-        shown = ", ".join(own)
-        raise InputError(f"the robot's joint '{missing[0]}' is not among the data's ({shown:.300}); make names agree")
-    order = [own.index(name) for name in names]
+    match = matched(own, names)
+    order = [own.index(match[name]) for name in names]
+    remarks = list(data.remarks)
+    if any(name != other for name, other in match.items()):
+        remarks.append("joints matched by name: " + ", ".join(f"{other}={name}" for name, other in match.items()))
+    if left_out := [(own[k], np.ptp(data.q[:, k])) for k in range(d) if k not in order]:
+        moves = ", ".join(f"{name} (moved by {reach:.3g})" for name, reach in left_out)
+        remarks.append(f"not joints of the robot, left out: {moves}")
     columns = {key: array[:, order] for key in PER_JOINT if (array := getattr(data, key)) is not None}
     needs = None if data.needs is None else data.needs._replace(joints=tuple(data.needs.joints[k] for k in order))
-    return data._replace(**columns, joint_names=data.joint_names[order], needs=needs)
+    return data._replace(**columns, joint_names=np.array(names), needs=needs, remarks=tuple(remarks))
 
 
 def segments(

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
@@ -140,7 +141,7 @@ def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray
     return rounding
 
 
-def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:
+def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
     """Returns a tree like another from a vector, in the order of its leaves; nothing is compiled."""
     leaves, structure = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])

@@ -72,6 +72,23 @@ def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> Measured
     return padded(recordings)
 
 
+def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
+    """Cuts segments of `samples` samples to predict, which begin at every `every`-th sample of the trajectories.
+
+    Raises:
+        InputError: no trajectory is that long.
+    """
+    pieces = []
+    for index in np.unique(data.trajectory):
+        own = np.flatnonzero(data.trajectory == index)
+        pieces += [own[first : first + samples] for first in range(0, len(own) - samples + 1, every)]
+    if not pieces:
+        raise InputError(f"no trajectory has {samples} samples to predict; record longer motions, or predict fewer")
+    rows = np.stack(pieces)
+    t = data.t[rows]
+    return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], np.ones(rows.shape))
+
+
 def grid_places(t: Float[np.ndarray, " N"], *, gap: float = GAP) -> Int[np.ndarray, " N"]:
     """Indices of samples on a grid with the steps of the samples, and within a gap steps of at most the median."""
     steps = np.diff(t)

@@ -1,23 +1,29 @@
 """Validates a log, and writes the findings into a folder."""
 
+import contextlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from dln_jax.cli.arguments import names_listed, refuse_given
+from dln_jax.cli.encoders import facts
 from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.data.checks import Examination, examine, read, report
+from dln_jax.data.checks import Examination, Recording, examine, read, report
 from dln_jax.data.robots import read_robot
+from dln_jax.data.splits import with_joints
 from dln_jax.figures.logs import log_figure
 from dln_jax.files import write_bytes, write_figure, write_json
+from dln_jax.types import InputError
 
 
 def validate(options: Any) -> None:
     """Examines the log, prints and writes the findings; exits with status 1 if there is an error among them."""
-    recording = read(options.data, rate=options.rate, units=options.units)
     if options.robot is None:
         refuse_given(options, ["lock"], "for joints of --robot")
     robot = None if options.robot is None else read_robot(options.robot, lock=names_listed(options.lock))
+    names = () if robot is None else robot.tree.names
+    recording = for_robot(read(options.data, **facts(options), robot=names), names)
     examined = examine(recording, robot)
     lines = report(examined, str(options.data))
     with command_folder(options, "check_data") as folder:
@@ -30,6 +36,15 @@ def validate(options: Any) -> None:
         print(f"folder: {folder}")
     if any(finding.severity == "error" for finding in examined.findings):
         raise SystemExit(1)
+
+
+def for_robot(recording: Recording, names: Sequence[str]) -> Recording:
+    """The recording with the robot's joints, if their names match; else unchanged, which the checks then report."""
+    if not names or set(names) == set(recording.names) or recording.data.joint_names is None:
+        return recording
+    with contextlib.suppress(InputError):
+        return recording._replace(data=with_joints(recording.data, names), names=tuple(names))
+    return recording
 
 
 def metrics(examined: Examination) -> dict[str, Any]:

@@ -29,9 +29,13 @@ def test_columns_take_the_robots_order(tmp_path):
 
 
 def test_other_joints_are_refused():
-    for names, message in ((("elbow",), "have 2 joints, the robot 1"), (("elbow", "wrist"), "'wrist' is not among")):
+    for data, names, message in (
+        (from_arrays(ARRAYS), ("elbow",), "have 2 joints, the robot 1"),
+        (NAMED, ("elbow", "slide", "wrist"), "have 2 joints, the robot 3"),
+        (NAMED, ("elbow", "wrist"), "'wrist' is not among"),
+    ):
         with pytest.raises(InputError, match=message):
-            with_joints(NAMED, names)
+            with_joints(data, names)
     for names in (np.array(["a"]), np.array(["a", "a"]), np.array([1, 2])):
         with pytest.raises(InputError, match="expected 2 different strings"):
             from_arrays({**ARRAYS, "joint_names": names})

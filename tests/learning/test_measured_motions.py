@@ -16,12 +16,11 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.measured_predictions import predict_measured, prediction_metrics
+from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, prediction_metrics
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.planar_chain import PlanarChainParameters, make_planar_chain
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.types import InputError, Needs
-from scripts.reports.robots.double_pendulum import cut_segments
 from tests.standard_errors import SURE, statistics
 
 pytestmark = pytest.mark.slow

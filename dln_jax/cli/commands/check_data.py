@@ -19,7 +19,7 @@ class Arguments(Folder, Drawn, Logged):
     """The log to validate."""
 
     data: Path
-    """Log as npz or CSV: t and q, and optionally tau, qd, qdd and trajectory."""
+    """Log as npz, CSV or ROS bag: t and q, and optionally tau, qd, qdd and trajectory."""
     robot: Unstated[Path] = None
     """URDF or MJCF of the robot (needs MuJoCo)."""
     lock: Unstated[str] = None

@@ -24,10 +24,11 @@ class Arguments(Options):
 
 def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder; `InputError` for data without tau."""
+    from dln_jax.cli.encoders import facts
     from dln_jax.data import schema
     from dln_jax.training.dynamics.run import run
 
-    if options.data is not None and "tau" in schema.load(options.data).estimated:
+    if options.data is not None and "tau" in schema.load(options.data, **facts(options)).estimated:
         raise InputError(
             f"{options.data} has no tau, which train_hnn is fitted to; motions without applied forces are for "
             f"train_hnn_task --task measured --data {options.data}"

@@ -69,17 +69,19 @@ def as_recording(data: Trajectories) -> Recording:
     return Recording(data)
 
 
-def read(path: str | Path, *, rate: float | int | None = None, units: str | None = None) -> Recording:
+def read(path: str | Path, **stated: Any) -> Recording:
     """Reads a file in the schema; arguments and errors as `schema.load`.
 
     Samples out of order and duplicates, which `schema.load` refuses, are repaired and reported.
     """
-    return schema.load_arrays(path, _from_arrays, rate=rate, units=units)
+    return schema.load_arrays(path, _from_arrays, **stated)
 
 
 def _from_arrays(arrays: dict[str, Any]) -> Recording:
-    names = np.ravel(arrays.pop("joint_names", np.array([], str)))
-    kept, repaired = _in_order(arrays)
+    names = np.ravel(arrays.get("joint_names", np.array([], str)))
+    kept, repaired = _in_order({key: array for key, array in arrays.items() if key != "joint_names"})
+    if names.dtype.kind in "US" and np.shape(kept.get("q"))[1:] == (len(set(names.tolist())),) == names.shape:
+        kept["joint_names"] = names
     return Recording(schema.from_arrays(kept), tuple(map(str, names)), repaired)
 
 
@@ -199,7 +201,7 @@ def report(examined: Examination, name: str) -> list[str]:
     """Lines of text; findings come last, most severe first."""
     data, smoothed = examined.recording.data, examined.smoothed
     count = len(np.unique(data.trajectory))
-    lines = [f"{name}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} joints"]
+    lines = [f"{name}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} joints", *data.remarks]
     if smoothed is not None:
         steps = timing(data.t, data.trajectory)
         lines.append(f"{steps.rate:.4g} Hz, steps vary by {steps.jitter:.1%}, {steps.gaps} gaps")

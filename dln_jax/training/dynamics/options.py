@@ -26,9 +26,10 @@ class Plant:
     model: str | None = None
     """What is learned."""
     data: Unstated[Path] = None
-    """Trajectories, npz or CSV (default: the embedded letters, or states of --scene)."""
+    """Trajectories, npz, CSV or ROS bag (default: the embedded letters, or states of --scene)."""
     test: Unstated[str] = None
-    """Labels of test trajectories, comma separated (default: e,q,v, else every sixth, else blocks of time)."""
+    """Test trajectories: labels, comma separated; last:30% of every trajectory; or blocks, of ten blocks of time
+    (default: e,q,v, else every sixth, else blocks of time)."""
     scene: Unstated[str] = None
     """Textbook scene whose needs the data have, such as cart-pole or chain-3; without --data, the scene to sample."""
     needs: Unstated[str] = None

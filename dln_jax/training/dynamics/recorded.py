@@ -5,12 +5,21 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.cli.arguments import names_listed, refuse_given, require_positive_if_given
-from dln_jax.cli.encoders import checked, fitted_torque, needs_from_option, preparation, smoothed
+from dln_jax.cli.encoders import (
+    checked,
+    facts,
+    fitted_torque,
+    needs_from_option,
+    preparation,
+    smoothed,
+    without_torque,
+)
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split, with_joints
+from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL
@@ -50,17 +59,19 @@ class Recorded(NamedTuple):
 def read(options: Options) -> Recorded:
     """Reads and checks the data and robot that the arguments name, before anything is written."""
     scene = scene_named(options.scene) if options.scene else None
-    labels = tuple(options.test.split(",")) if options.test else None
+    parts = options.test if is_cut(options.test) else None
+    labels = None if parts or not options.test else [label.strip() for label in options.test.split(",")]
+    robot = robot_of(options)
     if options.data is None:
-        refuse_given(options, ["rate", "units"], "for a file: add --data")
+        refuse_given(options, ["rate", "units", "joints", "topics", "torque_factor"], "for a file: add --data")
     if options.data is not None:
-        data, name = schema.load(options.data, rate=options.rate, units=options.units), str(options.data)
+        names = () if robot is None else robot.tree.names
+        data, name = schema.load(options.data, **facts(options), robot=names), str(options.data)
     else:
         scene = scene or two_link_arm()
         data, name = default_data(scene), f"default data of {scene.name}"
-        if labels is None and scene.name == "two-link-arm":
-            labels = CHARACTERS_TEST
-    robot = robot_of(options)
+        if labels is None and not parts and scene.name == "two-link-arm":
+            labels = list(CHARACTERS_TEST)
     if robot is not None:
         data = with_joints(data, robot.tree.names)
     needs, origin = stated_needs(options, scene, data, robot)
@@ -72,6 +83,7 @@ def read(options: Options) -> Recorded:
         raise InputError(
             f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
             f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}"
+            f"{without_torque(data)}"
         )
     if robot is not None and needs.joints != robot.tree.joints:
         raise InputError(
@@ -79,8 +91,8 @@ def read(options: Options) -> Recorded:
         )
     data = data._replace(needs=needs)
     rubbing = bool(needs.friction or needs.joint_friction)
-    cut = labels is None and len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES
-    settled = (*["split"] * cut, *["friction"] * rubbing)
+    cut = labels is None and (parts or len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES)
+    settled = (*["split"] * bool(cut), *["friction"] * rubbing)
     findings = [] if options.data is None else checked(options, data, options.data, robot=robot, without=settled)
     filtered = smoothed(options, data)
     lines = [*preparation(data, filtered), *findings]
@@ -88,7 +100,9 @@ def read(options: Options) -> Recorded:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)
     recordings = len(np.unique(data.trajectory))
-    if cut and recordings < LEAST_TRAJECTORIES:
+    if parts:
+        data, labels = stated_test(data, parts)
+    elif cut and recordings < LEAST_TRAJECTORIES:
         data = in_blocks(data, BLOCKS)
     parents = parents_of(options, needs.degrees_of_freedom)
     sets = split(data, test=labels, seed=options.seed)

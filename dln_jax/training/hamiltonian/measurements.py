@@ -4,7 +4,9 @@ Motions with noisy states are fitted through an integrator, weighted by that noi
 noise, a fit of the rates is sufficient.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from dln_jax.data.bodies import find_bodies
 from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
 from dln_jax.data.schema import Trajectories, column, time_derivative
 from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, segments, select
+from dln_jax.data.stated_tests import stated_test
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
@@ -50,10 +53,8 @@ class Stated(NamedTuple):
     """Labels of the test trajectories, separated by commas, or an npz file with test trajectories."""
     noise: tuple[float, ...] | None = None
     """Standard deviation of q, one for all or one each; or, if the file has p, of q and then p (default: estimated)."""
-    rate: float | None = None
-    """Sampling rate for a file without t, Hz."""
-    units: str | None = None
-    """Units of CSV titles without one."""
+    file: Mapping[str, Any] = MappingProxyType({})
+    """Keywords of `data.schema.load`."""
 
 
 class Trust(NamedTuple):
@@ -104,9 +105,11 @@ def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[
         if min(count, len(data.t) - count) < WINDOW[name]:
             raise InputError(f"{file} has {len(data.t)} samples; expected some hundred, a fifth of them for the test")
         return samples_of(data, slice(0, count)), samples_of(data, slice(count, None))
+    data, labels = stated_test(data, test)
+    present = np.unique(data.trajectory)
     chosen = present[5::6] if len(present) >= 6 else present[-1:]
-    if test is not None:
-        chosen = label_indices(data, [label.strip() for label in test.split(",")])
+    if labels is not None:
+        chosen = label_indices(data, labels)
     rest = np.setdiff1d(present, chosen)
     if not len(rest):
         raise InputError(f"all trajectories of {file} are for the test; leave some to learn from")

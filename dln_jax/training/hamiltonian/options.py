@@ -66,7 +66,7 @@ class RecordedOptions(Checked):
     """Recorded motions."""
 
     data: Unstated[Path] = None
-    """Trajectories as npz or CSV."""
+    """Trajectories as npz, CSV or ROS bag."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ class MeasuredOptions(RecordedOptions):
     """What the plant needs, such as '{"joints": ["revolute"], "friction": true}' (default: as the file, else revolute
     joints, a potential and friction)."""
     test: Unstated[str] = None
-    """Labels of test trajectories, or an npz file of them (default: every sixth, or the last fifth)."""
+    """Labels of test trajectories, an npz file of them, last:30% of every trajectory, or blocks, of ten blocks of time
+    (default: every sixth, or the last fifth)."""
     noise: Unstated[str] = None
     """Standard deviations of q, and with p in the file of q and p: one number or one each (default: estimated)."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.cli.arguments import numbers_of, require_positive_if_given
-from dln_jax.cli.encoders import checked, needs_from_option
+from dln_jax.cli.encoders import checked, facts, needs_from_option
 from dln_jax.cli.optimisers import optimiser_named
 from dln_jax.cli.progress import progress
 from dln_jax.compilation import in_background
@@ -66,7 +66,8 @@ def prepare(options: Any) -> Case:
 
     needs = None if stated("needs") is None else needs_from_option(options.needs)
     noise = None if stated("noise") is None else numbers_of("--noise", options.noise, positive=True)
-    known = Stated(needs, stated("test"), noise)._replace(rate=stated("rate"), units=stated("units"))
+    file = facts(options) if stated("data") is not None else {}
+    known = Stated(needs, stated("test"), noise, file)
     problem = problem_of(options.task, trajectories=stated("trajectories"), data=stated("data"), stated=known)
     findings = []
     if stated("data") is not None:
@@ -179,6 +180,7 @@ def announce(case: Case) -> Iterator[str]:
     if missing:
         of = "finite differences" if problem.noise is None else "local polynomials, not finite differences,"
         yield f"not in the data: {', '.join(missing)}; {of} start the fit to motions"
+    yield from data.remarks
     yield from case.findings
     if in_velocities(problem, description):
         q = ", ".join(f"{coordinate:.3g}" for coordinate in gauge_of(problem).q)

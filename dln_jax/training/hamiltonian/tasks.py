@@ -102,7 +102,7 @@ def problem_of(
         return generated(name, trajectories)
     if data is None:
         raise InputError(f"task '{name}' needs its data, which are not part of this project: give their file")
-    loaded = schema.load(data, rate=stated.rate, units=stated.units)
+    loaded = schema.load(data, **stated.file)
     if name == REAL:
         if loaded.degrees_of_freedom != 1:
             raise InputError(f"{data} has {loaded.degrees_of_freedom} coordinates; the task is that of one pendulum")

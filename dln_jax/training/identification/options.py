@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.options import Drawn, Filtered, Folder
@@ -19,16 +19,20 @@ class Robot:
     robot: Path
     """URDF or MJCF file: the kinematics, and values to start from. It is not changed."""
     data: Path
-    """Trajectories as npz or CSV, with tau; joint_names, if present, are matched with the robot's."""
+    """Trajectories as npz, CSV or ROS bag, with tau; joint names, if present, are matched with the robot's."""
     test: Unstated[str] = None
-    """Labels of held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
-    blocks of time)."""
+    """Held-out trajectories: labels, comma separated; last:30% of every trajectory; or blocks, of ten blocks of time
+    (default: the third of every five; of one trajectory, of ten blocks of time)."""
     lock: Unstated[str] = None
     """Joints that do not move; "*finger*" names all with finger in their name (default: all move)."""
     friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = "viscous,coulomb,offset"
     """Friction laws whose coefficients are identified (default: viscous,coulomb,offset)."""
     velocity_scale: Unstated[float] = None
     """Velocity at which dry friction has three quarters of its force, rad/s or m/s (default: fitted for each joint)."""
+    by: Literal["torques", "motions", "both"] = "torques"
+    """What is fitted: torques of filtered motions, motions simulated with the torques (output error), or both."""
+    window: Unstated[float] = None
+    """Length of the simulated windows of --by motions and both, s (default: 0.3)."""
     uncertainty: bool = True
     """Estimate the uncertainty of the torques, and flag states out of distribution."""
     residual: bool = False

@@ -14,6 +14,7 @@ from dln_jax.figures.torques import torque_by_joint
 from dln_jax.files import write_bytes, write_json
 from dln_jax.identification.consistent import is_consistent
 from dln_jax.identification.identify import Identification, identify, parameters_of
+from dln_jax.identification.motions import MotionFit
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
 from dln_jax.identification.residual import ResidualFit
 from dln_jax.metrics.errors import normalised_error
@@ -30,6 +31,7 @@ from dln_jax.training.identification.additions import (
     store_bands,
     stored_description,
 )
+from dln_jax.training.identification.motions import fit_by, motion_lines, prediction_metrics
 from dln_jax.training.identification.options import Options
 from dln_jax.training.identification.task import Case, prepare, with_shapes
 from dln_jax.training.identification.verdict import judged
@@ -49,13 +51,17 @@ class Outcome(NamedTuple):
     solution: Identification
     residual: ResidualFit | None
     seconds: float
+    motions: MotionFit | None
+    """Fit to motions, whose parameters are those of `solution`, if asked for."""
+    by_torques: np.ndarray
+    """Parameters of the fit of torques alone."""
 
 
 def announce(case: Case) -> Iterator[str]:
     """Lines on the robot, the data and the assumptions made."""
     train, test, blocks = case.sets
     yield f"{case.robot_file}: {len(case.names)} joints, {', '.join(case.names)}"
-    kind = "blocks of time of the one trajectory" if blocks else "trajectories"
+    kind = "blocks of time of the one trajectory" if blocks else "trajectories or parts of them"
     yield f"{case.data_file}: {len(train.t)} samples fitted, {len(test.t)} held out ({kind})"
     if train.joint_names is None:
         yield "the data name no joints: taken to be in this order (key joint_names)"
@@ -78,20 +84,31 @@ def fit(case: Case, options: Options, folder: Path, mesh: Mesh | None) -> Fitted
         consistent=options.consistent,
         regularisation=options.regularisation,
     )
+    by_torques, motions = solution.theta, None
+    if case.motions is not None:
+        solution, motions = fit_by(
+            options.by, case.model, case.known, solution, case.sets.train, case.motions, options.window
+        )
     kept = parameters_of(solution.theta, case.known)
     residual = add_residual(case, kept) if options.residual else None
     seconds = time.perf_counter() - began
     parameters = kept if residual is None else residual.parameters
-    return Fitted(stored_description(case, residual), parameters, Outcome(case, solution, residual, seconds))
+    return Fitted(
+        stored_description(case, residual), parameters, Outcome(case, solution, residual, seconds, motions, by_torques)
+    )
 
 
 def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     """Held-out errors, uncertainty and verdict; writes parameters, the report and the robot's file."""
-    case, solution, residual, seconds = fitted.outcome
+    case, solution, residual, seconds, motions, by_torques = fitted.outcome
     predict = predictor(case.model)
     metrics, predicted = evaluate(case, solution, predict)
     if residual is not None and residual.settings:
         predicted[ADDED] = judge_residual(case, residual, metrics)
+    of_motions = []
+    if motions is not None and case.motions is not None:
+        numbers = prediction_metrics(case.model, case.known, case.motions, by_torques, solution.theta, motions)
+        of_motions, metrics = motion_lines(options.by, motions, numbers), metrics | numbers
     kept = ADDED if ADDED in predicted else KEPT
     torques = {name: prediction.torque for name, prediction in predicted.items()}
     verdict, of_verdict = judged(case, solution, predict, torques, kept, robust=options.robust)
@@ -114,7 +131,8 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
         figures=figures,
         chosen=fitted.description,
         lines=(
-            *summary(solution), *shape_lines(case), *residual_lines(residual), *lines, "every parameter: report.txt"
+            *of_motions, *summary(solution), *shape_lines(case), *residual_lines(residual), *lines,
+            "every parameter: report.txt",
         ),
     )  # fmt: skip
 

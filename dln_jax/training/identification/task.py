@@ -6,17 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.arguments import names_in, names_listed, numbers_of, require_positive_if_given
-from dln_jax.cli.encoders import checked, fitted_torque, preparation, smoothed
+from dln_jax.cli.arguments import names_in, names_listed, numbers_of, refuse_given, require_positive_if_given
+from dln_jax.cli.encoders import checked, facts, fitted_torque, preparation, smoothed, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select, with_joints
+from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.friction import FrictionShape, require_laws, shape_of
 from dln_jax.mechanics.trees import tree_to_json
 from dln_jax.models.model import Parameters
+from dln_jax.training.identification.motions import MotionSets, lightly_filtered
 from dln_jax.training.identification.options import IDENTIFIED, NO_FRICTION, Options
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
@@ -58,6 +60,8 @@ class Case(NamedTuple):
     """The torques that the fit and its uncertainty bands refer to."""
     robot_file: str = ""
     data_file: str = ""
+    motions: MotionSets | None = None
+    """Motions to fit and to predict, with --by motions or both."""
 
     @property
     def laws(self) -> tuple[FrictionLaw, ...]:
@@ -73,26 +77,34 @@ def prepare(options: Options) -> Case:
     require_laws(laws, "--friction")
     require_positive_if_given(options, ["velocity_scale"])
     try:
-        data = with_joints(schema.load(options.data, rate=options.rate, units=options.units), robot.tree.names)
+        data = with_joints(schema.load(options.data, **facts(options), robot=robot.tree.names), robot.tree.names)
     except InputError as error:
         raise InputError(str(error) if str(options.data) in str(error) else f"{options.data}: {error}") from None
     if "tau" in data.estimated:
-        raise InputError(f"{options.data}: the data have no tau; identification takes measured torques")
+        raise InputError(
+            f"{options.data}: the data have no tau; identification takes measured torques{without_torque(data)}"
+        )
     filtered = smoothed(options, data)
     lines = (*preparation(data, filtered), *checked(options, data, options.data, robot=robot, without=SETTLED))
-    labels = [label.strip() for label in options.test.split(",")] if options.test else None
+    require_positive_if_given(options, ["window"])
+    light = None
+    if options.by == "torques":
+        refuse_given(options, ["window"], "for --by motions or both")
+    else:
+        light = lightly_filtered(data, filtered)
     if filtered is not None:
-        labels = labels and labels_of_parts(filtered.data, labels)
-        data = filtered.data._replace(joint_names=data.joint_names)
+        data = filtered.data
+    sets, motions = held_out(data, options.test or None, in_parts=filtered is not None), None
+    if light is not None:
+        motions = MotionSets(*held_out(light, options.test or None, in_parts=filtered is not None)[:2])
     needs = robot.tree.needs._replace(joint_friction=cast(tuple[FrictionLaw, ...], laws))
     scale = {} if options.velocity_scale is None else {"velocity_scale": options.velocity_scale}
     description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **scale)
     noise = noises(options.noise, robot.tree.degrees_of_freedom)
-    sets = split(data, labels)
     torque = fitted_torque(filtered)
-    files = {"robot_file": options.robot.name, "data_file": options.data.name}
-    case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque, **files)
-    return with_description(case)
+    case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque)
+    named = {"robot_file": options.robot.name, "data_file": options.data.name}
+    return with_description(case._replace(motions=motions, **named))
 
 
 def with_description(case: Case, **changes: Any) -> Case:
@@ -132,11 +144,19 @@ def for_residual(train: Trajectories) -> tuple[Trajectories, Trajectories]:
     return select(train, np.setdiff1d(present, chosen)), select(train, chosen)
 
 
+def held_out(data: Trajectories, test: str | None, *, in_parts: bool) -> Sets:
+    """Training and held-out data as --test states them; `in_parts` if a filter cut trajectories at gaps."""
+    if not is_cut(test):
+        labels = stated_test(data, test)[1]
+        return split(data, labels_of_parts(data, labels) if in_parts and labels else labels)
+    return split(*stated_test(data, test))
+
+
 def split(data: Trajectories, test: list[str] | None) -> Sets:
     """Training and held-out trajectories, or blocks of time if there is only one trajectory."""
     if len(np.unique(data.trajectory)) == 1:
         if test is not None:
-            raise InputError("--test names trajectories, and the data have one only; leave it out for blocks of time")
+            raise InputError("--test names trajectories, and the data have one only; give last:30%, or leave it out")
         return split(in_blocks(data, BLOCKS), None)._replace(blocks=True)
     present = np.unique(data.trajectory)
     held = present[HELD_OUT] if len(present) > 2 else present[-1:]

@@ -18,7 +18,7 @@ from dln_jax.types import InputError
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.encoder_data import encoders
 from scripts.reports.excitation import excitation
-from scripts.reports.robots import double_pendulum, known_kinematics, lip, log_checks, speed
+from scripts.reports.robots import double_pendulum, identified_by, known_kinematics, lip, log_checks, speed
 from scripts.reports.robots.recorded_arm import recorded_arm
 
 MEASURES: dict[str, Callable[[bool], Findings]] = {
@@ -77,4 +77,5 @@ def cases(options: Arguments = Arguments()) -> list[Case]:
     if (pendulum := options.double_pendulum) is not None:
         splits = double_pendulum.HELD_OUT[: 1 if options.quick else None]
         measures["recordings/double-pendulum"] = lambda quick: Findings(double_pendulum.rows(pendulum, splits))
+        measures["recordings/identify-by"] = lambda quick: Findings(identified_by.rows(pendulum, splits))
     return [Case(name, in_float64(partial(measure, options.quick))) for name, measure in measures.items()]

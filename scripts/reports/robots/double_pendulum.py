@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from dln_jax.data.encoders import smooth
-from dln_jax.data.schema import Trajectories, load
-from dln_jax.learning.measured_motions import MeasuredWindows
-from dln_jax.metrics.measured_predictions import predict_measured, valid_times
-from dln_jax.types import InputError
+from dln_jax.data.schema import load
+from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
 from scripts.reports.robots.arm import torque_of
 from scripts.reports.robots.double_pendulum_fits import (
     CUTOFF,
@@ -98,20 +96,3 @@ def read(path: Path) -> Logs:
     data = load(path)
     known = {"rate": BASE, "trim": TRIM, "decimate": round(BASE / RATE), "filter_torque": True}
     return Logs(*(smooth(data, cutoff, **known).data for cutoff in (CUTOFF, FINE)))
-
-
-def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
-    """Cuts segments of `samples` samples to predict, which begin at every `every`-th sample of the trajectories.
-
-    Raises:
-        InputError: no trajectory is that long.
-    """
-    pieces = []
-    for index in np.unique(data.trajectory):
-        own = np.flatnonzero(data.trajectory == index)
-        pieces += [own[first : first + samples] for first in range(0, len(own) - samples + 1, every)]
-    if not pieces:
-        raise InputError(f"no trajectory has {samples} samples to predict; record longer motions, or predict fewer")
-    rows = np.stack(pieces)
-    t = data.t[rows]
-    return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], np.ones(rows.shape))

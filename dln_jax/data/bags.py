@@ -1,0 +1,259 @@
+"""Reads joint states from ROS bags: `sensor_msgs/JointState` of ROS 2 (sqlite, MCAP) and ROS 1, by rosbags.
+
+A message has a stamp, names, and positions, velocities and efforts in SI units, each empty or with one number per name.
+Every joint and quantity is a series of its own, so names may come in any order and be absent from some messages. The
+series are put on one clock by these rules:
+
+- The clock is that of the slowest series; its stamps are the times of the log.
+- Positions and velocities of other series are interpolated by cubic splines, efforts linearly, since they may jump.
+- A time is left out if a series has no two messages around it that are at most `BRIDGED` of its median steps apart.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from dln_jax.types import InputError
+
+SUFFIXES = (".db3", ".mcap", ".bag")
+METADATA = "metadata.yaml"
+"""File that makes a folder a ROS 2 bag."""
+TYPE = "sensor_msgs/msg/JointState"
+FIELDS = {"position": "q", "velocity": "qd", "effort": "tau"}
+"""Fields of a message, and their keys in the schema."""
+BRIDGED = 2.5
+"""Median steps between two messages that are interpolated between: one lost message is bridged."""
+RESTART = 1_000_000_000
+"""ns by which stamps may run backwards (messages out of order); more is a clock that was set, and is not used."""
+INSTALL = "pip install 'dln-jax[bag]'"
+
+Choose = Callable[[Sequence[str]], Sequence[str]]
+"""Names in a log -> the joints to keep, in their order."""
+
+
+class Series(NamedTuple):
+    """One quantity of one joint."""
+
+    stamps: np.ndarray
+    """ns, increasing."""
+    values: np.ndarray
+    topic: str
+
+
+class Messages(NamedTuple):
+    """Series of one topic, and what was found about its stamps."""
+
+    series: dict[tuple[str, str], Series]
+    """By field and joint."""
+    remarks: tuple[str, ...]
+
+
+def read(path: Path, *, topics: Sequence[str] = (), choose: Choose = tuple) -> tuple[dict[str, Any], list[str]]:
+    """Reads a bag, or every bag in a folder as a trajectory: arrays by schema key, and no unread keys.
+
+    Args:
+        path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
+        topics: topics to read; where two have the same quantity of a joint, the first counts. Default: the only topic
+            of joint states.
+        choose: selects joints.
+
+    Raises:
+        InputError: rosbags is missing, the file is no bag, a topic is absent or ambiguous, messages are malformed, or
+            topics do not overlap in time.
+    """
+    bags = paths(path)
+    parts = []
+    for bag in bags:
+        try:
+            parts.append(one(bag, topics, choose))
+        except InputError as error:
+            raise InputError(str(error) if bag == path else f"{bag.name}: {error}") from None
+    first = parts[0]
+    for bag, part in zip(bags, parts, strict=True):
+        if (missing := {*first} ^ {*part}) or list(part["joint_names"]) != list(first["joint_names"]):
+            what = f"{', '.join(sorted(missing))} only in one" if missing else "other joints"
+            raise InputError(f"{bags[0].name} and {bag.name} differ ({what}); give bags of the same joints and fields")
+    arrays = {key: np.concatenate([part[key] for part in parts]) for key in ("t", *FIELDS.values()) if key in first}
+    arrays |= {"trajectory": np.repeat(np.arange(len(parts)), [len(part["t"]) for part in parts])}
+    arrays |= {"label": np.array([bag.stem for bag in bags]), "joint_names": np.array(first["joint_names"])}
+    remarks = [
+        f"{bag.name}: {remark}" for bag, part in zip(bags, parts, strict=True) for remark in part["remarks"]
+    ]  # fmt: skip
+    return {**arrays, "remarks": tuple(remarks)}, []
+
+
+def paths(path: Path) -> list[Path]:
+    """The bags that a path names."""
+    if not path.is_dir() or (path / METADATA).is_file():
+        return [path]
+    inside = sorted(
+        entry for entry in path.iterdir() if entry.suffix.lower() in SUFFIXES or (entry / METADATA).is_file()
+    )
+    if not inside:
+        raise InputError(f"the folder has neither {METADATA}, as a ROS 2 bag has, nor bags ({', '.join(SUFFIXES)})")
+    if len({bag.stem for bag in inside}) < len(inside):
+        raise InputError("the folder has two bags of one name; rename one, since names label the trajectories")
+    return inside
+
+
+def one(path: Path, topics: Sequence[str], choose: Choose) -> dict[str, Any]:
+    """Arrays of one bag, with its `remarks`."""
+    by_topic = {topic: _series(topic, rows) for topic, rows in _messages(path, topics).items()}
+    series: dict[tuple[str, str], Series] = {}
+    for messages in by_topic.values():
+        series = {**messages.series, **series}
+    positioned = list(dict.fromkeys(joint for field, joint in series if field == "position"))
+    if not positioned:
+        raise InputError(f"no message of {', '.join(by_topic)} has names and positions; choose others: --topics")
+    joints = list(choose(positioned))
+    there = {field: [joint for joint in joints if (field, joint) in series] for field in FIELDS}
+    remarks = [remark for messages in by_topic.values() for remark in messages.remarks]
+    if left_out := [joint for joint in positioned if joint not in joints]:
+        remarks.append(f"joints left out: {', '.join(left_out)}")
+    if any(series["effort", joint].values.any() for joint in there["effort"]):
+        if without := [joint for joint in joints if joint not in there["effort"]]:
+            raise InputError(
+                f"joint '{without[0]}' has no efforts, others have; read these alone: --joints "
+                f"{','.join(there['effort'])}"
+            )
+    else:
+        remarks.append("no efforts in the messages (none, NaN or zeros only), so there is no tau")
+        there["effort"] = []
+    if 0 < len(there["velocity"]) < len(joints):
+        remarks.append("velocities of some joints are missing; they are derived from q for all")
+    kept = {field: joints for field, names in there.items() if len(names) == len(joints)}
+    times, values, clock = on_one_clock({(f, joint): series[f, joint] for f in kept for joint in joints})
+    arrays: dict[str, Any] = {"t": 1e-9 * (times - times[0])}
+    for field in kept:
+        arrays[FIELDS[field]] = np.stack([values[field, joint] for joint in joints], axis=1)
+    return {**arrays, "joint_names": joints, "remarks": (*remarks, *clock)}
+
+
+def on_one_clock(
+    series: dict[tuple[str, str], Series],
+) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray], tuple[str, ...]]:
+    """Stamps of the slowest series, values of all series there, and remarks; the rules are those of the module.
+
+    Raises:
+        InputError: the series do not overlap in time.
+    """
+    steps = {key: np.median(np.diff(one.stamps)) if len(one.stamps) > 1 else np.inf for key, one in series.items()}
+    # Steps that agree to 1 % belong to one rate; of those, the series with the fewest messages.
+    slowest = max(steps.values())
+    key = min((key for key in series if steps[key] >= 0.99 * slowest), key=lambda key: len(series[key].stamps))
+    clock = series[key].stamps
+    inside = np.ones(len(clock), bool)
+    for other, own in series.items():
+        after = np.searchsorted(own.stamps, clock)
+        at = np.minimum(after, len(own.stamps) - 1)
+        around = (after > 0) & (after < len(own.stamps))
+        near = own.stamps[at] - own.stamps[np.maximum(at - 1, 0)] <= BRIDGED * steps[other]
+        inside &= (own.stamps[at] == clock) | (around & near)
+    times = clock[inside]
+    if len(times) < 2:
+        topics = ", ".join(sorted({own.topic for own in series.values()}))
+        raise InputError(
+            f"the messages of {topics} do not overlap in time ({len(times)} common samples); leave joints out by "
+            f"--joints, or choose other --topics"
+        )
+    exact = all(np.isin(times, own.stamps, assume_unique=True).all() for own in series.values())
+    values = {other: _at(own, times, cubic=other[0] != "effort") for other, own in series.items()}
+    if exact and inside.all():
+        return times, values, ()
+    rate = f"{1e9 / steps[key]:.4g} Hz" if np.isfinite(steps[key]) else "one message"
+    rule = "" if exact else "; q and qd by cubic splines between messages, tau linearly"
+    left = f"; {np.sum(~inside)} times without near messages of all joints are left out" * (not inside.all())
+    return times, values, (f"clock: stamps of {key[0]} of {key[1]} in {series[key].topic}, {rate}{rule}{left}",)
+
+
+def _at(series: Series, times: np.ndarray, *, cubic: bool) -> np.ndarray:
+    """Values of a series at times inside it; exact at its own stamps."""
+    places = np.minimum(np.searchsorted(series.stamps, times), len(series.stamps) - 1)
+    equal = series.stamps[places] == times
+    if equal.all():
+        return series.values[places]
+    start = series.stamps[0]
+    t, at = 1e-9 * (series.stamps - start), 1e-9 * (times - start)
+    between = CubicSpline(t, series.values)(at) if cubic and len(t) > 3 else np.interp(at, t, series.values)
+    return np.where(equal, series.values[places], between)
+
+
+def _series(topic: str, rows: Iterator[tuple[int, Any]]) -> Messages:
+    """Sorted series of a topic from (time of receipt in ns, message)."""
+    received, stamps, columns = [], [], {}
+    for number, (receipt, message) in enumerate(rows):
+        received.append(receipt)
+        stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        names = list(message.name)
+        for field in FIELDS:
+            values = getattr(message, field)
+            if len(values) and len(values) != len(names):
+                raise InputError(
+                    f"message {number + 1} of {topic} has {len(names)} names, but {field} of length {len(values)}"
+                )
+            for joint, value in zip(names, values, strict=False):
+                if np.isfinite(value):
+                    columns.setdefault((field, joint), []).append((number, float(value)))
+    times, remarks = np.array(stamps, np.int64), []
+    if not times.all() or (np.diff(times) < -RESTART).any():
+        why = "some messages have no stamp" if not times.all() else "stamps jump back by more than 1 s"
+        remarks.append(f"{topic}: {why}; times of receipt are used")
+        times = np.array(received, np.int64)
+    series, repeated, reversed_ = {}, 0, 0
+    for key, column in columns.items():
+        numbers, values = (np.array(part) for part in zip(*column, strict=True))
+        own = times[numbers.astype(int)]
+        reversed_ = max(reversed_, int(np.sum(np.diff(own) < 0)))
+        distinct, first = np.unique(own, return_index=True)
+        repeated = max(repeated, len(own) - len(distinct))
+        series[key] = Series(distinct, values[first], topic)
+    if repeated:
+        remarks.append(f"{topic}: {repeated} messages repeat a stamp (the first is kept)")
+    if reversed_:
+        remarks.append(f"{topic}: {reversed_} messages are earlier than the one before (sorted by stamp)")
+    return Messages(series, tuple(remarks))
+
+
+def _messages(path: Path, topics: Sequence[str]) -> dict[str, Iterator[tuple[int, Any]]]:
+    """Messages with their times of receipt by topic, in the order of `topics`."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise InputError(f"reading ROS bags takes the package rosbags: {INSTALL}") from None
+    try:
+        # Bags of older releases do not define their messages.
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            everywhere = {connection.topic: connection.msgtype for connection in reader.connections}
+            wanted = _wanted(topics, everywhere)
+            connections = [connection for connection in reader.connections if connection.topic in wanted]
+            rows: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in wanted}
+            for connection, receipt, raw in reader.messages(connections=connections) if connections else ():
+                rows[connection.topic].append((receipt, reader.deserialize(raw, connection.msgtype)))
+    except InputError:
+        raise
+    except Exception as error:  # the readers of sqlite, MCAP, YAML and CDR raise many types
+        reason = (str(error).splitlines() or [""])[0][:120]
+        raise InputError(f"not a readable ROS bag ({type(error).__name__}: {reason}); see `ros2 bag info`") from error
+    if empty := [topic for topic, own in rows.items() if not own]:
+        raise InputError(f"topic {empty[0]} has no messages")
+    return {topic: iter(own) for topic, own in rows.items()}
+
+
+def _wanted(topics: Sequence[str], everywhere: dict[str, str]) -> list[str]:
+    """The topics to read; the messages list those that are there."""
+    joint_states = [topic for topic, kind in everywhere.items() if kind == TYPE]
+    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(everywhere.items()))
+    listed = f"the bag has {listed or 'no topics'}"
+    if absent := [topic for topic in topics if topic not in everywhere]:
+        raise InputError(f"topic {absent[0]:.80} is not in the bag; {listed:.600}")
+    if other := [topic for topic in topics if topic not in joint_states]:
+        raise InputError(f"topic {other[0]} has messages {everywhere[other[0]]}; expected {TYPE}; {listed:.600}")
+    if not joint_states:
+        raise InputError(f"no topic has {TYPE}; {listed:.600}")
+    if not topics and len(joint_states) > 1:
+        raise InputError(f"{', '.join(joint_states)} have joint states; choose, or combine, by --topics A,B")
+    return list(dict.fromkeys(topics)) or joint_states

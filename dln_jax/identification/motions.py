@@ -1,0 +1,250 @@
+"""Identification by motions: output error over short windows, alone or together with the equations of the torques.
+
+    minimise over theta, delay, and of every window w its start z_w and a constant torque e_w
+
+        sum over samples |(q(t; z_w, theta) - q_measured) / noise_q|² + sum over windows |e_w / noise_tau|²
+            + share * |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.weighted`)
+
+The simulated motion is driven by tau(t - delay) + e_w. Starts and constant torques are eliminated window by window
+(Kaufman's derivative, `learning.motions`). No acceleration is needed: forces that no log records, such as the vibration
+of a belt, enter torques of filtered motions but hardly move a joint.
+
+Windows in which something unusual happened, such as a touch, are off by far more than others. A window whose residual
+is longer than the median counts by the median over its length (Huber), with weights from the previous fit.
+
+The residual is linearised at theta, which gives equations of the same kind as those of torques. The least-squares
+problems with physically consistent bodies are those of `consistent`, one a round; a step is halved until the sum
+decreases (consistent bodies form a convex set).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import window_indices
+from dln_jax.identification.consistent import REGULARISATION, fit_consistent
+from dln_jax.identification.equations import Columns
+from dln_jax.learning.linear import unravelled
+from dln_jax.learning.measured_motions import motion
+from dln_jax.learning.motions import without_start
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers.least_squares import triangular_factor
+from dln_jax.types import InputError, require_positive
+
+ROUNDS, SETTLED = 12, 1e-4
+"""Largest number of linearisations, and the relative decrease of the sum at which they stop."""
+CHUNK = 64
+"""Windows that are linearised at a time."""
+REWEIGHTINGS = 2
+"""Number of times that windows are weighted by their distance and the fit is repeated."""
+SHORTEST_STEP = 1 / 64
+"""Fraction of a step below which the search ends."""
+TYPICAL_DELAY = 1e-3
+"""Unit of the delay among the unknowns, s."""
+
+
+class MotionWindows(NamedTuple):
+    """Measured motions of W windows of T samples; shorter ones repeat their last sample with weight 0."""
+
+    t: Float[np.ndarray, "W T"]
+    """Time since the first sample, s."""
+    q: Float[np.ndarray, "W T d"]
+    qd: Float[np.ndarray, "W T d"]
+    """Starts the search for z_w."""
+    tau: Float[np.ndarray, "W T d"]
+    slope: Float[np.ndarray, "W T d"]
+    """Rate of tau, N m/s or N/s, which shifts it in time."""
+    weight: Float[np.ndarray, "W T"]
+
+
+class MotionFit(NamedTuple):
+    """Parameters that fit motions."""
+
+    theta: Float[np.ndarray, " P"]
+    delay: float
+    """Time by which motions follow the logged torques, s; 0 if it was not fitted."""
+    before: float
+    """Root mean square distance of the motions from the measurements at the initial parameters, in units of noise_q."""
+    after: float
+    """The same at the result."""
+    rounds: int
+    converged: bool
+
+
+def cut_motions(data: Trajectories, length: int) -> MotionWindows:
+    """Consecutive windows of `length` samples within segments; errors as `data.splits.window_indices`."""
+    indices, weight = window_indices(data, length)
+    slope = np.concatenate(
+        [
+            np.gradient(data.tau[own], data.t[own], axis=0)
+            for own in np.split(np.arange(len(data.t)), np.flatnonzero(np.diff(data.trajectory)) + 1)
+        ]
+    )
+    t = data.t[indices]
+    return MotionWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], slope[indices], weight)
+
+
+def linearise(model: Model, like: Parameters) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """(theta [P], delay, noise_q [d], noise_tau [d], windows) -> residuals [W, T d + d] and J [W, T d + d, P + 1].
+
+    The last column is that of the delay, in units of `TYPICAL_DELAY`. Residuals are those of the nearest starts.
+    """
+
+    def one(unknowns: Array, noise_q: Array, noise_tau: Array, window: tuple[Array, ...]) -> Array:
+        t, q, qd, tau, slope, weight = window
+        d = q.shape[1]
+
+        def error(unknowns: Array, start: Array) -> Array:
+            system = dynamics(model.energies(unravelled(unknowns[:-1], like)))
+            driving = tau - TYPICAL_DELAY * unknowns[-1] * slope + noise_tau * start[2 * d :]
+            states = motion(system, start[: 2 * d], t, driving)
+            off = jnp.sqrt(weight)[:, None] * (states[:, :d] - q) / noise_q
+            return jnp.concatenate([jnp.ravel(off), start[2 * d :]])
+
+        frozen, first = jax.lax.stop_gradient(unknowns), jnp.concatenate([q[0], qd[0], jnp.zeros(d)])
+        return without_start(lambda start: error(frozen, start), lambda start: error(unknowns, start), first)
+
+    def both(unknowns: Array, *arguments) -> tuple[Array, Array]:
+        def value(unknowns: Array) -> tuple[Array, Array]:
+            left = one(unknowns, *arguments)
+            return left, left
+
+        slopes, left = jax.jacfwd(value, has_aux=True)(unknowns)
+        return left, slopes
+
+    every = jax.jit(jax.vmap(both, in_axes=(None, None, None, 0)), compiler_options=quick_compilation())
+
+    def linearised(theta, delay, noise_q, noise_tau, windows: MotionWindows) -> tuple[np.ndarray, np.ndarray]:
+        unknowns = np.append(theta, delay / TYPICAL_DELAY)
+        count, parts = len(windows.t), []
+        with jax.enable_x64(True):
+            for first in range(0, count, CHUNK):
+                rows = np.minimum(np.arange(first, first + CHUNK), count - 1)  # one shape, so one program
+                chunk = tuple(jnp.asarray(array[rows]) for array in windows)
+                parts.append([np.asarray(part) for part in every(unknowns, noise_q, noise_tau, chunk)])
+        left, slopes = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
+        return left, slopes
+
+    return linearised
+
+
+def distances(
+    linearised: Callable, start: Float[np.ndarray, " P"], noise_tau: Float[np.ndarray, " d"], windows: MotionWindows
+) -> Float[np.ndarray, " d"]:
+    """Root mean square distance of every joint's simulated motion from the measured one, rad or m, by two rounds.
+
+    The first round has a thousandth of the spread of q as noise; each moves the compromise between starts and torques.
+    """
+    d = windows.q.shape[2]
+    noise = spread = np.maximum(1e-3 * windows.q.reshape(-1, d).std(axis=0), np.finfo(float).tiny)
+    for _ in range(2):
+        left = linearised(start, 0.0, noise, noise_tau, windows)[0][:, : windows.q[0].size]
+        sizes = np.sum(left.reshape(-1, d) ** 2, axis=0) / windows.weight.sum()
+        noise = np.maximum(noise * np.sqrt(sizes), 1e-3 * spread)
+    return noise
+
+
+def fit_motions(
+    model: Model,
+    known: Parameters,
+    columns: Columns,
+    prior: Float[np.ndarray, " P"],
+    start: Float[np.ndarray, " P"],
+    windows: MotionWindows,
+    *,
+    noise_tau: Float[np.ndarray, " d"],
+    noise_q: Float[np.ndarray, " d"] | None = None,
+    torques: Float[np.ndarray, "K P_and_1"] | None = None,
+    share: float = 1.0,
+    delay: bool = True,
+    regularisation: float = REGULARISATION,
+    linearised: Callable | None = None,
+) -> MotionFit:
+    """Fits physically consistent parameters to motions, and to torques too if their equations are given.
+
+    Args:
+        model: a model that is linear in its parameters, such as `models.make_rigid_tree`.
+        known: its parameters, for their structure.
+        columns: columns of the parameters.
+        prior: values that undetermined directions keep.
+        start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
+        windows: from `cut_motions`.
+        noise_tau: standard deviation of a window's constant torque, N m or N.
+        noise_q: standard deviation of q, forces that were not recorded included, rad or m (default: the root mean
+            square distance of the motions simulated with the initial parameters).
+        torques: triangular factor of the torques' equations in units of noise.
+        share: weight of the torques.
+        delay: whether to fit a delay of the torques.
+        regularisation: as for `fit_consistent`.
+        linearised: `linearise(model, known)`, to reuse a compiled one.
+
+    Raises:
+        InputError: a noise or share that is not positive, or a start whose motions are not finite.
+    """
+    require_positive(share=share, noise_tau=float(np.min(noise_tau)))
+    linearised = linearise(model, known) if linearised is None else linearised
+    if noise_q is None:
+        noise_q = distances(linearised, start, noise_tau, windows)
+    require_positive(noise_q=float(np.min(noise_q)))
+    P = len(start)
+    wider = Columns((*columns.names, "delay"), (*columns.kinds, "signed"), (*columns.joints, 0))
+    fixed = np.zeros((0, P + 2)) if torques is None else np.sqrt(share) * np.insert(torques, P, 0.0, axis=1)
+    measured = np.sqrt(windows.weight.sum() * windows.q.shape[2])
+    motions = windows.q.shape[1] * windows.q.shape[2]
+    prior = np.append(prior, 0.0)
+
+    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        left, slopes = linearised(x[:-1], TYPICAL_DELAY * x[-1], noise_q, noise_tau, windows)
+        if not delay:
+            slopes = slopes * np.append(np.ones(P), 0.0)
+        total = float(np.sum(left**2) + np.sum((fixed @ np.append(x, -1.0)) ** 2))
+        return left, slopes, total
+
+    def distance(left: np.ndarray) -> float:
+        return float(np.linalg.norm(left[:, :motions]) / measured)
+
+    def descended(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, bool]:
+        left, slopes, total = at(x)
+        if not np.isfinite(total):
+            raise InputError("motions simulated with the initial fit are not finite; record faster, or filter less")
+        done, converged = 0, False
+        while done < ROUNDS and not converged:
+            done += 1
+            J, r = slopes.reshape(-1, P + 1), left.ravel()
+            rows = np.concatenate([np.column_stack([J, J @ x - r]), fixed])
+            triangle = triangular_factor(rows[:, :-1], rows[:, -1])
+            target = fit_consistent(triangle, wider, prior, regularisation=regularisation)
+            length, was = 1.0, total
+            while True:
+                candidate = x + length * (target.theta - x)
+                left, slopes, total = at(candidate)
+                if (np.isfinite(total) and total < was) or length < SHORTEST_STEP:
+                    break
+                length /= 2
+            if np.isfinite(total) and total < was:
+                x, converged = candidate, was - total < SETTLED * was
+            else:
+                left, slopes, total = at(x)
+                converged = True  # no step lowers the sum
+        return x, left, done, converged
+
+    x, equal, rounds, converged = np.append(start, 0.0), windows, 0, False
+    before = distance(at(x)[0])
+    for weighting in range(1 + REWEIGHTINGS):
+        if weighting:
+            windows = equal
+            norms = np.linalg.norm(at(x)[0], axis=1)
+            usual = np.minimum(1.0, np.median(norms) / np.maximum(norms, np.finfo(float).tiny))
+            windows = equal._replace(weight=equal.weight * usual[:, None])
+        x, _, done, converged = descended(x)
+        rounds += done
+    windows = equal
+    return MotionFit(x[:-1], TYPICAL_DELAY * float(x[-1]), before, distance(at(x)[0]), rounds, converged)
