@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
@@ -52,7 +52,7 @@ class MomentumObserver(NamedTuple):
     """(memory, q, qd, tau held since the sample before) -> memory with r at this sample."""
 
 
-def momentum_observer(model: Dynamics, d: int, *, rate: float, gain: Any) -> MomentumObserver:
+def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, gain: Any) -> MomentumObserver:
     """Returns a momentum observer of a natural system.
 
     Args:
@@ -65,7 +65,7 @@ def momentum_observer(model: Dynamics, d: int, *, rate: float, gain: Any) -> Mom
         InputError: a model without energy, or numbers that are not positive.
     """
     if not isinstance(model, Dynamics):
-        raise InputError("the model has no energy, which a momentum observer needs; train one that has, such as a DeLaN")
+        raise InputError("the model has no energy, which a momentum observer needs; train a DeLaN, for example")
     require_positive(d=d, rate=rate)
     for number in np.ravel(gain):
         require_positive(gain=float(number))
@@ -85,9 +85,10 @@ def momentum_observer(model: Dynamics, d: int, *, rate: float, gain: Any) -> Mom
 
 
 def observed(
-    observer: MomentumObserver, q: Float[Array, "N d"], qd: Float[Array, "N d"], tau: Float[Array, "N d"]
+    observer: MomentumObserver, q: Any, qd: Any, tau: Any
 ) -> Float[Array, "N d"]:
-    """External torques r along a log, with tau[k] held from sample k to k + 1; pure."""
+    """External torques r along a log of q, qd and tau [N, d], with tau[k] held from sample k to k + 1; pure."""
+    q, qd, tau = (jnp.asarray(column) for column in (q, qd, tau))
     held = jnp.concatenate([jnp.zeros_like(tau[:1]), tau[:-1]])
 
     def sample(memory: Momentum, row: tuple[Array, Array, Array]) -> tuple[Momentum, Array]:
@@ -159,16 +160,17 @@ class Wrench(NamedTuple):
 
 
 def flange_wrench(
-    jacobian: Float[Array, "6 d"], tau: Vector, *, length: float = 0.1, smallest: float = 1e-3
+    jacobian: Any, tau: Any, *, length: float = 0.1, smallest: float = 1e-3
 ) -> Wrench:
     """Returns the wrench F with Jᵀ F = tau, in the sense of least squares.
 
     Args:
-        jacobian: of the flange's linear and angular velocity, such as `mechanics.trees.frame_jacobian`.
-        tau: external torques.
+        jacobian: of the flange's linear and angular velocity [6, d], by `mechanics.trees.frame_jacobian`.
+        tau: external torques [d].
         length: that makes moments comparable with forces, m.
         smallest: singular values of the scaled Jacobian below this share of the largest count as zero.
     """
+    jacobian, tau = jnp.asarray(jacobian), jnp.asarray(tau)
     scale = jnp.concatenate([jnp.ones(3), jnp.full(3, 1 / length)])
     scaled = scale[:, None] * jacobian
     values, vectors = symmetric_eigen(scaled @ scaled.T)

@@ -141,12 +141,12 @@ def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says(make):
 
 
 def test_the_noise_of_a_log_is_found_by_its_likelihood():
-    process, prior, (_, y, u) = cart_pole_logs(3, 200)
+    process, prior, (_, y, u) = cart_pole_logs(2, 150)
     logs = [(prior, *log) for log in zip(y, u, strict=True)]
     wrong = process._replace(disturbance=np.array([3.0, 0.004]), noise=np.array([4e-3, 6e-4]))
-    result = tuned(wrong, logs, noise=True)
-    np.testing.assert_allclose(result.process.disturbance, process.disturbance, rtol=0.25)
-    np.testing.assert_allclose(result.process.noise, process.noise, rtol=0.1)
+    result = tuned(wrong, logs, noise=True, iterations=15)
+    np.testing.assert_allclose(result.process.disturbance, process.disturbance, rtol=0.3)
+    np.testing.assert_allclose(result.process.noise, process.noise, rtol=0.15)
     assert result.consistency == pytest.approx(1.0, abs=0.1)
 
 
