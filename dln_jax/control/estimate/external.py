@@ -84,9 +84,7 @@ def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, g
     return MomentumObserver(Momentum(jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(False)), update)
 
 
-def observed(
-    observer: MomentumObserver, q: Any, qd: Any, tau: Any
-) -> Float[Array, "N d"]:
+def observed(observer: MomentumObserver, q: Any, qd: Any, tau: Any) -> Float[Array, "N d"]:
     """External torques r along a log of q, qd and tau [N, d], with tau[k] held from sample k to k + 1; pure."""
     q, qd, tau = (jnp.asarray(column) for column in (q, qd, tau))
     held = jnp.concatenate([jnp.zeros_like(tau[:1]), tau[:-1]])
@@ -159,9 +157,7 @@ class Wrench(NamedTuple):
     """Norm of the torques that no wrench at the flange explains, N m or N: a contact elsewhere."""
 
 
-def flange_wrench(
-    jacobian: Any, tau: Any, *, length: float = 0.1, smallest: float = 1e-3
-) -> Wrench:
+def flange_wrench(jacobian: Any, tau: Any, *, length: float = 0.1, smallest: float = 1e-3) -> Wrench:
     """Returns the wrench F with Jᵀ F = tau, in the sense of least squares.
 
     Args:

@@ -2,11 +2,12 @@
 
 Over the first state x_0 of a window and the disturbances w_j of its N steps it minimises
 
-    |W⁻¹ (x_0 - prior)|² + sum_j |w_j / disturbance|² + sum_j |(y_j - measured(x_j)) / noise|²,   x_j+1 = step(x_j, u_j, w_j)
+    |W⁻¹ (x_0 - prior)|² + sum_j |w_j / disturbance|² + sum_j |(y_j - measured(x_j)) / noise|²
+    with  x_j+1 = step(x_j, u_j, w_j)
 
 (Rao, Rawlings and Mayne 2003). When the window moves on, its oldest sample goes into the prior by the extended Kalman
-filter. For a linear process the estimate is that of the Kalman filter; otherwise the window is linearised again in every
-iteration, where the extended filter linearises each sample once.
+filter. For a linear process the estimate is that of the Kalman filter. For others the window is linearised again in
+every iteration, where the extended filter linearises each sample once.
 """
 
 from typing import NamedTuple
@@ -115,7 +116,8 @@ def moving_horizon(
             lambda new, old: jnp.where(full, new, old), (moved, second), (memory.prior, memory.first)
         )
         older, ys, seen, w = (
-            jnp.where(full, jnp.roll(column, -1, axis=0), column) for column in (memory.u, memory.y, memory.seen, memory.w)
+            jnp.where(full, jnp.roll(column, -1, axis=0), column)
+            for column in (memory.u, memory.y, memory.seen, memory.w)
         )
         place = jnp.minimum(memory.count, N - 1)
         count = jnp.minimum(memory.count + 1, N)

@@ -15,7 +15,17 @@ from dln_jax.cli.arguments import choice, names_in
 from dln_jax.cli.options import Drawn, Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
-from scripts.reports.control import energy_laws, estimates, laws_in_c, learned, mpc, planned, robustness, swing_ups, tracking
+from scripts.reports.control import (
+    energy_laws,
+    estimates,
+    laws_in_c,
+    learned,
+    mpc,
+    planned,
+    robustness,
+    swing_ups,
+    tracking,
+)
 from scripts.reports.control.board import Motor
 from scripts.reports.control.values import equation, fits
 from scripts.reports.figures.robustness import shares

@@ -78,9 +78,7 @@ def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effec
         return jnp.concatenate([x[2:], MODEL.forward_dynamics(x[:2], x[2:], B @ u)])
 
     run = jax.jit(
-        lambda: simulate(
-            field, controller, exact.x, seconds=0.5, rate=100.0, controls=1, hardware=hardware
-        )
+        lambda: simulate(field, controller, exact.x, seconds=0.5, rate=100.0, controls=1, hardware=hardware)
     )()
     asked = jax.vmap(lambda x: ASKED.act((), 0.0, x)[1])(run.x[:-1])
     np.testing.assert_allclose(run.u[delay:], asked[delay:], rtol=0, atol=1e-5)
@@ -125,7 +123,7 @@ def test_a_controller_with_a_filter_and_late_measurements_is_the_same_in_c(tmp_p
 
     def act(y, *memory):
         memory, u = controller.act(jax.tree.unflatten(tree, memory), jnp.zeros(()), y)
-        return {"u": u, **{f"memory_{number}": leaf for number, leaf in enumerate(jax.tree.leaves(memory))}}
+        return {"u": u, **{f"after_{number}": leaf for number, leaf in enumerate(jax.tree.leaves(memory))}}
 
     export_c({"act": (act, (np.zeros(2), *map(np.asarray, leaves)))}, tmp_path / "loop")
     in_c, in_jax = load_c(tmp_path / "loop", flags=("-O1",)), jax.jit(act)
@@ -133,5 +131,5 @@ def test_a_controller_with_a_filter_and_late_measurements_is_the_same_in_c(tmp_p
     for y in np.asarray(measurements(12)):
         expected, got = in_jax(y, *memory), in_c.act(y, *memory_in_c)
         np.testing.assert_allclose(got.u, expected["u"], rtol=1e-9, atol=1e-12)
-        memory = [np.asarray(expected[f"memory_{number}"]) for number in range(len(leaves))]
-        memory_in_c = [np.asarray(getattr(got, f"memory_{number}")) for number in range(len(leaves))]
+        memory = [np.asarray(expected[f"after_{number}"]) for number in range(len(leaves))]
+        memory_in_c = [np.asarray(getattr(got, f"after_{number}")) for number in range(len(leaves))]

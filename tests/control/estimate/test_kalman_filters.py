@@ -110,8 +110,7 @@ def cart_pole_logs(count, samples):
         w = jnp.asarray(process.disturbance) * jax.random.normal(of_w, (samples, 2))
         v = jnp.asarray(process.noise) * jax.random.normal(of_v, (samples, 2))
         u = 2.0 * jnp.sin(0.05 * jnp.arange(samples))[:, None]
-        later = lambda x, row: (process.step(x, *row), x)
-        _, x = jax.lax.scan(later, x, (u, w))
+        _, x = jax.lax.scan(lambda x, row: (process.step(x, *row), x), x, (u, w))
         return x, x[:, :2] + v, u
 
     return process, prior, jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), count))
