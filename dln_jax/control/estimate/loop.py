@@ -1,9 +1,9 @@
 """Filters in closed loops and over logs: late measurements, several rates, and controls on their way to the motors.
 
 A measurement that is late by some samples belongs to an earlier state. The memory holds the belief at the time of the
-latest channel, and the measurements and controls since then. At every sample the filter goes through them again, so that
-each measurement is used at its own time, prompt channels at once. The law receives the state that the process predicts
-for the moment at which its control begins to act.
+latest channel, and the measurements and controls since then. At every sample the filter goes through them again, so
+that each measurement is used at its own time, prompt channels at once. The law receives the state that the process
+predicts for the moment at which its control begins to act.
 """
 
 from collections.abc import Sequence

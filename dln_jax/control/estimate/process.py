@@ -54,7 +54,7 @@ class Innovation(NamedTuple):
     """What a measurement tells that was not predicted: independent normal residuals if the process is right."""
 
     residual: Float[Array, " p"]
-    """Measurement minus prediction by all measurements before it, in the order of channels; 0 for one that is unseen."""
+    """Measurement minus its prediction from all measurements before it, channel by channel; 0 for one that is unseen."""
     variance: Float[Array, " p"]
     """Predicted variance of the residual; 1 for one that is unseen."""
     seen: Bool[Array, " p"]
@@ -155,9 +155,9 @@ def corrected(
 ) -> tuple[Belief, Innovation]:
     """Adds measurements y = predicted + slopes z + v with x = mean + W z, z ~ N(0, 1), one channel after the other.
 
-    Potter's square-root form (Bierman 1977, "Factorization methods for discrete sequential estimation", chapter V): with
-    a = Tᵀ slope and S = aᵀ a + variance, T <- T (1 - a aᵀ / (S + √(variance S))). The covariance stays positive, and no
-    matrix is inverted.
+    Potter's square-root form (Bierman 1977, "Factorization methods for discrete sequential estimation", chapter V):
+    with a = Tᵀ slope and S = aᵀ a + variance, T <- T (1 - a aᵀ / (S + √(variance S))). The covariance stays positive,
+    and no matrix is inverted.
     """
     seen = jnp.broadcast_to(jnp.asarray(seen, bool), y.shape)
     z, T = jnp.zeros_like(belief.x), jnp.eye(len(belief.x), dtype=belief.x.dtype)

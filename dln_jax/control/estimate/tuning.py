@@ -68,7 +68,7 @@ def tuned(
     Args:
         process: with first values above zero.
         logs: (belief in the first state, y [N, p], u [N, m]) of every log; those of equal length share a program.
-        noise: whether to change the measurements' noise too; by default it is known, for example from an encoder's step.
+        noise: whether to change the measurements' noise too; by default it is known, such as from an encoder's step.
         make: process -> filter.
         iterations: most iterations of L-BFGS.
 
@@ -116,8 +116,8 @@ def from_log(
 ) -> Tuned:
     """Returns the process of a model with the noise of a log of encoders and torques.
 
-    The noise of the coordinates is that which the encoder analysis finds, at least step / √12. The torque band starts at
-    a hundredth of the torques' range and is tuned.
+    The noise of the coordinates is that of the encoder analysis, at least step / √12. The torque band starts at a
+    hundredth of the torques' range and is tuned.
 
     Args:
         model: known or learned.

@@ -1,9 +1,9 @@
 """The unscented Kalman filter: the process is evaluated at points of the belief, without derivatives.
 
 With N = n + k columns s_j of a square root of the covariance of (x, w), the 2 N points mean +- √N s_j have the weight
-1 / (2 N) each (Julier and Uhlmann 1997 with kappa = 0; Arasaratnam and Haykin 2009, "Cubature Kalman filters"). Weights
-are positive, so that a square root of the covariance is a triangular factor of the scaled differences. It is exact for a
-linear process, and to second order for others.
+1 / (2 N) each (Julier and Uhlmann 1997 with kappa = 0; Arasaratnam and Haykin 2009, "Cubature Kalman filters").
+Weights are positive, so that a square root of the covariance is a triangular factor of the scaled differences. It is
+exact for a linear process, and to second order for others.
 """
 
 import math

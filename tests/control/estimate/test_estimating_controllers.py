@@ -1,4 +1,4 @@
-"""Controllers with a filter use late measurements at their own time, and act on the state in which controls take effect."""
+"""Controllers with a filter use late measurements at their own time, and act on the state of the moment of action."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def replayed(controller, y):
 def measurements(samples=60):
     random = np.random.default_rng(0)
     slow = np.cumsum(np.cumsum(random.normal(size=(samples, 2)), axis=0), axis=0) * [2e-4, 4e-4]
-    return jnp.asarray(slow + [0.0, np.pi])
+    return jnp.asarray(slow + np.array([0.0, np.pi]))
 
 
 def test_late_measurements_give_the_estimates_that_prompt_ones_gave_so_many_samples_before():
