@@ -54,7 +54,7 @@ class Innovation(NamedTuple):
     """What a measurement tells that was not predicted: independent normal residuals if the process is right."""
 
     residual: Float[Array, " p"]
-    """Measurement minus its prediction from all measurements before it, channel by channel; 0 for one that is unseen."""
+    """Measurement minus its prediction from all those before it, channel by channel; 0 for one that is unseen."""
     variance: Float[Array, " p"]
     """Predicted variance of the residual; 1 for one that is unseen."""
     seen: Bool[Array, " p"]
