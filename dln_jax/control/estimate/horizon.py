@@ -25,7 +25,7 @@ from dln_jax.types import InputError, require_positive
 
 
 class Window(NamedTuple):
-    """Memory of a moving horizon estimator; samples beyond `count` are not used yet."""
+    """Memory of a moving horizon estimator; samples beyond `steps` are not used yet."""
 
     x: Float[Array, " n"]
     """Estimate of the newest state."""
@@ -40,7 +40,7 @@ class Window(NamedTuple):
     """Disturbances in units of their deviations, from which the next solution starts."""
     first: Float[Array, " n"]
     """Estimate of the oldest state."""
-    count: Int[Array, ""]
+    steps: Int[Array, ""]
     """Steps in the window."""
 
 
@@ -77,9 +77,9 @@ def moving_horizon(
         return jnp.concatenate([first[None], later])
 
     def residual(unknowns: dict[str, Array], memory: Window) -> Array:
-        x = states(unknowns["first"], unknowns["w"], memory.u, memory.count)
+        x = states(unknowns["first"], unknowns["w"], memory.u, memory.steps)
         off = (memory.y - jax.vmap(process.measured)(x)) / jnp.asarray(process.noise)
-        used = memory.seen & (jnp.arange(N + 1) <= memory.count)[:, None]
+        used = memory.seen & (jnp.arange(N + 1) <= memory.steps)[:, None]
         arrival = solve(memory.prior.W, unknowns["first"] - memory.prior.x)
         return jnp.concatenate([arrival, unknowns["w"].ravel(), jnp.where(used, off, 0.0).ravel()])
 
@@ -94,7 +94,7 @@ def moving_horizon(
     def update(memory: Window, y: Array, seen: Array) -> tuple[Window, Innovation]:
         newest, innovation = kalman.update(memory.newest, y, seen)
         memory = memory._replace(
-            newest=newest, y=memory.y.at[memory.count].set(y), seen=memory.seen.at[memory.count].set(innovation.seen)
+            newest=newest, y=memory.y.at[memory.steps].set(y), seen=memory.seen.at[memory.steps].set(innovation.seen)
         )
         begun = levenberg_marquardt.init({"first": memory.first, "w": memory.w})
         one = jax.tree.map(lambda leaf: leaf[None], memory)
@@ -103,15 +103,15 @@ def moving_horizon(
             lambda unknowns, *leaves: residual(unknowns, jax.tree.unflatten(tree, leaves)),
             begun, tuple(leaves), iterations,
         ).parameters  # fmt: skip
-        x = states(solved["first"], solved["w"], memory.u, memory.count)[memory.count]
+        x = states(solved["first"], solved["w"], memory.u, memory.steps)[memory.steps]
         return memory._replace(x=x, first=solved["first"], w=solved["w"]), innovation
 
     def predict(memory: Window, u: Array) -> Window:
-        full = memory.count == N
+        full = memory.steps == N
         x = process.step(memory.x, u, jnp.zeros(disturbances, memory.x.dtype))
         # The oldest sample leaves a full window.
         moved = kalman.predict(kalman.update(memory.prior, memory.y[0], memory.seen[0])[0], memory.u[0])
-        second = states(memory.first, memory.w, memory.u, memory.count)[1]
+        second = states(memory.first, memory.w, memory.u, memory.steps)[1]
         prior, first = jax.tree.map(
             lambda new, old: jnp.where(full, new, old), (moved, second), (memory.prior, memory.first)
         )
@@ -119,8 +119,8 @@ def moving_horizon(
             jnp.where(full, jnp.roll(column, -1, axis=0), column)
             for column in (memory.u, memory.y, memory.seen, memory.w)
         )
-        place = jnp.minimum(memory.count, N - 1)
-        count = jnp.minimum(memory.count + 1, N)
+        place = jnp.minimum(memory.steps, N - 1)
+        count = jnp.minimum(memory.steps + 1, N)
         return Window(
             x, prior, kalman.predict(memory.newest, u), older.at[place].set(u), ys,
             seen.at[count].set(False), w.at[place].set(0.0), first, count,

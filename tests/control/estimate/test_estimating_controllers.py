@@ -80,7 +80,7 @@ def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effec
     run = jax.jit(
         lambda: simulate(field, controller, exact.x, seconds=0.5, rate=100.0, controls=1, hardware=hardware)
     )()
-    asked = jax.vmap(lambda x: ASKED.act((), 0.0, x)[1])(run.x[:-1])
+    asked = jax.vmap(lambda x: ASKED.act((), jnp.zeros(()), x)[1])(run.x[:-1])
     np.testing.assert_allclose(run.u[delay:], asked[delay:], rtol=0, atol=1e-5)
 
 

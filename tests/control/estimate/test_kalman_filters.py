@@ -27,7 +27,12 @@ from dln_jax.types import InputError
 F = np.array([[1.0, 0.1, 0.0], [-0.2, 0.95, 0.05], [0.0, 0.0, 0.9]])
 B, G = np.array([[0.0], [0.1], [0.3]]), np.array([[0.0, 0.02], [0.1, 0.0], [0.0, 0.3]])
 H = np.array([[1.0, 0.0, 0.0], [0.5, 0.0, 1.0]])
-LINEAR = Process(lambda x, u, w: F @ x + B @ u + G @ w, lambda x: H @ x, np.array([0.7, 0.4]), np.array([0.1, 0.2]))
+LINEAR = Process(
+    lambda x, u, w: jnp.asarray(F @ x + B @ u + G @ w),
+    lambda x: jnp.asarray(H @ x),
+    np.array([0.7, 0.4]),
+    np.array([0.1, 0.2]),
+)
 PRIOR = belief([0.3, -0.2, 0.1], [1.0, 2.0, 0.5])
 
 
@@ -36,7 +41,7 @@ def linear_log(samples, seed=0):
     x, y, u = np.array([0.5, 1.0, 0.0]), [], random.normal(size=(samples, 1))
     for number in range(samples):
         y.append(H @ x + random.normal(size=2) * LINEAR.noise)
-        x = LINEAR.step(x, u[number], random.normal(size=2) * LINEAR.disturbance)
+        x = F @ x + B @ u[number] + G @ (random.normal(size=2) * LINEAR.disturbance)
     return jnp.asarray(np.stack(y)), jnp.asarray(u)
 
 
