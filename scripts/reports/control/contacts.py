@@ -102,14 +102,14 @@ def contacts(quick: bool) -> Findings:
     alarm = alarm[:, round(2.0 * RATE) :] > threshold
     delays = np.where(alarm.any(axis=1), np.argmax(alarm, axis=1) / RATE, np.inf)
     case = "contacts/two-link"
-    free, found = f"in {len(later)} s without contact that did not set the threshold", f"of {PUSHED} of {SIZE} N m"
+    without, size = f"in {len(later)} s without contact that did not set the threshold", f"of {PUSHED} of {SIZE} N m"
     rows = [
         Row(case, "stated_false_alarms", ALARMS, "1/h"),
-        Row(case, "false_alarms", float(np.mean(later > threshold) * 3600), "1/h", expected=free),
+        Row(case, "false_alarms", float(np.mean(later > threshold) * 3600), "1/h", expected=without),
         Row(case, "band_shoulder", float(band[0]), "N m", expected="rms without contact"),
         Row(case, "band_elbow", float(band[1]), "N m", expected="rms without contact"),
         Row(case, "threshold", threshold, expected="times the band"),
-        Row(case, "pushes_detected", float(np.mean(delays <= 0.5)), expected=found),
+        Row(case, "pushes_detected", float(np.mean(delays <= 0.5)), expected=size),
         Row(case, "delay_median", float(np.median(delays)), "s"),
     ]
     return Findings(rows)

