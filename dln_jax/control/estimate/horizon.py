@@ -76,11 +76,12 @@ def moving_horizon(
         _, later = jax.lax.scan(step, first, (jnp.arange(N), u, w))
         return jnp.concatenate([first[None], later])
 
-    def residual(unknowns: dict[str, Array], memory: Window) -> Array:
-        x = states(unknowns["first"], unknowns["w"], memory.u, memory.steps)
+    def residual(unknowns: dict[str, Array], memory: Window, root: Array) -> Array:
+        first = memory.first + root @ unknowns["first"]
+        x = states(first, unknowns["w"], memory.u, memory.steps)
         off = (memory.y - jax.vmap(process.measured)(x)) / jnp.asarray(process.noise)
         used = memory.seen & (jnp.arange(N + 1) <= memory.steps)[:, None]
-        arrival = solve(memory.prior.W, unknowns["first"] - memory.prior.x)
+        arrival = solve(memory.prior.W, first - memory.prior.x)
         return jnp.concatenate([arrival, unknowns["w"].ravel(), jnp.where(used, off, 0.0).ravel()])
 
     def start(belief: Belief) -> Window:
@@ -96,15 +97,18 @@ def moving_horizon(
         memory = memory._replace(
             newest=newest, y=memory.y.at[memory.steps].set(y), seen=memory.seen.at[memory.steps].set(innovation.seen)
         )
-        begun = levenberg_marquardt.init({"first": memory.first, "w": memory.w})
-        one = jax.tree.map(lambda leaf: leaf[None], memory)
+        # In units of the filtered deviations: damping is one number for all unknowns.
+        root = kalman.update(memory.prior, memory.y[0], memory.seen[0])[0].W
+        begun = levenberg_marquardt.init({"first": jnp.zeros_like(memory.first), "w": memory.w})
+        one = jax.tree.map(lambda leaf: leaf[None], (memory, root))
         leaves, tree = jax.tree.flatten(one)
         solved = levenberg_marquardt.run(
-            lambda unknowns, *leaves: residual(unknowns, jax.tree.unflatten(tree, leaves)),
+            lambda unknowns, *leaves: residual(unknowns, *jax.tree.unflatten(tree, leaves)),
             begun, tuple(leaves), iterations,
         ).parameters  # fmt: skip
-        x = states(solved["first"], solved["w"], memory.u, memory.steps)[memory.steps]
-        return memory._replace(x=x, first=solved["first"], w=solved["w"]), innovation
+        first = memory.first + root @ solved["first"]
+        x = states(first, solved["w"], memory.u, memory.steps)[memory.steps]
+        return memory._replace(x=x, first=first, w=solved["w"]), innovation
 
     def predict(memory: Window, u: Array) -> Window:
         full = memory.steps == N
