@@ -15,9 +15,18 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, hanging_starts, outcomes, simulate
+from dln_jax.control.closed_loop import (
+    ClosedLoopRun,
+    Controller,
+    Hardware,
+    Outcomes,
+    hanging_starts,
+    outcomes,
+    simulate,
+)
+from dln_jax.control.estimate import Filter, Process, belief, extended, with_estimate
 from dln_jax.control.observers import with_differences
-from dln_jax.control.state_space import field_of
+from dln_jax.control.state_space import Law, field_of
 from dln_jax.control.swing_up import EnergyGains, SwingUp, SwingUpNumbers, swing_up
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
@@ -32,6 +41,8 @@ SECONDS = 10.0
 """Duration of a swing-up's simulation, s."""
 CUTOFF = 50.0
 """Cut-off frequency of the rates, which are differences of encoder readings, Hz."""
+HOLDING = 1.0
+"""Last part of a run in which the pole is held upright, s."""
 POSTURES = 65
 """Number of pole angles around the circle at which a model has to be usable."""
 
@@ -62,6 +73,8 @@ class Tried(NamedTuple):
     outcomes: Outcomes
     farthest: Float[np.ndarray, " n"]
     """Largest displacement of the driven coordinate, m or rad."""
+    effort: Float[np.ndarray, " n"]
+    """Root mean square control in the last second, N m or N."""
 
 
 def desktop_cart_pole() -> DesktopPlant:
@@ -127,11 +140,35 @@ def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics) -> SwingUp:
     )  # fmt: skip
 
 
+def differences(plant: DesktopPlant) -> Callable[[Law], Controller]:
+    """Rates by differences of the encoder readings and a low-pass."""
+    return lambda law: with_differences(law, 2, rate=plant.rate, cutoff=CUTOFF)
+
+
+def estimated(
+    plant: DesktopPlant, process: Process, make: Callable[[Process], Filter] = extended
+) -> Callable[[Law], Controller]:
+    """States by a filter of the encoder readings, with the process of a log (`control.estimate.from_log`)."""
+    hardware, start = plant.hardware, belief([0.0, np.pi, 0.0, 0.0], [1.0, np.pi, 1.0, 1.0])
+    return lambda law: with_estimate(
+        law, make(process), start, controls=1, measurements=2, lower=hardware.lower, upper=hardware.upper,
+        delay=hardware.delay,
+    )  # fmt: skip
+
+
 def motion_of(
-    plant: DesktopPlant, model: Dynamics | PlainDynamics, *, seconds: float = SECONDS
+    plant: DesktopPlant,
+    model: Dynamics | PlainDynamics,
+    *,
+    seconds: float = SECONDS,
+    estimator: Callable[[Law], Controller] | None = None,
 ) -> Callable[[Array, Array], ClosedLoopRun]:
-    """(initial state [4], key of the noise) -> a run of the true plant with the model's law."""
-    controller = with_differences(law_of(plant, model).law, 2, rate=plant.rate, cutoff=CUTOFF)
+    """(initial state [4], key of the noise) -> a run of the true plant with the model's law.
+
+    An estimator, such as `estimated`, makes a controller of encoder readings from the law; without one, rates are
+    differences of the readings.
+    """
+    controller = (estimator or differences(plant))(law_of(plant, model).law)
     B = np.asarray(plant.scene.needs.actuation)
     field = field_of(model_of_plant(plant), B)
 
@@ -151,14 +188,16 @@ def try_starts(
     starts: int = 1000,
     seed: int = 0,
     seconds: float = SECONDS,
+    estimator: Callable[[Law], Controller] | None = None,
 ) -> Tried:
-    """Runs swing-ups from random states near hanging, with independent noise."""
-    run = motion_of(plant, model, seconds=seconds)
+    """Runs swing-ups from random states near hanging, with independent noise; `estimator` as for `motion_of`."""
+    run = motion_of(plant, model, seconds=seconds, estimator=estimator)
+    held = min(round(HOLDING * plant.rate), round(seconds * plant.rate))
 
-    def extremes(x: Array, key: Array) -> tuple[Array, Array]:
-        states = run(x, key).x
-        return states[:, 1], jnp.max(jnp.abs(states[:, 0]))
+    def extremes(x: Array, key: Array) -> tuple[Array, Array, Array]:
+        motion = run(x, key)
+        return motion.x[:, 1], jnp.max(jnp.abs(motion.x[:, 0])), jnp.sqrt(jnp.mean(motion.u[-held:] ** 2))
 
     x = hanging_starts(starts, seed, position=plant.position)
-    angle, far = jax.jit(jax.vmap(extremes))(x, jax.random.split(jax.random.key(seed), starts))
-    return Tried(outcomes(angle, rate=plant.rate), np.asarray(far))
+    angle, far, effort = jax.jit(jax.vmap(extremes))(x, jax.random.split(jax.random.key(seed), starts))
+    return Tried(outcomes(angle, rate=plant.rate), np.asarray(far), np.asarray(effort))

@@ -12,7 +12,7 @@ from dln_jax.mechanics.trees.description import (
     tree_to_json,
     with_payload,
 )
-from dln_jax.mechanics.trees.frames import world_frames
+from dln_jax.mechanics.trees.frames import frame_jacobian, world_frames
 from dln_jax.mechanics.trees.inertia import (
     PARAMETERS,
     body_of_pseudo_inertia,
@@ -37,6 +37,7 @@ __all__ = [
     "body_of_pseudo_inertia",
     "composite_bodies",
     "dh_frames",
+    "frame_jacobian",
     "inertial_parameters",
     "kinetic_energy",
     "lagrangian",

@@ -4,6 +4,7 @@ All joints are about z of their link here: `aligned` rotates the links of a tree
 exchange axes cost nothing but signs.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxtyping import Float
 
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved
-from dln_jax.types import Vector
+from dln_jax.types import InputError, Vector
 
 Vector3 = Float[Array, "3"]
 
@@ -138,6 +139,38 @@ def world_frames(tree: Tree, q: Vector) -> tuple[Float[Array, "d 3 3"], Float[Ar
         rotations.append(rotation)
         origins.append(position)
     return jnp.stack(rotations), jnp.stack(origins)
+
+
+def frame_jacobian(tree: Tree, link: int, point: Any = (0.0, 0.0, 0.0)) -> Callable[[Vector], Float[Array, "6 d"]]:
+    """q -> J with (velocity of a point of a link, angular velocity of the link) = J qd, in the ground's frame.
+
+    Its transpose maps a force and a moment on the link, about the point, to joint torques.
+
+    Args:
+        tree: the bodies.
+        link: number of the link.
+        point: in the link's own frame, m.
+
+    Raises:
+        InputError: there is no such link.
+    """
+    if not 0 <= link < len(tree.joints):
+        raise InputError(f"link is {link}; expected one of 0 to {len(tree.joints) - 1}")
+    above = [link]
+    while tree.parents[above[-1]] >= 0:
+        above.append(tree.parents[above[-1]])
+
+    def jacobian(q: Vector) -> Float[Array, "6 d"]:
+        rotations, origins = world_frames(tree, q)
+        at = origins[link] + rotations[link] @ jnp.asarray(point, q.dtype)
+        columns = [jnp.zeros(6, q.dtype)] * len(tree.joints)
+        for joint in above:
+            axis, none = rotations[joint] @ jnp.asarray(tree.axes[joint], q.dtype), jnp.zeros(3, q.dtype)
+            turning = jnp.concatenate([jnp.cross(axis, at - origins[joint]), axis])
+            columns[joint] = turning if tree.joints[joint] == "revolute" else jnp.concatenate([axis, none])
+        return jnp.stack(columns, axis=1)
+
+    return jacobian
 
 
 def _turn(axis: Vector3, angle: Array) -> Float[Array, "3 3"]:

@@ -16,7 +16,9 @@ from dln_jax.cli.options import Drawn, Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.control import (
+    contacts,
     energy_laws,
+    estimates,
     foreign_plants,
     laws_in_c,
     learned,
@@ -42,6 +44,8 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
     **equation.CASES,
     "value/pendulum": fits.pendulum,
     "value/cart-pole": fits.cart_pole,
+    **estimates.CASES,
+    "contacts/two-link": contacts.contacts,
     "tracking/seven-axis": tracking.tracking,
     **{f"robustness/{name}": partial(robustness.robust, motor) for name, motor in MOTORS.items()},
     "laws/in-c": laws_in_c.laws,

@@ -69,7 +69,8 @@ def _of_seed(plant: DesktopPlant, model: str, seed: int, quick: bool) -> Outcome
     try:
         tried = try_starts(plant, learned.dynamics, starts=starts, seed=seed + TRY_SEED)
     except InputError:  # the controller rejects the model: all starts fail
-        tried = Tried(Outcomes(np.full(starts, np.inf), np.zeros(starts, bool)), np.full(starts, np.nan))
+        absent = np.full(starts, np.nan)
+        tried = Tried(Outcomes(np.full(starts, np.inf), np.zeros(starts, bool)), absent, absent)
     return Outcome(learned, errors, tried)
 
 

@@ -1,0 +1,186 @@
+"""External torques by a momentum observer, contacts at a stated rate of false alarms, and the wrench at a flange.
+
+With the momentum p = M(q) qd and the Lagrangian L = T - V, the equations of motion read
+
+    dp/dt = tau + dL/dq - friction + external,      r' = gain (external - r)
+
+so that the residual r follows the external torque as a first-order low-pass, without accelerations and without an
+inverted mass matrix (De Luca and Mattone 2003; De Luca, Albu-Schäffer, Haddadin and Hirzinger 2006). In sampled time,
+with tau held and the trapezoidal rule for beta = dL/dq - friction,
+
+    r <- r + (1 - exp(-gain dt)) ((p' - p) / dt - tau - (beta + beta') / 2 - r)
+
+A push shows if r leaves the band of the model's own errors. The score of a sample is the largest |r_i| / band_i, and
+`contact_threshold` finds the score that motions without contact exceed only as often as allowed.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.solvers.lapack import symmetric_eigen
+from dln_jax.types import InputError, Scalar, Vector, require_positive
+
+BLOCK = 1.0
+"""s: length of the blocks whose largest scores are fitted."""
+LEAST_BLOCKS = 20
+"""Fewest blocks for a fit."""
+
+
+class Momentum(NamedTuple):
+    """Memory of a momentum observer."""
+
+    r: Float[Array, " d"]
+    """Estimate of the external torques, N m or N."""
+    p: Float[Array, " d"]
+    beta: Float[Array, " d"]
+    begun: Bool[Array, ""]
+    """Whether there was a sample before."""
+
+
+class MomentumObserver(NamedTuple):
+    """An observer of external torques; pure."""
+
+    start: Momentum
+    update: Callable[[Momentum, Vector, Vector, Vector], Momentum]
+    """(memory, q, qd, tau held since the sample before) -> memory with r at this sample."""
+
+
+def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, gain: Any) -> MomentumObserver:
+    """Returns a momentum observer of a natural system.
+
+    Args:
+        model: known or learned, with an energy; its friction counts as known.
+        d: number of coordinates.
+        rate: of the samples, Hz.
+        gain: of the residual, 1/s, one for all or one per joint; 1 / gain is the time constant.
+
+    Raises:
+        InputError: a model without energy, or numbers that are not positive.
+    """
+    if not isinstance(model, Dynamics):
+        raise InputError("the model has no energy, which a momentum observer needs; train a DeLaN, for example")
+    require_positive(d=d, rate=rate)
+    for number in np.ravel(gain):
+        require_positive(gain=float(number))
+    share = -jnp.expm1(-jnp.asarray(gain, float) / rate)
+
+    def lagrangian(q: Vector, qd: Vector) -> Scalar:
+        return model.energy(q, qd) - 2 * model.energy(q, jnp.zeros_like(qd))
+
+    def update(memory: Momentum, q: Vector, qd: Vector, tau: Vector) -> Momentum:
+        p = model.mass_matrix(q) @ qd
+        beta = jax.grad(lagrangian)(q, qd) - model.friction(q, qd)
+        external = (p - memory.p) * rate - tau - (beta + memory.beta) / 2
+        r = jnp.where(memory.begun, memory.r + share * (external - memory.r), memory.r)
+        return Momentum(r, p, beta, jnp.ones_like(memory.begun))
+
+    return MomentumObserver(Momentum(jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(False)), update)
+
+
+def observed(observer: MomentumObserver, q: Any, qd: Any, tau: Any) -> Float[Array, "N d"]:
+    """External torques r along a log of q, qd and tau [N, d], with tau[k] held from sample k to k + 1; pure."""
+    q, qd, tau = (jnp.asarray(column) for column in (q, qd, tau))
+    held = jnp.concatenate([jnp.zeros_like(tau[:1]), tau[:-1]])
+
+    def sample(memory: Momentum, row: tuple[Array, Array, Array]) -> tuple[Momentum, Array]:
+        memory = observer.update(memory, *row)
+        return memory, memory.r
+
+    return jax.lax.scan(sample, observer.start, (q, qd, held))[1]
+
+
+def contact_score(r: Vector, band: Any) -> Scalar:
+    """Largest |r_i| / band_i; a contact is a score above the threshold.
+
+    Args:
+        r: external torques.
+        band: standard deviation of r without contact [d]: the model's torque band, for example `Run.torque_std` at this
+            state, or the root mean square of r in motions without contact.
+    """
+    return jnp.max(jnp.abs(r) / jnp.asarray(band))
+
+
+def contact_threshold(scores: Any, *, rate: float, false_alarms: float) -> float:
+    """Returns the score that motions without contact exceed at a stated rate.
+
+    The largest scores of blocks of a second follow a generalised extreme value law, fitted by its probability-weighted
+    moments (Hosking, Wallis and Wood 1985). It extrapolates to alarms rarer than the recording is long. No alarm is
+    counted twice within a block.
+
+    Args:
+        scores: of motions without contact [N], or a list of such recordings, like those to come.
+        rate: of the samples, Hz.
+        false_alarms: per hour.
+
+    Raises:
+        InputError: fewer than 20 s, scores that are not finite, or a rate of alarms of one per block or more.
+    """
+    from scipy.special import gamma
+    from scipy.stats import genextreme
+
+    require_positive(rate=rate, false_alarms=false_alarms)
+    maxima = block_maxima(scores, rate=rate)
+    if len(maxima) < LEAST_BLOCKS or not np.isfinite(maxima).all():
+        raise InputError(
+            f"there are {len(maxima)} s of scores without contact; expected {LEAST_BLOCKS} s or more, all finite"
+        )
+    share = false_alarms * BLOCK / 3600.0
+    if not share < 1:
+        raise InputError(f"false_alarms is {false_alarms} per hour; expected fewer than {3600 / BLOCK:g}")
+    maxima, order = np.sort(maxima), np.arange(len(maxima)) / (len(maxima) - 1)
+    later = (np.arange(len(maxima)) - 1) / (len(maxima) - 2)
+    first, second, third = np.mean(maxima), np.mean(order * maxima), np.mean(order * later * maxima)
+    c = (2 * second - first) / (3 * third - first) - math.log(2) / math.log(3)
+    k = 7.8590 * c + 2.9554 * c**2
+    k = k if abs(k) > 1e-6 else 1e-6  # a Gumbel law
+    scale = (2 * second - first) * k / (gamma(1 + k) * (1 - 2**-k))
+    return float(genextreme.isf(share, k, first + scale * (gamma(1 + k) - 1) / k, scale))
+
+
+def block_maxima(scores: Any, *, rate: float) -> Float[np.ndarray, " B"]:
+    """Largest scores of the whole blocks of a second in recordings."""
+    size = max(round(BLOCK * rate), 1)
+    recordings = [np.asarray(part, float) for part in (scores if isinstance(scores, list | tuple) else [scores])]
+    whole = [part[: len(part) // size * size].reshape(-1, size) for part in recordings]
+    return np.concatenate([part.max(axis=1) for part in whole]) if whole else np.zeros(0)
+
+
+class Wrench(NamedTuple):
+    """Force and moment of the environment on a flange, in the ground's frame."""
+
+    force: Float[Array, " 3"]
+    """N."""
+    moment: Float[Array, " 3"]
+    """About the flange's point, N m."""
+    determined: Bool[Array, ""]
+    """Whether the joints determine all six components; otherwise this is the shortest wrench that explains them."""
+    residual: Scalar
+    """Norm of the torques that no wrench at the flange explains, N m or N: a contact elsewhere."""
+
+
+def flange_wrench(jacobian: Any, tau: Any, *, length: float = 0.1, smallest: float = 1e-3) -> Wrench:
+    """Returns the wrench F with Jᵀ F = tau, in the sense of least squares.
+
+    Args:
+        jacobian: of the flange's linear and angular velocity [6, d], by `mechanics.trees.frame_jacobian`.
+        tau: external torques [d].
+        length: that makes moments comparable with forces, m.
+        smallest: singular values of the scaled Jacobian below this share of the largest count as zero.
+    """
+    jacobian, tau = jnp.asarray(jacobian), jnp.asarray(tau)
+    scale = jnp.concatenate([jnp.ones(3), jnp.full(3, 1 / length)])
+    scaled = scale[:, None] * jacobian
+    values, vectors = symmetric_eigen(scaled @ scaled.T)
+    counts = values > smallest**2 * values[-1]
+    along = vectors.T @ (scaled @ tau)
+    wrench = scale * (vectors @ jnp.where(counts, along / jnp.where(counts, values, 1.0), 0.0))
+    left = tau - jacobian.T @ wrench
+    return Wrench(wrench[:3], wrench[3:], jnp.all(counts), jnp.sqrt(left @ left))

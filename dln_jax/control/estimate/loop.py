@@ -1,0 +1,149 @@
+"""Filters in closed loops and over logs: late measurements, several rates, and controls on their way to the motors.
+
+A measurement that is late by some samples belongs to an earlier state. The memory holds the belief at the time of the
+latest channel, and the measurements and controls since then. At every sample the filter goes through them again, so
+that each measurement is used at its own time, prompt channels at once. The law receives the state that the process
+predicts for the moment at which its control begins to act.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from dln_jax.control.closed_loop import Controller, stateless
+from dln_jax.control.estimate.process import Belief, Filter, Innovation
+from dln_jax.control.state_space import Law, saturated
+from dln_jax.types import InputError, require_positive
+
+
+class Estimating(NamedTuple):
+    """Memory of a controller with a filter."""
+
+    x: Float[Array, " n"]
+    """Estimate of the state at the last sample."""
+    inner: Any
+    """Memory of the inner controller."""
+    filter: Any
+    """Memory of the filter, D samples ago, before the measurement of then."""
+    y: Float[Array, "D p"]
+    """Measurements of the last D samples by the time that they belong to, oldest first."""
+    seen: Bool[Array, "D p"]
+    u: Float[Array, "D+delay m"]
+    """Controls that act from D samples ago on, oldest first."""
+    number: Int[Array, ""]
+    """Samples so far."""
+
+
+def with_estimate(
+    law: Law | Controller,
+    filter: Filter,
+    belief: Belief,
+    *,
+    controls: int,
+    measurements: int,
+    lower: Any = -jnp.inf,
+    upper: Any = jnp.inf,
+    delay: int = 0,
+    late: Sequence[int] | int = 0,
+    every: Sequence[int] | int = 1,
+) -> Controller:
+    """Gives a law the states that a filter estimates from measurements, in place of differences of encoder readings.
+
+    Args:
+        law: x [n] -> u, or a controller with such measurements.
+        filter: such as `extended(process)`.
+        belief: in the state before the first measurement.
+        controls: m.
+        measurements: p.
+        lower: lower limits of the controls, which the filter has to know.
+        upper: upper limits.
+        delay: samples after which a control begins to act.
+        late: samples by which the channels of y are late, one per channel or one for all.
+        every: a channel has a new measurement at every so many samples, from the first on, one per channel or one for
+            all; in between its value is ignored.
+
+    Raises:
+        InputError: a number of samples that is negative or no whole number.
+    """
+    require_positive(controls=controls, measurements=measurements)
+    lag, period = _samples("late", late, measurements, 0), _samples("every", every, measurements, 1)
+    (wait,) = _samples("delay", delay, 1, 0)
+    controller = law if isinstance(law, Controller) else stateless(law)
+    depth = int(lag.max())
+    rows = depth - lag, np.arange(measurements)
+
+    def act(memory: Estimating, t: Array, y: Array) -> tuple[Estimating, Array]:
+        taken = memory.number - jnp.asarray(lag)
+        fresh = (taken >= 0) & (taken % jnp.asarray(period) == 0)
+        ys = jnp.concatenate([memory.y, jnp.zeros((1, measurements), y.dtype)]).at[rows].set(y)
+        seen = jnp.concatenate([memory.seen, jnp.zeros((1, measurements), bool)]).at[rows].set(fresh)
+
+        def through(past: Any, sample: tuple[Array, Array, Array, Array]) -> tuple[Any, Any]:
+            y, seen, u, number = sample
+            later = filter.predict(filter.update(past, y, seen)[0], u)
+            # Before the first sample there was no motion to predict.
+            later = jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), later, past)
+            return later, later
+
+        base = memory.filter
+        if depth:
+            numbers = memory.number - depth + jnp.arange(depth)
+            past, afterwards = jax.lax.scan(through, base, (ys[:-1], seen[:-1], memory.u[:depth], numbers))
+            base = jax.tree.map(lambda leaf: leaf[0], afterwards)
+        else:
+            past = base
+        past, _ = filter.update(past, ys[-1], seen[-1])
+        ahead = past.x
+        for number in range(wait):
+            ahead = filter.process.step(ahead, memory.u[depth + number], jnp.zeros_like(nothing(past.x)))
+        inner, u = controller.act(memory.inner, t, ahead)
+        u = saturated(u, lower, upper)
+        queue = jnp.concatenate([memory.u, u[None]])
+        if not depth:
+            base = filter.predict(past, queue[0])
+        return Estimating(past.x, inner, base, ys[1:], seen[1:], queue[1:], memory.number + 1), u
+
+    def nothing(x: Array) -> Array:
+        return filter.process.deviation(x, jnp.zeros(controls, x.dtype))
+
+    zeros = lambda *shape: jnp.zeros(shape, belief.x.dtype)  # noqa: E731
+    start = Estimating(
+        belief.x, controller.start, filter.start(belief), zeros(depth, measurements),
+        jnp.zeros((depth, measurements), bool), zeros(depth + int(wait), controls), jnp.asarray(0),
+    )  # fmt: skip
+    return Controller(start, act)
+
+
+def filtered(
+    filter: Filter, belief: Belief, y: Float[Array, "N p"], u: Float[Array, "N m"], seen: Any = True
+) -> tuple[Float[Array, "N n"], Innovation]:
+    """Filters a log: estimates of the states at its samples, and the innovations [N, p]; pure.
+
+    Args:
+        filter: such as `extended(process)`.
+        belief: in the state before the first measurement.
+        y: measurements.
+        u: controls that act from each sample to the next.
+        seen: which channels have a measurement at a sample, [N, p], [p] or one for all.
+    """
+    y = jnp.asarray(y)
+    seen = jnp.broadcast_to(jnp.asarray(seen, bool), y.shape)
+
+    def sample(memory: Any, row: tuple[Array, Array, Array]) -> tuple[Any, tuple[Array, Innovation]]:
+        y, u, seen = row
+        memory, innovation = filter.update(memory, y, seen)
+        return filter.predict(memory, u), (memory.x, innovation)
+
+    return jax.lax.scan(sample, filter.start(belief), (y, jnp.asarray(u), seen))[1]
+
+
+def _samples(name: str, value: Any, count: int, least: int) -> np.ndarray:
+    numbers = np.broadcast_to(np.asarray(value), (count,))
+    if not (np.equal(numbers, np.round(numbers)) & (numbers >= least)).all():
+        raise InputError(f"{name} is {value}; expected whole numbers of samples, {least} or more")
+    return numbers.astype(int)

@@ -1,0 +1,150 @@
+"""Noise of a process from a log: the values that make its measurements most probable.
+
+For a filter whose innovations r have the predicted variances S, the negative logarithm of the likelihood of a log is
+
+    sum over samples and channels of  ½ (r² / S + log 2 pi S)
+
+(Schweppe 1965). Its minimum over the logarithms of all deviations is found by L-BFGS with derivatives through the
+filter.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control.estimate.extended import extended
+from dln_jax.control.estimate.loop import filtered
+from dln_jax.control.estimate.process import Belief, Filter, Innovation, Process, belief, mechanical
+from dln_jax.data.encoders.sampling import noise_of, step_of, timing
+from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.types import InputError, Scalar
+
+SAMPLES = 2000
+"""Longest part of a trajectory that is used, from its start."""
+FIRST_RATE = 1.0
+"""Deviation of the first rates, 1/s or m/s."""
+RANGE = math.log(1e4)
+"""Largest change of a deviation's logarithm from its first value."""
+
+
+class Tuned(NamedTuple):
+    """A process with the noise of a log."""
+
+    process: Process
+    cost: float
+    """Negative log-likelihood per measurement."""
+    consistency: float
+    """Mean of r² / S: 1 for a process that is right, above 1 for a filter that trusts itself too much."""
+
+
+def surprise(innovation: Innovation) -> Scalar:
+    """Negative log-likelihood of innovations, in nats."""
+    r, S, seen = innovation
+    return jnp.sum(jnp.where(seen, 0.5 * (r**2 / S + jnp.log(2 * jnp.pi * S)), 0.0))
+
+
+def consistency(innovation: Innovation) -> Scalar:
+    """Mean of r² / S over the measurements (normalised innovations squared)."""
+    r, S, seen = innovation
+    return jnp.sum(jnp.where(seen, r**2 / S, 0.0)) / jnp.maximum(jnp.sum(seen), 1)
+
+
+def tuned(
+    process: Process,
+    logs: list[tuple[Belief, Any, Any]],
+    *,
+    noise: bool = False,
+    make: Callable[[Process], Filter] = extended,
+    iterations: int = 30,
+) -> Tuned:
+    """Returns the process with the disturbance, and on request the noise, that make logs most probable.
+
+    Args:
+        process: with first values above zero.
+        logs: (belief in the first state, y [N, p], u [N, m]) of every log; those of equal length share a program.
+        noise: whether to change the measurements' noise too; by default it is known, such as from an encoder's step.
+        make: process -> filter.
+        iterations: most iterations of L-BFGS.
+
+    Raises:
+        InputError: no logs, first values that are not positive, or a likelihood that is not finite.
+    """
+    from scipy.optimize import minimize
+
+    first = np.asarray([] if callable(process.disturbance) else process.disturbance, float).ravel()
+    if not logs or not len(first) or not (first > 0).all():
+        raise InputError("tuning needs a log, and a constant first disturbance above zero in every torque")
+    scales = np.concatenate([first, np.ravel(np.asarray(process.noise, float))]) if noise else first
+    count = sum(np.size(y) for _, y, _ in logs)
+
+    def scaled(theta: Array) -> Process:
+        values = jnp.asarray(scales) * jnp.exp(theta)
+        return process._replace(
+            disturbance=values[: len(first)], noise=values[len(first) :] if noise else process.noise
+        )
+
+    @jax.jit
+    @jax.value_and_grad
+    def of_one(theta: Array, log: tuple[Belief, Array, Array]) -> Scalar:
+        return surprise(filtered(make(scaled(theta)), *log)[1]) / count
+
+    def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
+        values, slopes = zip(*(of_one(jnp.asarray(theta), log) for log in logs), strict=True)
+        return float(sum(values)), np.asarray(sum(slopes), float)
+
+    if not math.isfinite(cost(np.zeros(len(scales)))[0]):
+        raise InputError("the likelihood of the log is not finite; check its y and u, and the model at its states")
+    bounds = [(-RANGE, RANGE)] * len(scales)
+    result = minimize(
+        cost, np.zeros(len(scales)), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations}
+    )
+    best = scaled(jnp.asarray(result.x))
+    best = best._replace(disturbance=np.asarray(best.disturbance), noise=np.asarray(best.noise))
+    ratio = jax.jit(lambda log: consistency(filtered(make(best), *log)[1]))
+    weights = [np.size(y) for _, y, _ in logs]
+    return Tuned(best, float(result.fun), float(np.average([ratio(log) for log in logs], weights=weights)))
+
+
+def from_log(
+    model: Dynamics | PlainDynamics, log: Trajectories, *, actuation: Any = None, substeps: int = 1, delay: int = 0
+) -> Tuned:
+    """Returns the process of a model with the noise of a log of encoders and torques.
+
+    The noise of the coordinates is that of the encoder analysis, at least step / √12. The torque band starts at a
+    hundredth of the torques' range and is tuned.
+
+    Args:
+        model: known or learned.
+        log: t, q and tau at equal steps.
+        actuation: matrix [d, m] of the process that is returned.
+        substeps: integrator steps per sample.
+        delay: samples after which the log's torques act.
+
+    Raises:
+        InputError: a log without motion or with trajectories of fewer than eight samples.
+    """
+    noise, rate = noise_of(log.q, log.trajectory), timing(log.t, log.trajectory).rate
+    if not (np.isfinite(noise).all() and (noise > 0).all()):
+        raise InputError(
+            f"the noise of q in the log is {noise.tolist()}; expected coordinates that move, in eight samples or more"
+        )
+    band = np.full(log.q.shape[1], 0.01 * max(float(np.ptp(log.tau)), 1e-300))
+    first = mechanical(model, rate=rate, band=band, encoder_noise=noise, substeps=substeps)
+    logs = []
+    for number in np.unique(log.trajectory):
+        q, tau = (column[log.trajectory == number] for column in (log.q, log.tau))
+        tau = np.concatenate([np.zeros((delay, tau.shape[1])), tau])[: len(q)][:SAMPLES]
+        start = np.concatenate([q[0], np.zeros_like(q[0])])
+        deviation = np.concatenate([np.maximum(noise, step_of(log.q)), np.full(len(noise), FIRST_RATE)])
+        logs.append((belief(start, deviation), jnp.asarray(q[:SAMPLES]), jnp.asarray(tau)))
+    result = tuned(first, logs)
+    whole = mechanical(
+        model, actuation, rate=rate, band=result.process.disturbance, encoder_noise=noise, substeps=substeps
+    )
+    return result._replace(process=whole)

@@ -1,0 +1,135 @@
+"""Controllers with a filter use late measurements at their own time, and act on the state of the moment of action."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dln_jax
+from dln_jax.control import Hardware, simulate, stateless
+from dln_jax.control.desktop_plants import desktop_rotary_pendulum, estimated, model_of_plant, try_starts
+from dln_jax.control.estimate import belief, extended, filtered, mechanical, with_estimate
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
+from dln_jax.scenes import cart_pole
+from dln_jax.types import InputError
+
+SCENE = cart_pole()
+MODEL, B = dln_jax.dynamics(SCENE.closed_form), np.array(SCENE.needs.actuation)
+PROCESS = mechanical(MODEL, B, rate=100.0, band=[0.2, 0.01], encoder_noise=[1e-3, 2e-3])
+PRIOR = belief([0.0, np.pi, 0.0, 0.0], [0.01, 0.05, 0.05, 0.1])
+ASKED = stateless(lambda x: jnp.array([1.0]) * jnp.sin(3 * x[0] + x[2] + 1.0))
+
+
+def replayed(controller, y):
+    """Estimates and controls of a controller along measurements."""
+
+    def sample(memory, row):
+        number, y = row
+        memory, u = controller.act(memory, number / 100.0, y)
+        return memory, (memory.x, u)
+
+    return jax.jit(lambda: jax.lax.scan(sample, controller.start, (jnp.arange(len(y)), y))[1])()
+
+
+def measurements(samples=60):
+    random = np.random.default_rng(0)
+    slow = np.cumsum(np.cumsum(random.normal(size=(samples, 2)), axis=0), axis=0) * [2e-4, 4e-4]
+    return jnp.asarray(slow + np.array([0.0, np.pi]))
+
+
+def test_late_measurements_give_the_estimates_that_prompt_ones_gave_so_many_samples_before():
+    y = measurements()
+    # A law that does not depend on the state has the same controls in both loops.
+    idle = stateless(lambda x: 0.0 * x[:1])
+    prompt = with_estimate(idle, extended(PROCESS), PRIOR, controls=1, measurements=2)
+    late = with_estimate(idle, extended(PROCESS), PRIOR, controls=1, measurements=2, late=(1, 3))
+    at_once, _ = replayed(prompt, y)
+    shifted = jnp.stack([jnp.roll(y[:, 0], 1), jnp.roll(y[:, 1], 3)], axis=1)
+    delayed, _ = replayed(late, shifted)
+    # At sample k the late loop knows channel 0 up to k - 1 and channel 1 up to k - 3: filter that log directly.
+    seen = np.ones((len(y), 2), bool)
+    for k in (10, 40):
+        seen[k], seen[k - 2 : k] = False, [True, False]
+        direct, _ = jax.jit(lambda s: filtered(extended(PROCESS), PRIOR, y, jnp.zeros((len(y), 1)), s))(seen)
+        np.testing.assert_allclose(delayed[k], direct[k], rtol=0, atol=1e-12)
+        seen[k - 2 : k + 1] = True
+    assert np.abs(delayed - at_once).max() > 1e-4
+
+
+def test_channels_of_several_rates_are_used_when_they_are_new():
+    y = measurements()
+    idle = stateless(lambda x: 0.0 * x[:1])
+    slow = with_estimate(idle, extended(PROCESS), PRIOR, controls=1, measurements=2, every=(1, 4))
+    seen = np.stack([np.ones(len(y), bool), np.arange(len(y)) % 4 == 0], axis=1)
+    direct, _ = jax.jit(lambda: filtered(extended(PROCESS), PRIOR, y, jnp.zeros((len(y), 1)), seen))()
+    np.testing.assert_allclose(replayed(slow, y)[0], direct, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effect(delay):
+    # With exact measurements and an exact model the delayed loop repeats the prompt one from its first control on.
+    sharp = PROCESS._replace(noise=np.array([1e-7, 1e-7]), disturbance=np.array([1e-6, 1e-6]))
+    exact = belief([0.0, np.pi, 0.0, 0.0], 1e-6)
+    hardware = Hardware(delay=delay, sees_rates=False)
+    controller = with_estimate(ASKED, extended(sharp), exact, controls=1, measurements=2, delay=delay)
+
+    def field(x, u):
+        return jnp.concatenate([x[2:], MODEL.forward_dynamics(x[:2], x[2:], B @ u)])
+
+    run = jax.jit(
+        lambda: simulate(field, controller, exact.x, seconds=0.5, rate=100.0, controls=1, hardware=hardware)
+    )()
+    asked = jax.vmap(lambda x: ASKED.act((), jnp.zeros(()), x)[1])(run.x[:-1])
+    np.testing.assert_allclose(run.u[delay:], asked[delay:], rtol=0, atol=1e-5)
+
+
+def test_a_failed_measurement_is_not_hidden():
+    controller = with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2)
+    _, u = replayed(controller, measurements(6).at[3, 1].set(jnp.nan))
+    assert np.isfinite(u[:3]).all() and np.isnan(u[3:]).all()
+
+
+def test_wrong_numbers_of_samples_are_refused():
+    with pytest.raises(InputError, match="late is"):
+        with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, late=(1, -1))
+    with pytest.raises(InputError, match="every is 0"):
+        with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, every=0)
+
+
+@pytest.mark.slow
+def test_swing_ups_with_a_filter_succeed_and_hold_with_less_torque():
+    plant = desktop_rotary_pendulum()
+    model = model_of_plant(plant)
+    # The plant's own noise: that of its control and of its encoders.
+    process = mechanical(
+        model, plant.scene.needs.actuation, rate=plant.rate, band=[2.5e-4, 1e-5],
+        encoder_step=plant.hardware.encoder_step,
+    )  # fmt: skip
+    by_differences, by_filter = (
+        try_starts(plant, model, starts=6, seconds=4.0, estimator=estimator)
+        for estimator in (None, estimated(plant, process))
+    )
+    assert by_differences.outcomes.share == by_filter.outcomes.share == 1
+    assert np.median(by_filter.effort) < 0.3 * np.median(by_differences.effort)
+
+
+@pytest.mark.slow
+def test_a_controller_with_a_filter_and_late_measurements_is_the_same_in_c(tmp_path):
+    controller = with_estimate(
+        ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, delay=1, late=(0, 1), every=(1, 2)
+    )
+    leaves, tree = jax.tree.flatten(controller.start)
+
+    def act(y, *memory):
+        memory, u = controller.act(jax.tree.unflatten(tree, memory), jnp.zeros(()), y)
+        return {"u": u, **{f"after_{number}": leaf for number, leaf in enumerate(jax.tree.leaves(memory))}}
+
+    export_c({"act": (act, (np.zeros(2), *map(np.asarray, leaves)))}, tmp_path / "loop")
+    in_c, in_jax = load_c(tmp_path / "loop", flags=("-O1",)), jax.jit(act)
+    memory = memory_in_c = [np.asarray(leaf) for leaf in leaves]
+    for y in np.asarray(measurements(12)):
+        expected, got = in_jax(y, *memory), in_c.act(y, *memory_in_c)
+        np.testing.assert_allclose(got.u, expected["u"], rtol=1e-9, atol=1e-12)
+        memory = [np.asarray(expected[f"after_{number}"]) for number in range(len(leaves))]
+        memory_in_c = [np.asarray(getattr(got, f"after_{number}")) for number in range(len(leaves))]
