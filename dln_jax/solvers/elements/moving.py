@@ -92,14 +92,14 @@ def moving_gradient(
 
 def moving_hessians(
     moving: Sequence[MovingEnergy], x: Blocks, lists: Lists, data: Sequence[Any]
-) -> tuple[Float[Array, "capacity s s"], ...]:
+) -> tuple[Float[Array, "_ _ _"], ...]:
     """Returns the Hessians of the elements."""
     return tuple(
         jax.vmap(m.hessian)(x[at.indices], m.describe(x, at, of)) for m, at, of in zip(moving, lists, data, strict=True)
     )
 
 
-def project_moving(hessians: Sequence[Float[Array, "capacity s s"]]) -> tuple[Float[Array, "capacity s s"], ...]:
+def project_moving(hessians: Sequence[Float[Array, "_ _ _"]]) -> tuple[Float[Array, "_ _ _"], ...]:
     """Projects Hessians to positive semi-definite ones."""
     return tuple(map(_projected, hessians))
 
