@@ -22,7 +22,7 @@ def two_blocks(tmp_path):
 
 def test_contact_is_refused_where_it_cannot_hold(capsys, two_blocks, tmp_path):
     mine = ("--scene", "drop", "--mesh", str(two_blocks), "--contact", "--out", str(tmp_path / "run"))
-    assert "BACKWARD_EULER or BDF2" in refused(capsys, simulate, *mine, "--integrator", "midpoint")
+    assert "use BACKWARD_EULER, BDF2" in refused(capsys, simulate, *mine, "--integrator", "midpoint")
     assert "has no --contact" in refused(capsys, simulate, "--scene", "slope", "--contact")
     assert not (tmp_path / "run").exists()
 

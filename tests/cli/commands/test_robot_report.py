@@ -28,7 +28,11 @@ def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch
 def test_recordings_are_cases_where_they_are_given(tmp_path):
     options = robot_report.Arguments(log=tmp_path, robot=tmp_path, double_pendulum=tmp_path)
     names = {case.name for case in robot_report.cases(options)}
-    assert names - {case.name for case in robot_report.cases()} == {"recordings/arm", "recordings/double-pendulum"}
+    assert names - {case.name for case in robot_report.cases()} == {
+        "recordings/arm",
+        "recordings/double-pendulum",
+        "recordings/identify-by",
+    }
 
 
 def test_errors_are_held_against_the_rival():
