@@ -15,7 +15,7 @@ from dln_jax.data.encoders import noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, prepare
 from dln_jax.mechanics.dynamics import Dynamics
-from dln_jax.types import require_positive
+from dln_jax.types import InputError, require_positive
 
 SECONDS = 10.0
 """Duration of a trial, s."""
@@ -73,8 +73,9 @@ def learn_to_swing_up(
 
 
 def model_of(recording: Trajectories) -> Dynamics:
-    """The identified model of a recording of q and commanded torques."""
-    assert recording.needs is not None  # explored
+    """The identified model of a recording of q and commanded torques; `InputError` if it states no needs."""
+    if recording.needs is None:
+        raise InputError("the recording states no needs of its plant; pass one that explore has made")
     return identified(prepare(recording, chain=True).train, recording.needs, chain=True).dynamics
 
 

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from impact_derivatives import compare_derivatives_with_differences
 from scipy.optimize import linprog
 
-from dln_jax.softbody import MIDPOINT, make_scene, make_step, with_parameters
+from dln_jax.softbody import MIDPOINT, make_scene, make_step
 from dln_jax.softbody.contact import body_contact, crossings
 from dln_jax.softbody.contact.crossings import _segments_meet_triangles
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh, vertices_where
@@ -98,24 +99,8 @@ def test_derivatives_through_an_impact_with_friction_agree_with_differences():
     mesh = joined(beam(0.4, 0.2, 2, 1), shifted(beam(0.4, 0.2, 2, 1), 0.1, 0.215))
     held = vertices_where(mesh, lambda x: x[:, 1] < 0.21)
     scene = scene_of(mesh, held=held, friction=0.3)
-    init, step = make_step(scene, 0.01, tolerance=1e-10)
     v = np.where(mesh.vertices[:, 1:] > 0.21, [0.5, -0.5], 0.0)
-
-    def outcome(values):
-        params = with_parameters(
-            scene.params, elastic={"youngs_modulus": values[0]}, contact={"stiffness": values[1], "friction": values[2]}
-        )
-        state, info = jax.lax.scan(lambda state, _: step(params, state), init(v=v), None, length=6)
-        return jnp.sum(state.x[:, 0] ** 2) + jnp.sum(state.v[:, 1]), info.converged
-
-    at = jnp.array([1e5, 1e5, 0.3])
-    (_, converged), gradient = jax.jit(jax.value_and_grad(outcome, has_aux=True))(at)
-    assert converged.all()
-    value = jax.jit(lambda values: outcome(values)[0])
-    for place, change in enumerate((10.0, 10.0, 1e-5)):
-        moved = change * np.eye(3)[place]
-        difference = (value(at + moved) - value(at - moved)) / (2 * change)
-        assert float(gradient[place]) == pytest.approx(float(difference), rel=1e-6)
+    compare_derivatives_with_differences(scene, v, steps=6, tolerance=1e-10)
 
 
 def test_surfaces_that_cross_at_the_start_are_refused_by_their_vertices():

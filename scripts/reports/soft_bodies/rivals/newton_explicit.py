@@ -14,7 +14,8 @@ wp.config.quiet = True
 
 import newton  # noqa: E402
 
-from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, Body, Run, measured, smith  # noqa: E402
+from scripts.reports.soft_bodies.rivals.body import GRAVITY, Body, Run, measured, smith  # noqa: E402
+from scripts.reports.soft_bodies.rivals.newton_vbd import add_body  # noqa: E402
 
 
 @wp.kernel
@@ -81,22 +82,6 @@ def motion_gradient(body: Body, dt: float, change: float = 1e-2) -> tuple[Run, f
 
 
 def _model(body: Body, *, requires_grad: bool) -> Any:
-    first, second = smith(*body.lame)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
-    builder.add_soft_mesh(
-        pos=wp.vec3(0.0, 0.0, 0.0),
-        rot=wp.quat_identity(),
-        scale=1.0,
-        vel=wp.vec3(0.0, 0.0, 0.0),
-        vertices=[wp.vec3(*place) for place in body.mesh.vertices],
-        indices=body.mesh.elements.ravel().tolist(),
-        density=DENSITY,
-        k_mu=first,
-        k_lambda=second,
-        k_damp=0.0,
-        particle_radius=0.0,
-        add_surface_mesh_edges=False,
-    )
-    for vertex in body.held:
-        builder.particle_mass[vertex] = 0.0
+    add_body(builder, body, smith(*body.lame))
     return builder.finalize(device="cpu", requires_grad=requires_grad)

@@ -16,11 +16,8 @@ from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, Body, Run,
 VERSION = newton.__version__
 
 
-def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3, repetitions: int = 2) -> Run:
-    """A motion with steps of dt in s; the stiffness of contact in N/m is Newton's default."""
-    mu, lam = body.lame
-    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
-    builder.default_shape_cfg.ke, builder.default_shape_cfg.kd, builder.default_shape_cfg.mu = stiffness, 0.0, 0.0
+def add_body(builder: newton.ModelBuilder, body: Body, moduli: tuple[float, float]) -> None:
+    """Adds a body and holds its held vertices; solvers read the two moduli in Pa differently."""
     builder.add_soft_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
         rot=wp.quat_identity(),
@@ -29,15 +26,22 @@ def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3, repet
         vertices=[wp.vec3(*place) for place in body.mesh.vertices],
         indices=body.mesh.elements.ravel().tolist(),
         density=DENSITY,
-        k_mu=mu,
-        k_lambda=lam,
+        k_mu=moduli[0],
+        k_lambda=moduli[1],
         k_damp=0.0,
         particle_radius=0.0,
         add_surface_mesh_edges=body.near > 0,
     )
-    builder.particle_qd = [wp.vec3(*v) for v in body.v + np.zeros_like(body.mesh.vertices)]
     for vertex in body.held:
         builder.particle_mass[vertex] = 0.0
+
+
+def motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3, repetitions: int = 2) -> Run:
+    """A motion with steps of dt in s; the stiffness of contact in N/m is Newton's default."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
+    builder.default_shape_cfg.ke, builder.default_shape_cfg.kd, builder.default_shape_cfg.mu = stiffness, 0.0, 0.0
+    add_body(builder, body, body.lame)
+    builder.particle_qd = [wp.vec3(*v) for v in body.v + np.zeros_like(body.mesh.vertices)]
     if body.floor:
         builder.add_ground_plane()
     builder.color()

@@ -1,0 +1,29 @@
+"""Derivatives of an impact with friction, by the materials and the contact, beside central differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.softbody import make_step, with_parameters
+
+
+def compare_derivatives_with_differences(scene, v, *, steps, tolerance):
+    """Requires agreement to 1e-6 after some steps of 10 ms; E and kappa are 1e5 Pa, and the friction is 0.3."""
+    init, step = make_step(scene, 0.01, tolerance=tolerance)
+
+    def outcome(values):
+        params = with_parameters(
+            scene.params, elastic={"youngs_modulus": values[0]}, contact={"stiffness": values[1], "friction": values[2]}
+        )
+        state, info = jax.lax.scan(lambda state, _: step(params, state), init(v=v), None, length=steps)
+        return jnp.sum(state.x[:, 0] ** 2) + jnp.sum(state.v[:, 1]), info.converged
+
+    at = jnp.array([1e5, 1e5, 0.3])
+    (_, converged), gradient = jax.jit(jax.value_and_grad(outcome, has_aux=True))(at)
+    assert converged.all()
+    value = jax.jit(lambda values: outcome(values)[0])
+    for place, change in enumerate((10.0, 10.0, 1e-5)):
+        moved = change * np.eye(3)[place]
+        difference = (value(at + moved) - value(at - moved)) / (2 * change)
+        assert float(gradient[place]) == pytest.approx(float(difference), rel=1e-6)
