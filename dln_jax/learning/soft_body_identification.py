@@ -20,8 +20,9 @@ from jaxtyping import Array, Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.rollout import rollout
 from dln_jax.scale.mesh import local, program, spread
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.scene import Params, SoftScene
-from dln_jax.softbody.step import Stepper, static_solve
+from dln_jax.softbody.step import Stepper
 from dln_jax.types import require_positive
 
 

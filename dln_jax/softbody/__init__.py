@@ -5,9 +5,10 @@
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.driven import Drive, Example, drive, driven_step
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, BDF2, MIDPOINT, Integrator
 from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, potential, with_parameters
-from dln_jax.softbody.step import Stepper, make_step, positions_and_convergence, static_solve
+from dln_jax.softbody.step import Stepper, make_step, positions_and_convergence
 from dln_jax.softbody.ties import Tie, TiedState, make_tied_step
 from dln_jax.softbody.verdict import Info
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator
 from dln_jax.softbody.mesh.mesh import components
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State
-from dln_jax.softbody.step import Balanced, step_parts
+from dln_jax.softbody.step_parts import Balanced, step_parts
 from dln_jax.softbody.verdict import Info, trusted
 from dln_jax.solvers.newton import find_root
 from dln_jax.types import InputError, Vector, require_positive

@@ -12,7 +12,7 @@ Therefore the state carries the energy created since the energy was lowest, max(
 exceed the same share of the largest energy at hand so far.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -21,10 +21,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.softbody.mesh.simplices import volume_ratios
-from dln_jax.softbody.scene import Growth, Params, SoftScene, element_energies
+from dln_jax.softbody.scene import Growth, Params, SoftScene, element_energies, least_distance
 from dln_jax.solvers.elements.energies import ElementEnergy, value
 from dln_jax.solvers.newton import SolverInfo
 
+TOLERANCE = 1e-6
+"""Default largest residual force per mass, in m/s²; Newton's last step usually reduces it far below."""
 LARGEST_GROWTH = 0.1
 """Share of the energy at hand. In the example scenes, steps of backward Euler, BDF2 and the average-vector-field method
 stay below 0.012 and whole motions below 0.023, and smooth motions of the midpoint rule below 1e-3; contact that the
@@ -149,6 +151,30 @@ def least_J(scene: SoftScene, params: Params, x: Float[Array, "n dim"]) -> Float
     if not len(elements) or not any(np.array_equal(term.indices, elements) for term in scene.terms):
         return None
     return jnp.min(volume_ratios(x, params.rest, elements))
+
+
+def verdict_on_positions(
+    scene: SoftScene,
+    params: Params,
+    x: Array,
+    outcome: SolverInfo,
+    overlaps: Callable[[Array], Array] | None,
+    contact: Sequence[Any],
+) -> Info:
+    """Combines the solver's verdict with that on the positions: no element is inverted."""
+    least = least_J(scene, params, x)
+    converged = outcome.converged if least is None else outcome.converged & (least > 0)
+    pairs = None if overlaps is None else overlaps(x)
+    return Info(
+        outcome.residual,
+        outcome.iterations,
+        converged,
+        outcome.definite,
+        least_J=least,
+        overlaps=pairs,
+        least_distance=least_distance(scene, x, outcome.lists[1], contact),
+        overflow=outcome.overflow,
+    )
 
 
 @jax.custom_jvp

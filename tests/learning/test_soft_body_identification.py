@@ -9,10 +9,11 @@ import pytest
 
 from dln_jax.learning.soft_body_identification import ObservedMotions, design, identify
 from dln_jax.rollout import rollout
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh.mesh import make_mesh, vertices_where
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import make_scene, with_parameters
-from dln_jax.softbody.step import make_step, positions_and_convergence, static_solve
+from dln_jax.softbody.step import make_step, positions_and_convergence
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity

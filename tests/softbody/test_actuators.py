@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import BDF2
 from dln_jax.softbody.mesh import (
     beam,
@@ -27,7 +28,7 @@ from dln_jax.softbody.mesh import (
 )
 from dln_jax.softbody.mesh.mesh import NamedSet
 from dln_jax.softbody.scene import make_scene, potential, with_parameters
-from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms import (
     body_force,
     elastic,

@@ -9,11 +9,12 @@ import pytest
 from scipy.linalg import eigh
 
 from dln_jax.rollout import rollout
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, MIDPOINT
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare
-from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.damping import mass_damping, stiffness_damping
 from dln_jax.softbody.terms.elasticity import elastic

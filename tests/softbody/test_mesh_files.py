@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dln_jax.cli.commands import simulate
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh import (
     Mesh,
     NamedSet,
@@ -31,7 +32,6 @@ from dln_jax.softbody.mesh import (
 from dln_jax.softbody.mesh.mesh import components
 from dln_jax.softbody.mesh.solids import FileMesh, solid_mesh
 from dln_jax.softbody.scene import make_scene
-from dln_jax.softbody.step import static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.types import InputError

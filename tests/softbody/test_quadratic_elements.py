@@ -14,6 +14,7 @@ from scipy.spatial import Delaunay
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody import examples
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh import (
     NamedSet,
     barycentric_split,
@@ -31,7 +32,7 @@ from dln_jax.softbody.mesh import (
 )
 from dln_jax.softbody.mesh.simplices import SIDES, regularity, volume_ratios
 from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare, with_parameters
-from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean

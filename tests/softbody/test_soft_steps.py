@@ -10,12 +10,13 @@ from jax.extend.core import jaxprs_in_params
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.driven import drive, driven_step
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.examples import drop
 from dln_jax.softbody.integrators import BACKWARD_EULER, BDF2, INTEGRATORS, MIDPOINT
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import make_scene, potential, with_parameters
-from dln_jax.softbody.step import make_step, positions_and_convergence, static_solve
+from dln_jax.softbody.step import make_step, positions_and_convergence
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 from scipy.sparse import bsr_array, coo_array, csr_array, tril
 from scipy.sparse.linalg import cg
@@ -36,6 +37,7 @@ from dln_jax.solvers.elements.linear_solvers import (
     sparse,
     width_of_band,
 )
+from dln_jax.types import InputError
 
 # With more unknowns the dense factorisation is slower than the block-tridiagonal one, measured on two cores.
 _DENSE_UNKNOWNS = 160
@@ -73,6 +75,27 @@ def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, d
     """Chooses the method with the least work for the Hessian at x, with concrete data of the elements."""
     measure = partial(search_takes_at_most, energies=energies, at=at, x=x, data=data, residual=SEARCH_RESIDUAL)
     return least_work(energies, at, measure)(energies, at)
+
+
+def known_data(values: Any, data: Callable[[], Any]) -> Any | None:
+    """Data of the elements, or `None` if a value is traced or a control is missing."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
+        return None
+    try:
+        with jax.ensure_compile_time_eval():
+            return data()
+    except InputError:
+        return None
+
+
+def requested_or_chosen(
+    requested: LinearSolverFactory | None, energies: Sequence[ElementEnergy], at: Pattern, x: Array, data: Any | None
+) -> LinearSolverFactory:
+    """Returns the requested linear solver, or the one with the least work, chosen once."""
+    if requested is not None:
+        return requested
+    solver = by_size(energies, at) if data is None else by_stiffness(energies, at, x=x, data=data)
+    return lambda *_: solver
 
 
 def least_work(

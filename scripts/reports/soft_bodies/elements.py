@@ -15,12 +15,12 @@ from matplotlib.ticker import NullFormatter
 from scipy.spatial import Delaunay
 
 from dln_jax.figures import style
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh.mesh import Mesh, boundary_vertices, make_mesh, vertices_where, volumes
 from dln_jax.softbody.mesh.quadratic import barycentric_split, quadratic
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.mesh.simplices import SIDES
 from dln_jax.softbody.scene import make_scene, with_parameters
-from dln_jax.softbody.step import static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean

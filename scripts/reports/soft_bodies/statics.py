@@ -12,10 +12,10 @@ from jaxtyping import Array
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import eigsh, spsolve
 
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh.mesh import boundary_vertices, make_mesh, vertices_where
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.scene import Params, SoftScene, element_energies, make_scene, prepare, with_parameters
-from dln_jax.softbody.step import static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.solvers.elements.assembly import entries, gradient, pattern

@@ -9,10 +9,11 @@ import numpy as np
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.contact import body_contact
+from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import INTEGRATORS
 from dln_jax.softbody.mesh.simplices import determinant
 from dln_jax.softbody.scene import Params, SoftScene, make_scene, with_parameters
-from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity

@@ -1,0 +1,62 @@
+"""Static equilibria: minima of the potential alone."""
+
+from functools import partial
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.mesh.intersections import count_overlaps
+from dln_jax.softbody.scene import (
+    Params,
+    SoftScene,
+    contact_energies,
+    element_energies,
+    prepare,
+    prepare_contacts,
+)
+from dln_jax.softbody.verdict import (
+    TOLERANCE,
+    Info,
+    trusted,
+    verdict_on_positions,
+)
+from dln_jax.solvers.elements.assembly import pattern
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
+from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.selection import known_data, requested_or_chosen
+
+
+def static_solve(
+    scene: SoftScene,
+    params: Params,
+    control: Any = None,
+    *,
+    x: Any = None,
+    tolerance: float = TOLERANCE,
+    iterations: int = 200,
+    linear_solver: LinearSolverFactory | None = None,
+    definite: bool = False,
+) -> tuple[Float[Array, "n dim"], Info]:
+    """Positions [n, dim] of an equilibrium: a minimum of the potential alone, near the start x (default: rest shape).
+
+    Args:
+        scene: the body; without held vertices or springs to the world there is no unique minimum.
+        params: of the scene.
+        control: actuation, for scenes that have one.
+        x: initial positions; held vertices stay there.
+        tolerance, iterations, linear_solver, definite: as for `make_step`.
+    """
+    x = params.rest if x is None else x
+    data = prepare(scene, params, x, control=control)
+    energies, (count, dimension) = element_energies(scene), scene.mesh.vertices.shape
+    at = pattern(energies, count, dimension, scene.free)
+    known = known_data((params, x, control), lambda: data)
+    chosen = requested_or_chosen(linear_solver, energies, at, x, known)
+    solve = partial(minimise, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite)
+    contact = prepare_contacts(scene, params, x)
+    solve = partial(solve, moving=contact_energies(scene), moving_data=contact)
+    x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
+    overlaps = None if scene.contacts else count_overlaps(scene.mesh)
+    info = verdict_on_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), overlaps, contact)
+    return trusted(x, info.converged), info
