@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, values
-from dln_jax.export.c.plan import Plan, strides
+from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, strides, values
+from dln_jax.export.c.plan import Plan
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import C_TYPES, PRECISIONS, literal
 
@@ -36,6 +36,8 @@ class Source:
 
     precision: str
     libm: bool
+    finite: bool = False
+    """Arguments and intermediate results are finite."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
     functions: set[str] = field(default_factory=set)
     """Elementary functions called on scalars."""
@@ -163,9 +165,7 @@ class Body:
             return name if self.inputs[node.attribute][1] else f"{name}[{self.index(positions, names)}]"
         if node in self.plan.arrays or node.op in ("carry", "project"):
             return f"{name}[{self.index(positions, names)}]"
-        if node.op == "counter" or node.size == 1:
-            return name
-        return f"{name}_{int(positions.flat[0])}"
+        return name
 
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
         """Returns the C expression of an index, from a table unless it is linear in the loop variables."""

@@ -86,6 +86,7 @@ OPERATIONS = {
     "add": Operation("({0} + {1})", np.add),
     "sub": Operation("({0} - {1})", np.subtract),
     "mul": Operation("({0} * {1})", np.multiply),
+    "multiply_add": Operation("MULTIPLY_ADD({0}, {1}, {2})", lambda a, b, c: a * b + c, 2),
     "div": Operation("({0} / {1})", np.divide),
     "integer_div": Operation("({0} / {1})", _quotient),
     "neg": Operation("(-{0})", np.negative, 0),

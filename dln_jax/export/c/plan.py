@@ -9,14 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Loop, Node, Region, is_constant
-from dln_jax.export.c.operations import OPERATIONS, TRANSCENDENTAL, VECTORISED
+from dln_jax.export.c.nodes import Loop, Node, Region, is_direct
+from dln_jax.export.c.operations import OPERATIONS, VECTORISED
 from dln_jax.export.c.program import Program
+from dln_jax.export.c.simplify import UNROLL_LIMIT
 
-UNROLL_LIMIT = 64
-"""Largest number of elements of a result, or of products of a sum, that may be unrolled."""
-_VECTOR = 8
-_VECTOR_OF_FUNCTIONS = 4
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """Operations that read arguments through a pointer."""
@@ -88,25 +85,6 @@ def _bodies(program: Program, node: Node) -> list[Loop]:
     return [program.loops[number] for number in _numbers(node)]
 
 
-def is_direct(node: Node) -> bool:
-    """Returns whether the positions of a gather are linear in the indices of a loop."""
-    return len(node.args) == 1 and node.value is not None and strides(node.value) is not None
-
-
-def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
-    """Returns (first, steps) with positions = first + sum_a steps_a i_a, or None if there are none."""
-    if positions.size == 0:
-        return 0, (0,) * positions.ndim
-    first = int(positions.flat[0])
-    steps = []
-    expected = np.array(first)
-    for axis, extent in enumerate(positions.shape):
-        corner = (0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)
-        steps.append(int(positions[corner]) - first if extent > 1 else 0)
-        expected = expected[..., None] + steps[-1] * np.arange(extent)
-    return (first, tuple(steps)) if np.array_equal(positions, expected) else None
-
-
 def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
     """Returns the needed nodes in order, their readers, the nodes that are read whole, and those read by pointer."""
     reached, waiting = set(), list(results)
@@ -131,20 +109,7 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
 
 
 def _is_unrolled(node: Node) -> bool:
-    if node.op == "dot_general":
-        count, columns = node.args[1].shape[1:]
-        beside = is_constant(node.args[1]) and columns >= _VECTOR_OF_FUNCTIONS
-        return node.size * count <= UNROLL_LIMIT and not beside
-    if node.op.startswith(("reduce_", "arg")):
-        return node.args[0].size <= UNROLL_LIMIT and node.op.startswith("reduce_")
-    if node.op == "take":
-        return node.size < _VECTOR
-    if node.op not in OPERATIONS:
-        return False
-    if node.size < (_VECTOR_OF_FUNCTIONS if node.op in TRANSCENDENTAL else _VECTOR):
-        return True
-    scattered = any(arg.op == "gather" and not is_direct(arg) for arg in node.args)
-    return node.size <= UNROLL_LIMIT and scattered and node.op not in TRANSCENDENTAL
+    return node.size == 1 and (node.op in OPERATIONS or node.op == "take")
 
 
 def _is_scalar(node: Node) -> bool:
@@ -226,18 +191,6 @@ def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np
             positions = np.asarray(node.value).ravel()[mask]
             for arg, start in zip(node.args, starts, strict=False):
                 needed[arg][positions[(positions >= start) & (positions < start + arg.size)] - start] = True
-        elif node in unrolled and node.op == "take":
-            needed[node.args[0]][:] = True
-            needed[node.args[1]][...] |= mask
-        elif node in unrolled and node.op in OPERATIONS:
-            for arg in node.args:
-                needed[arg][...] |= mask if arg.size == node.size else mask.any()
-        elif node in unrolled and node.op == "dot_general":
-            rows, columns = (mask.reshape(node.shape).any(axis=axis) for axis in (2, 1))
-            for arg, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
-                needed[arg][...] |= np.broadcast_to(used, arg.shape).ravel()
-        elif node in unrolled and node.op.startswith("reduce_"):
-            needed[node.args[0]][...] |= np.repeat(mask, node.args[0].shape[1])
         else:
             for arg in node.args:
                 needed[arg][:] = True
