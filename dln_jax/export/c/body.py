@@ -118,10 +118,16 @@ class Body:
         """Counts floating-point operations."""
         self.operations += operations * self._turns
 
-    def declared(self, name: str, dtype: str, size: int) -> None:
-        """Declares an array, or a scalar if the size is 0."""
+    def declared(self, name: str, dtype: str, size: int, value: str = "") -> None:
+        """Declares an array, or a scalar if the size is 0; a scalar with a value is constant."""
         self.bytes += max(size, 1) * (4 if self.source.precision == "f32" and dtype == "real" else 8)
-        self.line(f"{C_TYPES[dtype]} {name}{f'[{size}]' if size else ''};")
+        self.line(
+            f"const {C_TYPES[dtype]} {name} = {value};"
+            if value
+            else f"{C_TYPES[dtype]} {name}[{size}];"
+            if size
+            else f"{C_TYPES[dtype]} {name};"
+        )
 
     def kept(self, node: Node) -> str:
         """Returns the name of an array for a node: one that is free again, or a new one."""

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from dln_jax.export.c import products
 from dln_jax.export.c.body import Body
 from dln_jax.export.c.nodes import Node, is_constant, owners, read_source, strides, values
 from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
@@ -23,18 +22,31 @@ _BOXES = 6
 """Largest number of boxes that become separate loops; more boxes are read through tables of positions."""
 
 
-def unrolled(body: Body, node: Node) -> None:
-    """Writes a scalar."""
-    first, at = np.array(0), node.args
-    if node.op == "take":
-        text = f"{body.name(at[0])}[{body.read(at[1], first)}]"
-    else:
-        text = _expression(body, node, [body.read(arg, first) for arg in at])
+def unrolled(body: Body, node: Node) -> set[Node]:
+    """Writes a scalar: an expression of the scalars that are fused into it, and of variables; returns what it wrote."""
+    first = np.array(0)
+    if node in body.plan.beside and not body.source.libm:
+        pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
+        body.source.functions.add("sin_cos")
+        body.spend(OPERATIONS["sin"].cost)
+        for scalar in pair:
+            body.declared(body.name(scalar), "real", 0)
+        body.line("elementary_sin_cos({}, &{}, &{});".format(body.read(node.args[0], first), *map(body.name, pair)))
+        return {*pair}
+
+    def text_of(arg: Node) -> str:
+        if arg is not node and body.plan.root.get(arg) is not node:
+            return body.read(arg, first)
+        if arg.op == "take":
+            return f"{body.name(arg.args[0])}[{body.read(arg.args[1], first)}]"
+        return _expression(body, arg, list(map(text_of, arg.args)))
+
+    text = text_of(node)
     if node in body.plan.arrays:
         body.line(f"{body.kept(node)}[0] = {text};")
     else:
-        body.bytes += 8
-        body.line(f"const {C_TYPES[node.dtype]} {body.name(node)} = {text};")
+        body.declared(body.name(node), node.dtype, 0, text)
+    return {node}
 
 
 def combination(node: Node) -> tuple[Callable[..., str], int]:

@@ -67,6 +67,11 @@ class Operation(NamedTuple):
     function: str | None = None
     """Function of <math.h> that it calls, if any."""
 
+    @property
+    def repeats_arguments(self) -> bool:
+        """Whether the C contains an argument twice, which must then be a variable."""
+        return any(self.c.count(f"{{{k}}}") > 1 for k in range(3))
+
 
 def _function(name: str, fold: Callable[..., Any] | None, *, arguments: int = 1) -> Operation:
     call = f"{name}{{f}}({', '.join(f'{{{k}}}' for k in range(arguments))})"

@@ -14,6 +14,8 @@ from dln_jax.export.c.operations import OPERATIONS, VECTORISED
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.simplify import UNROLL_LIMIT
 
+_DEPTH = 16
+"""Largest depth of a scalar expression; compilers limit the depth of parentheses."""
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """Operations that read arguments through a pointer."""
@@ -38,6 +40,8 @@ class Plan(NamedTuple):
     """Arrays of its region that a step reads; a loop reads the arrays that its body reads, and None the results."""
     readers: dict[Node, set[Node | None]]
     """Steps that read an array."""
+    beside: dict[Node, Node]
+    """The cosine of a sine, and the reverse: scalars of the same argument."""
 
 
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
@@ -66,14 +70,20 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     in_order = sorted(nodes, key=lambda node: (levels[node], node in unrolled or node.op != "dot_general", node.number))
     for node in in_order:
         ends = root.get(node, node)
-        if needed[ends].any() and (node in unrolled or ends is node):
+        if needed[ends].any() and ends is node:
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root, results)
     steps: dict[Node, set[Node | None]] = {}
     for step, read in reads.items():
         for source in read:
             steps.setdefault(source, set()).add(step)
-    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps)
+    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps, _sines(unrolled - arrays))
+
+
+def _sines(scalars: set[Node]) -> dict[Node, Node]:
+    sines, cosines = ({(*n.args, n.region): n for n in scalars if n.op == op} for op in ("sin", "cos"))
+    pairs = [(sines[key], cosines[key]) for key in sines.keys() & cosines.keys()]
+    return {**dict(pairs), **{cosine: sine for sine, cosine in pairs}}
 
 
 def _numbers(node: Node) -> list[int]:
@@ -118,15 +128,23 @@ def _is_scalar(node: Node) -> bool:
 
 
 def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
-    """Returns the last node of the loop that an elementwise node is fused into."""
+    """Returns the last node of the loop, or of the scalar expression, that an elementwise node is fused into."""
     root: dict[Node, Node] = {}
+    depths: dict[Node, int] = {}
     for node in reversed(nodes):
-        if node.op not in OPERATIONS or node in unrolled:
+        if node.op not in OPERATIONS:
             continue
         into = {root.get(reader) for reader in readers[node]}
         alone = node in whole or node.op in VECTORISED or any(reader.op in VECTORISED for reader in readers[node])
         same = all(reader.shape == node.shape and reader.region == node.region for reader in readers[node])
-        root[node] = next(iter(into)) or node if len(into) == 1 and same and not alone and readers[node] else node
+        alone |= len(into) != 1 or not same
+        if node in unrolled:
+            depths[node] = 1 + max((depths.get(reader, _DEPTH) for reader in readers[node]), default=_DEPTH)
+            alone |= (
+                len(readers[node]) > 1 or depths[node] > _DEPTH or OPERATIONS[readers[node][0].op].repeats_arguments
+            )
+            depths[node] = 0 if alone else depths[node]
+        root[node] = node if alone else next(iter(into)) or node
     return root
 
 

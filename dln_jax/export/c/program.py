@@ -38,6 +38,7 @@ from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, on_kind
 from dln_jax.export.c.text import LARGEST, NUMPY_TYPES
 from dln_jax.types import InputError
 
+
 class Part(NamedTuple):
     """A program that others call."""
 
@@ -186,9 +187,7 @@ class Program:
         if not simplify.unrolls_product(self, a, b):
             return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
         left, right = (np.array(self.scalars(node), object).reshape(node.shape) for node in (a, b))
-        elements = [
-            self._dot(left[batch, i], right[batch, :, j]) for batch, i, j in np.ndindex(batch, m, n)
-        ]
+        elements = [self._dot(left[batch, i], right[batch, :, j]) for batch, i, j in np.ndindex(batch, m, n)]
         return self.gather(elements, np.arange(len(elements)).reshape(batch, m, n))
 
     def _dot(self, left: Iterable[Node], right: Iterable[Node]) -> Node:
@@ -209,7 +208,9 @@ class Program:
             if node.op == "gather":
                 owner, starts = owners(node.args, np.asarray(node.value).ravel())
                 places = np.asarray(node.value).ravel() - starts[owner]
-                self._scalars[node] = [self._element(node.args[k], place) for k, place in zip(owner, places, strict=True)]
+                self._scalars[node] = [
+                    self._element(node.args[k], place) for k, place in zip(owner, places, strict=True)
+                ]
             else:
                 self._scalars[node] = [self._element(node, np.int64(place)) for place in range(node.size)]
         return self._scalars[node]
