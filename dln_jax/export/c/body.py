@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, values
-from dln_jax.export.c.plan import Plan, strides
+from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, strides, values
+from dln_jax.export.c.plan import Plan
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import C_TYPES, PRECISIONS, literal
 
@@ -36,6 +36,8 @@ class Source:
 
     precision: str
     libm: bool
+    finite: bool = False
+    """Arguments and intermediate results are finite."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
     functions: set[str] = field(default_factory=set)
     """Elementary functions called on scalars."""
@@ -116,10 +118,16 @@ class Body:
         """Counts floating-point operations."""
         self.operations += operations * self._turns
 
-    def declared(self, name: str, dtype: str, size: int) -> None:
-        """Declares an array, or a scalar if the size is 0."""
+    def declared(self, name: str, dtype: str, size: int, value: str = "") -> None:
+        """Declares an array, or a scalar if the size is 0; a scalar with a value is constant."""
         self.bytes += max(size, 1) * (4 if self.source.precision == "f32" and dtype == "real" else 8)
-        self.line(f"{C_TYPES[dtype]} {name}{f'[{size}]' if size else ''};")
+        self.line(
+            f"const {C_TYPES[dtype]} {name} = {value};"
+            if value
+            else f"{C_TYPES[dtype]} {name}[{size}];"
+            if size
+            else f"{C_TYPES[dtype]} {name};"
+        )
 
     def kept(self, node: Node) -> str:
         """Returns the name of an array for a node: one that is free again, or a new one."""
@@ -163,9 +171,7 @@ class Body:
             return name if self.inputs[node.attribute][1] else f"{name}[{self.index(positions, names)}]"
         if node in self.plan.arrays or node.op in ("carry", "project"):
             return f"{name}[{self.index(positions, names)}]"
-        if node.op == "counter" or node.size == 1:
-            return name
-        return f"{name}_{int(positions.flat[0])}"
+        return name
 
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
         """Returns the C expression of an index, from a table unless it is linear in the loop variables."""

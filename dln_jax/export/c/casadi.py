@@ -55,14 +55,14 @@ class Block(NamedTuple):
 
 
 def external_functions(
-    name: str, functions: Mapping[str, Any], *, libm: bool, stack: int, leave_out: bool = False
+    name: str, functions: Mapping[str, Any], source: Source, *, stack: int, leave_out: bool = False
 ) -> tuple[Source, str, list[str]]:
     """Returns the source of tables, the C text of `casadi_NAME_F` and its derivatives for every F, and refusals.
 
     Args:
         name: name of the export.
         functions: as for `export_c`.
-        libm: call the C library's elementary functions.
+        source: an empty source in double precision.
         stack: bytes of stack that a function may use.
         leave_out: omit functions that CasADi cannot take, and return the reasons.
 
@@ -70,7 +70,7 @@ def external_functions(
         InputError: CasADi cannot take a function: its arrays are not real or have more than two axes, a name is
             reserved, or it has no arguments or no derivatives, or needs more stack.
     """
-    source, text, largest, left_out = Source("f64", libm), "", 1, []
+    text, largest, left_out = "", 1, []
     for key, (function, examples) in functions.items():
         symbol = f"casadi_{name}_{key}"
         try:
@@ -236,7 +236,7 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
         return jnp.split(way(x, seeds), cuts)
 
     closed, _ = traced(evaluate, [np.zeros(inputs[k].size) for k in dense])
-    program, arguments, results = program_of(closed)
+    program, arguments, results = program_of(closed, finite=source.finite)
     names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
     targets = [f"res[{j}]" for j, output in enumerate(outputs) if output.dense]
     body = body_of(source, program, results, names, targets, optional=True)

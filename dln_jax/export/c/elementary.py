@@ -130,9 +130,26 @@ const real head = $head, middle = MULTIPLY_ADD(-n, $next_part, head);
 const real lost = MULTIPLY_ADD(-n, $next_part, head - middle), r = middle - MULTIPLY_ADD(n, $last_part, -lost);
 const real z = r * r$sin_powers;
 const real sine = MULTIPLY_ADD(r * z, $sin, r), cosine = MULTIPLY_ADD(z, MULTIPLY_ADD(z, $cos, -$half), 1);
-const elementary_word quadrant = elementary_word_of(shifted) + QUARTER, odd = elementary_word_of(x) & ODD;
+"""
+_QUARTER = """const elementary_word quadrant = elementary_word_of(shifted) + QUARTER, odd = elementary_word_of(x) & ODD;
 const elementary_word value = elementary_word_of(elementary_choice((int)(quadrant & 1), cosine, sine));
 return elementary_number_of(value ^ ((quadrant & 2) << $to_sign) ^ odd);
+"""
+_BOTH = """const elementary_word quadrant = elementary_word_of(shifted), odd = elementary_word_of(x) & $sign;
+const elementary_word first = elementary_word_of(elementary_choice((int)(quadrant & 1), cosine, sine));
+const elementary_word second = elementary_word_of(elementary_choice((int)(quadrant & 1), sine, cosine));
+*sine_of_x = elementary_number_of(first ^ ((quadrant & 2) << $to_sign) ^ odd);
+*cosine_of_x = elementary_number_of(second ^ (((quadrant + 1) & 2) << $to_sign));
+"""
+_SIN_COS = """static inline void elementary_sin_cos(real x, real *sine_of_x, real *cosine_of_x)
+{
+    if (!(fabs${f}(x) <= $bound)) {
+        *sine_of_x = sin${f}(x);
+        *cosine_of_x = cos${f}(x);
+        return;
+    }
+BODY
+}
 """
 # y = 2ᵏ f for a positive normal number
 _SCALED = """
@@ -173,8 +190,8 @@ const real numerator = elementary_choice(a < $split, small, large);
 const real denominator = elementary_choice(a < $split, small_below, large_below);
 return copysign${{f}}(elementary_choice(a < $split, a, 1) + numerator / denominator, x);
 """,
-    "sin": _QUADRANT.replace("QUARTER", "0").replace("ODD", "$sign"),
-    "cos": _QUADRANT.replace("QUARTER", "1").replace("ODD", "0"),
+    "sin": _QUADRANT + _QUARTER.replace("QUARTER", "0").replace("ODD", "$sign"),
+    "cos": _QUADRANT + _QUARTER.replace("QUARTER", "1").replace("ODD", "0"),
     "log": f"""const real grown = x * $growth, y = elementary_choice(x < $smallest, grown, x);{_SCALED}
 const real bias = elementary_choice(x < $smallest, $grown_bias, $bias), k = elementary_number_of(counted) - bias;
 const real s = f - 1;{_LOGARITHM}
@@ -197,7 +214,8 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
     """Returns the C of `elementary_NAME(x)` for names, of `elementary_NAME_each(n, x, y)` for arrays, and of helpers.
 
     The name `choice` stands for the choice between two numbers, which the others need too, `rounded` for rounding to
-    fewer bits, and `ordered` for comparisons in the total order.
+    fewer bits, `ordered` for comparisons in the total order, and `sin_cos` for both functions of one argument, in the
+    time of one.
 
     The source must first include <float.h>, <math.h> and <stdint.h> and define the type `real` and
     `MULTIPLY_ADD(a, b, c)`, which is a b + c, fused or not. Arrays have separate functions because gcc vectorises the
@@ -205,7 +223,7 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
     """
     arrays = set(arrays)
     needed = set(names) | arrays
-    chosen = needed & set(VECTORISED)
+    chosen = needed & {*VECTORISED, "sin_cos"}
     if not chosen and not needed & {"choice", "rounded", "ordered"}:
         return ""  # clang warns of unused functions
     facts = _values(precision)
@@ -214,6 +232,9 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
     text.append(fill(_COMMON, precision, **facts))
     text += [fill(_ROUNDED, precision, **facts)] * ("rounded" in needed)
     text += [fill(_ORDERED, precision, **facts)] * ("ordered" in needed)
+    if "sin_cos" in chosen:
+        both = _SIN_COS.replace("BODY", _lines(_QUADRANT + _BOTH, precision))
+        text.append(fill(both, precision, bound=number(BOUNDS["sin"][precision], precision)))
     for name in (name for name in VECTORISED if name in chosen):
         bounded = name in BOUNDS
         text.append(_function(name, precision, "_within" * bounded))
@@ -226,9 +247,12 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
 
 
 def _function(name: str, precision: str, ending: str = "") -> str:
-    lines = fill(_BODIES[name], precision, **_values(precision)).splitlines()
-    body = "\n".join(_wrapper.fill(line) for line in lines if line)
-    return f"static inline real elementary_{name}{ending}(real x)\n{{\n{body}\n}}\n"
+    return f"static inline real elementary_{name}{ending}(real x)\n{{\n{_lines(_BODIES[name], precision)}\n}}\n"
+
+
+def _lines(body: str, precision: str) -> str:
+    lines = fill(body, precision, **_values(precision)).splitlines()
+    return "\n".join(_wrapper.fill(line) for line in lines if line)
 
 
 def _values(precision: str) -> dict[str, str]:

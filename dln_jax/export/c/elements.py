@@ -6,11 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from dln_jax.export.c import products
 from dln_jax.export.c.body import Body
-from dln_jax.export.c.nodes import Node, is_constant, owners, read_source, values
+from dln_jax.export.c.nodes import Node, is_constant, owners, read_source, strides, values
 from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
-from dln_jax.export.c.plan import UNROLL_LIMIT, strides
+from dln_jax.export.c.simplify import UNROLL_LIMIT
 from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES
 
 _CHOICES = {
@@ -23,54 +22,37 @@ _BOXES = 6
 """Largest number of boxes that become separate loops; more boxes are read through tables of positions."""
 
 
-def unrolled(body: Body, node: Node) -> None:
-    """Writes the elements of a node that something reads, one statement for every element."""
-    name = body.kept(node) if node in body.plan.arrays else body.name(node)
-    for k in np.flatnonzero(body.plan.needed[node]):
-        text = _element(body, node, int(k))
-        if node in body.plan.arrays:
-            body.line(f"{name}[{k}] = {text};")
-        else:
-            body.bytes += 8
-            body.line(f"const {C_TYPES[node.dtype]} {name}{f'_{k}' if node.size > 1 else ''} = {text};")
+def unrolled(body: Body, node: Node) -> set[Node]:
+    """Writes a scalar: an expression of the scalars that are fused into it, and of variables; returns what it wrote."""
+    first = np.array(0)
+    if node in body.plan.beside and not body.source.libm:
+        pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
+        body.source.functions.add("sin_cos")
+        body.spend(OPERATIONS["sin"].cost)
+        for scalar in pair:
+            body.declared(body.name(scalar), "real", 0)
+        body.line("elementary_sin_cos({}, &{}, &{});".format(body.read(node.args[0], first), *map(body.name, pair)))
+        return {*pair}
 
+    def text_of(arg: Node) -> str:
+        if arg is not node and body.plan.root.get(arg) is not node:
+            return body.read(arg, first)
+        if arg.op == "take":
+            return f"{body.name(arg.args[0])}[{body.read(arg.args[1], first)}]"
+        return _expression(body, arg, list(map(text_of, arg.args)))
 
-def _element(body: Body, node: Node, k: int) -> str:
-    if node.op == "dot_general":
-        a, b = node.args
-        (_, m, count), n = a.shape, b.shape[2]
-        batch, row, column = np.unravel_index(k, node.shape)
-        first = [body.read(a, np.array((batch * m + row) * count + term)) for term in range(count)]
-        second = [body.read(b, np.array((batch * count + term) * n + column)) for term in range(count)]
-        body.spend((2 * count - 1) * (node.dtype == "real"))
-        return products.chain(list(zip(first, second, strict=True)), node.dtype)
-    if node.op.startswith("reduce_"):
-        count = node.args[0].shape[1]
-        return _combined(body, node, k, [body.read(node.args[0], np.array(k * count + term)) for term in range(count)])
-    if node.op == "take":
-        return f"{body.name(node.args[0])}[{body.read(node.args[1], np.array(k))}]"
-    return _expression(body, node, [body.read(arg, np.array(k if arg.size > 1 else 0)) for arg in node.args])
+    text = text_of(node)
+    if node in body.plan.arrays:
+        body.line(f"{body.kept(node)}[0] = {text};")
+    else:
+        body.declared(body.name(node), node.dtype, 0, text)
+    return {node}
 
 
 def combination(node: Node) -> tuple[Callable[..., str], int]:
     """Returns a function that gives the C of two combined terms, and its floating-point operations."""
     op = node.op.partition("_")[2]
     return partial(expression, op, node.dtype), OPERATIONS[op].cost * (node.dtype == "real")
-
-
-def _combined(body: Body, node: Node, k: int, terms: list[str]) -> str:
-    """Returns the C of an unrolled reduction."""
-    combine, cost = combination(node)
-    body.spend(cost * (len(terms) - 1))
-    text = terms[0]
-    for place, term in enumerate(terms[1:]):
-        text = combine(text, term)
-        # The C of max and min repeats its operands: without a variable, the text would double with every term.
-        if node.op in ("reduce_max", "reduce_min") and place < len(terms) - 2:
-            name = f"v{node.number}_{k}_{place}"
-            body.line(f"const {C_TYPES[node.dtype]} {name} = {text};")
-            text = name
-    return text
 
 
 def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False) -> str:

@@ -90,7 +90,7 @@ def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -
         if node in plan.arrays:
             copied(body, node, body.kept(node), own=True)
     elif node in plan.unrolled:
-        elements.unrolled(body, node)
+        done |= elements.unrolled(body, node)
     elif node.op == "dot_general":
         members = [
             other for other in plan.order[node.region]

@@ -9,6 +9,7 @@ import numpy as np
 from dln_jax.export.c.nodes import Node, is_constant, values
 from dln_jax.export.c.primitives import Parameters, Rule, convert, rows_of
 from dln_jax.export.c.program import Program
+from dln_jax.export.c.simplify import VECTOR
 from dln_jax.export.c.text import UNSIGNED, limit
 
 _COMBINED = ("add", "sub", "mul", "min", "max")
@@ -118,6 +119,9 @@ def take(program: Program, operand: Node, positions: Node) -> Node:
     """Returns the elements of the flat operand at positions, which must be inside."""
     if is_constant(positions):
         return program.gather([operand], values(positions))
+    if positions.size < VECTOR and positions.shape:
+        taken = [take(program, operand, position) for position in program.scalars(positions)]
+        return program.gather(taken, np.arange(len(taken)).reshape(positions.shape))
     return program.make("take", positions.shape, operand.dtype, [operand, positions])
 
 

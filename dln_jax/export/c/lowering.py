@@ -1,6 +1,7 @@
 """Lowers a jaxpr to a program: inlines calls, keeps control flow, and applies a rule for every primitive."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ _REFUSED = {
 
 
 def program_of(
-    closed: Any, repeated: Collection[int] = (), *, precision: str = "f64"
+    closed: Any, repeated: Collection[int] = (), *, precision: str = "f64", finite: bool = False
 ) -> tuple[Program, list[Node], list[Node]]:
     """Returns the program of a closed jaxpr, its inputs and its results.
 
@@ -37,12 +38,13 @@ def program_of(
         closed: the jaxpr, as `jaxprs.traced` returns it.
         repeated: `id` values of jaxprs whose calls stay calls in the program.
         precision: f32 or f64.
+        finite: arguments and intermediate results are finite numbers.
 
     Raises:
         InputError: the jaxpr has no C: an unsupported primitive (the message names the line that made it), random
             numbers, an unsupported dtype, or a shape that is unknown at compile time.
     """
-    program = Program(real=PRECISIONS[precision][0], repeated=repeated)
+    program = Program(real=PRECISIONS[precision][0], repeated=repeated, finite=finite)
     inputs = [
         program.make("input", variable.aval.shape, kind_of(variable.aval.dtype), attribute=number)
         for number, variable in enumerate(closed.jaxpr.invars)
@@ -119,7 +121,7 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
     call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
     if call not in program.lowered:
-        part = Program(real=program.real, repeated=program.repeated, parts=program.parts, lowered=program.lowered)
+        part = replace(program, nodes=[], loops={}, floor=(), _interned={}, _scalars={})
         inside = [
             part.constant(values(arg), arg.dtype)
             if k in fixed

@@ -75,6 +75,34 @@ def is_uniform(node: Node) -> bool:
     return node.op == "gather" and node.value is not None and bool((node.value == node.value.flat[0]).all())
 
 
+def zeros(node: Node) -> np.ndarray:
+    """Returns which elements [size] are known to be zero."""
+    if node.op == "const":
+        return np.asarray(node.value).ravel() == 0
+    if node.op == "gather":
+        return np.concatenate([zeros(arg) for arg in node.args])[np.asarray(node.value).ravel()]
+    return np.zeros(node.size, bool)
+
+
+def is_direct(node: Node) -> bool:
+    """Returns whether the positions of a gather are linear in the indices of a loop."""
+    return len(node.args) == 1 and node.value is not None and strides(node.value) is not None
+
+
+def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
+    """Returns (first, steps) with positions = first + sum_a steps_a i_a, or None if there are none."""
+    if positions.size == 0:
+        return 0, (0,) * positions.ndim
+    first = int(positions.flat[0])
+    steps = []
+    expected = np.array(first)
+    for axis, extent in enumerate(positions.shape):
+        corner = (0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)
+        steps.append(int(positions[corner]) - first if extent > 1 else 0)
+        expected = expected[..., None] + steps[-1] * np.arange(extent)
+    return (first, tuple(steps)) if np.array_equal(positions, expected) else None
+
+
 def owners(sources: Sequence[Node], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the index of the source at every position of the sources laid end to end, and their first positions."""
     starts = np.cumsum([0, *(source.size for source in sources)])

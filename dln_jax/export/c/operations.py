@@ -67,6 +67,11 @@ class Operation(NamedTuple):
     function: str | None = None
     """Function of <math.h> that it calls, if any."""
 
+    @property
+    def repeats_arguments(self) -> bool:
+        """Whether the C contains an argument twice, which must then be a variable."""
+        return any(self.c.count(f"{{{k}}}") > 1 for k in range(3))
+
 
 def _function(name: str, fold: Callable[..., Any] | None, *, arguments: int = 1) -> Operation:
     call = f"{name}{{f}}({', '.join(f'{{{k}}}' for k in range(arguments))})"
@@ -86,6 +91,7 @@ OPERATIONS = {
     "add": Operation("({0} + {1})", np.add),
     "sub": Operation("({0} - {1})", np.subtract),
     "mul": Operation("({0} * {1})", np.multiply),
+    "multiply_add": Operation("MULTIPLY_ADD({0}, {1}, {2})", lambda a, b, c: a * b + c, 2),
     "div": Operation("({0} / {1})", np.divide),
     "integer_div": Operation("({0} / {1})", _quotient),
     "neg": Operation("(-{0})", np.negative, 0),

@@ -9,14 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Loop, Node, Region, is_constant
-from dln_jax.export.c.operations import OPERATIONS, TRANSCENDENTAL, VECTORISED
+from dln_jax.export.c.nodes import Loop, Node, Region, is_direct
+from dln_jax.export.c.operations import OPERATIONS, VECTORISED
 from dln_jax.export.c.program import Program
+from dln_jax.export.c.simplify import UNROLL_LIMIT
 
-UNROLL_LIMIT = 64
-"""Largest number of elements of a result, or of products of a sum, that may be unrolled."""
-_VECTOR = 8
-_VECTOR_OF_FUNCTIONS = 4
+_DEPTH = 16
+"""Largest depth of a scalar expression; compilers limit the depth of parentheses."""
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """Operations that read arguments through a pointer."""
@@ -41,6 +40,8 @@ class Plan(NamedTuple):
     """Arrays of its region that a step reads; a loop reads the arrays that its body reads, and None the results."""
     readers: dict[Node, set[Node | None]]
     """Steps that read an array."""
+    beside: dict[Node, Node]
+    """The cosine of a sine, and the reverse: scalars of the same argument."""
 
 
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
@@ -69,14 +70,20 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     in_order = sorted(nodes, key=lambda node: (levels[node], node in unrolled or node.op != "dot_general", node.number))
     for node in in_order:
         ends = root.get(node, node)
-        if needed[ends].any() and (node in unrolled or ends is node):
+        if needed[ends].any() and ends is node:
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root, results)
     steps: dict[Node, set[Node | None]] = {}
     for step, read in reads.items():
         for source in read:
             steps.setdefault(source, set()).add(step)
-    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps)
+    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps, _sines(unrolled - arrays))
+
+
+def _sines(scalars: set[Node]) -> dict[Node, Node]:
+    sines, cosines = ({(*n.args, n.region): n for n in scalars if n.op == op} for op in ("sin", "cos"))
+    pairs = [(sines[key], cosines[key]) for key in sines.keys() & cosines.keys()]
+    return {**dict(pairs), **{cosine: sine for sine, cosine in pairs}}
 
 
 def _numbers(node: Node) -> list[int]:
@@ -86,25 +93,6 @@ def _numbers(node: Node) -> list[int]:
 
 def _bodies(program: Program, node: Node) -> list[Loop]:
     return [program.loops[number] for number in _numbers(node)]
-
-
-def is_direct(node: Node) -> bool:
-    """Returns whether the positions of a gather are linear in the indices of a loop."""
-    return len(node.args) == 1 and node.value is not None and strides(node.value) is not None
-
-
-def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
-    """Returns (first, steps) with positions = first + sum_a steps_a i_a, or None if there are none."""
-    if positions.size == 0:
-        return 0, (0,) * positions.ndim
-    first = int(positions.flat[0])
-    steps = []
-    expected = np.array(first)
-    for axis, extent in enumerate(positions.shape):
-        corner = (0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)
-        steps.append(int(positions[corner]) - first if extent > 1 else 0)
-        expected = expected[..., None] + steps[-1] * np.arange(extent)
-    return (first, tuple(steps)) if np.array_equal(positions, expected) else None
 
 
 def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
@@ -131,20 +119,7 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
 
 
 def _is_unrolled(node: Node) -> bool:
-    if node.op == "dot_general":
-        count, columns = node.args[1].shape[1:]
-        beside = is_constant(node.args[1]) and columns >= _VECTOR_OF_FUNCTIONS
-        return node.size * count <= UNROLL_LIMIT and not beside
-    if node.op.startswith(("reduce_", "arg")):
-        return node.args[0].size <= UNROLL_LIMIT and node.op.startswith("reduce_")
-    if node.op == "take":
-        return node.size < _VECTOR
-    if node.op not in OPERATIONS:
-        return False
-    if node.size < (_VECTOR_OF_FUNCTIONS if node.op in TRANSCENDENTAL else _VECTOR):
-        return True
-    scattered = any(arg.op == "gather" and not is_direct(arg) for arg in node.args)
-    return node.size <= UNROLL_LIMIT and scattered and node.op not in TRANSCENDENTAL
+    return node.size == 1 and (node.op in OPERATIONS or node.op == "take")
 
 
 def _is_scalar(node: Node) -> bool:
@@ -153,15 +128,23 @@ def _is_scalar(node: Node) -> bool:
 
 
 def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
-    """Returns the last node of the loop that an elementwise node is fused into."""
+    """Returns the last node of the loop, or of the scalar expression, that an elementwise node is fused into."""
     root: dict[Node, Node] = {}
+    depths: dict[Node, int] = {}
     for node in reversed(nodes):
-        if node.op not in OPERATIONS or node in unrolled:
+        if node.op not in OPERATIONS:
             continue
         into = {root.get(reader) for reader in readers[node]}
         alone = node in whole or node.op in VECTORISED or any(reader.op in VECTORISED for reader in readers[node])
         same = all(reader.shape == node.shape and reader.region == node.region for reader in readers[node])
-        root[node] = next(iter(into)) or node if len(into) == 1 and same and not alone and readers[node] else node
+        alone |= len(into) != 1 or not same
+        if node in unrolled:
+            depths[node] = 1 + max((depths.get(reader, _DEPTH) for reader in readers[node]), default=_DEPTH)
+            alone |= (
+                len(readers[node]) > 1 or depths[node] > _DEPTH or OPERATIONS[readers[node][0].op].repeats_arguments
+            )
+            depths[node] = 0 if alone else depths[node]
+        root[node] = node if alone else next(iter(into)) or node
     return root
 
 
@@ -226,18 +209,6 @@ def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np
             positions = np.asarray(node.value).ravel()[mask]
             for arg, start in zip(node.args, starts, strict=False):
                 needed[arg][positions[(positions >= start) & (positions < start + arg.size)] - start] = True
-        elif node in unrolled and node.op == "take":
-            needed[node.args[0]][:] = True
-            needed[node.args[1]][...] |= mask
-        elif node in unrolled and node.op in OPERATIONS:
-            for arg in node.args:
-                needed[arg][...] |= mask if arg.size == node.size else mask.any()
-        elif node in unrolled and node.op == "dot_general":
-            rows, columns = (mask.reshape(node.shape).any(axis=axis) for axis in (2, 1))
-            for arg, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
-                needed[arg][...] |= np.broadcast_to(used, arg.shape).ravel()
-        elif node in unrolled and node.op.startswith("reduce_"):
-            needed[node.args[0]][...] |= np.repeat(mask, node.args[0].shape[1])
         else:
             for arg in node.args:
                 needed[arg][:] = True

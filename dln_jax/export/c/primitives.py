@@ -4,15 +4,17 @@ A rule takes the program, the equation's parameters and its arguments, and retur
 parameters include `kind`, the kind of the first result.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from math import prod
 from typing import Any
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Node
+from dln_jax.export.c.nodes import Node, zeros
 from dln_jax.export.c.operations import on_kind
-from dln_jax.export.c.program import Program, neutral
+from dln_jax.export.c.program import Program
+from dln_jax.export.c.simplify import UNROLL_LIMIT, neutral
 from dln_jax.export.c.text import UNSIGNED
 
 Rule = Callable[..., Any]
@@ -195,12 +197,11 @@ def _reduction(name: str) -> Rule:
         if node.size == 0:
             return program.broadcast(program.constant(neutral(op, node.dtype), node.dtype), shape)
         rows = rows_of(program, node, axes)
-        if rows.shape[1] == 2:
-            first, second = (program.gather([rows], np.arange(rows.size).reshape(rows.shape)[:, k]) for k in range(2))
-            rows = program.elementwise(op, first, second)
-        elif rows.shape[1] > 2:
-            rows = program.make(f"reduce_{op}", rows.shape[:1], node.dtype, [rows])
-        return program.reshape(rows, shape)
+        columns = np.arange(rows.size).reshape(rows.shape).T
+        if len(columns) > 2 and rows.size - program.finite * zeros(rows).sum() > UNROLL_LIMIT:
+            return program.reshape(program.make(f"reduce_{op}", rows.shape[:1], node.dtype, [rows]), shape)
+        terms = [program.gather([rows], positions) for positions in columns]
+        return program.reshape(functools.reduce(functools.partial(program.elementwise, op), terms), shape)
 
     return rule
 

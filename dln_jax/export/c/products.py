@@ -21,15 +21,6 @@ _ROWS = 16
 """Largest number of rows with separate sums; a product with more rows is a loop over rows."""
 
 
-def chain(pairs: list[tuple[str, str]], dtype: str) -> str:
-    """Returns the C of a sum of products, as nested multiply-adds."""
-    first, *rest = pairs
-    text = f"{first[0]} * {first[1]}" if dtype == "real" else expression(on_kind("mul", dtype), dtype, *first)
-    for pair in rest:
-        text = _multiply_add(*pair, text, dtype)
-    return text
-
-
 def _multiply_add(a: str, b: str, total: str, dtype: str = "real") -> str:
     """Returns the C of total + a b; for booleans, of total or (a and b)."""
     if dtype == "real":

@@ -8,7 +8,7 @@ is. A gather of gathers is one gather.
 |---|---|
 | `input`, `const` | a leaf of an argument; numbers |
 | `gather` | elements of the sources, laid end to end, at the positions `value` |
-| a name in `operations.OPERATIONS` | elementwise, for arguments of one shape or scalars |
+| a name in `operations.OPERATIONS` | elementwise, for arguments of one shape or scalars; small results are scalars |
 | `dot_general` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
 | `reduce_*`, `arg*` | reduction over the last axis of the argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
@@ -21,25 +21,22 @@ is. A gather of gathers is one gather.
 | `call` | a call of another program |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, an iteration reads `carry` and `counter` |
 
-Simplifications keep the results of IEEE arithmetic, except the sign of zero in 0 + x = x, which XLA simplifies too.
-There is 1 x = x, but neither 0 x = 0, which would hide a NaN, nor 0 - x = -x, which has the wrong sign at 0.
+`simplify` states which operations become others, and which are written as scalars.
 """
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Loop, Node, Region, is_all, is_constant, is_uniform, values, without_unused
+from dln_jax.export.c import simplify
+from dln_jax.export.c.nodes import Loop, Node, Region, is_constant, owners, values, without_unused
 from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, on_kind
-from dln_jax.export.c.text import LARGEST, NUMPY_TYPES, UNSIGNED, limit
+from dln_jax.export.c.text import LARGEST, NUMPY_TYPES
 from dln_jax.types import InputError
-
-_NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "integer_div": 1, "or": 0, "xor": 0, "and": ...}
-"""Number that leaves the other argument unchanged; for `and`, all bits of its kind are set."""
 
 
 class Part(NamedTuple):
@@ -65,7 +62,10 @@ class Program:
     """Called programs by their `identity`, the attribute of a `call`."""
     lowered: dict[Any, bytes] = field(default_factory=dict)
     """Identities of called programs, by the `id` of the jaxpr and the constant arguments."""
+    finite: bool = False
+    """Whether arguments and intermediate results are finite, so that 0 x = 0."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)
+    _scalars: dict[Node, list[Node]] = field(default_factory=dict)
 
     def make(
         self,
@@ -162,10 +162,13 @@ class Program:
             with np.errstate(all="ignore"):
                 value = operation.fold(*map(values, args))
             return self.constant(np.broadcast_to(value, shape), dtype)
-        if (simpler := self._simpler(op, args, shape)) is not None:
-            return simpler
-        if (pushed := self._below_broadcast(op, args, shape)) is not None:
-            return pushed
+        for other in (simplify.simpler, simplify.below_broadcast):
+            if (equal := other(self, op, args, shape)) is not None:
+                return equal
+        if simplify.unrolls(self, op, args, shape):
+            columns = [self.scalars(arg) * (prod(shape) if arg.shape == () else 1) for arg in args]
+            elements = [self.elementwise(op, *row) for row in zip(*columns, strict=True)]
+            return self.gather(elements, np.arange(len(elements)).reshape(shape))
         if op in COMMUTATIVE:
             args = tuple(sorted(args, key=lambda arg: arg.number))
         return self.make(op, shape, dtype, args)
@@ -181,7 +184,45 @@ class Program:
             return self.elementwise("mul", self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
         if is_constant(a) and not is_constant(b):
             return self.transpose(self.dot_general(self.transpose(b), self.transpose(a)))
-        return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
+        if not simplify.unrolls_product(self, a, b):
+            return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
+        left, right = (np.array(self.scalars(node), object).reshape(node.shape) for node in (a, b))
+        elements = [self._dot(left[batch, i], right[batch, :, j]) for batch, i, j in np.ndindex(batch, m, n)]
+        return self.gather(elements, np.arange(len(elements)).reshape(batch, m, n))
+
+    def _dot(self, left: Iterable[Node], right: Iterable[Node]) -> Node:
+        """Returns the sum of the products of scalars."""
+        total: Node | None = None
+        for a, b in zip(left, right, strict=True):
+            if total is not None and a.dtype == "real":
+                total = self.elementwise("multiply_add", a, b, total)
+            else:
+                product = self.elementwise("mul", a, b)
+                total = product if total is None else self.elementwise("add", total, product)
+        assert total is not None
+        return total
+
+    def scalars(self, node: Node) -> list[Node]:
+        """Returns the elements of a node as scalars."""
+        if node not in self._scalars:
+            if node.op == "gather":
+                owner, starts = owners(node.args, np.asarray(node.value).ravel())
+                places = np.asarray(node.value).ravel() - starts[owner]
+                self._scalars[node] = [
+                    self._element(node.args[k], place) for k, place in zip(owner, places, strict=True)
+                ]
+            else:
+                self._scalars[node] = [self._element(node, np.int64(place)) for place in range(node.size)]
+        return self._scalars[node]
+
+    def _element(self, node: Node, place: np.int64) -> Node:
+        if node.op == "const":
+            return self.constant(np.asarray(node.value).flat[place], node.dtype)
+        return node if node.shape == () else self.make("gather", (), node.dtype, (node,), value=np.asarray(place))
+
+    def one(self, node: Node) -> Node:
+        """Returns the scalar that all elements equal."""
+        return node if node.shape == () else self.gather([node], np.zeros((), np.int64))
 
     def transpose(self, node: Node) -> Node:
         """Returns the node with its last two axes exchanged."""
@@ -196,65 +237,3 @@ class Program:
             index = np.arange(chosen_value.size).reshape(shape)
             return self.gather(both, np.where(chosen_value, index + chosen_value.size, index))
         return self.elementwise("select", chosen, if_true, if_false)
-
-    def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
-        for kept, other in (args, args[::-1])[: 2 if op in COMMUTATIVE else 1] if op in _NEUTRAL else ():
-            if is_all(other, neutral(op, kept.dtype)):
-                return self.broadcast(kept, shape)
-        if (known := _comparison_known(op, args)) is not None:
-            return self.broadcast(self.constant(known, "bool"), shape)
-        if op in ("max", "min") and args[0] is args[1]:
-            return self.broadcast(args[0], shape)
-        if op in ("add", "sub") and args[1].op == "neg":
-            return self.elementwise("sub" if op == "add" else "add", args[0], args[1].args[0])
-        if op == "add" and args[0].op == "neg":
-            return self.elementwise("sub", args[1], args[0].args[0])
-        if op == "neg" and args[0].op == "neg":
-            return args[0].args[0]
-        if op == "abs" and args[0].op in ("neg", "abs"):
-            return self.elementwise("abs", args[0].args[0])
-        if op == "select" and args[1] is args[2]:
-            return self.broadcast(args[1], shape)
-        return None
-
-    def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
-        """Returns the operation applied before a common broadcast of its arguments, or None if they share none."""
-        repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
-        others = [arg for arg in args if arg.size == 1 or is_uniform(arg)]
-        if not shape or any(arg.op == "const" for arg in repeated) or len(repeated) + len(others) < len(args):
-            return None
-        if not repeated:
-            if prod(shape) <= 1:
-                return None
-            return self.broadcast(self.elementwise(op, *map(self._one, args)), shape)
-        positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
-        for arg in repeated:
-            alike = arg.op == "gather" and len(arg.args) == 1 and arg.args[0].shape == source[0].shape
-            if not alike or arg.args[0].size >= arg.size or not np.array_equal(np.asarray(arg.value), positions):
-                return None
-        below = [arg.args[0] if any(arg is one for one in repeated) else self._one(arg) for arg in args]
-        return self.gather([self.elementwise(op, *below)], positions)
-
-    def _one(self, node: Node) -> Node:
-        """Returns the scalar that all elements equal."""
-        return node if node.shape == () else self.gather([node], np.zeros((), np.int64))
-
-
-def neutral(op: str, dtype: str) -> Any:
-    """Returns the number that leaves the other argument of an operation unchanged."""
-    if op in ("max", "min"):
-        return limit(dtype, upper=op == "min")
-    return ~NUMPY_TYPES[dtype](0) if op == "and" else _NEUTRAL[op]
-
-
-def _comparison_known(op: str, args: tuple[Node, ...]) -> bool | None:
-    """Returns the result of a comparison that does not depend on its operands; compilers warn of those."""
-    if op in ("lt", "gt") and args[0] is args[1]:
-        return False
-    if op in ("eq", "ne", "le", "ge") and args[0] is args[1] and args[0].dtype != "real":
-        return op != "ne"
-    if op in ("lt", "ge") and args[0].dtype in UNSIGNED and is_all(args[1], 0):
-        return op == "ge"
-    if op in ("gt", "le") and args[0].dtype in UNSIGNED and is_all(args[0], 0):
-        return op == "le"
-    return None

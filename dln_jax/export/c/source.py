@@ -57,6 +57,7 @@ def export_c(
     casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
     stack: int = STACK,
+    finite: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
@@ -74,6 +75,8 @@ def export_c(
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
             NAME_casadi.c functions that CasADi cannot take; the files list the missing functions.
         stack: bytes of stack that a function may use; a plan over many steps may need more than the default.
+        finite: arguments and intermediate results are finite numbers. Then 0 x = 0, and the zeros and ones of a
+            derivative's structure cost nothing; a NaN or an infinity may not reach all results that it reaches in JAX.
         overwrite: replace existing files.
 
     Raises:
@@ -82,7 +85,7 @@ def export_c(
     """
     texts = source_files(
         functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi,
-        leave_out_large=leave_out_large, stack=stack,
+        leave_out_large=leave_out_large, stack=stack, finite=finite,
     )  # fmt: skip
     return write_exports(Path(directory), texts, overwrite=overwrite)
 
@@ -96,6 +99,7 @@ def source_files(
     casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
     stack: int = STACK,
+    finite: bool = False,
 ) -> dict[str, bytes]:
     """Returns the contents of the files by name; arguments as for `export_c`."""
     require_positive(stack=stack)
@@ -106,7 +110,7 @@ def source_files(
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     with computing_in(precision):
         source, signatures, texts, left_out = _exported(
-            functions, Source(precision, libm), name, leave_out_large, stack
+            functions, Source(precision, libm, finite), name, leave_out_large, stack
         )
         version = importlib.metadata.version("dln-jax")
         written_by = f"Written by dln-jax {version}, C format {FORMAT}."
@@ -122,7 +126,7 @@ def source_files(
                 raise InputError("CasADi computes in double; export with precision f64")
             chosen = {key: functions[key] for key in signatures if casadi is True or key in casadi}
             source, text, left_out = external.external_functions(
-                name, chosen, libm=libm, stack=stack, leave_out=leave_out_large
+                name, chosen, Source("f64", libm, finite), stack=stack, leave_out=leave_out_large
             )
             title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
             files[f"{name}_casadi.c"] = title + preamble(source, name) + text
@@ -188,7 +192,7 @@ def _function(
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(signature.arguments)}
     targets = [] if signature.returns else [leaf.name for leaf in signature.results]
     try:
-        program, _, results = program_of(closed, repeated, precision=source.precision)
+        program, _, results = program_of(closed, repeated, precision=source.precision, finite=source.finite)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error

@@ -16,15 +16,18 @@ SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 FLAGS = ("-std=c99", "-pedantic", *STRICT, "-g", "-O1", *SANITIZERS)
 
 
-def in_sanitized_c(functions: Functions, states: Mapping[str, list[Any]], folder: Path) -> dict[str, list[list[Any]]]:
+def in_sanitized_c(
+    functions: Functions, states: Mapping[str, list[Any]], folder: Path, **options: Any
+) -> dict[str, list[list[Any]]]:
     """Results of each function in each of its states, in double precision; fails at the first sanitizer report.
 
     Args:
         functions: of arrays by name, each with examples.
         states: of each function, its arguments.
         folder: of the export and the program.
+        options: of `export_c`.
     """
-    export_c(functions, folder)
+    export_c(functions, folder, **options)
     _, signatures, _ = read_interface(folder, "model")
     program = folder / "run"
     (folder / "run.c").write_text(_main(signatures, {name: len(states[name]) for name in functions}))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dln_jax.export.c import casadi as external_c
+from dln_jax.export.c.body import Source
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import compile_c
 from dln_jax.export.c.source import export_c
@@ -206,7 +207,7 @@ def test_derivatives_that_take_more_than_the_stack_are_refused():
     with pytest.raises(
         InputError, match=r"^casadi_m_f: it would take 4 KiB of stack; .* up to 2 KiB; export it without casadi$"
     ):
-        external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, libm=True, stack=2048)
+        external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, Source("f64", libm=True), stack=2048)
 
 
 def test_what_casadi_cannot_take_is_left_out_where_it_may_be(tmp_path):

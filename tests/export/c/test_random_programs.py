@@ -46,7 +46,7 @@ def refused(program):
     return False
 
 
-def compared(seeds, folder):
+def compared(seeds, folder, **options):
     """Fails unless all of these programs that C has agree with JAX; how many it does not have."""
     every = {f"program_{seed}": random_programs.program(seed) for seed in seeds}
     states = {
@@ -55,11 +55,11 @@ def compared(seeds, folder):
     }
     programs = every
     try:
-        got = in_sanitized_c(programs, states, folder)
+        got = in_sanitized_c(programs, states, folder, **options)
     except InputError:
         programs = {name: program for name, program in every.items() if not refused(program)}
         assert programs.keys() != every.keys()
-        got = in_sanitized_c(programs, states, folder)
+        got = in_sanitized_c(programs, states, folder, **options)
     for name, (function, _) in programs.items():
         jitted = jax.jit(function)
         for state, ours in zip(states[name], got[name], strict=True):
@@ -78,16 +78,21 @@ def close(ours, theirs, where):
         np.testing.assert_array_equal(ours, theirs, err_msg=where)
 
 
+either_contract = pytest.mark.parametrize("finite", [False, True], ids=["any-arguments", "finite-arguments"])
+
+
 @needs_compiler
-def test_a_few_random_programs_agree_with_jax(tmp_path):
-    assert not compared(range(FEW), tmp_path)
+@either_contract
+def test_a_few_random_programs_agree_with_jax(finite, tmp_path):
+    assert not compared(range(FEW), tmp_path, finite=finite)
 
 
 @pytest.mark.slow
 @needs_compiler
+@either_contract
 @pytest.mark.parametrize("seeds", batches(FEW, ALL_SUPPORTED), ids=str)
-def test_random_programs_agree_with_jax(seeds, tmp_path):
-    assert not compared(seeds, tmp_path)
+def test_random_programs_agree_with_jax(seeds, finite, tmp_path):
+    assert not compared(seeds, tmp_path, finite=finite)
 
 
 @needs_compiler

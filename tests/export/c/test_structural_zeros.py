@@ -1,0 +1,128 @@
+"""Zeros and ones that a derivative's structure fixes cost nothing in C for finite arguments, and change no result."""
+
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from comparison import in_c, in_jax
+from jax import lax
+
+from dln_jax.export.c.families import functions_of_system
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c, source_files
+from dln_jax.mechanics import integrators
+from dln_jax.scenes import chain, two_link_arm
+
+needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc on the PATH")
+BOUND = 1e-12
+SPARSE = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]])
+
+
+def operations(function, *examples, finite=True):
+    stated = json.loads(source_files({"f": (function, examples)}, name="m", finite=finite)["m.json"])
+    return stated["functions"]["f"]["operations"]
+
+
+def rk4_jacobian(x, dt):
+    step = integrators.rk4(lambda t, y: jnp.stack([y[1], -jnp.sin(y[0]) - 0.1 * y[1] * jnp.abs(y[1])]))
+    return jax.jacfwd(lambda x: step(0.0, x, dt))(x)
+
+
+def hessian(x):
+    return jax.hessian(lambda x: jnp.sum(jnp.sin(x) * x[::-1] ** 2) + x[0] * x[1] * x[2])(x)
+
+
+def tangents_in_a_scan(x, u):
+    """The last state has no influence, and the controls act on one state."""
+
+    def body(carry, control):
+        return jnp.stack([carry[1], carry[2] * carry[0] + control, 0.5 * carry[2]]), carry[0]
+
+    return jax.jacfwd(lambda x, u: lax.scan(body, x, u), argnums=(0, 1))(x, u)
+
+
+def tangents_in_a_while_loop(x):
+    def newton(x):
+        return lax.while_loop(lambda s: s[1] < 3, lambda s: (s[0] - (s[0] ** 2 - x) / (2 * s[0]), s[1] + 1), (x, 0))[0]
+
+    return jax.jacfwd(newton)(jnp.abs(x) + 1)
+
+
+def batched_products(a, b):
+    placed = jnp.zeros((3, 4, 4)).at[:, 0, 1].set(a).at[:, 2, 2].set(1.0)
+    return jax.vmap(lambda m, c: m @ (SPARSE + jnp.diag(c)) @ m.T)(placed, b), jnp.einsum("bij,jk->bik", placed, SPARSE)
+
+
+def solved(q):
+    def solve(q):
+        m = jnp.array([[2.0 + q[0], 0.0, 0.0], [0.0, 3.0, q[1]], [0.0, q[1], 4.0]])
+        return jnp.linalg.solve(m, jnp.eye(3)), jnp.linalg.cholesky(m), lax.cond(q[0] > 0, jnp.sin, jnp.cos, q)
+
+    return jax.jacfwd(solve)(0.1 * q)
+
+
+ARM = functions_of_system(two_link_arm().closed_form, 2, dtype=np.float64)
+PROGRAMS = {
+    "rk4_jacobian": (rk4_jacobian, (np.zeros(2), np.zeros(()))),
+    "hessian": (hessian, (np.zeros(5),)),
+    "tangents_in_a_scan": (tangents_in_a_scan, (np.zeros(3), np.zeros(4))),
+    "tangents_in_a_while_loop": (tangents_in_a_while_loop, (np.zeros(4),)),
+    "batched_products": (batched_products, (np.zeros(3), np.zeros((3, 4)))),
+    "solved": (solved, (np.zeros(2),)),
+    "inverse_dynamics_jacobian": ARM["inverse_dynamics_jacobian"],
+    "step_rk4_jacobian": ARM["step_rk4_jacobian"],
+}
+MECHANICS = {
+    **{name: ARM[name] for name in ("inverse_dynamics_jacobian", "step_rk4_jacobian")},
+    "chain": functions_of_system(chain(3).closed_form, 3, dtype=np.float64)["step_rk4_jacobian"],
+}
+
+
+@needs_compiler
+def test_dropping_zeros_changes_no_result(tmp_path):
+    random = np.random.default_rng(0)
+    states = {
+        name: [tuple(random.normal(size=example.shape) for example in examples) for _ in range(4)]
+        for name, (_, examples) in PROGRAMS.items()
+    }
+    ours, theirs = in_c(PROGRAMS, states, tmp_path, finite=True), in_jax(PROGRAMS, states)
+    for name in PROGRAMS:
+        for mine, of_jax in zip(ours[name], theirs[name], strict=True):
+            np.testing.assert_allclose(mine, of_jax, atol=BOUND * max(1, np.abs(of_jax).max()), err_msg=name)
+
+
+@pytest.mark.parametrize("n", [3, 6, 12])
+def test_the_jacobian_of_independent_squares_costs_one_product_each(n):
+    assert operations(jax.jacfwd(lambda x: x * x), np.zeros(n)) <= 2 * n
+
+
+def test_a_product_costs_what_its_pattern_needs():
+    """Each row of the sparse matrix has one element: a factor of one costs nothing, the others one product a column."""
+    assert operations(lambda b: SPARSE @ b, np.zeros((4, 5))) <= 3 * 5
+    assert operations(lambda b: SPARSE @ b, np.zeros((4, 5)), finite=False) >= 4 * 4 * 5
+
+
+def test_a_double_integrator_has_a_linearisation_without_operations():
+    def step(x, u):
+        return jnp.concatenate([x[:3] + 0.1 * x[3:], x[3:] + 0.1 * u])
+
+    assert operations(lambda x, u: jax.jacfwd(step, argnums=(0, 1))(x, u), np.zeros(6), np.zeros(3)) == 0
+
+
+@pytest.mark.parametrize("name", MECHANICS)
+def test_derivatives_of_mechanics_take_fewer_operations_where_arguments_are_finite(name):
+    function, examples = MECHANICS[name]
+    assert operations(function, *examples) < 0.9 * operations(function, *examples, finite=False)
+
+
+@needs_compiler
+def test_nan_reaches_every_result_unless_arguments_are_finite(tmp_path):
+    functions = {"product": (lambda x: SPARSE @ jnp.stack([x, x], 1), (np.zeros(4),))}
+    x = np.array([np.nan, 1.0, 2.0, 3.0])
+    for finite in (False, True):
+        export_c(functions, tmp_path / str(finite), finite=finite)
+        result = load_c(tmp_path / str(finite), flags=("-O1",)).product(x)
+        assert np.isnan(result).all(1).tolist() == [not finite, not finite, True, not finite]
