@@ -81,7 +81,7 @@ def fit_by(
     if by == "both":
         # Samples with correlated residuals count once, as in the standard errors.
         noise = solution.fit.noise * np.sqrt(solution.statistics.correlation)
-        compact = equations.compressed(equations.regressor_of(model, known, train))
+        compact = equations.compressed(equations.regressor_of(model, parameters_of(solution.theta, known), train))
         torques = equations.weighted(compact, noise)
     fit = fit_motions(
         model, known, solution.columns, solution.known, solution.theta, cut_motions(sets.train, length),

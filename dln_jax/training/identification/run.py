@@ -17,8 +17,10 @@ from dln_jax.identification.identify import Identification, identify, parameters
 from dln_jax.identification.motions import MotionFit
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
 from dln_jax.identification.residual import ResidualFit
+from dln_jax.mechanics.trees import armature_matrix
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import Verdict
+from dln_jax.models.rigid_tree import pairs_of
 from dln_jax.training.identification.additions import (
     ADDED,
     Predict,
@@ -33,7 +35,7 @@ from dln_jax.training.identification.additions import (
 )
 from dln_jax.training.identification.motions import fit_by, motion_lines, prediction_metrics
 from dln_jax.training.identification.options import Options
-from dln_jax.training.identification.task import Case, prepare, with_shapes
+from dln_jax.training.identification.task import Case, prepare, referred, with_terms
 from dln_jax.training.identification.verdict import judged
 from dln_jax.training.pipeline import Fitted, Judged, Kind, png
 from dln_jax.training.uncertainty import uncertainty_metrics
@@ -73,12 +75,15 @@ def announce(case: Case) -> Iterator[str]:
 def fit(case: Case, options: Options, folder: Path, mesh: Mesh | None) -> Fitted:
     """Fits shapes of friction, the linear parameters, and a residual network if one is asked for."""
     began = time.perf_counter()
-    case = with_shapes(options.velocity_scale, case)
+    measured, friction = with_terms(options.velocity_scale, case)
+    at = None if friction is None or "load" not in measured.laws else friction.parameters
+    case = measured if friction is None else referred(measured, friction.parameters)
     solution = identify(
         case.model,
         case.known,
         case.sets.train,
         joints=case.robot.tree.joints,
+        at=at,
         noise=case.noise,
         robust=options.robust,
         consistent=options.consistent,
@@ -90,6 +95,7 @@ def fit(case: Case, options: Options, folder: Path, mesh: Mesh | None) -> Fitted
             options.by, case.model, case.known, solution, case.sets.train, case.motions, options.window
         )
     kept = parameters_of(solution.theta, case.known)
+    case = referred(measured, kept)
     residual = add_residual(case, kept) if options.residual else None
     seconds = time.perf_counter() - began
     parameters = kept if residual is None else residual.parameters
@@ -121,7 +127,8 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
         figures |= bands
     write_json(folder / "parameters.json", {"base": base_rows(solution), "parameters": parameter_rows(solution)})
     write_bytes(folder / "report.txt", text(solution).encode())
-    lines = [*findings(solution, case.sets.train, case.names), *write_file(folder, options, case, solution, verdict)]
+    lines = [*case.lines, *findings(solution, case.sets.train, case.names)]
+    lines += write_file(folder, options, case, solution, verdict)
     return Judged(
         metrics={**metrics, "identify_seconds": seconds},
         rows=lambda _: rows(case, solution, predicted),
@@ -192,19 +199,22 @@ def write_file(folder: Path, options: Options, case: Case, solution: Identificat
         which = ", ".join(name for name, good in zip(case.names, bodies, strict=True) if not good)
         return [f"no {path.name}: the least-squares links behind {which} are not physically consistent"]
     parameters = parameters_of(solution.theta, case.known)
-    tree = case.robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(parameters.armature))
+    motors = case.description["motors"]
+    armature = armature_matrix(parameters.armature, motors, pairs_of(parameters.coupling))
+    tree = case.robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(armature))
     remarks = [f"Identified from {options.data.name}."]
     coefficients = {
         name: np.asarray(values)
         for name, values in parameters._asdict().items()
-        if values is not None and name not in ("inertias", "armature")
+        if values is not None and name not in ("inertias", "armature", "coupling")
     }
     friction = {"damping": coefficients.pop("viscous", None), "coulomb": coefficients.pop("coulomb", None)}
     for name, values in coefficients.items():
         pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(case.names, values.tolist(), strict=True))
         remarks.append(f"Of friction, for which there is no place, {name}: {pairs}.")
+    remarks += [f"Not in this file: {line}." for line in shape_lines(case) if line.startswith(("load", "cooling"))]
     try:
-        write_robot(path, options.robot, tree, **friction, lock=case.locked, remarks=tuple(remarks))
+        write_robot(path, options.robot, tree, **friction, motors=motors, lock=case.locked, remarks=tuple(remarks))
     except InputError as error:
         return [f"no {path.name}: {error}"]
     lacks = " without armature, for which URDF has no place (a comment in it states it)" * (path.suffix == ".urdf")
