@@ -22,8 +22,6 @@ from dln_jax.types import InputError
 INSTALL = "pip install 'dln-jax[robot]'"
 LARGEST_NUMBER = 1e20
 """Largest admissible number, in SI units."""
-JOINT_WRAP = 1
-"""MuJoCo's mjWRAP_JOINT, an element of a fixed tendon."""
 
 
 class Robot(NamedTuple):
@@ -149,9 +147,10 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[
                 f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: lock it if it does not move"
             )
     moving = {k for k, name in enumerate(names) if name not in locked}
-    # Equality constraints and tendons between locked joints have no effect.
+    # Equality constraints and tendons between locked joints have no effect; tendons without a spring are motors.
     joints, over = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtWrap.mjWRAP_JOINT)
-    tied = {int(k) for numbers in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid) for k in numbers}
+    springs = np.repeat((model.tendon_stiffness != 0) | np.asarray(model.tendon_limited, bool), model.tendon_num)
+    tied = {int(k) for numbers in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid[springs]) for k in numbers}
     if set(map(int, model.eq_type)) - {joints} or set(map(int, model.wrap_type)) - {over} or tied & moving:
         raise InputError(
             "it has equality constraints or tendons, which close loops; expected a tree: lock the joints that they tie"
@@ -217,8 +216,6 @@ def _armature(model: Any, moving: list[int]) -> np.ndarray:
     armature = np.asarray(model.dof_armature[model.jnt_dofadr[moving]], float)
     for tendon in np.flatnonzero(model.tendon_armature):
         wraps = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
-        if (model.wrap_type[wraps] != JOINT_WRAP).any():
-            continue  # the inertia of a tendon in space depends on q
         coefficients = np.zeros(model.njnt)
         coefficients[model.wrap_objid[wraps]] = model.wrap_prm[wraps]
         c = coefficients[moving]

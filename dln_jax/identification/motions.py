@@ -45,7 +45,7 @@ ROUNDS, SETTLED = 12, 1e-4
 CHUNK = 64
 """Windows that are linearised at a time."""
 REWEIGHTINGS = 2
-"""Number of times that windows are weighted by their distance and the fit is repeated."""
+"""Default number of reweightings."""
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""
 TYPICAL_DELAY = 1e-3
@@ -168,6 +168,7 @@ def fit_motions(
     share: float = 1.0,
     delay: bool = True,
     regularisation: float = REGULARISATION,
+    reweightings: int = REWEIGHTINGS,
 ) -> MotionFit:
     """Fits physically consistent parameters to motions, and to torques too if their equations are given.
 
@@ -184,6 +185,7 @@ def fit_motions(
         share: weight of the torques.
         delay: whether to fit a delay of the torques.
         regularisation: as for `fit_consistent`.
+        reweightings: number of times that windows are weighted by their distance and the fit is repeated.
 
     Raises:
         InputError: a noise or share that is not positive, or a start whose motions are not finite.
@@ -237,7 +239,7 @@ def fit_motions(
 
     x, equal, rounds, converged = np.append(start, 0.0), windows, 0, False
     before = distance(at(x)[0])
-    for weighting in range(1 + REWEIGHTINGS):
+    for weighting in range(1 + reweightings):
         if weighting:
             windows = equal
             norms = np.linalg.norm(at(x)[0], axis=1)

@@ -35,18 +35,19 @@ def require_motors(rates: Any, coupled: Sequence[Pair], d: int) -> None:
         raise InputError(f"coupled is {stated}; expected each pair of different joints, 1 to {d}, once, lower first")
 
 
-def armature_matrix(
-    inertias: Vector, rates: Any = None, coupling: Mapping[Pair, Any] | None = None
-) -> Float[Array, "d d"] | Vector:
-    """Returns A [d, d], or I [d] unchanged if every motor turns with its own joint alone."""
+def armature_matrix(inertias: Any, rates: Any = None, coupling: Mapping[Pair, Any] | None = None) -> Any:
+    """Returns A [d, d], or I [d] unchanged if every motor turns with its own joint alone; NumPy if all is known."""
     if rates is None and not coupling:
         return inertias
-    A = jnp.diag(jnp.asarray(inertias))
-    for (i, j), value in (coupling or {}).items():
-        A = A.at[[i, j], [j, i]].add(value)
-    if rates is None:
-        return A
-    S = jnp.asarray(rates, A.dtype)
+    entries = (coupling or {}).items()
+    learned = any(isinstance(value, Array) for value in (inertias, *(value for _, value in entries)))
+    numpy = jnp if learned else np
+    A = numpy.diag(numpy.asarray(inertias))
+    for (i, j), value in entries:
+        place = np.zeros(A.shape)
+        place[i, j] = place[j, i] = 1.0
+        A = A + value * place
+    S = np.eye(len(A)) if rates is None else np.asarray(rates, float)
     return S.T @ A @ S
 
 

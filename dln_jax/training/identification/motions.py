@@ -13,7 +13,7 @@ from dln_jax.data.encoders import Smoothed, smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification import equations
 from dln_jax.identification.identify import Identification, parameters_of
-from dln_jax.identification.motions import MotionFit, cut_motions, fit_motions, linearise
+from dln_jax.identification.motions import MotionFit, cut_motions, fit_motions
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
@@ -84,8 +84,8 @@ def fit_by(
         compact = equations.compressed(equations.regressor_of(model, parameters_of(solution.theta, known), train))
         torques = equations.weighted(compact, noise)
     fit = fit_motions(
-        model, known, solution.columns, solution.known, solution.theta, cut_motions(sets.train, length),
-        noise_tau=PUSH * solution.fit.noise, torques=torques, linearised=linearise(model, known),
+        model, solution.columns, solution.known, solution.theta, cut_motions(sets.train, length),
+        noise_tau=PUSH * solution.fit.noise, torques=torques,
     )  # fmt: skip
     kept = solution.consistent._replace(theta=fit.theta, converged=fit.converged)
     return solution._replace(consistent=kept), fit

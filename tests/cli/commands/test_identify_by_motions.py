@@ -63,7 +63,7 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
     )
     windows = cut_motions(log, 21)
     assert len(windows.t) == 10
-    at = linearise(model, known)
+    at = linearise(model)
     scales = np.array([1e-3]), np.array([0.1])
     left, slopes = at(theta, 0.0, *scales, windows)
     assert np.abs(left).max() < 1e-6
@@ -77,7 +77,7 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
     wrong = theta.copy()
     wrong[-1] = 0.3
     fit = fit_motions(
-        model, known, columns_of(known), wrong, wrong, windows, noise_tau=scales[1], noise_q=scales[0], delay=False
+        model, columns_of(known), wrong, wrong, windows, noise_tau=scales[1], noise_q=scales[0], delay=False
     )
     assert fit.converged and fit.after < 0.1 * fit.before
     assert fit.theta[-1] == pytest.approx(0.1, abs=0.01)
