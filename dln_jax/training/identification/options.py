@@ -41,7 +41,8 @@ class Robot:
     by: Literal["torques", "motions", "both"] = "torques"
     """What is fitted: torques of filtered motions, motions simulated with the torques (output error), or both."""
     window: Unstated[float] = None
-    """Length of the simulated windows of --by motions and both, s (default: 0.3)."""
+    """Length of the simulated windows of --by motions and both, s (default: chosen by inner splits of the training
+    data, which may also keep the parameters by torques)."""
     uncertainty: bool = True
     """Estimate the uncertainty of the torques, and flag states out of distribution."""
     residual: bool = False

@@ -33,7 +33,7 @@ from dln_jax.training.identification.additions import (
     store_bands,
     stored_description,
 )
-from dln_jax.training.identification.motions import fit_by, motion_lines, prediction_metrics
+from dln_jax.training.identification.motions import Chosen, fit_by, motion_lines, prediction_metrics
 from dln_jax.training.identification.options import Options
 from dln_jax.training.identification.task import Case, prepare, referred, with_terms
 from dln_jax.training.identification.verdict import judged
@@ -54,7 +54,8 @@ class Outcome(NamedTuple):
     residual: ResidualFit | None
     seconds: float
     motions: MotionFit | None
-    """Fit to motions, whose parameters are those of `solution`, if asked for."""
+    """Fit to motions, whose parameters are those of `solution`, if asked for and chosen."""
+    choice: Chosen | None
     by_torques: np.ndarray
     """Parameters of the fit of torques alone."""
 
@@ -78,21 +79,15 @@ def fit(case: Case, options: Options, folder: Path, mesh: Mesh | None) -> Fitted
     measured, friction = with_terms(options.velocity_scale, case)
     at = None if friction is None or "load" not in measured.laws else friction.parameters
     case = measured if friction is None else referred(measured, friction.parameters)
-    solution = identify(
-        case.model,
-        case.known,
-        case.sets.train,
-        joints=case.robot.tree.joints,
-        at=at,
-        noise=case.noise,
-        robust=options.robust,
-        consistent=options.consistent,
-        regularisation=options.regularisation,
-    )
-    by_torques, motions = solution.theta, None
+    settings = {
+        "joints": case.robot.tree.joints, "at": at, "noise": case.noise, "robust": options.robust,
+        "consistent": options.consistent, "regularisation": options.regularisation,
+    }  # fmt: skip
+    solution = identify(case.model, case.known, case.sets.train, **settings)
+    by_torques, motions, choice = solution.theta, None, None
     if case.motions is not None:
-        solution, motions = fit_by(
-            options.by, case.model, case.known, solution, case.sets.train, case.motions, options.window
+        solution, motions, choice = fit_by(
+            options.by, case.model, case.known, solution, case.sets.train, case.motions, options.window, **settings
         )
     kept = parameters_of(solution.theta, case.known)
     case = referred(measured, kept)
@@ -100,21 +95,23 @@ def fit(case: Case, options: Options, folder: Path, mesh: Mesh | None) -> Fitted
     seconds = time.perf_counter() - began
     parameters = kept if residual is None else residual.parameters
     return Fitted(
-        stored_description(case, residual), parameters, Outcome(case, solution, residual, seconds, motions, by_torques)
+        stored_description(case, residual),
+        parameters,
+        Outcome(case, solution, residual, seconds, motions, choice, by_torques),
     )
 
 
 def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     """Held-out errors, uncertainty and verdict; writes parameters, the report and the robot's file."""
-    case, solution, residual, seconds, motions, by_torques = fitted.outcome
+    case, solution, residual, seconds, motions, choice, by_torques = fitted.outcome
     predict = predictor(case.model)
     metrics, predicted = evaluate(case, solution, predict)
     if residual is not None and residual.settings:
         predicted[ADDED] = judge_residual(case, residual, metrics)
     of_motions = []
-    if motions is not None and case.motions is not None:
+    if choice is not None and case.motions is not None:
         numbers = prediction_metrics(case.model, case.known, case.motions, by_torques, solution.theta, motions)
-        of_motions, metrics = motion_lines(options.by, motions, numbers), metrics | numbers
+        of_motions, metrics = motion_lines(options.by, motions, choice, numbers), metrics | numbers
     kept = ADDED if ADDED in predicted else KEPT
     torques = {name: prediction.torque for name, prediction in predicted.items()}
     verdict, of_verdict = judged(case, solution, predict, torques, kept, robust=options.robust)
