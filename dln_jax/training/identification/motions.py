@@ -17,13 +17,13 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.identification import equations
 from dln_jax.identification.identify import Identification, identify, parameters_of
-from dln_jax.identification.motions import MotionFit, cut_motions, fit_motions
+from dln_jax.identification.motions import REWEIGHTINGS, MotionFit, cut_motions, fit_motions
 from dln_jax.learning.measured_motions import MeasuredWindows
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
-WINDOWS = (0.3, 0.6)
+WINDOWS = (0.3, 1.0)
 """Lengths of windows that inner splits choose from, s; the first one if there is only one trajectory or block."""
 FOLDS = 3
 """Inner splits, each with a third of the trajectories held out."""
@@ -109,7 +109,7 @@ def fit_by(
 
 def fitted(
     by: str, model: Model, solution: Identification, train: Trajectories, motions: Trajectories, window: float,
-    *, known: Parameters,
+    *, known: Parameters, reweightings: int = REWEIGHTINGS,
 ) -> MotionFit:  # fmt: skip
     """The fit to windows of this length; arguments and errors as for `fit_by`."""
     length = round(window / step_of(motions)) + 1
@@ -123,7 +123,7 @@ def fitted(
         torques = equations.weighted(compact, noise)
     return fit_motions(
         model, solution.columns, solution.known, solution.theta, cut_motions(motions, length),
-        noise_tau=PUSH * solution.fit.noise, torques=torques,
+        noise_tau=PUSH * solution.fit.noise, torques=torques, reweightings=reweightings,
     )  # fmt: skip
 
 
@@ -141,7 +141,7 @@ def chosen_window(
         solution = identify(model, known, inner, **options)
         thetas: dict[float | None, np.ndarray] = {None: solution.theta}
         for window in WINDOWS:
-            thetas[window] = fitted(by, model, solution, inner, moved, window, known=known).theta
+            thetas[window] = fitted(by, model, solution, inner, moved, window, known=known, reweightings=0).theta
         for window, theta in thetas.items():
             times.setdefault(window, []).append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
     means = {window: float(np.mean(np.concatenate(parts))) for window, parts in times.items()}
