@@ -226,8 +226,8 @@ def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[dict
         for k in np.flatnonzero(~own)
         if any(values[k] for values in stated.values())
     ]
-    joints = (None if values is None else np.where(own, values, 0.0) for values in (damping, coulomb))
-    return *joints, others
+    first, second = (None if values is None else np.where(own, values, 0.0) for values in (damping, coulomb))
+    return first, second, others
 
 
 def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Mapping[str, Any]]) -> None:

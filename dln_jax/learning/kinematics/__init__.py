@@ -4,8 +4,8 @@ fit = fit_tree(needs, train, validation)
 make_serial_tree(needs).energies(fit.parameters)
 """
 
-from dln_jax.learning.kinematics.agreement import Difference, difference
-from dln_jax.learning.kinematics.fit import TreeFit, Twin, fit_tree
+from dln_jax.learning.kinematics.agreement import Difference, Twin, difference
+from dln_jax.learning.kinematics.fit import TreeFit, fit_tree
 from dln_jax.learning.kinematics.frames import (
     Frames,
     KinematicPrior,

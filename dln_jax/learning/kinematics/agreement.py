@@ -18,6 +18,8 @@ from dln_jax.learning.kinematics.projection import LENGTH, Structure
 
 SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
 """Largest differences of two arms that count as the same, rad and m."""
+SAME_ERROR = 0.1
+"""Largest relative difference of the validation errors of two descents that agree."""
 TURNS = 8
 """Angles about an axis from which the comparison starts, for arms whose axes are parallel."""
 
@@ -31,9 +33,34 @@ class Difference(NamedTuple):
     """Between axes, across them, m."""
 
     @property
+    def size(self) -> float:
+        """Of both, in units of those that count as the same."""
+        return self.angle / SAME_ANGLE + self.length / SAME_LENGTH
+
+    @property
     def same(self) -> bool:
         """Whether they count as one arm."""
         return bool(self.angle <= SAME_ANGLE and self.length <= SAME_LENGTH)
+
+
+class Twin(NamedTuple):
+    """Another descent to the lowest loss, refined alike."""
+
+    error: float
+    """Its validation error relative to that of the fit, or its training error without validation."""
+    off: Difference
+
+    @property
+    def same(self) -> bool:
+        """Whether both are the same arm, with the same error."""
+        return self.off.same and bool(abs(self.error - 1) <= SAME_ERROR)
+
+    @property
+    def words(self) -> str:
+        """The comparison as text."""
+        kind = "the same arm" if self.same else "another arm"
+        angle, length = np.degrees(self.off.angle), 1e3 * self.off.length
+        return f"{kind} (axes within {angle:.2g}° and {length:.2g} mm, error {self.error:.3g} times)"
 
 
 class Lines(NamedTuple):
@@ -51,7 +78,7 @@ def difference(first: Frames, second: Frames, structure: Structure) -> Differenc
     turning = np.array([kind == "revolute" for kind in structure.joints])
     others = second, mirrored(second, structure.parents, structure.joints)
     found = [_aligned(one, lines_of(other, structure.parents, gravity=gravity), turning) for other in others]
-    return min(found, key=lambda off: off.angle / SAME_ANGLE + off.length / SAME_LENGTH)
+    return min(found, key=lambda off: off.size)
 
 
 def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> Lines:

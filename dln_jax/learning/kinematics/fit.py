@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import drawn
-from dln_jax.learning.kinematics.agreement import Difference, difference
+from dln_jax.learning.kinematics.agreement import Twin, difference
 from dln_jax.learning.kinematics.frames import Frames
 from dln_jax.learning.kinematics.projection import (
     Descent,
@@ -38,8 +38,6 @@ ROUNDS = 2
 """Rounds of weighting the joints by their unexplained torques; further rounds change the weights by percents."""
 CHUNK = 4096
 """Samples whose columns are in memory at a time."""
-SAME_ERROR = 0.1
-"""Largest relative difference of the validation errors of two descents that agree."""
 LEAST_NOISE = 1e-7
 """Lower bound on a joint's noise in the weights, relative to its torque."""
 
@@ -67,30 +65,10 @@ class TreeFit(NamedTuple):
     """Descents that ended at the lowest loss."""
     agreement: int
     """Descents that the search required to agree (`Search.agreement`)."""
-    twin: "Twin | None"
-    """Comparison with the second best of them; `None` if no other reached the lowest loss, or none was asked for."""
+    twin: Twin | None
+    """Comparison with another descent to the same loss; `None` if there is none, or none was asked for."""
     seconds: float
     """Duration of the whole call, compilation included."""
-
-
-class Twin(NamedTuple):
-    """Another descent to the lowest loss, refined alike."""
-
-    error: float
-    """Its validation error relative to that of the fit, or its training error without validation."""
-    off: Difference
-
-    @property
-    def same(self) -> bool:
-        """Whether both are the same arm, with the same error."""
-        return self.off.same and bool(abs(self.error - 1) <= SAME_ERROR)
-
-    @property
-    def words(self) -> str:
-        """The comparison as text."""
-        kind = "the same arm" if self.same else "another arm"
-        angle, length = np.degrees(self.off.angle), 1e3 * self.off.length
-        return f"{kind} (axes within {angle:.2g}° and {length:.2g} mm, validation error {self.error:.3g} times)"
 
 
 def fit_tree(
@@ -112,7 +90,7 @@ def fit_tree(
     Gauss-Newton refines random frames on a subset of the samples, with all else eliminated (`projection`). The best are
     refined on all samples, with joints weighted by their unexplained torque. Validation chooses between local minima
     whose losses differ by less than a factor of two. Handedness and other gauges (see `models.serial_tree`) are
-    arbitrary.
+    arbitrary. The search goes on until another descent to the same loss has found the same arm (`agreement`).
 
     Args:
         needs: kinds of joints, gravity, friction.
@@ -159,22 +137,25 @@ def fit_tree(
             report(
                 f"{len(descents)} descents, {agreeing(descents)} to the lowest loss, {float(descents[0].at.loss):.3g}"
             )
-            candidates = [finished(descent) for descent in _finalists(descents, validation)]
-            best = min(candidates, key=lambda candidate: float(np.sum(candidate.judged / scale**2)))
-            frames, solution = best.state.frames, best.solution
+            finalists = _finalists(descents, validation)
+            candidates = [finished(descent) for descent in finalists]
+            errors = [float(np.sum(candidate.judged / scale**2)) for candidate in candidates]
+            chosen = int(np.argmin(errors))
+            best, start = candidates[chosen], finalists[chosen]
             if not settings.confirm:
                 break
-            if agreeing(descents) > 1:
-                other = finished(descents[1])
-                relative = np.sum(other.judged / scale**2) / np.sum(candidates[0].judged / scale**2)
-                off = difference(candidates[0].state.frames, other.state.frames, structure)
-                twin = Twin(float(relative), off)
-                report(f"two descents to the lowest loss found {twin.words}")
+            if others := [descent for descent in descents if descent is not start and _alike(descent, start)]:
+                nearest = min(others, key=lambda other: difference(start.frames, other.frames, structure).size)
+                other = finished(nearest)
+                relative = float(np.sum(other.judged / scale**2)) / errors[chosen]
+                twin = Twin(relative, difference(best.state.frames, other.state.frames, structure))
+                report(f"two descents to this tree's loss found {twin.words}")
             if (twin is not None and twin.same) or searched.starts >= settings.starts or time.perf_counter() > until:
                 break
             # One more wave of starts, whatever agrees already.
             wanted = settings._replace(agreement=agreeing(descents) + 1)
         losses = np.array([float(descent.at.loss) for descent in descents])
+        frames, solution = best.state.frames, best.solution
         parameters = _parameters(structure, frames, solution.x)
     return TreeFit(
         parameters=parameters,
@@ -207,6 +188,12 @@ def _some(data: Trajectories, most: int, seed: int) -> Samples:
     """Returns all samples, or a random subset of at most `most`."""
     some = drawn(data, most, seed)
     return Samples(some.q, some.qd, some.qdd, some.tau)
+
+
+def _alike(one: Descent, other: Descent) -> bool:
+    """Whether two descents ended at the same loss."""
+    low, high = sorted((float(one.at.loss), float(other.at.loss)))
+    return high <= (1 + ALIKE) * low
 
 
 def _finalists(descents: list[Descent], validation: Trajectories | None) -> list[Descent]:

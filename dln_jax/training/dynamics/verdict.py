@@ -107,7 +107,7 @@ def searched(
         remedy = "try another --seed, more --seconds or a --kinematic-prior of the arm"
         return Verdict("doubtful", reason, remedy), numbers
     if twin is not None and not twin.same:
-        reason = f"two descents to the lowest loss found {twin.words}, so the motions do not determine the axes"
+        reason = f"two descents to the same loss found {twin.words}, so the motions do not determine the axes"
         return Verdict("doubtful", reason, "record more and different motions, or add a --kinematic-prior"), numbers
     if above is not None and above > FAR_FROM_NOISE:
         reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"

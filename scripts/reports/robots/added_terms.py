@@ -4,6 +4,9 @@ An arm of two joints moves for 20 s while its gears warm up from 20 to 45 °C; t
 of their size. One plant has none of the terms, the others one each.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -21,7 +24,7 @@ NOISE, SAMPLES, STEP = 0.02, 800, 0.025
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
 LINK = inertial_parameters(2.0, [0.05, 0.02, 0.1], np.diag([0.02, 0.03, 0.01]))
 ARM = serial(*dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0.1, 0, 0]]), [LINK] * 2, armature=[0.1, 0.05])
-PLANTS = {
+PLANTS: dict[str, dict[str, Any]] = {
     "none": {"friction": LAWS},
     "coupled": {"friction": LAWS, "coupled": ((0, 1),)},
     "load": {"friction": (*LAWS, "load"), "load": (0.2, 0.1)},
@@ -33,7 +36,7 @@ LOGS, OF_PLANTS = 20, 5
 
 def added_terms(quick: bool) -> Findings:
     """Shares of logs in which a term is kept, by plant and term."""
-    options = {"cooling": False, "motors": None, "coupled": ()}
+    options: dict[str, Any] = {"cooling": False, "motors": None, "coupled": ()}
     terms = terms_of(LAWS, None, (), **options)
     candidates = {
         "coupled": terms._replace(coupled=((0, 1),)),
@@ -54,20 +57,21 @@ def added_terms(quick: bool) -> Findings:
     return Findings(rows)
 
 
-def torques_of(plant: str):
+def torques_of(plant: str) -> Callable[..., Any]:
     """(q, qd, qdd, temperature) of N samples -> torques."""
     model = make_rigid_tree(ARM, velocity_scale=0.02, **PLANTS[plant])
+    energies: Any = model.energies  # of a rigid tree, which takes a temperature too
     parameters = model.init(jax.random.key(0))._replace(viscous=np.array([0.4, 0.3]), coulomb=np.array([0.5, 0.3]))
     if plant == "coupled":
         parameters = parameters._replace(coupling={"1_2": np.array(0.03)})
 
     def torque(q, qd, qdd, temperature):
-        return dynamics(model.energies(parameters, temperature)).inverse_dynamics(q, qd, qdd)
+        return dynamics(energies(parameters, temperature)).inverse_dynamics(q, qd, qdd)
 
     return jax.jit(jax.vmap(torque))
 
 
-def log_of(torque, seed: int) -> Trajectories:
+def log_of(torque: Callable[..., Any], seed: int) -> Trajectories:
     """Five sines per joint, with noise on the torques."""
     random, w = np.random.default_rng(seed), np.arange(1.0, 6.0)[:, None]
     t = STEP * np.arange(SAMPLES)

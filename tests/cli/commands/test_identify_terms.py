@@ -126,6 +126,7 @@ def test_a_run_without_temperature_is_not_exported_for_one(place, tmp_path):
     older = {key: value for key, value in description.items() if key not in ("motors", "coupled", "cooling")}
     with jax.enable_x64(True):
         assert build(older) is not None  # files of releases without these terms
+        (tmp_path / "run").mkdir()
         save(tmp_path / "run", description, build(description).init(jax.random.key(0)))
         with pytest.raises(InputError, match="does not depend on temperature"):
             export_run(tmp_path / "run", tmp_path / "c", temperature=40.0)
