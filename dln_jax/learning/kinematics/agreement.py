@@ -77,8 +77,8 @@ def difference(first: Frames, second: Frames, structure: Structure) -> Differenc
     one = lines_of(first, structure.parents, gravity=gravity)
     turning = np.array([kind == "revolute" for kind in structure.joints])
     others = second, mirrored(second, structure.parents, structure.joints)
-    found = [_aligned(one, lines_of(other, structure.parents, gravity=gravity), turning) for other in others]
-    return min(found, key=lambda off: off.size)
+    offsets = [_aligned(one, lines_of(other, structure.parents, gravity=gravity), turning) for other in others]
+    return min(offsets, key=lambda off: off.size)
 
 
 def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> Lines:
