@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from dln_jax.data.encoders import Smoothed, smooth
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import select
+from dln_jax.data.splits import in_blocks, select
 from dln_jax.identification import equations
 from dln_jax.identification.identify import Identification, identify, parameters_of
 from dln_jax.identification.motions import REWEIGHTINGS, MotionFit, cut_motions, fit_motions
@@ -24,7 +24,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
 WINDOWS = (0.3, 1.0)
-"""Lengths of windows that inner splits choose from, s; the first one if there is only one trajectory or block."""
+"""Lengths of windows that inner splits choose from, s."""
 FOLDS = 3
 """Inner splits, each with a third of the trajectories held out."""
 PUSH = 0.1
@@ -130,20 +130,26 @@ def fitted(
 def chosen_window(
     by: str, model: Model, known: Parameters, train: Trajectories, motions: Trajectories, **options: Any
 ) -> Chosen:
-    """Chooses by the mean valid prediction time of inner held-out trajectories."""
+    """Chooses by the mean valid prediction time of inner held-out trajectories, or blocks of time of a single one.
+
+    A length is left out if its motions are not finite.
+    """
+    if len(np.unique(motions.trajectory)) == 1:
+        train, motions = (in_blocks(part, 2 * FOLDS) for part in (train, motions))
     present, variance = np.unique(motions.trajectory), spread_of(motions)
-    if len(present) < 2:
-        return Chosen(WINDOWS[0], {})
-    times: dict[float | None, list[np.ndarray]] = {}
+    times: dict[float | None, list[np.ndarray]] = {window: [] for window in (None, *WINDOWS)}
     for fold in range(min(FOLDS, len(present))):
         rest = np.delete(present, slice(fold, None, FOLDS))
         inner, moved, held = select(train, rest), select(motions, rest), select(motions, present[fold::FOLDS])
         solution = identify(model, known, inner, **options)
         thetas: dict[float | None, np.ndarray] = {None: solution.theta}
-        for window in WINDOWS:
-            thetas[window] = fitted(by, model, solution, inner, moved, window, known=known, reweightings=0).theta
+        for window in [window for window in WINDOWS if window in times]:
+            try:
+                thetas[window] = fitted(by, model, solution, inner, moved, window, known=known, reweightings=0).theta
+            except InputError:
+                del times[window]
         for window, theta in thetas.items():
-            times.setdefault(window, []).append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
+            times[window].append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
     means = {window: float(np.mean(np.concatenate(parts))) for window, parts in times.items()}
     best = max(means, key=lambda window: means[window])
     return Chosen(best, {"torques" if window is None else f"{window:g} s": mean for window, mean in means.items()})

@@ -87,9 +87,10 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
 def test_motions_identify_the_pendulum_and_predict_longer(place, capsys):
     log = ("--robot", "rod.urdf", "--data", "log.npz", "--cutoff", "4", "--friction", "viscous", "--test", "last:25%")
     numbers = {}
-    for by in ("motions", "both"):
-        command(identify, *log, "--by", by, "--out", by, "--no-figures", "--no-uncertainty")
+    for by, window in (("motions", ()), ("both", ("--window", "0.3"))):
+        command(identify, *log, "--by", by, *window, "--out", by, "--no-figures", "--no-uncertainty")
         said = capsys.readouterr().out
+        assert ("chosen by inner splits of the training data: windows of" in said) == (by == "motions")
         assert f"by {by}: windows are off" in said and "verdict: good" in said
         numbers[by] = json.loads((place / by / "metrics.json").read_text())
         assert numbers[by]["vpt_seconds"] >= numbers[by]["by_torques_vpt_seconds"]
