@@ -10,7 +10,7 @@ from typing import Any
 from dln_jax.cli.arguments import arguments_for
 from dln_jax.cli.scaled import copied_folder, is_first, wait_for_all
 from dln_jax.errors import InputError
-from dln_jax.files import as_type, is_file, read_json, write_json
+from dln_jax.files import as_type, is_file, is_folder, read_json, write_json
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 CHOSEN = "chosen"
@@ -40,24 +40,30 @@ def stored_arguments(options: Any) -> dict[str, Any]:
 
 
 def stored_files(options: Any) -> dict[str, Path]:
-    """The input files that affect the result, by argument name."""
+    """The input files, and folders such as ROS bags, that affect the result, by argument name."""
     values = dataclasses.asdict(options)
-    return {key: v for key, v in values.items() if isinstance(v, Path) and key not in PLACES and is_file(v)}
+    paths = {key: v for key, v in values.items() if isinstance(v, Path) and key not in PLACES}
+    return {key: path for key, path in paths.items() if is_file(path) or is_folder(path)}
 
 
 def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
-    """SHA-256 digests of files; a resumed run recognises its files by them, even if they have moved."""
-    digests = {}
-    for name, path in files.items():
+    """SHA-256 digests of files and folders; a resumed run recognises its data by them, even if they have moved."""
+
+    def of_file(path: Path) -> str:
         with path.open("rb") as file:
-            digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
-    return digests
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    def of_folder(path: Path) -> str:
+        inside = sorted((part.relative_to(path).as_posix(), part) for part in path.rglob("*") if is_file(part))
+        return hashlib.sha256("\n".join(f"{of_file(part)} {name}" for name, part in inside).encode()).hexdigest()
+
+    return {name: of_folder(path) if is_folder(path) else of_file(path) for name, path in files.items()}
 
 
 def with_stored_arguments(typed: Any, arguments: type) -> Any:
     """Restores the arguments of the run in --out; arguments on the command line must not contradict them.
 
-    A file may have moved, if its content is the same.
+    A file or folder may have moved, if its content is the same.
 
     Args:
         typed: arguments on the command line.
@@ -77,7 +83,7 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
     for key, digest in (digests if isinstance(digests, dict) else {}).items():
         moved = stored_files(typed).get(key)
         path, option = moved or Path(str(values.get(key))), f"--{key.replace('_', '-')}"
-        if not is_file(path):
+        if not (is_file(path) or is_folder(path)):
             raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
         if fingerprints({key: path})[key] != digest:
             raise InputError(

@@ -37,11 +37,19 @@ UNITS = {
     "qd": {"rpm": math.pi / 30, **{f"{unit}/s": factor for unit, factor in POSITIONS.items()}},
     "qdd": {f"{unit}/s2": factor for unit, factor in POSITIONS.items()},
     **dict.fromkeys(("tau", "tau_inertial", "tau_coriolis", "tau_gravity", "pd"), FORCES),
+    "temperature": {"degc": 1.0, "c": 1.0},
     "p": {"nms": 1.0, "ns": 1.0, "kgm2/s": 1.0, "kgm/s": 1.0},
     "trajectory": {},
 }
 """Conversion factor to SI for every admissible unit, by key."""
-EXAMPLES = {"t": "t [s]", "qd": "qd1 [rad/s]", "qdd": "qdd1 [rad/s^2]", "tau": "tau1 [N m]", "p": "p1 [N m s]"}
+EXAMPLES = {
+    "t": "t [s]",
+    "qd": "qd1 [rad/s]",
+    "qdd": "qdd1 [rad/s^2]",
+    "tau": "tau1 [N m]",
+    "p": "p1 [N m s]",
+    "temperature": "temperature [C]",
+}
 _SPELLINGS = {"degrees": "deg", "degree": "deg", "°": "deg", "²": "2", "µ": "u", "μ": "u", "sec": "s"}
 # Longest key first, since "tau" would also match the start of "tau_inertial".
 _TITLE = re.compile(rf"({'|'.join(sorted(UNITS, key=len, reverse=True))}|time)(?=$|[\d_ .\[(/])(.*)", re.DOTALL)
@@ -192,13 +200,15 @@ def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
     if all(joint.isdecimal() for joint in joints):
         joints.sort(key=int)
     for key, own in keys.items():
-        if key in ("t", "trajectory") or not joints:
+        if key in ("t", "trajectory") or not joints or (key == "temperature" and list(own) == [""]):
             continue
         for name, there, absent in ((key, own, joints), ("q", joints, own)):
             if missing := [joint for joint in absent if joint not in there]:
                 raise InputError(f"there is no column '{name}{missing[0]:.40}'; q and {key} must name the same joints")
     return {
-        key: [own[joint] for joint in joints] if key not in ("t", "trajectory") and joints else list(own.values())
+        key: [own[joint] for joint in joints]
+        if key not in ("t", "trajectory") and joints and "" not in own
+        else list(own.values())
         for key, own in keys.items()
     }
 

@@ -17,9 +17,12 @@ from dln_jax.data.robots import Robot, joint_names, opened
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
+from dln_jax.mechanics.trees.motors import single_motors
 from dln_jax.types import InputError, require_positive
 
 LUMPS = "The inertia of all bodies that move with a joint is in the link behind it; links fixed to that link have none."
+COUPLED = "coupled_motor_"
+"""Start of the names of fixed tendons that stand for motors that turn with several joints."""
 
 
 def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
@@ -43,6 +46,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
     ET.SubElement(ET.SubElement(root, "option", settings), "flag", contact="disable")
     world, motors = ET.SubElement(root, "worldbody"), ET.SubElement(root, "actuator")
     bodies: list[ET.Element] = []
+    armature, coupled = single_motors(tree.armature)
     for link, (name, parent) in enumerate(zip(names, tree.parents, strict=True)):
         theta, turn = np.asarray(tree.inertias[link], float), np.asarray(tree.rotations[link])
         if not theta[0] > 0:
@@ -54,7 +58,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
             place["xyaxes"] = _text(turn[:, :2].T)  # the first two columns keep all digits
         bodies.append(ET.SubElement(bodies[parent] if parent >= 0 else world, "body", place))
         bodies[-1].append(_mjcf_inertial(theta))
-        numbers = {"armature": tree.armature, "damping": robot.damping, "frictionloss": robot.coulomb}
+        numbers = {"armature": armature, "damping": robot.damping, "frictionloss": robot.coulomb}
         stated = {key: _text(values[link]) for key, values in numbers.items()}
         for key, limits in (("range", robot.position_limits[link]), ("actuatorfrcrange", robot.force_limits[link])):
             if np.isfinite(limits).all():
@@ -62,6 +66,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
         kind = "hinge" if tree.joints[link] == "revolute" else "slide"
         ET.SubElement(bodies[-1], "joint", {"name": name, "type": kind, "axis": _text(tree.axes[link]), **stated})
         ET.SubElement(motors, "motor", name=f"motor_{name}", joint=name)
+    _tendons(root, names, [{"armature": I, "coefficients": c} for I, c in coupled])
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
@@ -73,17 +78,22 @@ def write_robot(
     *,
     damping: Any = None,
     coulomb: Any = None,
+    motors: Any = None,
     lock: Mapping[str, float] | Sequence[str] = (),
     remarks: tuple[str, ...] = (),
 ) -> None:
     """Writes a copy of `original` with the inertias and friction of a tree, and its armature if the format has it.
 
+    An armature matrix, and friction of motors that turn with several joints, are fixed tendons in MJCF. URDF has no
+    place for them: a comment states them.
+
     Args:
         path: path of the new file.
         original: URDF or MJCF file from which the tree's structure was read; it stays unchanged.
         tree: tree with the joints of that file, by name.
-        damping: viscous friction of each joint [d], N m s or N s/m; by default unchanged.
+        damping: viscous friction of each joint (or motor) [d], N m s or N s/m; by default unchanged.
         coulomb: dry friction [d], N m or N; by default unchanged.
+        motors: matrix S [d, d] of motor rates S qd, at which friction acts; by default each joint has its own motor.
         lock: joints that were locked when the tree was read, as for `read_robot`. The bodies behind a locked joint
             count towards the link before it, in the position in which the joint is locked.
         remarks: lines of the comment at the top of the file.
@@ -107,18 +117,26 @@ def write_robot(
     if locked:
         where = ", ".join(f"{name} at {position!r}" for name, position in locked.items())
         remarks = (*remarks, f"Locked during identification, and part of the link before (rad or m): {where}.")
+    damping, coulomb, of_motors = _split(motors, damping, coulomb)
+    armature, coupled = single_motors(tree.armature)
     friction = {"damping": damping, "coulomb": coulomb}
     if root.tag == "robot":
-        if np.any(tree.armature):
-            numbers = ", ".join(f"{name} {_text(value)}" for name, value in zip(names, tree.armature, strict=True))
+        if np.any(armature):
+            numbers = ", ".join(f"{name} {_text(value)}" for name, value in zip(names, armature, strict=True))
             remarks = (*remarks, f"Armature, for which URDF has no place (kg m² or kg): {numbers}.")
+        for inertia, c in coupled:
+            remarks = (*remarks, f"Armature of a motor at {_sum(c, names)}, which URDF lacks: {_text(inertia)}.")
+        for motor in of_motors:
+            losses = ", ".join(f"{key} {_text(value)}" for key, value in motor.items() if key != "coefficients")
+            remarks = (*remarks, f"Friction of a motor at {_sum(motor['coefficients'], names)}, likewise: {losses}.")
         _into_urdf(root, tree, locked, **friction)
     else:
         if locked:
             raise InputError(
                 f"{original}: bodies behind the locked joints of an MJCF file would have no mass; remove these joints"
             )
-        _into_mjcf(original, root, model, tree, **friction)
+        _into_mjcf(original, root, model, tree._replace(armature=armature), **friction)
+        _tendons(root, names, [*of_motors, *({"armature": I, "coefficients": c} for I, c in coupled)])
     comment = ET.Comment("\n  " + "\n  ".join(line.replace("--", "- -") for line in remarks) + "\n")
     comment.tail = "\n"
     root.insert(0, comment)
@@ -194,6 +212,44 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
                     joint.set(key, _text(values[k]))
             k += 1
         body.insert(0, inertial)
+
+
+def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[dict[str, Any]]]:
+    """Friction of joints with a motor of their own, and that of all other motors, by row of the matrix S."""
+    if motors is None:
+        return damping, coulomb, []
+    S = np.asarray(motors, float)
+    own = (np.eye(len(S)) == S).all(axis=1)
+    stated = {key: values for key, values in (("damping", damping), ("frictionloss", coulomb)) if values is not None}
+    others = [
+        {"coefficients": S[k], **{key: float(values[k]) for key, values in stated.items()}}
+        for k in np.flatnonzero(~own)
+        if any(values[k] for values in stated.values())
+    ]
+    first, second = (None if values is None else np.where(own, values, 0.0) for values in (damping, coulomb))
+    return first, second, others
+
+
+def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Mapping[str, Any]]) -> None:
+    """Replaces the fixed tendons of coupled motors, by name; others stay, but their inertia is now in the motors'."""
+    group = root.find("tendon")
+    for tendons in root.findall("tendon"):
+        for tendon in tendons.findall("fixed"):
+            tendon.attrib.pop("armature", None)
+            if (tendon.get("name") or "").startswith(COUPLED):
+                tendons.remove(tendon)
+    for number, motor in enumerate(motors, 1):
+        group = ET.SubElement(root, "tendon") if group is None else group
+        numbers = {key: _text(value) for key, value in motor.items() if key != "coefficients"}
+        tendon = ET.SubElement(group, "fixed", {"name": f"{COUPLED}{number}", **numbers})
+        for name, coefficient in zip(names, motor["coefficients"], strict=True):
+            if coefficient:
+                ET.SubElement(tendon, "joint", joint=name, coef=_text(coefficient))
+
+
+def _sum(coefficients: np.ndarray, names: Sequence[str]) -> str:
+    """The rate of a motor in words."""
+    return " + ".join(f"{_text(c)} {name}" for c, name in zip(coefficients, names, strict=True) if c)
 
 
 def _link(joint: ET.Element, which: str) -> str | None:

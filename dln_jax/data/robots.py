@@ -147,9 +147,10 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[
                 f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: lock it if it does not move"
             )
     moving = {k for k, name in enumerate(names) if name not in locked}
-    # Equality constraints and tendons between locked joints have no effect.
+    # Equality constraints and tendons between locked joints have no effect; tendons without a spring are motors.
     joints, over = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtWrap.mjWRAP_JOINT)
-    tied = {int(k) for numbers in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid) for k in numbers}
+    springs = np.repeat((model.tendon_stiffness != 0) | np.asarray(model.tendon_limited, bool), model.tendon_num)
+    tied = {int(k) for numbers in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid[springs]) for k in numbers}
     if set(map(int, model.eq_type)) - {joints} or set(map(int, model.wrap_type)) - {over} or tied & moving:
         raise InputError(
             "it has equality constraints or tendons, which close loops; expected a tree: lock the joints that they tie"
@@ -203,18 +204,32 @@ def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping
     dofs, infinite = model.jnt_dofadr[moving], np.array([-np.inf, np.inf])
     tree = make_tree(
         parents, joints, rotations, positions, axes, inertias,
-        armature=model.dof_armature[dofs], gravity=np.asarray(model.opt.gravity), names=names,
+        armature=_armature(model, moving), gravity=np.asarray(model.opt.gravity), names=names,
     )  # fmt: skip
     ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], infinite)
     forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], infinite)
     return Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
 
 
+def _armature(model: Any, moving: list[int]) -> np.ndarray:
+    """Armature of the moving joints: [d], or [d, d] if fixed tendons have an armature."""
+    armature = np.asarray(model.dof_armature[model.jnt_dofadr[moving]], float)
+    for tendon in np.flatnonzero(model.tendon_armature):
+        wraps = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
+        coefficients = np.zeros(model.njnt)
+        coefficients[model.wrap_objid[wraps]] = model.wrap_prm[wraps]
+        c = coefficients[moving]
+        armature = np.diag(armature) if armature.ndim == 1 else armature
+        armature = armature + model.tendon_armature[tendon] * np.outer(c, c)
+    return armature
+
+
 def _require_numbers(robot: Robot) -> None:
     """Raises `InputError` for numbers out of the range of real robots."""
     tree = robot.tree
     frames = {"inertia": tree.inertias, "position": tree.positions, "rotation": tree.rotations, "axis": tree.axes}
-    losses = {"damping": robot.damping, "dry friction": robot.coulomb, "armature": tree.armature}
+    armature = tree.armature if np.ndim(tree.armature) == 1 else np.diagonal(tree.armature)
+    losses = {"damping": robot.damping, "dry friction": robot.coulomb, "armature": armature}
     for what, stated in {**frames, "gravity": [tree.gravity] * tree.degrees_of_freedom, **losses}.items():
         numbers = np.asarray(stated, float).reshape(tree.degrees_of_freedom, -1)
         right = (np.abs(numbers) <= LARGEST_NUMBER) & ((numbers >= 0) | (what not in losses))

@@ -9,6 +9,7 @@ Samples of all trajectories are concatenated on axis 0.
 | `tau` | [N, d] | N m or N | zero if absent |
 | `p`, `pd` | [N, d] | | optional canonical momentum and its rate |
 | `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
+| `temperature` | [N, d] or [N] | °C | optional, of each joint's gear or motor, or one for all |
 | `trajectory` | [N] int | | index of a sample's trajectory; any number >= 0 without `label`; one recording if absent |
 | `label` | [K] str | | name of each trajectory; if absent, its number, and trajectories are renumbered from 0 |
 | `joint_names` | [d] str | | optional, joint of each column |
@@ -25,17 +26,16 @@ import numpy as np
 
 from dln_jax.data import bags, csv_tables, joint_names
 from dln_jax.data.arrays import FOLDER, load_file, numeric
+from dln_jax.data.schema_keys import KEYS, OPTIONAL, RATES
+from dln_jax.data.stated_facts import scaled, with_chosen, with_times
 from dln_jax.data.stated_needs import needs_from_text
+from dln_jax.data.trajectory_times import require_increasing_time, time_derivative, trajectory_names
 from dln_jax.files import is_file, is_folder, writing
-from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.types import InputError, Needs
 
 Data = TypeVar("Data")
-RATES = ("qd", "qdd")
-OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
-PER_JOINT = ("q", *RATES, *OPTIONAL)
-KEYS = ("t", *PER_JOINT, "trajectory", "label", "joint_names", "needs")
-LARGEST_INDEX = 2**53
-"""Largest integer up to which float64 is exact."""
+ABSOLUTE_ZERO = -273.15
+"""°C."""
 
 
 class Trajectories(NamedTuple):
@@ -53,6 +53,8 @@ class Trajectories(NamedTuple):
     tau_inertial: np.ndarray | None = None
     tau_coriolis: np.ndarray | None = None
     tau_gravity: np.ndarray | None = None
+    temperature: np.ndarray | None = None
+    """[N, d], °C, of each joint."""
     needs: Needs | None = None
     joint_names: np.ndarray | None = None
     estimated: tuple[str, ...] = ()
@@ -132,68 +134,6 @@ def load_arrays(
     return load_file(path, completed, KEYS, readers=readers)
 
 
-def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]:
-    """Selects, orders and renames the joints as stated (see `data.joint_names.chosen`).
-
-    Raises:
-        InputError: joints are stated, but the file names none; or as `chosen`.
-    """
-    if not joints:
-        return arrays
-    names = np.asarray(arrays.get("joint_names", ()))
-    if names.ndim != 1 or not names.size or names.dtype.kind not in "US":
-        raise InputError("--joints needs the joints' names, which the file lacks; add joint_names, or names in titles")
-    own = names.tolist()
-    # A bag has been read for the joints of a robot alone.
-    stated = [entry for entry in joints if "remarks" not in arrays or entry.partition("=")[0].strip() in own]
-    kept = joint_names.chosen(own, stated)
-    places = [own.index(name) for name in kept.own]
-    if "needs" in arrays and places != list(range(len(own))):
-        raise InputError("--joints selects or reorders joints, but the file has needs for its own; leave --joints out")
-    columns = {key: np.asarray(arrays[key])[:, places] for key in PER_JOINT if np.ndim(arrays.get(key)) == 2}
-    return {**arrays, **columns, "joint_names": np.array(kept.names)}
-
-
-def scaled(arrays: dict[str, Any], torque_factor: Any) -> dict[str, Any]:
-    """Multiplies tau by the stated factors (see `data.joint_names.factors`).
-
-    Raises:
-        InputError: there is no tau, or as `factors`.
-    """
-    if torque_factor is None:
-        return arrays
-    if np.ndim(arrays.get("tau")) != 2:
-        why = "".join(f"; {remark}" for remark in arrays.get("remarks", ()))
-        raise InputError(f"--torque-factor scales tau, which the file lacks; leave it out{why}")
-    count = np.shape(arrays["tau"])[1]
-    names = np.asarray(arrays.get("joint_names", [str(joint + 1) for joint in range(count)])).astype(str).tolist()
-    numbers = joint_names.factors(torque_factor, names)
-    listed = ", ".join(f"{name} {number:.4g}" for name, number in zip(names, numbers, strict=True))
-    remarks = (*arrays.get("remarks", ()), f"tau is that of the log times {listed}")
-    return {**arrays, "tau": np.asarray(arrays["tau"]) * numbers, "remarks": remarks}
-
-
-def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
-    """Completes the arrays with t, from the rate, and with trajectory, as one recording, if they are absent.
-
-    Raises:
-        InputError: there is neither t nor a rate, there are both, or the rate is not positive.
-    """
-    if "q" not in arrays:
-        return arrays  # `from_arrays` refuses them
-    samples = len(np.atleast_1d(np.asarray(arrays["q"])))
-    if rate is None and "t" not in arrays:
-        raise InputError("key 't' is missing; add the time of each sample in seconds, or give --rate HZ")
-    arrays = {"trajectory": np.zeros(samples, int), **arrays}
-    if rate is None:
-        return arrays
-    require_positive(rate=rate)
-    if "t" in arrays:
-        raise InputError("the file has t, so its rate is known; leave --rate out")
-    starts = np.flatnonzero(np.diff(np.asarray(arrays["trajectory"]), prepend=np.nan))
-    return {**arrays, "t": (np.arange(samples) - np.repeat(starts, np.diff(starts, append=samples))) / rate}
-
-
 def column(data: Trajectories, key: str) -> np.ndarray:
     """One of the optional arrays; raises `InputError` if it is absent."""
     array = getattr(data, key)
@@ -215,8 +155,8 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     if samples < 2:
         raise InputError(f"q has {samples} sample(s); expected at least 2: record longer trajectories")
     t = numeric(arrays, "t", (samples,))
-    trajectory, label = _trajectory_names(arrays, samples)
-    _require_increasing_time(t, trajectory, label)
+    trajectory, label = trajectory_names(arrays, samples)
+    require_increasing_time(t, trajectory, label)
 
     checked = {"q": q} | {key: numeric(arrays, key, q.shape) for key in (*RATES, *OPTIONAL) if key in arrays}
     estimated = tuple(key for key in (*RATES, "tau") if key not in arrays)
@@ -224,6 +164,8 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
         if key in estimated:
             checked[key] = time_derivative(t, checked[source], trajectory, name=key)
     checked.setdefault("tau", np.zeros_like(q))
+    if arrays.get("temperature") is not None:
+        checked["temperature"] = _temperature(arrays, q.shape)
     needs = needs_from_text(str(arrays["needs"])) if "needs" in arrays else None
     if needs is not None and needs.degrees_of_freedom != q.shape[1]:
         raise InputError(
@@ -234,6 +176,16 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
         t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=estimated,
         remarks=tuple(arrays.get("remarks", ())), **checked,
     )  # fmt: skip
+
+
+def _temperature(arrays: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Temperatures [N, d], from one for each joint or one for all."""
+    stated = np.asarray(arrays["temperature"])
+    common = stated.ndim == 1 or (stated.ndim == 2 and stated.shape[1] == 1)
+    values = numeric({"temperature": stated.reshape(-1) if common else stated}, "temperature", shape[: 2 - common])
+    if values.min() < ABSOLUTE_ZERO:
+        raise InputError(f"temperature is {values.min():.3g} °C, below absolute zero; expected degrees Celsius")
+    return np.broadcast_to(values[:, None], shape).copy() if common else values
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
@@ -277,58 +229,3 @@ def _joint_names(stated: Any, d: int) -> np.ndarray:
     if names.dtype.kind not in "US" or names.shape != (d,) or len(set(names.tolist())) < d:
         raise InputError(f"joint_names has type {names.dtype} and shape {names.shape}; expected {d} different strings")
     return names.astype(str)
-
-
-def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
-    trajectory = numeric(arrays, "trajectory", (samples,), most=np.inf)
-    if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0 or trajectory.max() > LARGEST_INDEX:
-        raise InputError("trajectory has entries that are not whole numbers >= 0; give the index of each trajectory")
-    trajectory = trajectory.astype(np.int64)
-    if "label" not in arrays:
-        present, trajectory = np.unique(trajectory, return_inverse=True)
-        return trajectory.reshape(-1), present.astype(str)
-    count = int(trajectory.max()) + 1
-    try:
-        label = np.asarray(arrays["label"])
-    except ValueError as error:
-        raise InputError("label is ragged; expected one string per trajectory") from error
-    if label.dtype.kind not in "US" or label.ndim != 1:
-        raise InputError(f"label has type {label.dtype} and shape {label.shape}; expected one string per trajectory")
-    if len(label) < count:
-        raise InputError(f"label names {len(label)} trajectories, but trajectory counts {count}; add the missing names")
-    if len(set(label)) < len(label):
-        raise InputError("label has repeated names; give every trajectory a name of its own")
-    return trajectory, label.astype(str)
-
-
-def _require_increasing_time(t: np.ndarray, trajectory: np.ndarray, label: np.ndarray) -> None:
-    same = trajectory[1:] == trajectory[:-1]
-    starts = trajectory[np.flatnonzero(np.r_[True, ~same])]
-    if len(set(starts)) < len(starts):
-        raise InputError("trajectory returns to an earlier index; keep the samples of each trajectory together")
-    for sample in 1 + np.flatnonzero(same & (np.diff(t) <= 0))[:1]:
-        raise InputError(
-            f"t does not increase at sample {sample} of trajectory '{label[trajectory[sample]]}'; sort the samples by "
-            "time, and number recordings that follow one another in a column 'trajectory'"
-        )
-
-
-def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *, name: str) -> np.ndarray:
-    """Second-order finite differences of values [N, d] over t [N], trajectory by trajectory.
-
-    Central inside, one-sided at the ends, any spacing; differences never reach across trajectories.
-
-    Raises:
-        InputError: a trajectory has fewer than three samples; the message names `name`, the key to be estimated.
-    """
-    result = np.empty_like(values)
-    for index in np.unique(trajectory):
-        samples = trajectory == index
-        count = int(samples.sum())
-        if count < 3:
-            raise InputError(
-                f"{name} is missing, and trajectory {index} has {count} sample(s): estimating it takes at least 3; "
-                f"add {name} or record longer trajectories"
-            )
-        result[samples] = np.gradient(values[samples], t[samples], axis=0, edge_order=2)
-    return result

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.joint_names import matched
-from dln_jax.data.schema import PER_JOINT, Trajectories
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.schema_keys import PER_JOINT
 from dln_jax.types import InputError, require_positive, require_seed
 
 PER_SAMPLE = ("t", "trajectory", *PER_JOINT)

@@ -1,15 +1,16 @@
 """Physically consistent parameters: least squares over positive definite pseudo-inertias and positive coefficients.
 
 A body has the pseudo-inertia J = L M Lᵀ, where J_0 = L Lᵀ is its prior and M is symmetric and positive definite. M is
-relative to the prior, so its entries have no units. Armature and friction are c = c_0 exp(z). M and z minimise
+relative to the prior, so its entries have no units. So has the armature matrix of coupled motors, whose other entries
+are zero. Armature of other motors and friction are c = c_0 exp(z). M and z minimise
 
     F = sum over joints of |Phi_j theta - tau_j|² / noise_j²  +  regularisation (sum of D(J | J_0) + sum of z² / 2)
 
-D(J | J_0) = tr M - log det M - 4 is the entropic divergence of Lee, Wensing and Park (T-RO 2020), which does not depend
-on the frame. The sum is convex in M, and D is a barrier for the physically consistent bodies. F is therefore minimised
-by an interior-point method (Boyd and Vandenberghe, Convex Optimization, chapter 11): Newton's method with a
-regularisation that falls to the requested value. The data enter as one triangular factor, so an iteration takes on the
-order of P³ operations, independent of the number of samples N.
+D(J | J_0) = tr M - log det M - n (n = 4 for a body) is the entropic divergence of Lee, Wensing and Park (T-RO 2020),
+which does not depend on the frame. The sum is convex in M, and D is a barrier for the physically consistent bodies. F
+is therefore minimised by an interior-point method (Boyd and Vandenberghe, Convex Optimization, chapter 11): Newton's
+method with a regularisation that falls to the requested value. The data enter as one triangular factor, so an iteration
+takes on the order of P³ operations, independent of the number of samples N.
 """
 
 from typing import NamedTuple
@@ -52,6 +53,20 @@ class ConsistentFit(NamedTuple):
     """Total number of Newton iterations."""
     converged: bool
     """Whether the Newton decrement fell below the tolerance; otherwise the iterations or the line search ran out."""
+
+
+def motors_are_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> bool:
+    """Whether the armature matrices of coupled motors are positive definite."""
+    return all(np.linalg.eigvalsh(_armature(theta, group))[0] > 0 for group in columns.motors)
+
+
+def _armature(theta: np.ndarray, group: list[tuple[int, int, int]]) -> np.ndarray:
+    """Armature matrix of coupled motors, without the others."""
+    motors = sorted({motor for _, motor, _ in group})
+    A = np.zeros((len(motors), len(motors)))
+    for column, i, j in group:
+        A[motors.index(i), motors.index(j)] = A[motors.index(j), motors.index(i)] = theta[column]
+    return A
 
 
 def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[bool, ...]:
@@ -106,32 +121,52 @@ def fit_consistent(
     start = np.zeros(len(kinds))
     start[positive] = np.where(known[positive] > 0, known[positive], UNKNOWN_SHARE * typical[positive])
     start[signed] = known[signed]
-    # Columns of the map to theta: ten per body, then the positive coefficients, then the signed ones.
-    maps = []
+    # Columns of the map to theta: those of every block, then the positive coefficients, then the signed ones.
+    maps, bases = [], []
     for places in inertial:
         J = pseudo_inertia(nearest_body(known[places]))
         start[places], factor = np.asarray(body_of_pseudo_inertia(J)), np.linalg.cholesky(J)
         directions = [np.asarray(body_of_pseudo_inertia(factor @ E @ factor.T)) for E in _BASIS]
         maps.append(identity[:, places] @ np.stack(directions, axis=1))
+        bases.append(_BASIS)
+    for group in columns.motors:
+        places = [column for column, *_ in group]
+        start[places] = [start[column] if i == j else known[column] for column, i, j in group]
+        if not np.linalg.eigvalsh(_armature(start, group))[0] > 0:
+            start[places] = [start[column] if i == j else 0.0 for column, i, j in group]
+        factor = np.linalg.cholesky(_armature(start, group))
+        back = np.linalg.inv(factor)
+        units = [_armature(identity[column], group) for column in places]
+        relative = np.stack([back @ unit @ back.T for unit in units])
+        lengths_of = np.linalg.norm(relative, axis=(1, 2))
+        maps.append(identity[:, places] / lengths_of)
+        bases.append(relative / lengths_of[:, None, None])
+    positive = np.setdiff1d(positive, [column for group in columns.motors for column, *_ in group])
     to_theta = np.hstack([*maps, identity[:, positive] * start[positive], identity[:, signed] * typical[signed]])
     A, r = triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1]
-    problem = _Problem(A, r, len(inertial), slice(10 * len(inertial), 10 * len(inertial) + len(positive)))
+    blocks, first = [], 0
+    for basis in bases:
+        blocks.append((slice(first, first + len(basis)), basis))
+        first += len(basis)
+    problem = _Problem(A, r, tuple(blocks), slice(first, first + len(positive)))
     x, done, converged = _minimum(problem, regularisation, iterations)
-    return ConsistentFit(start + to_theta @ problem.directions(x), _divergences(problem.bodies_of(x)), done, converged)
+    divergences = _divergences(problem.blocks_of(x)[: len(inertial)])
+    return ConsistentFit(start + to_theta @ problem.directions(x), divergences, done, converged)
 
 
 class _Problem(NamedTuple):
-    """Residuals A y + r with y = (M - 1 of every body in the basis, exp(z) - 1, signed parameters)."""
+    """Residuals A y + r with y = (M - 1 of every block in its basis, exp(z) - 1, signed parameters)."""
 
     A: np.ndarray
     r: np.ndarray
-    bodies: int
+    blocks: tuple[tuple[slice, np.ndarray], ...]
+    """Places in x, and basis [K, n, n], of every body and group of coupled motors."""
     z: slice
     """Places of z in the unknowns x, which hold it in place of exp(z) - 1."""
 
-    def bodies_of(self, x: np.ndarray) -> np.ndarray:
-        """M [B, 4, 4]."""
-        return np.eye(4) + np.einsum("bk,kij->bij", x[: 10 * self.bodies].reshape(-1, 10), _BASIS)
+    def blocks_of(self, x: np.ndarray) -> list[np.ndarray]:
+        """M [n, n] of every block."""
+        return [np.eye(basis.shape[1]) + np.tensordot(x[own], basis, 1) for own, basis in self.blocks]
 
     def directions(self, x: np.ndarray) -> np.ndarray:
         """y as a function of the unknowns."""
@@ -141,8 +176,8 @@ class _Problem(NamedTuple):
 
     def value(self, x: np.ndarray, weight: float) -> float:
         """F; infinite where a body is not physically consistent or z exceeds 100."""
-        M, z = self.bodies_of(x), x[self.z]
-        if (M.size and np.linalg.eigvalsh(M).min() <= 0) or z.max(initial=0.0) > 100:
+        M, z = self.blocks_of(x), x[self.z]
+        if any(np.linalg.eigvalsh(block)[0] <= 0 for block in M) or z.max(initial=0.0) > 100:
             return np.inf
         errors = self.A @ self.directions(x) + self.r
         return float(errors @ errors + weight * (_divergences(M).sum() + 0.5 * z @ z))
@@ -153,13 +188,13 @@ class _Problem(NamedTuple):
         slopes = self.A.copy()
         slopes[:, self.z] *= np.exp(z)
         rows, right = [slopes], [-errors]
-        for body, M in enumerate(self.bodies_of(x)):
+        for (own, basis), M in zip(self.blocks, self.blocks_of(x), strict=True):
             C = np.linalg.cholesky(M)
-            inner = np.linalg.solve(C, np.linalg.solve(C, _BASIS).transpose(0, 2, 1))
-            block = np.zeros((16, len(x)))
-            block[:, 10 * body : 10 * body + 10] = inner.reshape(10, 16).T
+            inner = np.linalg.solve(C, np.linalg.solve(C, basis).transpose(0, 2, 1))
+            block = np.zeros((M.size, len(x)))
+            block[:, own] = inner.reshape(len(basis), M.size).T
             rows.append(np.sqrt(weight / 2) * block)
-            right.append(-np.sqrt(weight / 2) * (C.T @ C - np.eye(4)).ravel())
+            right.append(-np.sqrt(weight / 2) * (C.T @ C - np.eye(len(M))).ravel())
         # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
         bend = np.sqrt(weight / 2 + np.maximum(slopes[:, self.z].T @ errors, 0.0))
         rows.append(bend[:, None] * np.eye(len(x))[self.z])
@@ -191,6 +226,6 @@ def _minimum(problem: _Problem, regularisation: float, iterations: int) -> tuple
     return x, iterations, False
 
 
-def _divergences(M: np.ndarray) -> np.ndarray:
-    """tr M - log det M - 4 of every body."""
-    return np.trace(M, axis1=1, axis2=2) - np.linalg.slogdet(M)[1] - 4
+def _divergences(blocks: list[np.ndarray]) -> np.ndarray:
+    """tr M - log det M - n of every block."""
+    return np.array([np.trace(M) - np.linalg.slogdet(M)[1] - len(M) for M in blocks])

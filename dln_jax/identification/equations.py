@@ -7,8 +7,8 @@ The equations are compressed to one triangular factor per joint:
 Reweighting joints, fixing parameters and changing unknowns then act on the [P + 1, P + 1] factors, not on the data.
 
 The columns follow from the model's parameters. The leaf `inertias` [links, 10] holds the inertial parameters of the
-bodies; every other leaf has one entry per joint and gives its name to its columns. A new friction law therefore needs
-no change here.
+bodies, the leaves of `coupling` one entry of the motors' armature matrix each; every other leaf has one entry per joint
+and gives its name to its columns. A new friction law therefore needs no change here.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,9 +25,10 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.least_squares import triangular_factor
 from dln_jax.types import InputError
 
-Kind = Literal["inertia", "positive", "signed"]
-BODIES = "inertias"
-"""Name of the leaf with the inertial parameters, ten columns per body."""
+Kind = Literal["inertia", "positive", "signed", "coupling"]
+BODIES, MOTORS, COUPLING = "inertias", "armature", "coupling_"
+"""Names of the leaves with the inertial parameters, ten columns per body, and with the motors' inertias; start of the
+names of columns off the diagonal of the armature, such as "coupling_2_3"."""
 SIGNED = ("offset",)
 """Endings of the names of leaves whose entries may have either sign."""
 CHUNK = 2048
@@ -40,14 +41,31 @@ class Columns(NamedTuple):
     names: tuple[str, ...]
     """Names such as "I_xx_3" or "viscous_2", joints counted from 1."""
     kinds: tuple[Kind, ...]
-    """"inertia" for the ten columns of a body, "positive" for armature and friction, "signed" for either sign."""
+    """"inertia" for the ten columns of a body, "positive" for armature and friction, "signed" for either sign,
+    "coupling" for the armature between two motors."""
     joints: tuple[int, ...]
-    """Joint of every column, counted from 0."""
+    """Joint of every column, counted from 0, the second one of a coupling."""
 
     @property
     def bodies(self) -> Int[np.ndarray, "bodies 10"]:
         """The ten columns of every body."""
         return np.flatnonzero(np.array(self.kinds) == "inertia").reshape(-1, 10)
+
+    @property
+    def motors(self) -> list[list[tuple[int, int, int]]]:
+        """Groups of motors that are coupled: (column, motor, motor) of every entry of their armature matrix."""
+        pairs: list[tuple[int, int, int]] = []
+        for column in np.flatnonzero(np.array(self.kinds) == "coupling").tolist():
+            first, second = self.names[column].removeprefix(COUPLING).split("_")
+            pairs.append((column, int(first) - 1, int(second) - 1))
+        groups: list[list[tuple[int, int, int]]] = []
+        for entry in pairs:
+            near = [group for group in groups if {k for _, *both in group for k in both} & set(entry[1:])]
+            groups = [group for group in groups if group not in near] + [[entry, *(e for group in near for e in group)]]
+        for group in groups:
+            for motor in sorted({k for _, *both in group for k in both}):
+                group.append((self.names.index(f"{MOTORS}_{motor + 1}"), motor, motor))
+        return groups
 
 
 def columns_of(parameters: Parameters) -> Columns:
@@ -60,6 +78,9 @@ def columns_of(parameters: Parameters) -> Columns:
         shape = np.shape(leaf)
         bodies = name == BODIES and len(shape) == 2 and shape[1] == len(PARAMETERS)
         kind: Kind = "inertia" if bodies else "signed" if name.endswith(SIGNED) else "positive"
+        if name.startswith(COUPLING):
+            names, kinds, joints = [*names, name], [*kinds, "coupling"], [*joints, int(name.rpartition("_")[2]) - 1]
+            continue
         for place in range(int(np.prod(shape))):
             joint, which = divmod(place, len(PARAMETERS)) if bodies else (place, 0)
             names.append(f"{PARAMETERS[which] if bodies else name}_{joint + 1}")

@@ -62,6 +62,7 @@ def identify(
     data: Trajectories,
     *,
     joints: tuple[JointKind, ...] | None = None,
+    at: Parameters | None = None,
     noise: Any = None,
     robust: bool = False,
     rank_tolerance: float | None = None,
@@ -78,6 +79,8 @@ def identify(
         known: prior parameters, such as those of a robot file; directions that the data do not determine keep them.
         data: training data with tau; hold out other motions to judge the result.
         joints: kinds of the joints, from which the random states are drawn; all revolute by default.
+        at: parameters at which the model is linearised, for friction by load, whose forces are linear as long as the
+            links' torques keep their signs: those of `learning.friction.fit_friction`.
         noise: standard deviation of the torque of each joint [d], N m or N; estimated by default.
         robust: use Huber's loss, which grows linearly beyond 1.345 times the noise; the noise is then estimated.
         rank_tolerance: as for `fit_weighted`.
@@ -100,11 +103,12 @@ def identify(
     free = np.ones(len(theta))
     free[columns.bodies[massless]] = 0.0
     linearise = design(model)
-    regressor, weights = regressor_of(model, known, data, free=free, linearise=linearise), None
+    at = known if at is None else at
+    regressor, weights = regressor_of(model, at, data, free=free, linearise=linearise), None
     # The random states fill chunks of the same size as the data, so that both use one compiled program.
     samples = max(STATES * d, -(-len(data.t) // -(-len(data.t) // equations.CHUNK)))
     states = random_states(joints, samples, seed)
-    general = compressed(regressor_of(model, known, states, free=free, linearise=linearise))
+    general = compressed(regressor_of(model, at, states, free=free, linearise=linearise))
     A = general.triangles.reshape(-1, general.unknowns + 1)[:, :-1]
     structure, base = determinacy(null_directions(A)), base_parameters(A, columns)
     if robust:

@@ -17,6 +17,7 @@ problems with physically consistent bodies are those of `consistent`, one a roun
 decreases (consistent bodies form a convex set).
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -35,7 +36,7 @@ from dln_jax.learning.linear import unravelled
 from dln_jax.learning.measured_motions import motion
 from dln_jax.learning.motions import without_start
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model
 from dln_jax.solvers.least_squares import triangular_factor
 from dln_jax.types import InputError, require_positive
 
@@ -44,7 +45,7 @@ ROUNDS, SETTLED = 12, 1e-4
 CHUNK = 64
 """Windows that are linearised at a time."""
 REWEIGHTINGS = 2
-"""Number of times that windows are weighted by their distance and the fit is repeated."""
+"""Default number of reweightings."""
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""
 TYPICAL_DELAY = 1e-3
@@ -92,11 +93,13 @@ def cut_motions(data: Trajectories, length: int) -> MotionWindows:
     return MotionWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], slope[indices], weight)
 
 
-def linearise(model: Model, like: Parameters) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+@functools.lru_cache(maxsize=4)
+def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """(theta [P], delay, noise_q [d], noise_tau [d], windows) -> residuals [W, T d + d] and J [W, T d + d, P + 1].
 
     The last column is that of the delay, in units of `TYPICAL_DELAY`. Residuals are those of the nearest starts.
     """
+    like = jax.eval_shape(model.init, jax.random.key(0))
 
     def one(unknowns: Array, noise_q: Array, noise_tau: Array, window: tuple[Array, ...]) -> Array:
         t, q, qd, tau, slope, weight = window
@@ -154,7 +157,6 @@ def distances(
 
 def fit_motions(
     model: Model,
-    known: Parameters,
     columns: Columns,
     prior: Float[np.ndarray, " P"],
     start: Float[np.ndarray, " P"],
@@ -166,13 +168,12 @@ def fit_motions(
     share: float = 1.0,
     delay: bool = True,
     regularisation: float = REGULARISATION,
-    linearised: Callable | None = None,
+    reweightings: int = REWEIGHTINGS,
 ) -> MotionFit:
     """Fits physically consistent parameters to motions, and to torques too if their equations are given.
 
     Args:
         model: a model that is linear in its parameters, such as `models.make_rigid_tree`.
-        known: its parameters, for their structure.
         columns: columns of the parameters.
         prior: values that undetermined directions keep.
         start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
@@ -184,13 +185,13 @@ def fit_motions(
         share: weight of the torques.
         delay: whether to fit a delay of the torques.
         regularisation: as for `fit_consistent`.
-        linearised: `linearise(model, known)`, to reuse a compiled one.
+        reweightings: number of times that windows are weighted by their distance and the fit is repeated.
 
     Raises:
         InputError: a noise or share that is not positive, or a start whose motions are not finite.
     """
     require_positive(share=share, noise_tau=float(np.min(noise_tau)))
-    linearised = linearise(model, known) if linearised is None else linearised
+    linearised = linearise(model)
     if noise_q is None:
         noise_q = distances(linearised, start, noise_tau, windows)
     require_positive(noise_q=float(np.min(noise_q)))
@@ -238,7 +239,7 @@ def fit_motions(
 
     x, equal, rounds, converged = np.append(start, 0.0), windows, 0, False
     before = distance(at(x)[0])
-    for weighting in range(1 + REWEIGHTINGS):
+    for weighting in range(1 + reweightings):
         if weighting:
             windows = equal
             norms = np.linalg.norm(at(x)[0], axis=1)

@@ -4,8 +4,12 @@ Forces are linear in them, so that `learning.linear.fit_linear(..., negligible=1
 Data determine only combinations of the eleven numbers per joint ("base parameters"). A fit returns the shortest
 solution that predicts the same forces, which need not be physically consistent.
 
-Forces are not linear in the shape of friction and the share of load. They are fixed when the model is built;
-`learning.friction.fit_friction` fits them.
+Forces are not linear in the shape of friction, the share of load and the cooling of friction. They are fixed when the
+model is built; `learning.friction.fit_friction` fits them. Viscous friction of warm grease is lower:
+
+    b(T) = b exp(-k (T - T_ref))
+
+Motors that turn with several joints, and armature as a matrix: `mechanics.trees.motors`.
 """
 
 from typing import Any, NamedTuple
@@ -25,6 +29,7 @@ from dln_jax.mechanics.friction import (
 )
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.motors import Pair, armature_matrix, motors_of, require_motors
 from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.models.model import Model
 from dln_jax.types import FrictionLaw, InputError
@@ -33,6 +38,9 @@ USUAL: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
 """Friction laws of `friction=True`."""
 Number = float | tuple[float, ...]
 """One number for all joints, or one per joint."""
+Rows = tuple[tuple[float, ...], ...]
+WARM = ("viscous", "viscous_forward", "viscous_backward")
+"""Coefficients that temperature changes."""
 
 
 class RigidTreeParameters(NamedTuple):
@@ -52,6 +60,8 @@ class RigidTreeParameters(NamedTuple):
     coulomb_forward: Any = None
     coulomb_backward: Any = None
     sigmoid: Any = None
+    coupling: Any = None
+    """Entries C_ij of the armature between motors, by "i_j" with joints counted from 1, kg m² or kg."""
 
     @property
     def friction(self) -> FrictionCoefficients:
@@ -68,6 +78,11 @@ def make_rigid_tree(
     sigmoid_slope: Number = 10.0,
     sigmoid_shift: Number = 0.0,
     load: Number = 0.0,
+    cooling: Number = 0.0,
+    reference_temperature: float = 25.0,
+    temperature: float | None = None,
+    motors: Rows | None = None,
+    coupled: tuple[Pair, ...] = (),
     dtype: DTypeLike = jnp.float64,
 ) -> Model:
     """Returns a model with the frames of a tree.
@@ -77,11 +92,18 @@ def make_rigid_tree(
         friction: laws whose coefficients are also parameters, as in `mechanics.friction.laws`; True: `USUAL`.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
         load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
+        cooling: k, 1/K; not fitted.
+        reference_temperature: T_ref, °C, to which the viscous coefficients refer.
+        temperature: T, °C, of all functions (default: T_ref). `energies(parameters, T)` takes another one, a number or
+            one per joint.
+        motors: rows of S in motor rates S qd, at which armature and friction act; by default each joint has its own.
+        coupled: pairs of motors, counted from 0, whose armature has an entry off the diagonal, which is a parameter.
         dtype: type of the parameters.
 
     Raises:
-        InputError: an unknown law, two laws for the same friction, a velocity or slope that is not positive, or a share
-            outside [0, 1), or without its law.
+        InputError: an unknown law, two laws for the same friction, a velocity or slope that is not positive, a share
+            outside [0, 1), or without its law, cooling without viscous friction, motors that do not determine the
+            joints' rates, or an armature of the tree that such motors do not have.
     """
     laws = USUAL if friction is True else friction or ()
     require_laws(laws, "friction")
@@ -95,15 +117,34 @@ def make_rigid_tree(
         raise InputError(f"load is {load}, but friction has {', '.join(laws) or 'no law'}; add 'load' to friction")
     d = tree.degrees_of_freedom
     names = coefficients_of(laws)
+    cools = any(cooling) if isinstance(cooling, tuple) else bool(cooling)
+    if cools and not set(names) & set(WARM):
+        raise InputError(f"cooling is {cooling}, but friction has {', '.join(laws) or 'no law'}; add 'viscous' to it")
+    require_motors(motors, coupled, d)
+    own, entries = motors_of(tree.armature, motors, coupled)
 
     def init(key: Array) -> RigidTreeParameters:
-        none = {name: jnp.zeros(d, dtype) for name in names}
-        return RigidTreeParameters(jnp.asarray(tree.inertias, dtype), jnp.asarray(tree.armature, dtype), **none)
+        more: dict[str, Any] = {name: jnp.zeros(d, dtype) for name in names}
+        if coupled:
+            keys = (f"{i + 1}_{j + 1}" for i, j in coupled)
+            more["coupling"] = {key: jnp.asarray(entry, dtype) for key, entry in zip(keys, entries, strict=True)}
+        return RigidTreeParameters(jnp.asarray(tree.inertias, dtype), jnp.asarray(own, dtype), **more)
 
-    def energies(parameters: RigidTreeParameters) -> Any:
-        fitted = tree._replace(inertias=parameters.inertias, armature=parameters.armature)
-        dissipation = joint_dissipation(**parameters.friction._asdict(), **shape._asdict()) if names else None
-        carried = Load(jnp.asarray(load), shape.velocity_scale) if any(shares) else None
+    def energies(parameters: RigidTreeParameters, at: Any = temperature) -> Any:
+        armature = armature_matrix(parameters.armature, motors, pairs_of(parameters.coupling))
+        fitted = tree._replace(inertias=parameters.inertias, armature=armature)
+        coefficients = parameters.friction._asdict()
+        if cools and at is not None:
+            factor = jnp.exp(-jnp.asarray(cooling) * (at - reference_temperature))
+            coefficients |= {name: factor * value for name in WARM if (value := coefficients[name]) is not None}
+        dissipation = joint_dissipation(**coefficients, **shape._asdict(), joint_map=motors) if names else None
+        carried = Load(jnp.asarray(load), shape.velocity_scale, motors) if any(shares) else None
         return with_friction(tree_system(fitted), dissipation, carried)
 
     return Model(init, energies)
+
+
+def pairs_of(coupling: dict[str, Any] | None) -> dict[Pair, Any]:
+    """Entries of the armature by pairs of motors counted from 0."""
+    named = (coupling or {}).items()
+    return {(int(key.partition("_")[0]) - 1, int(key.partition("_")[2]) - 1): value for key, value in named}

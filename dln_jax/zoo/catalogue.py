@@ -195,6 +195,11 @@ def make_stored_tree(
     sigmoid_slope: Number = 10.0,
     sigmoid_shift: Number = 0.0,
     load: Number = 0.0,
+    cooling: Number = 0.0,
+    reference_temperature: float = 25.0,
+    temperature: float | None = None,
+    motors: tuple[tuple[float, ...], ...] | None = None,
+    coupled: tuple[tuple[int, int], ...] = (),
     dtype: DTypeLike = jnp.float64,
 ) -> Model:
     """`make_rigid_tree` for a tree from `mechanics.trees.tree_to_json`, with the friction named by the needs."""
@@ -211,6 +216,11 @@ def make_stored_tree(
         sigmoid_slope=sigmoid_slope,
         sigmoid_shift=sigmoid_shift,
         load=load,
+        cooling=cooling,
+        reference_temperature=reference_temperature,
+        temperature=temperature,
+        motors=motors,
+        coupled=coupled,
         dtype=dtype,
     )
 

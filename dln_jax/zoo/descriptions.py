@@ -29,6 +29,8 @@ Description = dict[str, Any]
 """JSON values."""
 STATED = set(Needs._fields) - {"joint_friction", "joint_map", "velocity_scale"}
 """Fields that stored needs must have; files of older releases lack the fields of joint friction."""
+LATER = {"cooling": 0.0, "reference_temperature": 25.0, "temperature": None, "motors": None, "coupled": []}
+"""Keywords that files of older releases lack, with values that leave their terms out."""
 OWN = "own"
 """Name of a model whose factory is not stored in the file."""
 
@@ -113,7 +115,9 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
         raise InputError(f"model description: name is {reprlib.repr(name)}, expected that of a model; {REMEDY}")
     functions = functions_of(name, factory, trust=trust)
     values = {key: value for key, value in description.items() if key not in ("name", "precision")}
-    _require_keys(values, _parameters(functions))
+    expected = _parameters(functions)
+    values = {**{key: value for key, value in LATER.items() if key in expected}, **values}
+    _require_keys(values, expected)
     if "precision" not in description:
         raise InputError(f"model description: lacks precision; {REMEDY}")
     if not isinstance(precision := description["precision"], str):

@@ -96,7 +96,8 @@ def test_what_is_held_stays():
 @pytest.mark.parametrize(
     "laws, options, message",
     [
-        (("viscous", "offset"), {}, "viscous, offset has no shape to find; fit_linear finds the coefficients"),
+        (("coulomb",), {"cooling": True}, "friction has coulomb, which no temperature changes; add viscous"),
+        (("viscous",), {"cooling": True}, "the data have no temperature, on which friction is to depend"),
         (("coulomb",), {"noise": 0.0}, "noise is 0.0; expected a positive number"),
     ],
 )

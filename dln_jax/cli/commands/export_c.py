@@ -31,6 +31,8 @@ class Arguments:
     """C name with which files and functions start."""
     iterations: int = 3
     """Newton steps of the implicit midpoint rule."""
+    temperature: Unstated[float] = None
+    """Temperature of the C functions, °C, if friction depends on it (default: the reference of the identification)."""
     libm: bool = False
     """Call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones."""
     casadi: bool = False
@@ -45,7 +47,8 @@ def main(options: Arguments) -> None:
 
     paths = export_run(
         options.run, options.out, functions=options.functions, name=options.name, precision=options.precision,
-        iterations=options.iterations, libm=options.libm, casadi=options.casadi, overwrite=options.overwrite,
+        iterations=options.iterations, temperature=options.temperature, libm=options.libm, casadi=options.casadi,
+        overwrite=options.overwrite,
     )  # fmt: skip
     print(f"{options.out}: {', '.join(path.name for path in paths)}")
     for path in paths:

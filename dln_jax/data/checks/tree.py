@@ -82,7 +82,9 @@ def against_tree(
     chosen = inside[:: -(-len(inside) // MOST)]
     q, qd, qdd, tau = samples = tuple(getattr(data, key)[chosen] for key in ("q", "qd", "qdd", "tau"))
     tree, down = robot.tree, np.asarray(robot.tree.gravity, float)
-    phi, theta = regressor_of(tree), np.concatenate([np.ravel(tree.inertias), np.ravel(tree.armature)])
+    motors = np.asarray(tree.armature, float)
+    phi = regressor_of(tree)
+    theta = np.concatenate([np.ravel(tree.inertias), np.diag(motors) if motors.ndim == 2 else motors])
     friction = _friction(qd)
     varies = np.ptp(tau, axis=0) > 0
     sizes = np.where(varies, tau.std(axis=0), 1.0)

@@ -39,7 +39,7 @@ class Smoothed(NamedTuple):
     """Trajectories with derivatives of filtered coordinates, and the settings used."""
 
     data: Trajectories
-    """q, qd, qdd and tau at equal steps; other arrays of the log are dropped."""
+    """q, qd, qdd, tau and temperature at equal steps; other arrays of the log are dropped."""
     cutoff: float
     """Cut-off of the filter, Hz; infinite without a filter."""
     rate: float
@@ -120,8 +120,15 @@ def smooth(
             f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
+    slow = data.temperature
     columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
-    for t, x in (even[index] for index in kept):
+    temperatures: list[np.ndarray] = []
+    for index in kept:
+        t, x = even[index]
+        if slow is not None:
+            known = pieces[index]
+            of_joints = [np.interp(t, data.t[known], column) for column in slow[known].T]
+            temperatures.append(np.stack(of_joints, axis=1)[ends : len(t) - ends : decimate])
         arrays = t, *_filtered(x[:, :d], x[:, d:], rate, cutoff, filter_torque=filtered)
         for key, array in zip(columns, arrays, strict=True):
             columns[key].append(array[ends : len(t) - ends : decimate])
@@ -130,6 +137,7 @@ def smooth(
         trajectory=np.repeat(np.arange(len(kept)), [len(t) for t in columns["t"]]),
         label=_labels(data, [int(data.trajectory[pieces[index][0]]) for index in kept]),
         **dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")),
+        temperature=None if slow is None else np.concatenate(temperatures),
         estimated=tuple(key for key in data.estimated if key == "tau"),
     )
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0

@@ -1,13 +1,17 @@
 """Exports a trained run as C99 source: all functions of its model, or a selection."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from dln_jax.export.c.families import DERIVATIVES, functions_of_run
 from dln_jax.export.c.source import export_c
 from dln_jax.export.c.text import PRECISIONS
 from dln_jax.mechanics.discrete import ITERATIONS
 from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load
 
 
@@ -19,6 +23,7 @@ def export_run(
     name: str = "model",
     precision: str | None = None,
     iterations: int = ITERATIONS,
+    temperature: float | None = None,
     libm: bool = False,
     casadi: bool = False,
     overwrite: bool = False,
@@ -33,12 +38,19 @@ def export_run(
         name: name of the export.
         precision: f32 or f64; default: the precision of the training.
         iterations: Newton steps of the implicit midpoint rule.
+        temperature: temperature of the C functions, °C, for a robot whose friction depends on it; default: the
+            reference of its identification.
         libm, casadi, overwrite: as for `export_c`.
 
     Raises:
-        InputError: the folder holds no run, a function does not exist, or `export_c` refuses one.
+        InputError: the folder holds no run, a function does not exist, a temperature that the model does not depend
+            on, or `export_c` refuses a function.
     """
     trained = load(run)
+    if temperature is not None:
+        if not np.any(trained.description.get("cooling", 0.0)):
+            raise InputError(f"the model in {run} does not depend on temperature; leave --temperature out")
+        trained = dataclasses.replace(trained, model=build({**trained.description, "temperature": float(temperature)}))
     precision = precision or str(trained.description["precision"])
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")

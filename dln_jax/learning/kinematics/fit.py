@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import drawn
+from dln_jax.learning.kinematics.agreement import Twin, difference
 from dln_jax.learning.kinematics.frames import Frames
 from dln_jax.learning.kinematics.projection import (
     Descent,
@@ -23,7 +24,7 @@ from dln_jax.learning.kinematics.projection import (
     design,
     inertias_of,
 )
-from dln_jax.learning.kinematics.search import ALIKE, Search, agreeing, search
+from dln_jax.learning.kinematics.search import ALIKE, Search, Searched, agreeing, search
 from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree, rotation_vector
@@ -64,6 +65,8 @@ class TreeFit(NamedTuple):
     """Descents that ended at the lowest loss."""
     agreement: int
     """Descents that the search required to agree (`Search.agreement`)."""
+    twin: Twin | None
+    """Comparison with another descent to the same loss; `None` if there is none, or none was asked for."""
     seconds: float
     """Duration of the whole call, compilation included."""
 
@@ -87,7 +90,7 @@ def fit_tree(
     Gauss-Newton refines random frames on a subset of the samples, with all else eliminated (`projection`). The best are
     refined on all samples, with joints weighted by their unexplained torque. Validation chooses between local minima
     whose losses differ by less than a factor of two. Handedness and other gauges (see `models.serial_tree`) are
-    arbitrary.
+    arbitrary. The search goes on until another descent to the same loss has found the same arm (`agreement`).
 
     Args:
         needs: kinds of joints, gravity, friction.
@@ -118,40 +121,79 @@ def fit_tree(
     structure = Structure(order, needs.joints, acceleration, needs.friction, velocity_scale)
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(train))
-        program = compiled(structure, ridge=ridge)
-        descents = search(structure, program, _some(train, settings.samples, settings.seed), scale, settings)
+        program, columns = compiled(structure, ridge=ridge), _columns(structure)
+        some, every = (_some(train, count, settings.seed) for count in (settings.samples, most_samples))
+        searched, twin, until, wanted = Searched([], 0), None, began + settings.seconds, settings
+
+        def finished(descent: Descent) -> _Finished:
+            state, unit = _refined(program, structure, descent, every, scale, settings)
+            solution = _solved(columns, state, unit, train, rank_tolerance)
+            errors = [_joint_errors(columns, state.frames, solution.x, part) for part in (train, validation or train)]
+            return _Finished(state, solution, *errors)
+
+        while True:
+            searched = search(structure, program, some, scale, wanted, until=until, before=searched)
+            descents = searched.descents
+            report(
+                f"{len(descents)} descents, {agreeing(descents)} to the lowest loss, {float(descents[0].at.loss):.3g}"
+            )
+            finalists = _finalists(descents, validation)
+            candidates = [finished(descent) for descent in finalists]
+            errors = [float(np.sum(candidate.judged / scale**2)) for candidate in candidates]
+            chosen = int(np.argmin(errors))
+            best, start = candidates[chosen], finalists[chosen]
+            if not settings.confirm:
+                break
+            if others := [descent for descent in descents if descent is not start and _alike(descent, start)]:
+                nearest = min(others, key=lambda other: difference(start.frames, other.frames, structure).size)
+                other = finished(nearest)
+                relative = float(np.sum(other.judged / scale**2)) / errors[chosen]
+                twin = Twin(relative, difference(best.state.frames, other.state.frames, structure))
+                report(f"two descents to this tree's loss found {twin.words}")
+            if (twin is not None and twin.same) or searched.starts >= settings.starts or time.perf_counter() > until:
+                break
+            # One more wave of starts, whatever agrees already.
+            wanted = settings._replace(agreement=agreeing(descents) + 1)
         losses = np.array([float(descent.at.loss) for descent in descents])
-        report(f"{len(descents)} descents, {agreeing(descents)} of them to the lowest loss, {losses[0]:.3g}")
-        every, finalists = _some(train, most_samples, settings.seed), _finalists(descents, validation)
-        refined = [_refined(program, structure, descent, every, scale, settings) for descent in finalists]
-        columns = _columns(structure)
-        solved = [_solved(columns, descent, unit, train, rank_tolerance) for descent, unit in refined]
-        pairs = [(descent.frames, solution.x) for (descent, _), solution in zip(refined, solved, strict=True)]
-        errors = [_joint_errors(columns, *pair, train) for pair in pairs]
-        judged = [_joint_errors(columns, *pair, validation or train) for pair in pairs]
-        best = int(np.argmin([np.sum(squares / scale**2) for squares in judged]))
-        (frames, linear), solution = pairs[best], solved[best]
-        parameters = _parameters(structure, frames, linear)
+        frames, solution = best.state.frames, best.solution
+        parameters = _parameters(structure, frames, solution.x)
     return TreeFit(
         parameters=parameters,
         frames=jax.tree.map(np.asarray, frames),
-        torque_mse=float(errors[best].sum()),
-        joint_mse=errors[best],
-        validation_error=float("nan") if validation is None else float(judged[best].sum()),
-        parameter_count=len(refined[best][0].at.slope) + structure.linear_count,
+        torque_mse=float(best.trained.sum()),
+        joint_mse=best.trained,
+        validation_error=float("nan") if validation is None else float(best.judged.sum()),
+        parameter_count=len(best.state.at.slope) + structure.linear_count,
         rank=solution.rank,
         condition=solution.condition,
         losses=losses,
         agreeing=agreeing(descents),
         agreement=settings.agreement,
+        twin=twin,
         seconds=time.perf_counter() - began,
     )
+
+
+class _Finished(NamedTuple):
+    """A descent, refined, with its linear parameters and mean squared errors by joint."""
+
+    state: Descent
+    solution: least_squares.LeastSquaresSolution
+    trained: Float[np.ndarray, " d"]
+    judged: Float[np.ndarray, " d"]
+    """On validation samples, or those of training without them."""
 
 
 def _some(data: Trajectories, most: int, seed: int) -> Samples:
     """Returns all samples, or a random subset of at most `most`."""
     some = drawn(data, most, seed)
     return Samples(some.q, some.qd, some.qdd, some.tau)
+
+
+def _alike(one: Descent, other: Descent) -> bool:
+    """Whether two descents ended at the same loss."""
+    low, high = sorted((float(one.at.loss), float(other.at.loss)))
+    return high <= (1 + ALIKE) * low
 
 
 def _finalists(descents: list[Descent], validation: Trajectories | None) -> list[Descent]:

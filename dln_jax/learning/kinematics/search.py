@@ -37,6 +37,8 @@ class Search(NamedTuple):
     """Samples drawn from the data for the search; the best frames are refined on all."""
     seconds: float = float("inf")
     """Time after which the best frames so far are taken; at least one wave of starts runs."""
+    confirm: bool = True
+    """Whether to search until two descents end at the same arm, with the same validation error."""
     seed: int = 0
     """Seed of the starts and of the samples."""
     threads: int = 2
@@ -48,10 +50,26 @@ class Search(NamedTuple):
     """Deviation of the prior's positions, m."""
 
 
+class Searched(NamedTuple):
+    """Descents so far."""
+
+    descents: list[Descent]
+    """Final states, lowest loss first."""
+    starts: int
+    """Number of random starts; the others are moves of the best."""
+
+
 def search(
-    structure: Structure, program: Program, samples: Samples, unit: Float[np.ndarray, " d"], settings: Search
-) -> list[Descent]:
-    """Returns the final states of all descents, lowest loss first.
+    structure: Structure,
+    program: Program,
+    samples: Samples,
+    unit: Float[np.ndarray, " d"],
+    settings: Search,
+    *,
+    until: float,
+    before: Searched = Searched([], 0),  # noqa: B008
+) -> Searched:
+    """Descends from random starts, and from moves of the best, until enough descents agree on the lowest loss.
 
     Args:
         structure: known properties of the tree.
@@ -59,6 +77,8 @@ def search(
         samples: samples of the data for the search.
         unit: scale of the joints' torques.
         settings: limits of the search.
+        until: reading of `time.perf_counter` at which the search ends.
+        before: an earlier search, which another wave of starts continues.
 
     Raises:
         InputError: a setting out of range.
@@ -66,18 +86,18 @@ def search(
     counts = {name: getattr(settings, name) for name in ("starts", "agreement", "iterations", "seconds", "threads")}
     require_positive(**counts, prior_angle=settings.prior_angle, prior_length=settings.prior_length)
     require_seed(settings.seed)
-    until = time.perf_counter() + settings.seconds
 
     def end(frames: Frames) -> Descent:
         with jax.enable_x64(True):  # the setting is local to a thread
             limits = {"iterations": settings.iterations, "expired": lambda: time.perf_counter() > until}
             return descend(program, structure, frames, samples, unit, **limits)
 
-    descents: list[Descent] = []
+    descents, done = before
     with ThreadPoolExecutor(settings.threads) as pool:
-        starts = _starts(structure, settings)
+        starts = _starts(structure, settings, done)
         while wave := list(itertools.islice(starts, WAVE)):
             descents = _sorted([*descents, *pool.map(end, wave)])
+            done += len(wave)
             if agreeing(descents) >= settings.agreement or time.perf_counter() > until:
                 break
         for joints in (1, 2):
@@ -86,7 +106,7 @@ def search(
                 descents = _sorted([*descents, *pool.map(end, _turns(structure, best.frames, joints))])
                 if not descents[0].at.loss < (1 - ALIKE) * best.at.loss:
                     break
-    return descents
+    return Searched(descents, done)
 
 
 def agreeing(descents: list[Descent]) -> int:
@@ -94,9 +114,9 @@ def agreeing(descents: list[Descent]) -> int:
     return sum(float(descent.at.loss) <= (1 + ALIKE) * float(descents[0].at.loss) for descent in descents)
 
 
-def _starts(structure: Structure, settings: Search) -> Iterator[Frames]:
+def _starts(structure: Structure, settings: Search, first: int) -> Iterator[Frames]:
     prior = settings.kinematic_prior
-    for index in range(settings.starts):
+    for index in range(first, settings.starts):
         random = np.random.default_rng([settings.seed, index])
         if prior is None:
             yield random_frames(len(structure.joints), random)

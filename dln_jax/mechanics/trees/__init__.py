@@ -20,6 +20,7 @@ from dln_jax.mechanics.trees.inertia import (
     moved,
     pseudo_inertia,
 )
+from dln_jax.mechanics.trees.motors import armature_matrix
 from dln_jax.mechanics.trees.recursions import (
     composite_bodies,
     kinetic_energy,
@@ -34,6 +35,7 @@ from dln_jax.mechanics.trees.recursions import (
 __all__ = [
     "PARAMETERS",
     "Tree",
+    "armature_matrix",
     "body_of_pseudo_inertia",
     "composite_bodies",
     "dh_frames",

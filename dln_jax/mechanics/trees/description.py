@@ -34,7 +34,7 @@ class Tree(NamedTuple):
     inertias: Any
     """[d, 10], the links' inertial parameters in their own frames, as `inertia.PARAMETERS`."""
     armature: Any
-    """[d], inertias of the motors on the joints' side, kg m² or kg."""
+    """[d], inertias of the motors on the joints' side, kg m² or kg; [d, d] if motors turn with several joints."""
     gravity: Any = np.array(EARTH)
     """[3], m/s², in the frame of the ground."""
     names: tuple[str, ...] = ()
@@ -68,7 +68,7 @@ def make_tree(
 
     Raises:
         InputError: links out of order, joints of another kind, arrays of another shape or not finite, an invalid
-            rotation, or an axis of length zero.
+            rotation, an armature of negative inertia, or an axis of length zero.
     """
     d = len(parents)
     if d == 0 or any(not -1 <= parent < link for link, parent in enumerate(parents)):
@@ -82,13 +82,16 @@ def make_tree(
         "positions": (positions, (d, 3)),
         "axes": (axes, (d, 3)),
         "inertias": (inertias, (d, 10)),
-        "armature": (np.zeros(d) if armature is None else armature, (d,)),
+        "armature": (np.zeros(d) if armature is None else armature, (d, d) if np.ndim(armature) == 2 else (d,)),
         "gravity": (gravity, (3,)),
     }
     checked = {name: finite_array(name, array, shape) for name, (array, shape) in arrays.items()}
     turned = checked["rotations"]
     if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turned) < 0).any():
         raise InputError("rotations has a matrix that is no rotation; expected orthonormal columns, right-handed")
+    A = checked["armature"]
+    if A.ndim == 2 and (np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] < -1e-9 * A.max()):
+        raise InputError("armature is no symmetric positive semidefinite matrix; expected that of motors' inertias")
     lengths = np.linalg.norm(checked["axes"], axis=1)
     if not (lengths > 0).all():
         raise InputError(f"joint {int(np.argmin(lengths))} has an axis of length zero; expected a direction")

@@ -48,7 +48,12 @@ def newton_euler(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
             carried, turned = inwards(frames[link], force), inwards(frames[link], moment)
             before = forces[parent]
             forces[parent] = (before[0] + carried, before[1] + turned + cross(frames[link].position, carried))
-    return jnp.stack(tau) + tree.armature * qdd
+    return jnp.stack(tau) + _motor_momentum(tree, qdd)
+
+
+def _motor_momentum(tree: Tree, rates: Vector) -> Vector:
+    """A qd of the motors, or their force A qdd."""
+    return tree.armature @ rates if np.ndim(tree.armature) == 2 else tree.armature * rates
 
 
 def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]:
@@ -102,7 +107,8 @@ def composite_bodies(tree: Tree, q: Vector) -> Matrix:
             bodies[tree.parents[link]] = tuple(a + b for a, b in zip(bodies[tree.parents[link]], carried, strict=True))
     zero = jnp.zeros((), q.dtype)
     rows = [jnp.stack([jnp.asarray(M.get((i, j), zero)) for j in range(d)]) for i in range(d)]
-    return jnp.stack(rows) + jnp.diag(jnp.asarray(tree.armature, q.dtype))
+    armature = jnp.asarray(tree.armature, q.dtype)
+    return jnp.stack(rows) + (armature if armature.ndim == 2 else jnp.diag(armature))
 
 
 def _carried(body: tuple[Any, Any, Any], frame: Placed) -> tuple[Any, Any, Any]:
@@ -118,7 +124,7 @@ def _carried(body: tuple[Any, Any, Any], frame: Placed) -> tuple[Any, Any, Any]:
 
 
 def regressor(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
-    """Phi with tau = Phi theta, where theta holds the links' ten parameters end to end, then the armature, P = 11 d."""
+    """Phi with tau = Phi theta; theta holds the links' ten parameters end to end, then an armature [d], P = 11 d."""
 
     def force(inertias: Array, armature: Array) -> Vector:
         return newton_euler(tree._replace(inertias=inertias, armature=armature), q, qd, qdd)
@@ -130,10 +136,10 @@ def regressor(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d
 
 
 def kinetic_energy(tree: Tree, q: Vector, qd: Vector) -> Scalar:
-    """T = sum over links of ½ m |v|² + v . (ω x h) + ½ ω . I ω, and of ½ armature qd²."""
+    """T = sum over links of ½ m |v|² + v . (ω x h) + ½ ω . I ω, and ½ qd . A qd of the armature."""
     tree = aligned(tree)
     frames, moving = placed(tree, q), []
-    total = 0.5 * jnp.sum(tree.armature * qd**2)
+    total = 0.5 * qd @ _motor_momentum(tree, qd)
     z = jnp.array([0.0, 0.0, 1.0], q.dtype)
     for link, (parent, frame) in enumerate(zip(tree.parents, frames, strict=True)):
         w, v = moving[parent] if parent >= 0 else (jnp.zeros(3, q.dtype), jnp.zeros(3, q.dtype))

@@ -142,6 +142,10 @@ class ArmOptions:
 class TreeOptions(ArmOptions, Objective, Limited):
     """A tree of unknown joint frames."""
 
+    refine: Unstated[Literal["motions"]] = None
+    """Fit physically consistent bodies and friction on the learned axes to motions (output error), and keep them if
+    they predict validation motions longer."""
+
 
 @dataclass(frozen=True)
 class SelectionOptions(ArmOptions, Limited, Devices):

@@ -9,6 +9,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import torque_noise
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
+from dln_jax.learning.kinematics import Twin
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
@@ -60,7 +61,9 @@ def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) ->
     names = None if robot is None else robot.tree.names
     verdict, numbers = worst(judge(tested, names), judge(validated, names)), {}
     if task.search is not None:
-        of_search, numbers = searched(task.search.losses, task.search.agreeing, task.search.agreement, tested)
+        of_search, numbers = searched(
+            task.search.losses, task.search.agreeing, task.search.agreement, tested, task.search.twin
+        )
         verdict = verdict if of_search is None else worst(verdict, of_search)
     nmse = {"test_nmse": _nmse(tested), "validation_nmse": _nmse(validated)}
     return TorqueVerdict(verdict, {**nmse, **verdict_metrics(tested, verdict), **numbers}, nmse["validation_nmse"])
@@ -78,7 +81,7 @@ def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
 
 
 def searched(
-    losses: np.ndarray, agreeing: int, agreement: int, errors: HeldOut
+    losses: np.ndarray, agreeing: int, agreement: int, errors: HeldOut, twin: Twin | None = None
 ) -> tuple[Verdict | None, dict[str, float | int]]:
     """Verdict and metrics of a search for joint frames: agreement of its descents, and their errors over the noise.
 
@@ -87,8 +90,12 @@ def searched(
         agreeing: number of descents that reached the lowest loss.
         agreement: number of agreeing descents that the search aims for.
         errors: errors on held-out motions.
+        twin: comparison of two of these descents.
     """
     numbers: dict[str, float | int] = {"descents": len(losses), "descents_agreeing": agreeing}
+    if twin is not None:
+        off = {"twin_degrees": float(np.degrees(twin.off.angle)), "twin_metres": twin.off.length}
+        numbers |= {**off, "twin_error": twin.error}
     above = None
     if errors.noise is not None and (errors.noise > 0).all():
         above = float(np.mean(errors.error / errors.noise))
@@ -99,6 +106,9 @@ def searched(
         reason = f"only {agreeing} of {len(losses)} descents reached the lowest loss, so a lower one may exist"
         remedy = "try another --seed, more --seconds or a --kinematic-prior of the arm"
         return Verdict("doubtful", reason, remedy), numbers
+    if twin is not None and not twin.same:
+        reason = f"two descents to the same loss found {twin.words}, so the motions do not determine the axes"
+        return Verdict("doubtful", reason, "record more and different motions, or add a --kinematic-prior"), numbers
     if above is not None and above > FAR_FROM_NOISE:
         reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"
         remedy = (

@@ -14,9 +14,10 @@ from dln_jax.data import schema
 from dln_jax.data.arrays import spread
 from dln_jax.data.bodies import find_bodies
 from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
-from dln_jax.data.schema import Trajectories, column, time_derivative
+from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, segments, select
 from dln_jax.data.stated_tests import stated_test
+from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places

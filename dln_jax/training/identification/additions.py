@@ -76,8 +76,10 @@ def judge_residual(case: Case, added: ResidualFit, metrics: dict[str, float | in
 
 def shape_lines(case: Case) -> list[str]:
     """Fitted shape parameters of friction, in addition to its coefficients."""
-    shapes = {name: case.description[name] for name in shape_of(case.laws) if isinstance(case.description[name], list)}
-    units = {"sigmoid_slope": "s"}
+    named = (*shape_of(case.laws), "load", "cooling")
+    shapes = {name: case.description[name] for name in named if isinstance(case.description[name], list)}
+    reference = f"1/K about {case.description['reference_temperature']:g} °C"
+    units = {"sigmoid_slope": "s", "load": "of the torque that the gear carries", "cooling": reference}
     return [
         f"{name.replace('_', ' ')}: {', '.join(f'{value:.3g}' for value in values)} {units.get(name, 'rad/s or m/s')}"
         for name, values in shapes.items()

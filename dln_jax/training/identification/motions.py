@@ -2,31 +2,39 @@
 
 Motions need no accelerations. With --cutoff, their q is filtered `LIGHTER` times as high as that of torques, since the
 output error does not amplify noise.
+
+The length of the windows is chosen by inner splits: fits to some trajectories (or blocks) of the training data predict
+the others. The parameters by torques take part, and are kept if none predicts longer.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.encoders import Smoothed, smooth
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import in_blocks, select
 from dln_jax.identification import equations
-from dln_jax.identification.identify import Identification, parameters_of
-from dln_jax.identification.motions import MotionFit, cut_motions, fit_motions, linearise
+from dln_jax.identification.identify import Identification, identify, parameters_of
+from dln_jax.identification.motions import REWEIGHTINGS, MotionFit, cut_motions, fit_motions
+from dln_jax.learning.measured_motions import MeasuredWindows
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
-WINDOW = 0.3
-"""Length of a window, s. Of 0.1 and 0.3 s, the longer one predicted held-out motions of a recorded double pendulum
-longer."""
+WINDOWS = (0.3, 1.0)
+"""Lengths of windows that inner splits choose from, s."""
+FOLDS = 3
+"""Inner splits, each with a third of the trajectories held out."""
 PUSH = 0.1
 """Standard deviation of a window's constant torque over that of a sample's torque error, which cancels in part."""
 LIGHTER, NYQUIST, STEP = 5.0, 0.4, 0.01
 """Cut-off of the motions' q over that of the torques', its limit over the sampling rate, and their time step, s."""
 HORIZON, EVERY = 2.2, 0.5
 """Length of a predicted segment and interval of starts, s; shorter if a held-out motion is shorter."""
+TOGETHER = 32
+"""Segments that are predicted at a time."""
 FITTED = 0.1
 """Part of a segment that its initial state is fitted to, s."""
 
@@ -54,11 +62,27 @@ def lightly_filtered(data: Trajectories, filtered: Smoothed | None) -> Trajector
     return light
 
 
+class Chosen(NamedTuple):
+    """A choice between torques and motions by inner splits."""
+
+    window: float | None
+    """Length of the windows, s; `None` keeps the parameters by torques."""
+    seconds: dict[str, float]
+    """Mean valid prediction time on inner held-out motions, by "torques" and length; empty without inner splits."""
+
+    @property
+    def line(self) -> str:
+        """What was chosen, and why."""
+        shown = ", ".join(f"{name} {value:.3g} s" for name, value in self.seconds.items())
+        kept = "parameters by torques" if self.window is None else f"windows of {self.window:g} s"
+        return f"chosen by inner splits of the training data: {kept} (prediction times: {shown})"
+
+
 def fit_by(
     by: str, model: Model, known: Parameters, solution: Identification, train: Trajectories, sets: MotionSets,
-    window: float | None,
-) -> tuple[Identification, MotionFit]:  # fmt: skip
-    """The solution with parameters that fit motions, or motions and torques, and the record of that fit.
+    window: float | None, **options: Any,
+) -> tuple[Identification, MotionFit | None, Chosen]:  # fmt: skip
+    """The solution with parameters that fit motions, or motions and torques, the record of that fit, and the choice.
 
     Args:
         by: "motions" or "both".
@@ -66,29 +90,75 @@ def fit_by(
         known: its parameters in the robot's file.
         solution: consistent fit of the torques.
         train: its training data.
-        sets: motions.
-        window: length of the windows, s (default: `WINDOW`).
+        sets: motions; those of `sets.train` have the trajectories of `train`.
+        window: length of the windows, s (default: chosen from `WINDOWS` by inner splits).
+        options: of `identify`, for the fits of torques in inner splits.
 
     Raises:
         InputError: physically inconsistent parameters, or a window of fewer than four samples.
     """
     if solution.consistent is None:
         raise InputError(f"--by {by} needs physically consistent bodies to simulate; leave --no-consistent out")
-    length = round((WINDOW if window is None else window) / step_of(sets.train)) + 1
+    choice = chosen_window(by, model, known, train, sets.train, **options) if window is None else Chosen(window, {})
+    if choice.window is None:
+        return solution, None, choice
+    fit = fitted(by, model, solution, train, sets.train, choice.window, known=known)
+    kept = solution.consistent._replace(theta=fit.theta, converged=fit.converged)
+    return solution._replace(consistent=kept), fit, choice
+
+
+def fitted(
+    by: str, model: Model, solution: Identification, train: Trajectories, motions: Trajectories, window: float,
+    *, known: Parameters, reweightings: int = REWEIGHTINGS,
+) -> MotionFit:  # fmt: skip
+    """The fit to windows of this length; arguments and errors as for `fit_by`."""
+    length = round(window / step_of(motions)) + 1
     if length < 4:
         raise InputError(f"--window {window} has {length} samples of the log; expected 4 at least")
     torques = None
     if by == "both":
         # Samples with correlated residuals count once, as in the standard errors.
         noise = solution.fit.noise * np.sqrt(solution.statistics.correlation)
-        compact = equations.compressed(equations.regressor_of(model, known, train))
+        compact = equations.compressed(equations.regressor_of(model, parameters_of(solution.theta, known), train))
         torques = equations.weighted(compact, noise)
-    fit = fit_motions(
-        model, known, solution.columns, solution.known, solution.theta, cut_motions(sets.train, length),
-        noise_tau=PUSH * solution.fit.noise, torques=torques, linearised=linearise(model, known),
+    return fit_motions(
+        model, solution.columns, solution.known, solution.theta, cut_motions(motions, length),
+        noise_tau=PUSH * solution.fit.noise, torques=torques, reweightings=reweightings,
     )  # fmt: skip
-    kept = solution.consistent._replace(theta=fit.theta, converged=fit.converged)
-    return solution._replace(consistent=kept), fit
+
+
+def chosen_window(
+    by: str, model: Model, known: Parameters, train: Trajectories, motions: Trajectories, **options: Any
+) -> Chosen:
+    """Chooses by the mean valid prediction time of inner held-out trajectories, or blocks of time of a single one.
+
+    A length is left out if its motions are not finite.
+    """
+    if len(np.unique(motions.trajectory)) == 1:
+        train, motions = (in_blocks(part, 2 * FOLDS) for part in (train, motions))
+    present, variance = np.unique(motions.trajectory), spread_of(motions)
+    times: dict[float | None, list[np.ndarray]] = {window: [] for window in (None, *WINDOWS)}
+    for fold in range(min(FOLDS, len(present))):
+        rest = np.delete(present, slice(fold, None, FOLDS))
+        inner, moved, held = select(train, rest), select(motions, rest), select(motions, present[fold::FOLDS])
+        solution = identify(model, known, inner, **options)
+        thetas: dict[float | None, np.ndarray] = {None: solution.theta}
+        for window in [window for window in WINDOWS if window in times]:
+            try:
+                thetas[window] = fitted(by, model, solution, inner, moved, window, known=known, reweightings=0).theta
+            except InputError:
+                del times[window]
+        for window, theta in thetas.items():
+            times[window].append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
+    means = {window: float(np.mean(np.concatenate(parts))) for window, parts in times.items()}
+    best = max(means, key=lambda window: means[window])
+    return Chosen(best, {"torques" if window is None else f"{window:g} s": mean for window, mean in means.items()})
+
+
+def spread_of(*data: Trajectories) -> Float[np.ndarray, " d"]:
+    """Variance of every joint's q, the unit of prediction errors; 1 for a joint that rests."""
+    variance = np.concatenate([part.q for part in data]).var(axis=0)
+    return np.where(variance > 0, variance, 1.0)
 
 
 def step_of(data: Trajectories) -> float:
@@ -97,39 +167,51 @@ def step_of(data: Trajectories) -> float:
     return float(np.median(steps))
 
 
-def prediction_seconds(
+def prediction_times(
     model: Model, parameters: Parameters, held: Trajectories, variance: Float[np.ndarray, " d"]
-) -> tuple[float, float]:
-    """Mean valid prediction time of segments of held-out motions, and the length predicted, s."""
+) -> tuple[Float[np.ndarray, " W"], float]:
+    """Valid prediction times of segments of held-out motions, and the length predicted, s."""
     step, shortest = step_of(held), min(np.bincount(held.trajectory)[np.unique(held.trajectory)])
     fitted = max(3, round(FITTED / step) + 1)
     samples = max(min(round(HORIZON / step), int(shortest)), fitted + 1)
     segments = cut_segments(held, samples, every=max(1, min(round(EVERY / step), samples // 2)))
-    predicted = predict_measured(model, parameters, segments, fitted=fitted)
-    times = valid_times(segments, predicted, fitted=fitted, variance=variance)
-    return float(np.mean(times)), (samples - fitted) * step
+    count = len(segments.t)
+    rows = np.minimum(np.arange(-(-count // TOGETHER) * TOGETHER), count - 1)  # few shapes, so few programs
+    padded = MeasuredWindows(*(array[rows] for array in segments))
+    predicted = predict_measured(model, parameters, padded, fitted=fitted)
+    return valid_times(padded, predicted, fitted=fitted, variance=variance)[:count], (samples - fitted) * step
 
 
 def prediction_metrics(
-    model: Model, known: Parameters, sets: MotionSets, by_torques: np.ndarray, kept: np.ndarray, fit: MotionFit
+    model: Model, known: Parameters, sets: MotionSets, by_torques: np.ndarray, kept: np.ndarray, fit: MotionFit | None
 ) -> dict[str, float | int]:
     """Entries of metrics.json: prediction times of both fits, the delay, and the distance of the fitted motions."""
-    variance = np.concatenate([sets.train.q, sets.test.q]).var(axis=0)
-    variance = np.where(variance > 0, variance, 1.0)
-    before, length = prediction_seconds(model, parameters_of(by_torques, known), sets.test, variance)
-    after, _ = prediction_seconds(model, parameters_of(kept, known), sets.test, variance)
-    return {
-        "vpt_seconds": after, "by_torques_vpt_seconds": before, "predicted_seconds": length,
+    variance = spread_of(*sets)
+    before, length = prediction_times(model, parameters_of(by_torques, known), sets.test, variance)
+    after, _ = prediction_times(model, parameters_of(kept, known), sets.test, variance)
+    of_fit = {} if fit is None else {
         "delay_seconds": fit.delay, "motion_rms_before": fit.before, "motion_rms": fit.after, "rounds": fit.rounds,
+    }  # fmt: skip
+    return {
+        "vpt_seconds": float(np.mean(after)), "by_torques_vpt_seconds": float(np.mean(before)),
+        "predicted_seconds": length, **of_fit,
     }  # fmt: skip
 
 
-def motion_lines(by: str, fit: MotionFit, numbers: dict[str, float | int]) -> list[str]:
-    """What the fit to motions did, in three lines."""
-    lines = [
-        f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} rounds)",
+def motion_lines(by: str, fit: MotionFit | None, choice: Chosen, numbers: dict[str, float | int]) -> list[str]:
+    """What the fit to motions did, in a few lines."""
+    lines = [choice.line] if choice.seconds else []
+    if fit is not None:
+        lines.append(
+            f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} "
+            "rounds)"
+        )
+    lines.append(
         f"held-out motions: predicted for {numbers['vpt_seconds']:.3g} s of {numbers['predicted_seconds']:.3g} s, by "
-        f"torques alone for {numbers['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)",
-        f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay",
-    ]
-    return lines if fit.converged else [*lines, "the fit to motions did not converge; record motions closer to the use"]
+        f"torques alone for {numbers['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
+    )
+    if fit is not None:
+        lines.append(f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay")
+    if fit is not None and not fit.converged:
+        lines.append("the fit to motions did not converge; record motions closer to the use")
+    return lines

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.options import Drawn, Filtered, Folder
 
-IDENTIFIED = ("viscous", "coulomb", "stribeck", "offset", "asymmetric", "sigmoid")
-"""Friction laws in whose coefficients forces are linear."""
+IDENTIFIED = ("viscous", "coulomb", "stribeck", "offset", "asymmetric", "sigmoid", "load")
+"""Friction laws that are identified; load only if cross-validation asks for it."""
 NO_FRICTION = "none"
 
 
@@ -26,13 +26,23 @@ class Robot:
     lock: Unstated[str] = None
     """Joints that do not move; "*finger*" names all with finger in their name (default: all move)."""
     friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = "viscous,coulomb,offset"
-    """Friction laws whose coefficients are identified (default: viscous,coulomb,offset)."""
+    """Friction laws that are identified (default: viscous,coulomb,offset); load, a share of the torque that a gear
+    carries, is left out unless cross-validation asks for it."""
+    temperature: bool = False
+    """Let viscous friction fall with the log's temperature, if cross-validation asks for it."""
+    motors: Unstated[str] = None
+    """Rows of the matrix S of motor rates S qd, if motors turn with several joints (parallelograms, belts), such as
+    "1,0,0; 0,1,0; 0,1,1"; armature and friction then act at the motors (default: a motor at each joint)."""
+    coupled: Unstated[str] = None
+    """Pairs of joints, such as 2:3, whose motors share an inertia off the armature's diagonal, for gears of unknown
+    ratio; a pair is left out if no motion can show it, or cross-validation does not ask for it."""
     velocity_scale: Unstated[float] = None
     """Velocity at which dry friction has three quarters of its force, rad/s or m/s (default: fitted for each joint)."""
     by: Literal["torques", "motions", "both"] = "torques"
     """What is fitted: torques of filtered motions, motions simulated with the torques (output error), or both."""
     window: Unstated[float] = None
-    """Length of the simulated windows of --by motions and both, s (default: 0.3)."""
+    """Length of the simulated windows of --by motions and both, s (default: chosen by inner splits of the training
+    data, which may also keep the parameters by torques)."""
     uncertainty: bool = True
     """Estimate the uncertainty of the torques, and flag states out of distribution."""
     residual: bool = False

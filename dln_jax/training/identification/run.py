@@ -17,8 +17,10 @@ from dln_jax.identification.identify import Identification, identify, parameters
 from dln_jax.identification.motions import MotionFit
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
 from dln_jax.identification.residual import ResidualFit
+from dln_jax.mechanics.trees import armature_matrix
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import Verdict
+from dln_jax.models.rigid_tree import pairs_of
 from dln_jax.training.identification.additions import (
     ADDED,
     Predict,
@@ -31,9 +33,9 @@ from dln_jax.training.identification.additions import (
     store_bands,
     stored_description,
 )
-from dln_jax.training.identification.motions import fit_by, motion_lines, prediction_metrics
+from dln_jax.training.identification.motions import Chosen, fit_by, motion_lines, prediction_metrics
 from dln_jax.training.identification.options import Options
-from dln_jax.training.identification.task import Case, prepare, with_shapes
+from dln_jax.training.identification.task import Case, prepare, referred, with_terms
 from dln_jax.training.identification.verdict import judged
 from dln_jax.training.pipeline import Fitted, Judged, Kind, png
 from dln_jax.training.uncertainty import uncertainty_metrics
@@ -52,7 +54,8 @@ class Outcome(NamedTuple):
     residual: ResidualFit | None
     seconds: float
     motions: MotionFit | None
-    """Fit to motions, whose parameters are those of `solution`, if asked for."""
+    """Fit to motions, whose parameters are those of `solution`, if asked for and chosen."""
+    choice: Chosen | None
     by_torques: np.ndarray
     """Parameters of the fit of torques alone."""
 
@@ -73,42 +76,42 @@ def announce(case: Case) -> Iterator[str]:
 def fit(case: Case, options: Options, folder: Path, mesh: Mesh | None) -> Fitted:
     """Fits shapes of friction, the linear parameters, and a residual network if one is asked for."""
     began = time.perf_counter()
-    case = with_shapes(options.velocity_scale, case)
-    solution = identify(
-        case.model,
-        case.known,
-        case.sets.train,
-        joints=case.robot.tree.joints,
-        noise=case.noise,
-        robust=options.robust,
-        consistent=options.consistent,
-        regularisation=options.regularisation,
-    )
-    by_torques, motions = solution.theta, None
+    measured, friction = with_terms(options.velocity_scale, case)
+    at = None if friction is None or "load" not in measured.laws else friction.parameters
+    case = measured if friction is None else referred(measured, friction.parameters)
+    settings = {
+        "joints": case.robot.tree.joints, "at": at, "noise": case.noise, "robust": options.robust,
+        "consistent": options.consistent, "regularisation": options.regularisation,
+    }  # fmt: skip
+    solution = identify(case.model, case.known, case.sets.train, **settings)
+    by_torques, motions, choice = solution.theta, None, None
     if case.motions is not None:
-        solution, motions = fit_by(
-            options.by, case.model, case.known, solution, case.sets.train, case.motions, options.window
+        solution, motions, choice = fit_by(
+            options.by, case.model, case.known, solution, case.sets.train, case.motions, options.window, **settings
         )
     kept = parameters_of(solution.theta, case.known)
+    case = referred(measured, kept)
     residual = add_residual(case, kept) if options.residual else None
     seconds = time.perf_counter() - began
     parameters = kept if residual is None else residual.parameters
     return Fitted(
-        stored_description(case, residual), parameters, Outcome(case, solution, residual, seconds, motions, by_torques)
+        stored_description(case, residual),
+        parameters,
+        Outcome(case, solution, residual, seconds, motions, choice, by_torques),
     )
 
 
 def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     """Held-out errors, uncertainty and verdict; writes parameters, the report and the robot's file."""
-    case, solution, residual, seconds, motions, by_torques = fitted.outcome
+    case, solution, residual, seconds, motions, choice, by_torques = fitted.outcome
     predict = predictor(case.model)
     metrics, predicted = evaluate(case, solution, predict)
     if residual is not None and residual.settings:
         predicted[ADDED] = judge_residual(case, residual, metrics)
     of_motions = []
-    if motions is not None and case.motions is not None:
+    if choice is not None and case.motions is not None:
         numbers = prediction_metrics(case.model, case.known, case.motions, by_torques, solution.theta, motions)
-        of_motions, metrics = motion_lines(options.by, motions, numbers), metrics | numbers
+        of_motions, metrics = motion_lines(options.by, motions, choice, numbers), metrics | numbers
     kept = ADDED if ADDED in predicted else KEPT
     torques = {name: prediction.torque for name, prediction in predicted.items()}
     verdict, of_verdict = judged(case, solution, predict, torques, kept, robust=options.robust)
@@ -121,7 +124,8 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
         figures |= bands
     write_json(folder / "parameters.json", {"base": base_rows(solution), "parameters": parameter_rows(solution)})
     write_bytes(folder / "report.txt", text(solution).encode())
-    lines = [*findings(solution, case.sets.train, case.names), *write_file(folder, options, case, solution, verdict)]
+    lines = [*case.lines, *findings(solution, case.sets.train, case.names)]
+    lines += write_file(folder, options, case, solution, verdict)
     return Judged(
         metrics={**metrics, "identify_seconds": seconds},
         rows=lambda _: rows(case, solution, predicted),
@@ -192,19 +196,22 @@ def write_file(folder: Path, options: Options, case: Case, solution: Identificat
         which = ", ".join(name for name, good in zip(case.names, bodies, strict=True) if not good)
         return [f"no {path.name}: the least-squares links behind {which} are not physically consistent"]
     parameters = parameters_of(solution.theta, case.known)
-    tree = case.robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(parameters.armature))
+    motors = case.description["motors"]
+    armature = armature_matrix(parameters.armature, motors, pairs_of(parameters.coupling))
+    tree = case.robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(armature))
     remarks = [f"Identified from {options.data.name}."]
     coefficients = {
         name: np.asarray(values)
         for name, values in parameters._asdict().items()
-        if values is not None and name not in ("inertias", "armature")
+        if values is not None and name not in ("inertias", "armature", "coupling")
     }
     friction = {"damping": coefficients.pop("viscous", None), "coulomb": coefficients.pop("coulomb", None)}
     for name, values in coefficients.items():
         pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(case.names, values.tolist(), strict=True))
         remarks.append(f"Of friction, for which there is no place, {name}: {pairs}.")
+    remarks += [f"Not in this file: {line}." for line in shape_lines(case) if line.startswith(("load", "cooling"))]
     try:
-        write_robot(path, options.robot, tree, **friction, lock=case.locked, remarks=tuple(remarks))
+        write_robot(path, options.robot, tree, **friction, motors=motors, lock=case.locked, remarks=tuple(remarks))
     except InputError as error:
         return [f"no {path.name}: {error}"]
     lacks = " without armature, for which URDF has no place (a comment in it states it)" * (path.suffix == ".urdf")

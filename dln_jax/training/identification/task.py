@@ -14,12 +14,13 @@ from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select, with_joints
 from dln_jax.data.stated_tests import is_cut, stated_test
-from dln_jax.learning.friction import fit_friction
-from dln_jax.mechanics.friction import FrictionShape, require_laws, shape_of
+from dln_jax.learning.friction import FrictionFit, fit_friction
+from dln_jax.mechanics.friction import FrictionShape, require_laws
 from dln_jax.mechanics.trees import tree_to_json
 from dln_jax.models.model import Parameters
 from dln_jax.training.identification.motions import MotionSets, lightly_filtered
 from dln_jax.training.identification.options import IDENTIFIED, NO_FRICTION, Options
+from dln_jax.training.identification.terms import Wanted, at_reference, chosen, wanted
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
 
@@ -62,6 +63,8 @@ class Case(NamedTuple):
     data_file: str = ""
     motions: MotionSets | None = None
     """Motions to fit and to predict, with --by motions or both."""
+    wanted: Wanted = Wanted()
+    """Terms that cross-validation may add."""
 
     @property
     def laws(self) -> tuple[FrictionLaw, ...]:
@@ -97,14 +100,16 @@ def prepare(options: Options) -> Case:
     sets, motions = held_out(data, options.test or None, in_parts=filtered is not None), None
     if light is not None:
         motions = MotionSets(*held_out(light, options.test or None, in_parts=filtered is not None)[:2])
+    terms = wanted(options, cast(tuple[FrictionLaw, ...], laws), data)
     needs = robot.tree.needs._replace(joint_friction=cast(tuple[FrictionLaw, ...], laws))
     scale = {} if options.velocity_scale is None else {"velocity_scale": options.velocity_scale}
-    description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **scale)
+    fixed = {"motors": terms.motors, "coupled": terms.coupled, **scale}
+    description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **fixed)
     noise = noises(options.noise, robot.tree.degrees_of_freedom)
     torque = fitted_torque(filtered)
     case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque)
     named = {"robot_file": options.robot.name, "data_file": options.data.name}
-    return with_description(case._replace(motions=motions, **named))
+    return with_description(case._replace(motions=motions, wanted=terms, **named))
 
 
 def with_description(case: Case, **changes: Any) -> Case:
@@ -119,20 +124,37 @@ def with_description(case: Case, **changes: Any) -> Case:
     return case._replace(description=description, model=model, known=known)
 
 
-def with_shapes(velocity_scale: float | None, case: Case) -> Case:
-    """The case with friction curves whose shapes are fitted to the training data; unchanged if there is nothing to fit.
+def with_terms(velocity_scale: float | None, case: Case) -> tuple[Case, FrictionFit | None]:
+    """The case with the terms that cross-validation keeps and fitted shapes of friction, and their fit, if any.
 
     The velocity scale is fitted unless it is stated.
     """
     held = () if velocity_scale is None else ("velocity_scale",)
-    if not set(shape_of(case.laws)) - set(held):
-        return case
-    thin = -(-len(case.sets.train.t) // MOST_SAMPLES)
     start = FrictionShape(**({} if velocity_scale is None else {"velocity_scale": velocity_scale}))
+    tree, train = case.robot.tree, case.sets.train
+    terms, lines = chosen(case.wanted, tree, train, case.laws, start, held)
+    case = case._replace(lines=tuple(lines))
+    needs = {**case.description["needs"], "joint_friction": list(terms.laws)}
+    changes: dict[str, Any] = {"needs": needs, "coupled": [list(pair) for pair in terms.coupled]}
+    if not terms.learned:
+        return with_description(case, **changes), None
     fitted = fit_friction(
-        case.robot.tree, every(case.sets.train, thin), case.laws, shape=start, held=held, noise=case.noise
-    )
-    return with_description(case, **{name: values.tolist() for name, values in fitted.shape.items()})
+        tree, every(train, -(-len(train.t) // MOST_SAMPLES)), terms.laws, shape=start, held=held, noise=case.noise,
+        cooling="cooling" in terms.learned, motors=terms.motors, coupled=terms.coupled,
+    )  # fmt: skip
+    changes |= {name: values.tolist() for name, values in fitted.shape.items()}
+    if fitted.reference_temperature is not None:
+        changes["reference_temperature"] = fitted.reference_temperature
+    return with_description(case, **changes), fitted
+
+
+def referred(case: Case, parameters: Parameters) -> Case:
+    """The case with torques at the reference temperature, by the friction of these parameters."""
+    if not np.any(case.description["cooling"]):
+        return case
+    convert = at_reference(case.model, parameters, case.description["reference_temperature"])
+    sets = case.sets._replace(train=convert(case.sets.train), test=convert(case.sets.test))
+    return case._replace(sets=sets, motions=None if case.motions is None else MotionSets(*map(convert, case.motions)))
 
 
 def for_residual(train: Trajectories) -> tuple[Trajectories, Trajectories]:

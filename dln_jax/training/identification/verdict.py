@@ -1,5 +1,7 @@
 """Judges an identified robot: its torques on held-out motions, and its physical plausibility."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -110,7 +112,7 @@ def friction_verdict(
 
 def without_joints(parameters: RigidTreeParameters) -> RigidTreeParameters:
     """Parameters of the bodies alone, without armature and friction."""
-    return RigidTreeParameters(*(leaf if k == 0 or leaf is None else 0 * leaf for k, leaf in enumerate(parameters)))
+    return jax.tree.map(jnp.zeros_like, parameters)._replace(inertias=parameters.inertias)
 
 
 def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"]) -> Verdict:

@@ -19,6 +19,7 @@ from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.encoder_data import encoders
 from scripts.reports.excitation import excitation
 from scripts.reports.robots import double_pendulum, identified_by, known_kinematics, lip, log_checks, speed
+from scripts.reports.robots.added_terms import added_terms
 from scripts.reports.robots.recorded_arm import recorded_arm
 
 MEASURES: dict[str, Callable[[bool], Findings]] = {
@@ -33,6 +34,7 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
     "logs/sound": partial(log_checks.sound, with_robot=False),
     **{f"logs/{kind}": partial(log_checks.faulty, kind=kind) for kind in log_checks.FAULTS},
     "logs/sound-with-robot": partial(log_checks.sound, with_robot=True),
+    "terms/two-joints": added_terms,
     "speed/seven-axis": speed.speed,
 }
 """Functions quick -> findings, by SUBJECT/NAME."""

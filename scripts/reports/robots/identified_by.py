@@ -1,7 +1,8 @@
 """`identify --by torques, motions, both` on the recorded double pendulum: prediction times and torque errors.
 
 The robot is a rigid tree of two links, the second 0.3 m from the first, with rough masses; the splits, filters and the
-judgement are those of `double_pendulum`.
+judgement are those of `double_pendulum`. Inner splits of the training recordings choose the windows of motions, which
+both takes over.
 """
 
 from collections.abc import Sequence
@@ -59,10 +60,12 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
     held = logs.of(test)
     known: Parameters = MODEL.init(jax.random.key(0))
     solution = identify(MODEL, known, rest.coarse)
-    fits = {"torques": solution.theta}
-    for way in WAYS[1:]:
-        sets = MotionSets(rest.fine, held.fine)
-        fits[way] = fit_by(way, MODEL, known, solution, rest.coarse, sets, None)[0].theta
+    fits, sets = {"torques": solution.theta}, MotionSets(rest.fine, held.fine)
+    by_motions, _, choice = fit_by("motions", MODEL, known, solution, rest.coarse, sets, None)
+    by_both = solution
+    if choice.window is not None:
+        by_both, *_ = fit_by("both", MODEL, known, solution, rest.coarse, sets, choice.window)
+    fits |= {"motions": by_motions.theta, "both": by_both.theta}
     return {way: judged(Fitted(MODEL, parameters_of(theta, known)), held, logs) for way, theta in fits.items()}
 
 

@@ -63,7 +63,7 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
     )
     windows = cut_motions(log, 21)
     assert len(windows.t) == 10
-    at = linearise(model, known)
+    at = linearise(model)
     scales = np.array([1e-3]), np.array([0.1])
     left, slopes = at(theta, 0.0, *scales, windows)
     assert np.abs(left).max() < 1e-6
@@ -77,7 +77,7 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
     wrong = theta.copy()
     wrong[-1] = 0.3
     fit = fit_motions(
-        model, known, columns_of(known), wrong, wrong, windows, noise_tau=scales[1], noise_q=scales[0], delay=False
+        model, columns_of(known), wrong, wrong, windows, noise_tau=scales[1], noise_q=scales[0], delay=False
     )
     assert fit.converged and fit.after < 0.1 * fit.before
     assert fit.theta[-1] == pytest.approx(0.1, abs=0.01)
@@ -87,9 +87,10 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
 def test_motions_identify_the_pendulum_and_predict_longer(place, capsys):
     log = ("--robot", "rod.urdf", "--data", "log.npz", "--cutoff", "4", "--friction", "viscous", "--test", "last:25%")
     numbers = {}
-    for by in ("motions", "both"):
-        command(identify, *log, "--by", by, "--out", by, "--no-figures", "--no-uncertainty")
+    for by, window in (("motions", ()), ("both", ("--window", "0.3"))):
+        command(identify, *log, "--by", by, *window, "--out", by, "--no-figures", "--no-uncertainty")
         said = capsys.readouterr().out
+        assert ("chosen by inner splits of the training data: windows of" in said) == (by == "motions")
         assert f"by {by}: windows are off" in said and "verdict: good" in said
         numbers[by] = json.loads((place / by / "metrics.json").read_text())
         assert numbers[by]["vpt_seconds"] >= numbers[by]["by_torques_vpt_seconds"]

@@ -3,18 +3,26 @@
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 from jax.sharding import Mesh
 
+from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.objectives import Objective
-from dln_jax.models.rigid_tree import USUAL
+from dln_jax.models.rigid_tree import USUAL, make_rigid_tree
+from dln_jax.models.serial_tree import SerialTreeParameters, tree_of
 from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
 from dln_jax.training.dynamics.options import TreeOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task
+from dln_jax.training.identification.motions import MotionSets, fit_by, prediction_times, spread_of
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.descriptions import describe_for
+from dln_jax.zoo.descriptions import build, describe_for
+
+BALL = np.array([2.0, 0, 0, 0, 0.02, 0, 0, 0.02, 0, 0.02])
+"""Inertial parameters from which bodies start, in kg and kg m²."""
 
 
 def needs_of_tree(needs: Needs) -> Needs:
@@ -62,8 +70,48 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
     size = f"{solution.parameter_count} parameters, of the linear ones rank {solution.rank}, "
     print(f"learned tree: {size}condition {solution.condition:.3g}")
     task = task._replace(search=solution)
-    training = training_of(task, solution.parameters, solution.torque_mse, solution.seconds)
+    parameters = solution.parameters
+    if getattr(options, "refine", None) == "motions":
+        parameters = refined_by_motions(task, parameters)
+    training = training_of(task, parameters, solution.torque_mse, solution.seconds)
     return task, refined_if_asked(task, training)
+
+
+def refined_by_motions(task: Task, parameters: SerialTreeParameters) -> SerialTreeParameters:
+    """Bodies and friction on the same axes by motions, if they predict validation motions longer than torques do.
+
+    The bodies start as balls and are made physically consistent by a fit of torques.
+    """
+    needs, description = needs_of_tree(task.needs), task.description
+    tree = tree_of(parameters, needs, parents=description["parents"], acceleration=description["acceleration"])
+    d, friction = tree.degrees_of_freedom, USUAL if needs.friction else ()
+    known = tree._replace(
+        rotations=np.asarray(tree.rotations), positions=np.asarray(tree.positions),
+        inertias=np.tile(BALL, (d, 1)), armature=np.full(d, BALL[-1]),
+    )  # fmt: skip
+    train, validation = task.sets.train, task.sets.validation
+    with jax.enable_x64(True):
+        rigid = make_rigid_tree(known, friction=friction, velocity_scale=description["velocity_scale"])
+        prior = rigid.init(jax.random.key(0))
+        solution = identify(rigid, prior, train, joints=needs.joints)
+        sets = MotionSets(train, validation)
+        solution, _, choice = fit_by("motions", rigid, prior, solution, train, sets, None, joints=needs.joints)
+        fitted = parameters_of(solution.theta, prior)
+        better = parameters._replace(
+            **{name: value for name in parameters._fields if (value := getattr(fitted, name, None)) is not None}
+        )
+        variance, model = spread_of(*sets), build(description)
+        seconds = [
+            float(np.mean(prediction_times(model, candidate, validation, variance)[0]))
+            for candidate in (parameters, better)
+        ]
+    kept = seconds[1] > seconds[0]
+    print(*([choice.line] if choice.seconds else []), sep="\n", end="\n" * bool(choice.seconds))
+    print(
+        f"refined by motions: validation motions predicted for {seconds[1]:.3g} s, by torques for {seconds[0]:.3g} s; "
+        f"{'kept' if kept else 'not kept'}"
+    )
+    return better if kept else parameters
 
 
 METHOD = Method(plan, fit)

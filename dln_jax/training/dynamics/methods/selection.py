@@ -33,7 +33,7 @@ from dln_jax.training.dynamics.options import NETWORK, Options, SelectionOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task, method_of, planned
 from dln_jax.training.identification.additions import with_network
-from dln_jax.training.identification.task import Case, Sets, with_description, with_shapes
+from dln_jax.training.identification.task import Case, Sets, with_description, with_terms
 from dln_jax.zoo.descriptions import Description, build, describe
 
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
@@ -186,7 +186,7 @@ def _rigid_tree(options: Any, recorded: Recorded, robot: Robot) -> FittedModel:
     description = describe("rigid-tree", precision="f64", **stated)
     sets = Sets(train_set, validation, blocks=False)
     case = with_description(Case(robot, robot.tree.names, sets, description, None, None, None, (), ()))
-    case = with_shapes(options.velocity_scale, case)
+    case, _ = with_terms(options.velocity_scale, case)
     solution = identify(case.model, case.known, train_set, joints=robot.tree.joints)
     kept = parameters_of(solution.theta, case.known)
     return _as_training(recorded, case.description, case.model, kept, time.perf_counter() - began)

@@ -1,0 +1,98 @@
+"""Terms of a rigid tree's torques that a log may not show: coupled motors, friction by load, and by temperature.
+
+Every term lowers the error on the data that it is fitted to, the true plant having it or not. It is therefore kept only
+if it lowers the error in cross-validation over trajectories, or blocks of time, by more than `MARGIN` standard errors.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import BLOCKS, every, in_blocks
+from dln_jax.learning.friction_terms import Log, Terms, equations_of, link_signs, log_of, solve_terms
+from dln_jax.learning.model_selection import segments, significantly_better
+from dln_jax.mechanics.trees.description import Tree
+
+FOLDS = 4
+"""Parts of a log that are predicted by fits of the rest."""
+MOST_SAMPLES = 2_000
+"""Largest number of samples of the cross-validation."""
+MARGIN = 2.0
+"""Standard errors by which a term must lower the error: chance does so for about one log in forty."""
+
+
+class TriedTerm(NamedTuple):
+    """A term and the errors with and without it."""
+
+    name: str
+    without: float
+    """Mean squared error in cross-validation, summed over joints, in units of each torque's variance."""
+    within: float
+    """The same with the term."""
+    kept: bool
+
+
+def choose_terms(
+    tree: Tree, data: Trajectories, terms: Terms, candidates: Sequence[tuple[str, Terms]]
+) -> tuple[Terms, list[TriedTerm]]:
+    """Adds candidates one after another, and keeps each that lowers the error in cross-validation significantly.
+
+    Args:
+        tree: tree with known frames.
+        data: training data.
+        terms: terms that are always there.
+        candidates: names and terms, of which each states what it adds to the others.
+
+    Raises:
+        InputError: as for `learning.friction.fit_friction`.
+    """
+    if not candidates:
+        return terms, []
+    if len(np.unique(data.trajectory)) < FOLDS:
+        data = in_blocks(data, BLOCKS)
+    data = every(data, -(-len(data.t) // MOST_SAMPLES))
+    segment, tried = segments(data), []
+    errors = cross_validated(tree, data, terms, segment)
+    for name, candidate in candidates:
+        wider = joined(terms, candidate)
+        trial = cross_validated(tree, data, wider, segment)
+        kept = significantly_better(trial, errors, margin=MARGIN)
+        tried.append(TriedTerm(name, float(errors.mean()), float(trial.mean()), kept))
+        if kept:
+            terms, errors = wider, trial
+    return terms, tried
+
+
+def joined(terms: Terms, addition: Terms) -> Terms:
+    """Terms of both; shapes start as those of the first."""
+    laws, learned, coupled = (
+        tuple(dict.fromkeys((*getattr(terms, name), *getattr(addition, name))))
+        for name in ("laws", "learned", "coupled")
+    )
+    return terms._replace(laws=laws, learned=learned, coupled=coupled)
+
+
+def cross_validated(
+    tree: Tree, data: Trajectories, terms: Terms, segment: np.ndarray
+) -> Float[np.ndarray, " segments"]:
+    """Mean squared error of every segment, from fits to the folds without it."""
+    present = np.unique(data.trajectory)
+    folds = [np.isin(data.trajectory, present[fold::FOLDS]) for fold in range(FOLDS)]
+    fewest = min(int(np.sum(~held)) for held in folds)
+    with jax.enable_x64(True):
+        log, equations = log_of(tree, data, terms), equations_of(terms)
+        evaluate = jax.jit(equations)
+        squares = np.zeros(len(data.t))
+        for held in folds:
+            rest = np.flatnonzero(~held)
+            # One number of samples, so that one program serves all folds.
+            rows = rest[np.linspace(0, len(rest) - 1, fewest).round().astype(int)]
+            solution = solve_terms(terms, log.of(rows), equations)
+            whole: Log = log._replace(signs=link_signs(terms, log, solution))
+            A, b = (np.asarray(part) for part in evaluate(solution.nonlinear, whole))
+            squares[held] = np.sum((A @ solution.linear - b).reshape(len(data.t), -1) ** 2, axis=1)[held]
+    return np.bincount(segment, squares) / np.bincount(segment)

@@ -1,0 +1,116 @@
+"""Whether two fitted trees are the same arm: their joint axes in space at q = 0, up to what torques cannot determine.
+
+The axes of one arm are moved onto those of the other by a rotation and a shift, with or without a mirror. A point may
+slide along its axis, and the axes of prismatic joints have directions only. Gravity, if there is any, is one more
+direction.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from dln_jax.learning.kinematics.frames import Frames, mirrored
+from dln_jax.learning.kinematics.projection import LENGTH, Structure
+
+SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
+"""Largest differences of two arms that count as the same, rad and m."""
+SAME_ERROR = 0.1
+"""Largest relative difference of the validation errors of two descents that agree."""
+TURNS = 8
+"""Angles about an axis from which the comparison starts, for arms whose axes are parallel."""
+
+
+class Difference(NamedTuple):
+    """Largest differences between two arms."""
+
+    angle: float
+    """Between axes, or an axis and gravity, rad."""
+    length: float
+    """Between axes, across them, m."""
+
+    @property
+    def size(self) -> float:
+        """Of both, in units of those that count as the same."""
+        return self.angle / SAME_ANGLE + self.length / SAME_LENGTH
+
+    @property
+    def same(self) -> bool:
+        """Whether they count as one arm."""
+        return bool(self.angle <= SAME_ANGLE and self.length <= SAME_LENGTH)
+
+
+class Twin(NamedTuple):
+    """Another descent to the lowest loss, refined alike."""
+
+    error: float
+    """Its validation error relative to that of the fit, or its training error without validation."""
+    off: Difference
+
+    @property
+    def same(self) -> bool:
+        """Whether both are the same arm, with the same error."""
+        return self.off.same and bool(abs(self.error - 1) <= SAME_ERROR)
+
+    @property
+    def words(self) -> str:
+        """The comparison as text."""
+        kind = "the same arm" if self.same else "another arm"
+        angle, length = np.degrees(self.off.angle), 1e3 * self.off.length
+        return f"{kind} (axes within {angle:.2g}° and {length:.2g} mm, error {self.error:.3g} times)"
+
+
+class Lines(NamedTuple):
+    """Joint axes in space at q = 0."""
+
+    directions: Float[np.ndarray, "n 3"]
+    """Of all joints, then of gravity."""
+    points: Float[np.ndarray, "d 3"]
+
+
+def difference(first: Frames, second: Frames, structure: Structure) -> Difference:
+    """Compares two arms of the same structure."""
+    gravity = structure.acceleration > 0
+    one = lines_of(first, structure.parents, gravity=gravity)
+    turning = np.array([kind == "revolute" for kind in structure.joints])
+    others = second, mirrored(second, structure.parents, structure.joints)
+    offsets = [_aligned(one, lines_of(other, structure.parents, gravity=gravity), turning) for other in others]
+    return min(offsets, key=lambda off: off.size)
+
+
+def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> Lines:
+    """Axes of the joints in the frame of the ground."""
+    rotations: list[np.ndarray] = []
+    points: list[np.ndarray] = []
+    for link, parent in enumerate(parents):
+        R, p = (np.eye(3), np.zeros(3)) if parent < 0 else (rotations[parent], points[parent])
+        rotations.append(R @ np.asarray(frames.rotations[link]))
+        points.append(p + R @ np.asarray(frames.positions[link]))
+    down = [np.array([0.0, 0.0, -1.0])] * gravity
+    return Lines(np.stack([*(R[:, 2] for R in rotations), *down]), np.stack(points))
+
+
+def _aligned(one: Lines, other: Lines, turning: np.ndarray) -> Difference:
+    axes, pairs = one.directions[: len(one.points)], (one, other)
+    centres = [pair.points - pair.points[turning].mean(axis=0) if turning.any() else pair.points for pair in pairs]
+
+    def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        R = Rotation.from_rotvec(x[:3]).as_matrix()
+        apart = centres[1] @ R.T + x[3:] - centres[0]
+        across = apart - np.sum(apart * axes, axis=1, keepdims=True) * axes
+        return other.directions @ R.T - one.directions, across[turning]
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        directions, across = errors(x)
+        return np.concatenate([LENGTH * directions.ravel(), across.ravel()])
+
+    first = Rotation.align_vectors(one.directions, other.directions)[0]
+    starts = [Rotation.from_rotvec(2 * np.pi * k / TURNS * axes[-1]) * first for k in range(TURNS)]
+    solutions = [least_squares(residual, np.append(start.as_rotvec(), np.zeros(3))) for start in starts]
+    directions, across = errors(min(solutions, key=lambda solution: solution.cost).x)
+    # The chord of a small angle is the angle.
+    angle = 2 * np.arcsin(np.minimum(np.linalg.norm(directions, axis=1).max() / 2, 1.0))
+    return Difference(float(angle), float(np.linalg.norm(across, axis=1).max(initial=0.0)))
