@@ -21,8 +21,8 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_time,
     valid_prediction_times,
 )
-from dln_jax.scenes.datasets import generators
 from dln_jax.types import InputError
+from scripts.reports.arm.published_swings import STARTS, uniform_tests
 from scripts.reports.predictions import rollout_metrics
 
 FRICTION = 0.3
@@ -169,10 +169,10 @@ def test_recordings_that_cannot_be_followed_are_refused():
 
 
 def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
-    data = generators.uniform_tests()
+    data = uniform_tests()
     assert data.q.shape == (1200, 2) and data.t[399] == pytest.approx(7.98)
     np.testing.assert_array_equal(data.tau, 0.0)
-    np.testing.assert_array_equal(data.q[::400], generators.STARTS)
+    np.testing.assert_array_equal(data.q[::400], STARTS)
     # The published formulas of the plant, whose angle zero is horizontal, by plain numpy.
     q, qd = data.q[[0, 400, 800]].T, np.zeros((2, 3))
     for step in range(200):
