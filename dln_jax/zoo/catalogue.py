@@ -4,6 +4,7 @@ A name is the same on command lines, in files, in tables and beside published nu
 `Properties`, never on the spelling of a name.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -22,7 +23,7 @@ from dln_jax.models.hamiltonian import (
 )
 from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
-from dln_jax.models.model import Model, Scale
+from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
@@ -31,8 +32,7 @@ from dln_jax.models.rigid_tree import Number, make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
-from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Needs, ResidualTerm
+from dln_jax.types import InputError, Needs
 from dln_jax.zoo.differential_network import make_differential_network
 from dln_jax.zoo.images import make_image_model
 
@@ -92,34 +92,10 @@ def linear_friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype:
     return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=True, dtype=dtype)
 
 
-def residual_network(
-    make: Callable[[Needs], Model],
-    needs: Needs,
-    *,
-    terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
-    width: int = 8,
-    depth: int = 1,
-    activation: Activation = tanh,
-    resolved_velocity: Scale = 0.05,
-    torque_scale: Scale = 1.0,
-    rate_scale: Scale = 1.0,
-    acceleration_scale: Scale = 1.0,
-    dtype: DTypeLike = jnp.float64,
-) -> Model:
-    """Adds a `make_residual`; its `velocity_scale` is called `resolved_velocity` here."""
-    residual = make_residual(
-        needs,
-        terms=tuple(terms),
-        width=width,
-        depth=depth,
-        activation=activation,
-        velocity_scale=resolved_velocity,
-        torque_scale=torque_scale,
-        rate_scale=rate_scale,
-        acceleration_scale=acceleration_scale,
-        dtype=dtype,
-    )
-    return make_with_residual(make(needs), residual)
+@functools.wraps(make_residual)
+def residual_network(make: Callable[[Needs], Model], needs: Needs, **keywords: Any) -> Model:
+    """Adds a `make_residual`, whose keywords it takes."""
+    return make_with_residual(make(needs), make_residual(needs, **keywords))
 
 
 def make_stored_tree(
