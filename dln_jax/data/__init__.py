@@ -4,7 +4,7 @@ from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories, load, save
-from dln_jax.data.splits import Split, hold_out, merged, partition_labels, select, split
+from dln_jax.data.splits import Split, hold_out, merged, select, split
 
 __all__ = [
     "FunctionSamples",
@@ -16,7 +16,6 @@ __all__ = [
     "hold_out",
     "load",
     "merged",
-    "partition_labels",
     "read_robot",
     "save",
     "select",

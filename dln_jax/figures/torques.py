@@ -180,7 +180,7 @@ def tip_paths(
         data: all trajectories, including those of `test`.
         tip: q -> position [2] in m.
         test: test trajectories with the same indices as in `data`.
-        motions: rollouts of the model from the test's first states under its torques, as `recorded_motions`, or none; a
+        motions: rollouts of the model from the test's first states under its torques, or none; a
             path ends when the prediction is no longer valid.
         model: name of the model, which sets the colour.
     """

@@ -123,9 +123,7 @@ def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:
     return folded, samples
 
 
-def leading_directions(
-    rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], count: int, *, passes: int = 3, seed: int = 0
-) -> Float[np.ndarray, "P K"]:
+def leading_directions(rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], count: int) -> Float[np.ndarray, "P K"]:
     """Returns the combinations of parameters that the data determine best, for models too large for a full spectrum.
 
     Subspace iteration on D⁻¹JᵀJ D⁻¹ (Halko, Martinsson and Tropp 2011, algorithm 4.4). Phi times the result is the
@@ -135,13 +133,11 @@ def leading_directions(
         rows: iterates over the training data anew at every call.
         unit: scales by which the fit divided the joints' residuals.
         count: K.
-        passes: over the data; the first computes D.
-        seed: seed of the initial subspace.
     """
     squares = sum(np.sum((columns / unit[:, None]) ** 2, axis=(0, 1)) for columns, _ in rows())
     scale = np.sqrt(np.where(squares > 0, squares, 1.0))
-    basis = np.linalg.qr(np.random.default_rng(seed).normal(size=(len(scale), count)))[0]
-    for _ in range(passes - 1):
+    basis = np.linalg.qr(np.random.default_rng(0).normal(size=(len(scale), count)))[0]
+    for _ in range(2):
         products = np.zeros_like(basis)
         for columns, _residual in rows():
             scaled = (columns / unit[:, None] / scale).reshape(-1, len(scale))

@@ -19,31 +19,17 @@ from dln_jax.types import Hamiltonian
 DECOMPOSITION = ("inertial", "coriolis", "gravity")
 
 
-def predictions(
-    system: Driven, data: Trajectories, dtype, *, H: Hamiltonian | None = None, mesh: Mesh | None = None
-) -> dict[str, np.ndarray]:
-    """Returns predictions of a system for every sample: `tau`, `qdd`, and the parts of the torque, [N, d] in float64.
-
-    With recorded momenta and a Hamiltonian (`H`, or that of a system in momenta) also `tau_from_momenta` =
-    pd + dH/dq + friction: as published results of Hamiltonian models were computed.
-
-    Devices of a mesh share the samples.
-    """
-    program = jax.jit(prediction_program(lambda _: system, H=H, mesh=mesh))
-    return as_arrays(program(None, samples_of(data, dtype)))
-
-
 def prediction_program(
     system_of: Callable[[Any], Driven], *, H: Hamiltonian | None = None, mesh: Mesh | None = None
 ) -> Callable[[Any, tuple[Any, ...]], dict[str, Array]]:
-    """Returns (parameters, samples) -> `predictions` of the system with these parameters, for `jax.jit`.
+    """Returns (parameters, samples) -> predictions of the system with these parameters, for `jax.jit`.
 
-    Parameters are arguments of the program and not constants in it: one compilation serves every seed.
+    Every sample has `tau`, `qdd`, and the parts of the torque, [N, d]. With recorded momenta and a Hamiltonian (`H`, or
+    that of a system in momenta) also `tau_from_momenta` = pd + dH/dq + friction: as published results of Hamiltonian
+    models were computed.
 
-    Args:
-        system_of: parameters -> energies.
-        H: as for `predictions`.
-        mesh: devices that share the samples.
+    Parameters are arguments of the program and not constants in it: one compilation serves every seed. Devices of a
+    mesh share the samples.
     """
 
     def answers(parameters: Any, samples: tuple[Any, ...]) -> dict[str, Array]:

@@ -1,8 +1,8 @@
-"""Timing of calls: single ones, as in a control loop, and whole programs in turns."""
+"""Timing of single calls, as in a control loop."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -38,20 +38,3 @@ def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, 
         nanoseconds[index] = time.perf_counter_ns() - start
     p50, p99, p999, worst = (float(time) for time in np.percentile(nanoseconds / 1e3, [50, 99, 99.9, 100]))
     return Latency(compile_seconds, p50, p99, p999, worst, calls)
-
-
-def medians_in_turns(
-    programs: Mapping[str, Callable[..., Any]], arguments: tuple, *, repetitions: int, warm_up: int = 2
-) -> dict[str, float]:
-    """Median wall-clock seconds of compiled programs on the same arguments, until their results are ready.
-
-    The programs take turns, so that a slow period of the machine affects all of them.
-    """
-    seconds = {name: np.empty(repetitions) for name in programs}
-    for repetition in range(-warm_up, repetitions):
-        for name, program in programs.items():
-            start = time.perf_counter()
-            jax.block_until_ready(program(*arguments))
-            if repetition >= 0:
-                seconds[name][repetition] = time.perf_counter() - start
-    return {name: float(np.median(values)) for name, values in seconds.items()}

@@ -154,13 +154,12 @@ def valid_times(
     *,
     fitted: int,
     variance: Float[np.ndarray, " d"],
-    threshold: float = 1e-2,
 ) -> Float[np.ndarray, " W"]:
     """Valid prediction times of the segments in s, from the last fitted sample on, at measured samples."""
     measured = (segments.weight > 0) & (np.arange(segments.t.shape[1]) >= fitted - 1)
     return np.array(
         [
-            valid_prediction_time(q[kept], q_hat[kept], t[kept], variance, threshold=threshold)
+            valid_prediction_time(q[kept], q_hat[kept], t[kept], variance)
             for q, q_hat, t, kept in zip(segments.q, predicted.q, segments.t, measured, strict=True)
         ]
     )
@@ -210,14 +209,13 @@ def prediction_metrics(
     *,
     fitted: int,
     variance: Float[np.ndarray, " d"],
-    threshold: float = 1e-2,
 ) -> dict[str, float]:
     """Means over the segments, the median valid prediction time, and the bounds on these times.
 
     `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `vpt_lyapunov` (in Lyapunov times, if
     motions diverge) and `lyapunov_seconds`, by the model's own growth of small changes; `energy_drift`.
     """
-    times = valid_times(segments, predicted, fitted=fitted, variance=variance, threshold=threshold)
+    times = valid_times(segments, predicted, fitted=fitted, variance=variance)
     growth = float(np.mean(predicted.growth))
     chaotic = {"vpt_lyapunov": float(np.mean(times)) * growth, "lyapunov_seconds": 1 / growth} if growth > 0 else {}
     return {

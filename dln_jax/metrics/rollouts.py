@@ -10,7 +10,7 @@ accurate.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -27,6 +27,8 @@ from dln_jax.types import InputError, Vector, require_positive
 
 TORQUES: tuple[Torque, ...] = ("held", "interpolated")
 """Torques between two samples; all kinds are compared."""
+SUBSTEPS = 20
+"""Steps of RK4 per sample, as published."""
 
 
 class Motion(NamedTuple):
@@ -55,7 +57,7 @@ def follow(
     tau: Float[Array, "T d"],
     t: Float[Array, " T"],
     *,
-    substeps: int = 20,
+    substeps: int = SUBSTEPS,
     torque: Torque = "held",
 ) -> Motion:
     """Integrates the motion from (q0, qd0) under the torques tau at the times t, by RK4; `vmap` it over trajectories.
@@ -69,32 +71,10 @@ def follow(
     return _drive(dynamics, q0, qd0, tau, torque_slopes(tau, t, torque), t, substeps)
 
 
-def recorded_motions(
-    dynamics: Dynamics | PlainDynamics,
-    data: Trajectories,
-    *,
-    torques: Sequence[Torque] = TORQUES,
-    substeps: int = 20,
-    dtype: DTypeLike | None = None,
-) -> dict[Torque, list[Motion]]:
-    """Returns `follow` along all trajectories of the data, from their first states, as float64 arrays of their lengths.
-
-    All kinds of torque run in one program, in `dtype` (JAX's default if omitted).
-
-    Raises InputError for a trajectory of a single sample, no substeps, or a torque of another name.
-    """
-    require_positive(substeps=substeps)
-    program = jax.jit(motion_program(lambda _: dynamics, torques=torques, substeps=substeps))
-    return by_trajectory(program(None, records_of(data, dtype))[0], data, torques)
-
-
 def motion_program(
     dynamics_of: Callable[[Any], Dynamics | PlainDynamics],
-    *,
-    torques: Sequence[Torque] = TORQUES,
-    substeps: int = 20,
 ) -> Callable[[Any, Records], tuple[Motion, Array | None]]:
-    """Returns (parameters, records) -> motions and their energies, for `jax.jit`; leading axes [torques, trajectories].
+    """Returns (parameters, records) -> motions and their energies, for `jax.jit`; leading axes [TORQUES, trajectories].
 
     The energies, in J, are those of the predicting system at its own states; `None` for one that has no energy.
     Parameters are arguments of the program and not constants in it: one compilation serves every seed.
@@ -105,11 +85,11 @@ def motion_program(
         q0, qd0, tau, t = records
 
         def drive(q0, qd0, tau, t, slopes):
-            motion = _drive(dynamics, q0, qd0, tau, slopes, t, substeps)
+            motion = _drive(dynamics, q0, qd0, tau, slopes, t, SUBSTEPS)
             energy = jax.vmap(dynamics.energy)(motion.q, motion.qd) if isinstance(dynamics, Dynamics) else None
             return motion, energy
 
-        slopes = jnp.stack([jax.vmap(functools.partial(torque_slopes, torque=torque))(tau, t) for torque in torques])
+        slopes = jnp.stack([jax.vmap(functools.partial(torque_slopes, torque=torque))(tau, t) for torque in TORQUES])
         return jax.vmap(lambda slopes: jax.vmap(drive)(q0, qd0, tau, t, slopes))(slopes)
 
     return motions
@@ -131,12 +111,12 @@ def records_of(data: Trajectories, dtype: DTypeLike | None) -> Records:
     return Records(*(jnp.asarray(array, dtype) for array in (data.q[first], data.qd[first], data.tau[padded], t)))
 
 
-def by_trajectory(motions: Motion, data: Trajectories, torques: Sequence[Torque]) -> dict[Torque, list[Motion]]:
-    """Returns the motions of a `motion_program` in the form of `recorded_motions`."""
+def by_trajectory(motions: Motion, data: Trajectories) -> dict[Torque, list[Motion]]:
+    """Returns the motions of a `motion_program` as float64 arrays of their lengths."""
     groups, arrays = _samples(data), [np.asarray(leaf, np.float64) for leaf in motions]
     return {
         torque: [Motion(*(leaf[kind, k, : len(group)] for leaf in arrays)) for k, group in enumerate(groups)]
-        for kind, torque in enumerate(torques)
+        for kind, torque in enumerate(TORQUES)
     }
 
 
@@ -190,60 +170,29 @@ def normalised_state_error(data: Trajectories, motions: list[Motion]) -> float:
     return float(np.sqrt(_mean_or_infinity(np.concatenate(errors, axis=1))))
 
 
-def energy_error(
-    energy: Callable[[Array, Array], Array], motions: list[Motion], *, dtype: DTypeLike | None = None
-) -> float:
-    """Mean over all samples of |E(t) - E(0) - work(t)| in J, for the predicting system's own energy(q, qd).
-
-    It shows the error of the integration, and whether the forward model is consistent with that energy, but not whether
-    the energy is right. Infinite if a prediction is not finite.
-    """
-    q, qd = (jnp.asarray(np.concatenate(states), dtype) for states in list(zip(*motions, strict=True))[:2])
-    energies = np.asarray(jax.jit(jax.vmap(energy))(q, qd), np.float64)
-    return _imbalance(np.split(energies, np.cumsum([len(motion.q) for motion in motions])[:-1]), motions)
-
-
-def _imbalance(energies: Sequence[np.ndarray] | np.ndarray, motions: list[Motion]) -> float:
-    """Mean imbalance of energies that are at least as long as their motions."""
-    pairs = zip(energies, (motion.work for motion in motions), strict=True)
-    return _mean_or_infinity(np.concatenate([abs(energy[: len(work)] - energy[0] - work) for energy, work in pairs]))
-
-
-def rollout_metrics(
-    dynamics: Dynamics | PlainDynamics,
-    data: Trajectories,
-    *,
-    substeps: int = 20,
-    threshold: float = 1e-2,
-    dtype: DTypeLike | None = None,
-) -> dict[str, float]:
-    """Means over the trajectories of a system's predictions from their first states and torques.
+def metrics_of_motions(motions: Motion, energies: Array | None, data: Trajectories) -> dict[str, float]:
+    """Means over the trajectories of the motions and energies of a `motion_program` with both kinds of torque.
 
     `vpt_seconds` (torque held, as published), `vpt_interpolated_seconds` and `rollout_seconds` (the duration, which
     bounds them). For the interpolated motions, which are more accurate, also `normalised_state_error` and, if the
-    system has an energy, `energy_error_j`. Compare a model's figures with those of the true plant, which bound them.
+    system has an energy, `energy_error_j`: the mean over all samples of |E(t) - E(0) - work(t)|, infinite if a
+    prediction is not finite. It shows the error of the integration, and whether the forward model is consistent with
+    that energy, but not whether the energy is right. Compare a model's figures with those of the true plant, which
+    bound them.
 
-    Raises InputError for a trajectory of a single sample, a coordinate that never changes, or a number not positive.
+    Raises InputError for a coordinate that never changes.
     """
-    require_positive(substeps=substeps)
-    program = jax.jit(motion_program(lambda _: dynamics, substeps=substeps))
-    motions, energies = program(None, records_of(data, dtype))
-    return metrics_of_motions(motions, energies, data, threshold=threshold)
-
-
-def metrics_of_motions(
-    motions: Motion, energies: Array | None, data: Trajectories, *, threshold: float = 1e-2
-) -> dict[str, float]:
-    """Returns `rollout_metrics` from the motions and energies of a `motion_program` with both kinds of torque."""
-    held, interpolated = by_trajectory(motions, data, TORQUES).values()
+    held, interpolated = by_trajectory(motions, data).values()
     metrics = {
-        "vpt_seconds": float(np.mean(valid_prediction_times(data, held, threshold=threshold))),
-        "vpt_interpolated_seconds": float(np.mean(valid_prediction_times(data, interpolated, threshold=threshold))),
+        "vpt_seconds": float(np.mean(valid_prediction_times(data, held))),
+        "vpt_interpolated_seconds": float(np.mean(valid_prediction_times(data, interpolated))),
         "rollout_seconds": float(np.mean([np.ptp(data.t[group]) for group in _samples(data)])),
         "normalised_state_error": normalised_state_error(data, interpolated),
     }
     if energies is not None:
-        metrics["energy_error_j"] = _imbalance(np.asarray(energies, np.float64)[1], interpolated)
+        pairs = zip(np.asarray(energies, np.float64)[1], (motion.work for motion in interpolated), strict=True)
+        imbalances = [abs(energy[: len(work)] - energy[0] - work) for energy, work in pairs]
+        metrics["energy_error_j"] = _mean_or_infinity(np.concatenate(imbalances))
     return metrics
 
 

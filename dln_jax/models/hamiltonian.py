@@ -14,6 +14,7 @@ any kinetic energy of p.
 `mechanics.equations.flow` turns all of them into Hamilton's equations, and `dynamics` into equations in velocities.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import haiku as hk
@@ -37,6 +38,7 @@ from dln_jax.models.model import (
     viscous_dissipation,
 )
 from dln_jax.nn.activations import Activation, tanh
+from dln_jax.sizes import require_network
 from dln_jax.types import Needs, Scalar, Vector, require_positive
 
 
@@ -132,31 +134,33 @@ def make_separable_hamiltonian(
 
 
 def make_dissipative(
-    model: Model,
+    make: Callable[[Needs], Model],
     needs: Needs,
     *,
-    width: int = 8,
-    depth: int = 1,
-    activation: Activation | str = tanh,
+    friction_width: int = 0,
+    friction_depth: int = 1,
+    friction_activation: Activation | str = tanh,
     initial_friction: float = 0.05,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Adds friction that depends on q to a Hamiltonian `Model`, so that it loses energy for any parameters.
+    """Adds friction that may depend on q to a Hamiltonian `Model`, so that it loses energy for any parameters.
 
     Args:
-        model: conservative, built for needs without friction.
-        needs: needs of the scene; without friction nothing is added.
+        make: needs -> the model.
+        needs: needs of the scene; without friction the keywords have no effect.
+        friction_width: hidden units of the network for c; with 0 each coordinate has one coefficient, as `make` has it.
         initial_friction: approximate initial value of c, in N m s or N s/m.
-        width, depth, activation, dtype: keywords of the network for c, as described in `models.model`.
+        friction_depth, friction_activation, dtype: keywords of the network, as described in `models.model`.
 
     Raises:
         InputError: a width, depth or friction that is not positive.
     """
-    networks = perceptrons(width, depth, activation)
+    if not (needs.friction and friction_width):
+        return make(needs)
+    require_network(width=friction_width, depth=friction_depth)
     require_positive(initial_friction=initial_friction)
-    if not needs.friction:
-        return model
-    d = needs.degrees_of_freedom
+    networks = perceptrons(friction_width, friction_depth, friction_activation)
+    model, d = make(needs._replace(friction=False)), needs.degrees_of_freedom
     shift = jnp.log(jnp.expm1(jnp.asarray(initial_friction, dtype)))
 
     @hk.without_apply_rng

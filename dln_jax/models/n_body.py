@@ -23,16 +23,16 @@ from jaxtyping import Array, Float
 from dln_jax.mechanics.natural import NaturalHamiltonian
 from dln_jax.models.model import Model, model_of, perceptrons
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
+from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_positive
 
 FEATURES = {"distance": lambda r: r, "inverse": lambda r: 1 / r, "logarithm": jnp.log}
 """Functions of the distance that a pair energy may depend on."""
 
 
 def make_pairwise_hamiltonian(
-    bodies: int,
-    dimension: int,
+    needs: Needs,
     *,
+    dimension: int = 2,
     order: str = "bodies",
     alike: bool = True,
     features: tuple[str, ...] = ("distance", "inverse", "logarithm"),
@@ -45,7 +45,7 @@ def make_pairwise_hamiltonian(
     """Returns the (init, energies) pair of bodies with learned masses and pair energies.
 
     Args:
-        bodies: at least two.
+        needs: prismatic coordinates of at least two bodies, without friction.
         dimension: coordinates per body.
         order: order of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
         alike: whether all bodies share one mass and all pairs one energy; otherwise they have their own.
@@ -54,12 +54,17 @@ def make_pairwise_hamiltonian(
         width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
-        InputError: fewer than two bodies, numbers that are not positive, an unknown order, or unknown, repeated or no
-            features.
+        InputError: other needs, fewer than two bodies, numbers that are not positive, an unknown order, or unknown,
+            repeated or no features.
     """
     require_positive(dimension=dimension, distance_scale=distance_scale)
     networks = perceptrons(width, depth, activation)
-    if bodies < 2:
+    has_friction = needs.friction or needs.joint_friction
+    if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or has_friction:
+        raise InputError(
+            f"the pairwise model takes positions of bodies, {dimension} for each, without friction; it got {needs}"
+        )
+    if (bodies := needs.degrees_of_freedom // dimension) < 2:
         raise InputError(f"bodies is {bodies}; expected at least 2, since the energy is one of pairs")
     if order not in ("bodies", "axes"):
         raise InputError(f"order is {order!r}; expected 'bodies' (x1, y1, x2, y2) or 'axes' (x1, x2, y1, y2)")
@@ -86,4 +91,4 @@ def make_pairwise_hamiltonian(
         return jnp.diag(jnp.repeat(factors, dimension) if order == "bodies" else jnp.tile(factors, dimension))
 
     terms = {"potential": potential, "inverse_factor": inverse_factor}
-    return model_of(NaturalHamiltonian, lambda: terms, bodies * dimension, dtype)
+    return model_of(NaturalHamiltonian, lambda: terms, needs.degrees_of_freedom, dtype)

@@ -54,7 +54,7 @@ def make_residual(
     width: int = 8,
     depth: int = 1,
     activation: Activation | str = tanh,
-    velocity_scale: Scale = 0.05,
+    resolved_velocity: Scale = 0.05,
     torque_scale: Scale = 1.0,
     rate_scale: Scale = 1.0,
     acceleration_scale: Scale = 1.0,
@@ -64,7 +64,7 @@ def make_residual(
 
     Args:
         terms: some of potential, dissipation and inertia.
-        velocity_scale: 1/s or m/s, resolution of the dissipation's networks for rates near rest.
+        resolved_velocity: 1/s or m/s, resolution of the dissipation's networks for rates near rest.
         torque_scale, rate_scale, acceleration_scale: s, r and a above, in their units.
         needs, width, depth, activation, dtype: as described in `models.model`.
 
@@ -78,7 +78,7 @@ def make_residual(
     d = needs.degrees_of_freedom
     scales = {"torque_scale": torque_scale, "rate_scale": rate_scale, "acceleration_scale": acceleration_scale}
     s, r, a = (np.array(per_coordinate(needs, name, scale)) for name, scale in scales.items())
-    slow = np.array(per_coordinate(needs, "velocity_scale", velocity_scale))
+    slow = np.array(per_coordinate(needs, "resolved_velocity", resolved_velocity))
 
     def network(name: str, outputs: int, inputs: Array) -> Array:
         small = hk.initializers.VarianceScaling(START**2)

@@ -4,6 +4,7 @@ A name is the same on command lines, in files, in tables and beside published nu
 `Properties`, never on the spelling of a name.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -22,7 +23,7 @@ from dln_jax.models.hamiltonian import (
 )
 from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
-from dln_jax.models.model import Model, Scale
+from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
@@ -31,9 +32,7 @@ from dln_jax.models.rigid_tree import Number, make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
-from dln_jax.nn.activations import Activation, tanh
-from dln_jax.sizes import require_network
-from dln_jax.types import InputError, Needs, ResidualTerm, require_positive
+from dln_jax.types import InputError, Needs
 from dln_jax.zoo.differential_network import make_differential_network
 from dln_jax.zoo.images import make_image_model
 
@@ -93,97 +92,10 @@ def linear_friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype:
     return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=True, dtype=dtype)
 
 
-def friction_network(
-    make: Callable[[Needs], Model],
-    needs: Needs,
-    *,
-    friction_width: int = 0,
-    friction_depth: int = 1,
-    friction_activation: Activation = tanh,
-    initial_friction: float = 0.05,
-    dtype: DTypeLike = jnp.float32,
-) -> Model:
-    """Adds friction that may depend on q to a Hamiltonian: a network with `friction_width` hidden units.
-
-    With `friction_width` 0 each coordinate has one coefficient, as `make` has it. Without friction in the needs, the
-    keywords have no effect.
-    """
-    if not (needs.friction and friction_width):
-        return make(needs)
-    require_network(width=friction_width, depth=friction_depth)
-    return make_dissipative(
-        make(needs._replace(friction=False)),
-        needs,
-        width=friction_width,
-        depth=friction_depth,
-        activation=friction_activation,
-        initial_friction=initial_friction,
-        dtype=dtype,
-    )
-
-
-def residual_network(
-    make: Callable[[Needs], Model],
-    needs: Needs,
-    *,
-    terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
-    width: int = 8,
-    depth: int = 1,
-    activation: Activation = tanh,
-    resolved_velocity: Scale = 0.05,
-    torque_scale: Scale = 1.0,
-    rate_scale: Scale = 1.0,
-    acceleration_scale: Scale = 1.0,
-    dtype: DTypeLike = jnp.float64,
-) -> Model:
-    """Adds a `make_residual`; its `velocity_scale` is called `resolved_velocity` here."""
-    residual = make_residual(
-        needs,
-        terms=tuple(terms),
-        width=width,
-        depth=depth,
-        activation=activation,
-        velocity_scale=resolved_velocity,
-        torque_scale=torque_scale,
-        rate_scale=rate_scale,
-        acceleration_scale=acceleration_scale,
-        dtype=dtype,
-    )
-    return make_with_residual(make(needs), residual)
-
-
-def make_pairwise(
-    needs: Needs,
-    *,
-    dimension: int = 2,
-    order: str = "bodies",
-    alike: bool = True,
-    features: tuple[str, ...] = ("distance", "inverse", "logarithm"),
-    distance_scale: float = 1.0,
-    width: int = 32,
-    depth: int = 2,
-    activation: Activation = tanh,
-    dtype: DTypeLike = jnp.float32,
-) -> Model:
-    """`make_pairwise_hamiltonian` for the bodies whose coordinates the needs state."""
-    require_positive(dimension=dimension)
-    has_friction = needs.friction or needs.joint_friction
-    if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or has_friction:
-        raise InputError(
-            f"the pairwise model takes positions of bodies, {dimension} for each, without friction; it got {needs}"
-        )
-    return make_pairwise_hamiltonian(
-        needs.degrees_of_freedom // dimension,
-        dimension,
-        order=order,
-        alike=alike,
-        features=features,
-        distance_scale=distance_scale,
-        width=width,
-        depth=depth,
-        activation=activation,
-        dtype=dtype,
-    )
+@functools.wraps(make_residual)
+def residual_network(make: Callable[[Needs], Model], needs: Needs, **keywords: Any) -> Model:
+    """Adds a `make_residual`, whose keywords it takes."""
+    return make_with_residual(make(needs), make_residual(needs, **keywords))
 
 
 def make_stored_tree(
@@ -227,7 +139,7 @@ def make_stored_tree(
 
 MOMENTUM = {"momentum_scale": ("p",)}
 LAWS, LINEAR = (friction_laws,), (linear_friction_laws,)
-NETWORK = (friction_laws, friction_network)
+NETWORK = (friction_laws, make_dissipative)
 RATES = {"rate_scale": ("qd",), "acceleration_scale": ("qdd",), "tau_scale": ("tau",)}
 CATALOGUE = {
     "structured-delan": Entry(make_delan, Properties(definite=True), additions=LAWS),
@@ -246,7 +158,7 @@ CATALOGUE = {
     "structured-hnn": Entry(make_structured_hamiltonian, Properties(definite=True, canonical=True), additions=NETWORK),
     "black-box-hnn": Entry(make_black_box_hamiltonian, Properties(canonical=True), MOMENTUM, NETWORK),
     "separable-hnn": Entry(make_separable_hamiltonian, Properties(canonical=True), MOMENTUM, NETWORK),
-    "pairwise-hnn": Entry(make_pairwise, Properties(definite=True, canonical=True)),
+    "pairwise-hnn": Entry(make_pairwise_hamiltonian, Properties(definite=True, canonical=True)),
     "polynomial-hamiltonian": Entry(make_polynomial_hamiltonian, Properties(canonical=True, linear=True)),
     "phase-network": Entry(
         make_phase_network,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dln_jax import GaussNewton, fit
+from dln_jax import GaussNewton, Needs, fit
 from dln_jax.data.splits import hold_out
 from dln_jax.figures import style
 from dln_jax.learning.rates import problem
@@ -40,7 +40,7 @@ print(f"{len(task.train.data.t)} samples for training")
 # H = sum of p² / 2 m + sum over pairs of V(distance), with V a network of one layer of 8 units, by Gauss-Newton on the
 # rates.
 
-model = make_pairwise_hamiltonian(2, 2, width=8, depth=1, activation=tanh, dtype=jnp.float64)
+model = make_pairwise_hamiltonian(Needs(("prismatic",) * 4), width=8, depth=1, activation=tanh, dtype=jnp.float64)
 train, validation = hold_out(task.train.data, 0.1, seed=0)
 training = fit(problem(model, train, validation), GaussNewton(steps=ITERATIONS))
 flow = equations.flow(model.energies(training.parameters))

@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from dln_jax import GaussNewton, dynamics, fit, flow
+from dln_jax import GaussNewton, Needs, dynamics, fit, flow
 from dln_jax.data.splits import hold_out, split
 from dln_jax.figures import rotary_pendulum_drawing, style
 from dln_jax.learning.dynamics import problem as torque_problem
@@ -83,7 +83,7 @@ def writing_arm(frames: int) -> Film:
 def three_bodies(frames: int) -> Film:
     """Three bodies move by a Hamiltonian that was learned from rates."""
     task = three_body(trajectories=200)
-    model = make_pairwise_hamiltonian(3, 2, width=8, depth=1, activation=tanh, dtype=jnp.float64)
+    model = make_pairwise_hamiltonian(Needs(("prismatic",) * 6), width=8, depth=1, activation=tanh, dtype=jnp.float64)
     sets = hold_out(task.train.data, 0.1, seed=0)
     training = fit(rate_problem(model, *sets), GaussNewton(steps=80))
     learned = flow(model.energies(training.parameters))

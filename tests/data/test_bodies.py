@@ -8,7 +8,7 @@ import pytest
 from dln_jax.data.bodies import Bodies, arrangements, find_bodies, imbalance
 from dln_jax.mechanics.equations import flow
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.types import InputError
+from dln_jax.types import InputError, Needs
 from tests.published_motions import published_arrays
 
 COUNTS = {"two-body": 2, "three-body": 3}
@@ -51,7 +51,10 @@ def test_bodies_in_space_are_told_from_bodies_in_a_plane():
 def test_a_pairwise_model_is_the_same_in_both_orders():
     count, arrays = 3, published_arrays("three-body", 7, trajectories=1)
     sizes = {"width": 4, "depth": 1, "alike": False, "dtype": jnp.float64}
-    models = {order: make_pairwise_hamiltonian(count, 2, order=order, **sizes) for order in ("bodies", "axes")}
+    models = {
+        order: make_pairwise_hamiltonian(Needs(("prismatic",) * 2 * count), order=order, **sizes)
+        for order in ("bodies", "axes")
+    }
     parameters = models["bodies"].init(jax.random.key(0))
     parameters = jax.tree.map(lambda leaf: leaf + 0.1 * np.arange(leaf.size).reshape(leaf.shape), parameters)
     q, p = arrays["q"][:5], arrays["p"][:5]
@@ -62,4 +65,4 @@ def test_a_pairwise_model_is_the_same_in_both_orders():
     for one, other in zip(of_axes, of_bodies, strict=True):
         np.testing.assert_allclose(by_body(np.asarray(one), count), other, rtol=1e-12)
     with pytest.raises(InputError, match="order is 'columns'"):
-        make_pairwise_hamiltonian(2, 2, order="columns")  # pyright: ignore[reportArgumentType]
+        make_pairwise_hamiltonian(Needs(("prismatic",) * 4), order="columns")  # pyright: ignore[reportArgumentType]

@@ -22,11 +22,11 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
-from dln_jax.metrics.errors import predictions
 from dln_jax.scale.mesh import batch_mesh, of_first_process
 from dln_jax.scenes.pendulums import pendulum
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError
+from scripts.reports.predictions import predictions
 
 SAMPLES = 61
 """Which neither two nor four devices divide."""

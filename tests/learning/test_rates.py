@@ -23,6 +23,12 @@ from dln_jax.types import InputError, Needs
 NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)
 FREE = NEEDS._replace(friction=False)
 SMALL = {"width": 4, "depth": 1, "dtype": jnp.float64}
+FRICTION = {"friction_width": 4, "dtype": jnp.float64}
+
+
+def separable(needs):
+    """A separable model."""
+    return make_separable_hamiltonian(needs, **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +41,7 @@ def swing():
 
 def test_friction_takes_energy_and_never_gives_it():
     """dH/dt = -qdᵀ dD/dqd = -2 D <= 0, for random parameters and states."""
-    model = make_dissipative(make_separable_hamiltonian(FREE, **SMALL), NEEDS, **SMALL)
+    model = make_dissipative(separable, NEEDS, **FRICTION)
     q, p = 3 * jax.random.normal(jax.random.key(0), (2, 40, 2))
 
     @jax.jit
@@ -63,7 +69,7 @@ def test_friction_takes_energy_and_never_gives_it():
 def test_what_a_scene_lacks_is_not_built():
     model = make_separable_hamiltonian(FREE, **SMALL)
     parameters = jax.eval_shape(model.init, jax.random.key(0))
-    free = make_dissipative(model, FREE, **SMALL)
+    free = make_dissipative(separable, FREE, **FRICTION)
     assert jax.tree.structure(jax.eval_shape(free.init, jax.random.key(0))) == jax.tree.structure(parameters)
     baseline = make_phase_network(NEEDS, **SMALL)
     assert isinstance(flow(baseline.energies(jax.jit(baseline.init)(jax.random.key(0)))), PlainFlow)
@@ -155,7 +161,7 @@ def test_mistakes_are_named(swing):
         (lambda: make_polynomial_hamiltonian(needs, degree=1), "degree is 1"),
         (lambda: make_polynomial_hamiltonian(NEEDS), "conserves energy"),
         (lambda: make_polynomial_hamiltonian(Needs(joints=("prismatic",) * 6), degree=9), "lower the degree"),
-        (lambda: make_dissipative(make_separable_hamiltonian(FREE, **SMALL), NEEDS, width=0), "width is 0"),
+        (lambda: make_dissipative(separable, NEEDS, friction_width=-1), "width is -1"),
         (lambda: make_phase_network(needs, depth=0), "depth is 0"),
     ]
     for call, message in refused:

@@ -12,16 +12,18 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.rollouts import (
     Motion,
-    energy_error,
+    by_trajectory,
     follow,
+    metrics_of_motions,
+    motion_program,
     normalised_state_error,
-    recorded_motions,
-    rollout_metrics,
+    records_of,
     valid_prediction_time,
     valid_prediction_times,
 )
-from dln_jax.scenes.datasets import generators
 from dln_jax.types import InputError
+from scripts.reports.arm.published_swings import STARTS, uniform_tests
+from scripts.reports.predictions import rollout_metrics
 
 FRICTION = 0.3
 
@@ -59,10 +61,15 @@ def recordings():
     return schema.from_arrays({**arrays, "trajectory": [0] * 5 + [1] * 3, "label": ["long", "short"]})
 
 
+def predicted(system, data):
+    """Motions of a system along recordings, and their energies."""
+    return jax.jit(motion_program(lambda _: system))(None, records_of(data, None))
+
+
 def test_a_mass_follows_recorded_torques():
     """RK4 is exact for a torque that is constant or linear in each interval."""
     data = recordings()
-    motions = recorded_motions(sliding_mass(), data, substeps=2)
+    motions = by_trajectory(predicted(sliding_mass(), data)[0], data)
     for index, samples in enumerate((slice(0, 5), slice(5, 8))):
         exact = motions["interpolated"][index]
         np.testing.assert_allclose(exact.q, data.q[samples], rtol=1e-13)
@@ -87,12 +94,10 @@ def test_energy_is_the_work_of_the_torque_less_friction():
     q, qd = oscillation(np.asarray(t))
     np.testing.assert_allclose(motion.q[:, 0], q, atol=1e-9)
     np.testing.assert_allclose(motion.qd[:, 0], qd, atol=1e-9)
-    assert energy_error(system.energy, [motion]) < 1e-9
+    energy = jax.vmap(system.energy)(motion.q, motion.qd)
+    np.testing.assert_allclose(energy - energy[0], motion.work, atol=1e-9)
     supplied = 1.5 * motion.q[:, 0]
     assert float(supplied[-1] - motion.work[-1]) > 0.01  # what friction took
-    wrong = motion._replace(work=supplied)
-    assert energy_error(system.energy, [wrong]) > 1e-3
-    assert energy_error(system.energy, [motion._replace(q=motion.q.at[-1].set(jnp.nan))]) == np.inf
 
 
 T = np.arange(5) * 0.5 + 3.0
@@ -139,6 +144,9 @@ def test_the_true_plant_predicts_its_own_motions_and_another_does_not():
     assert truth["vpt_interpolated_seconds"] == truth["rollout_seconds"] == 1.0
     assert 0 < truth["vpt_seconds"] < 1.0  # holding the torque loses a recorded motion
     assert truth["normalised_state_error"] < 1e-13 and truth["energy_error_j"] < 1e-12
+    motions, energies = predicted(sliding_mass(), data)
+    assert metrics_of_motions(motions._replace(work=motions.work + 1), energies, data)["energy_error_j"] > 0.5
+    assert metrics_of_motions(motions, energies.at[1, 0, 1].set(jnp.nan), data)["energy_error_j"] == np.inf
     # A model without an energy is rolled out as well.
     oscillator = damped_oscillator()
     plain = PlainDynamics(oscillator.inverse_dynamics, oscillator.forward_dynamics, oscillator.decompose)
@@ -153,7 +161,7 @@ def test_recordings_that_cannot_be_followed_are_refused():
     with pytest.raises(InputError, match="trajectory 'short' has 1 sample; a rollout needs at least 2"):
         rollout_metrics(sliding_mass(), data._replace(trajectory=np.array([0] * 7 + [1])))
     with pytest.raises(InputError, match="substeps is 0"):
-        rollout_metrics(sliding_mass(), data, substeps=0)
+        follow(sliding_mass(), jnp.zeros(1), jnp.zeros(1), jnp.zeros((2, 1)), jnp.arange(2.0), substeps=0)
     with pytest.raises(InputError, match=r"q\[:, 0\] is the same in all samples"):
         valid_prediction_times(data._replace(q=np.ones_like(data.q)), [])
     with pytest.raises(InputError, match="no trajectories"):
@@ -161,10 +169,10 @@ def test_recordings_that_cannot_be_followed_are_refused():
 
 
 def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
-    data = generators.uniform_tests()
+    data = uniform_tests()
     assert data.q.shape == (1200, 2) and data.t[399] == pytest.approx(7.98)
     np.testing.assert_array_equal(data.tau, 0.0)
-    np.testing.assert_array_equal(data.q[::400], generators.STARTS)
+    np.testing.assert_array_equal(data.q[::400], STARTS)
     # The published formulas of the plant, whose angle zero is horizontal, by plain numpy.
     q, qd = data.q[[0, 400, 800]].T, np.zeros((2, 3))
     for step in range(200):

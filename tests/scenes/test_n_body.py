@@ -19,6 +19,11 @@ MIXED = Needs(("prismatic", "revolute"), friction=True)
 MASSES = np.array([1.0, 2.0, 0.5])
 
 
+def positions(count, dimension):
+    """Needs of bodies."""
+    return Needs(("prismatic",) * (count * dimension))
+
+
 def parameters_of(model):
     """Random ones of the right shapes; none is where it starts."""
     random = np.random.default_rng(8)
@@ -29,7 +34,7 @@ def parameters_of(model):
 @functools.cache
 def bodies(alike, dimension):
     """A random model of three bodies, and a state."""
-    model = make_pairwise_hamiltonian(3, dimension, alike=alike, **SMALL)
+    model = make_pairwise_hamiltonian(positions(3, dimension), dimension=dimension, alike=alike, **SMALL)
     parameters = parameters_of(model)
     x, p = jnp.asarray(np.random.default_rng(dimension).normal(size=(2, 3, dimension)))
     return model, parameters, x, p
@@ -83,7 +88,7 @@ def test_momentum_and_angular_momentum_are_conserved(alike, dimension):
 def test_gravity_is_one_set_of_parameters(alike):
     """w = -G m_i m_j on 1/r, and no network: the textbook's energy and accelerations."""
     masses = np.ones(3) if alike else MASSES
-    model = make_pairwise_hamiltonian(3, 2, alike=alike, features=("distance", "inverse"), **SMALL)
+    model = make_pairwise_hamiltonian(positions(3, 2), alike=alike, features=("distance", "inverse"), **SMALL)
     parameters = jax.tree.map(jnp.zeros_like, jax.eval_shape(model.init, jax.random.key(0)))
     parameters["~"]["log_mass"] += np.log(masses[:1] if alike else masses)
     products = masses[[0, 0, 1]] * masses[[1, 2, 2]]
@@ -121,7 +126,7 @@ def test_the_scale_divides_distances():
     x, p = bodies(True, 3)[2:]
     energies = []
     for scale in (1.0, 2.5):
-        model = make_pairwise_hamiltonian(3, 3, distance_scale=scale, **SMALL)
+        model = make_pairwise_hamiltonian(positions(3, 3), dimension=3, distance_scale=scale, **SMALL)
         H = flow(model.energies(bodies(True, 3)[1])).energy
         energies.append(float(jax.jit(H)(scale * x.ravel(), p.ravel())))
     assert energies[0] == pytest.approx(energies[1], rel=1e-13)
@@ -129,7 +134,7 @@ def test_the_scale_divides_distances():
 
 def test_absent_features_and_terms_cost_nothing():
     def seen(features):
-        model = make_pairwise_hamiltonian(2, 2, features=features, **SMALL)
+        model = make_pairwise_hamiltonian(positions(2, 2), features=features, **SMALL)
         parameters = jax.eval_shape(model.init, jax.random.key(0))
         text = str(jax.make_jaxpr(lambda p, q: flow(model.energies(p)).energy(q, q))(parameters, jnp.ones(4)))
         return "= log" in text, sum(leaf.size for leaf in jax.tree.leaves(parameters))
@@ -194,12 +199,12 @@ def test_the_momentum_scale_divides_momenta():
 
 
 REFUSED = [
-    (lambda: make_pairwise_hamiltonian(1, 2), "bodies is 1"),
-    (lambda: make_pairwise_hamiltonian(2, 0), "dimension is 0"),
-    (lambda: make_pairwise_hamiltonian(2, 2, width=0), "width is 0"),
-    (lambda: make_pairwise_hamiltonian(2, 2, distance_scale=-1.0), "distance_scale is -1"),
-    (lambda: make_pairwise_hamiltonian(2, 2, features=()), "expected some of distance, inverse, logarithm"),
-    (lambda: make_pairwise_hamiltonian(2, 2, features=("square",)), "square"),
+    (lambda: make_pairwise_hamiltonian(positions(1, 2)), "bodies is 1"),
+    (lambda: make_pairwise_hamiltonian(positions(2, 1), dimension=0), "dimension is 0"),
+    (lambda: make_pairwise_hamiltonian(positions(2, 2), width=0), "width is 0"),
+    (lambda: make_pairwise_hamiltonian(positions(2, 2), distance_scale=-1.0), "distance_scale is -1"),
+    (lambda: make_pairwise_hamiltonian(positions(2, 2), features=()), "expected some of distance, inverse, logarithm"),
+    (lambda: make_pairwise_hamiltonian(positions(2, 2), features=("square",)), "square"),
     (lambda: make_separable_hamiltonian(MIXED, depth=0), "depth is 0"),
     (lambda: make_separable_hamiltonian(MIXED, iterations=0), "iterations is 0"),
     (lambda: make_separable_hamiltonian(MIXED, momentum_scale=(1.0,)), "momentum_scale has 1"),

@@ -16,7 +16,7 @@ class Arguments(ImageOptions):
 
 def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder."""
-    from dln_jax.training.hamiltonian.images import IMAGES
+    from dln_jax.training.hamiltonian.pixels import IMAGES
     from dln_jax.training.pipeline import train
 
     train(IMAGES, options, "train_hnn_pixels")

@@ -1,6 +1,6 @@
 """Datasets generated from scenes, and the published tasks."""
 
-from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, characters, free_swing, uniform, uniform_tests
+from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, characters, free_swing, uniform
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.scenes.datasets.letters import LETTERS, LetterPath, letter_path
 from dln_jax.scenes.datasets.pendulum_frames import RodFrames, swinging_rod
@@ -20,5 +20,4 @@ __all__ = [
     "reference_motion",
     "swinging_rod",
     "uniform",
-    "uniform_tests",
 ]

@@ -27,10 +27,10 @@ from jaxtyping import Array, Float
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import determinant
 from dln_jax.softbody.terms.elasticity import rest_geometry, shape_gradients
-from dln_jax.softbody.terms.gravity import gravity as weight
+from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import muscles as driven_springs
 from dln_jax.softbody.terms.strain_energies import DeformationGradient, squared_norm
-from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Indices, Numbers, Term, material
+from dln_jax.softbody.terms.term import Context, Corners, Indices, Term
 from dln_jax.types import InputError, Scalar
 
 MASS = 6.0714288
@@ -82,12 +82,6 @@ def creature_terms(
     mesh: Mesh,
     muscles: Indices,
     *,
-    mu: Numbers = 500.0,
-    lam: Numbers = 50.0,
-    muscle_stiffness: Numbers = 90.0,
-    ground_stiffness: Numbers = 14000.0,
-    ground_friction: Numbers = 300.0,
-    gravity: float = 9.8,
     bumps: Bumps | None = None,
 ) -> tuple[Term, ...]:
     """Terms "elastic", "muscles", "gravity" and "ground" of a creature above y = 0; muscles are pairs [k, 2].
@@ -99,18 +93,15 @@ def creature_terms(
         got, expected = np.shape(bumps.wave_vector)[-1], mesh.dimension - 1
         raise InputError(f"the bumps' wave vectors have {got} components; expected {expected}, the horizontal ones")
     return (
-        _elements(mesh, mu, lam),
-        driven_springs(muscles, stiffness=muscle_stiffness, softening=1e-3),
-        weight(mesh, (*(0.0,) * (mesh.dimension - 1), -gravity)),
-        _ground(len(mesh.vertices), ground_stiffness, ground_friction, bumps),
+        _elements(mesh),
+        driven_springs(muscles, stiffness=90.0, softening=1e-3),
+        gravity(mesh, (*(0.0,) * (mesh.dimension - 1), -9.8)),
+        _ground(len(mesh.vertices), bumps),
     )
 
 
-def _elements(mesh: Mesh, mu: Numbers, lam: Numbers) -> Term:
-    count = len(mesh.elements)
-    parameters = CreatureMaterial(
-        material("mu", mu, count, "element"), material("lam", lam, count, "element", NOT_NEGATIVE)
-    )
+def _elements(mesh: Mesh) -> Term:
+    count, parameters = len(mesh.elements), CreatureMaterial(jnp.asarray(500.0), jnp.asarray(50.0))
 
     def prepare(parameters: CreatureMaterial, context: Context) -> tuple[Array, ...]:
         gradients, _ = jax.vmap(rest_geometry)(context.rest[mesh.elements])
@@ -126,9 +117,8 @@ def _elements(mesh: Mesh, mu: Numbers, lam: Numbers) -> Term:
     return Term("elastic", mesh.elements, energy, parameters, prepare, weights=shape_gradients)
 
 
-def _ground(count: int, stiffness: Numbers, friction: Numbers, bumps: Bumps | None) -> Term:
-    rough = material("ground_friction", friction, count, "vertex", NOT_NEGATIVE)
-    parameters = CreatureGround(material("ground_stiffness", stiffness, count, "vertex"), rough, bumps)
+def _ground(count: int, bumps: Bumps | None) -> Term:
+    parameters = CreatureGround(jnp.asarray(14000.0), jnp.asarray(300.0), bumps)
 
     def height(x: Sequence[Array] | Array, bumps: Bumps | None) -> Array:
         return x[-1] if bumps is None else x[-1] - ground_height(bumps, x[:-1])

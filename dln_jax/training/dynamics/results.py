@@ -17,7 +17,7 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import as_arrays, errors, mean_square, samples_of
 from dln_jax.metrics.latency import Latency, one_step
-from dln_jax.metrics.rollouts import TORQUES, Motion, by_trajectory, metrics_of_motions, records_of
+from dln_jax.metrics.rollouts import Motion, by_trajectory, metrics_of_motions, records_of
 from dln_jax.precision import data_type
 from dln_jax.training.dynamics.programs import Programs, judged_data
 from dln_jax.training.dynamics.task import Task
@@ -184,7 +184,7 @@ def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Moti
         return [], {}
     plant = programs.ceilings()
     ceilings = {ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}
-    return by_trajectory(motions, test, TORQUES)["interpolated"], {**metrics, **ceilings}
+    return by_trajectory(motions, test)["interpolated"], {**metrics, **ceilings}
 
 
 def figures_of(

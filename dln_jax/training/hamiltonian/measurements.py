@@ -15,7 +15,7 @@ from dln_jax.data.arrays import spread
 from dln_jax.data.bodies import find_bodies
 from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
 from dln_jax.data.schema import Trajectories, column
-from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, segments, select
+from dln_jax.data.splits import label_indices, require_no_copies, segments, select, select_samples
 from dln_jax.data.stated_tests import stated_test
 from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
@@ -105,7 +105,7 @@ def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[
         count = len(data.t) - round(TEST_SHARE * len(data.t))
         if min(count, len(data.t) - count) < WINDOW[name]:
             raise InputError(f"{file} has {len(data.t)} samples; expected some hundred, a fifth of them for the test")
-        return samples_of(data, slice(0, count)), samples_of(data, slice(count, None))
+        return select_samples(data, slice(0, count)), select_samples(data, slice(count, None))
     data, labels = stated_test(data, test)
     present = np.unique(data.trajectory)
     chosen = present[5::6] if len(present) >= 6 else present[-1:]
@@ -132,7 +132,7 @@ def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Tra
     of_q = _at_least(smooth.noise if noise is None else np.broadcast_to(noise, d), data.q)
     if "qd" not in data.estimated:
         return data, Noise(of_q, _at_least(smooth_locally(data._replace(q=data.qd)).noise, data.qd))
-    kept = samples_of(data, smooth.rows)
+    kept = select_samples(data, smooth.rows)
     return kept._replace(qd=smooth.data.qd, qdd=smooth.data.qdd), Noise(of_q)
 
 
@@ -164,7 +164,7 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
         raise InputError(f"--noise is for motions, but no segment without a gap has {SHORTEST} samples; leave it out")
     order = np.random.default_rng(0).permutation(len(parts))
     count = int(np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED)) + 1
-    surveyed = samples_of(data, np.concatenate([parts[index] for index in sorted(order[:count])]))
+    surveyed = select_samples(data, np.concatenate([parts[index] for index in sorted(order[:count])]))
     sizes = {key: spread(key, column(data, key)) for key in ("q", "p", "qd", "pd")}
     sizes = {key: np.where(size > 0, size, 1.0) for key, size in sizes.items()}
 
@@ -212,12 +212,6 @@ def motion_of(test: Trajectories) -> Motions:
     length = int(np.argmax(longest)) + 1 if longest.any() else len(test.t)
     t = test.t[:length] - test.t[0]
     return Motions(t, test.q[None, :length], column(test, "p")[None, :length])
-
-
-def samples_of(data: Trajectories, chosen: slice | np.ndarray) -> Trajectories:
-    """Selects samples."""
-    arrays = {key: getattr(data, key) for key in PER_SAMPLE}
-    return data._replace(**{key: array[chosen] for key, array in arrays.items() if array is not None})
 
 
 def pieces(data: Trajectories, length: int) -> Trajectories:

@@ -26,8 +26,6 @@ from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE, entry_of
 from dln_jax.zoo.descriptions import build, describe_for
 
-MODELS = ("black-box-hnn", "phase-network")
-"""Models of every task in the table, in addition to the one that suits the scene."""
 PAIRWISE, HELMHOLTZ = "pairwise-hnn", "helmholtz-hnn"
 POLYNOMIAL = "polynomial-hamiltonian"
 """Additional model for tasks with one coordinate and without friction."""
@@ -59,12 +57,6 @@ class Candidate(NamedTuple):
         """The name and the settings that distinguish it from candidates of the same name."""
         more = [f"{key} {value}" for key, value in self.keywords.items() if key != "friction_width"]
         return ", ".join([self.name, *more, *(["with friction"] if self.needs.friction else [])])
-
-
-def models_of(task: str) -> tuple[str, ...]:
-    """Models of a task in the table; the first is the one that suits the scene."""
-    every = (RECIPES[task].suits, *MODELS)
-    return (*every, POLYNOMIAL) if task in ("spring", "pendulum") else every
 
 
 def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:

@@ -1,11 +1,11 @@
-"""The pixel pendulum: data, models, training, errors and images, for the scripts that report on it.
+"""The pixel pendulum: data, models, training, errors and images, as a kind of the pipeline.
 
 Models: black-box-hnn (an energy in the latent plane) and phase-network (a network for the rates there), with the same
 autoencoder, loss and budget. The data are those of seed 0; a seed determines the parameters and the order of the
 samples.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -13,14 +13,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from dln_jax.cli.arguments import require_positive_if_given
+from dln_jax.cli.progress import progress
 from dln_jax.figures.animations import write_frame_gif
 from dln_jax.figures.phase_space import injection_figure
 from dln_jax.figures.style import TRUTH
-from dln_jax.files import write_figure
+from dln_jax.figures.training import training_curve
 from dln_jax.learning import frames as learning_frames
-from dln_jax.learning.engine.checkpoint import Checkpoint
-from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine import fit as fitting
+from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Progress, Report, silent
 from dln_jax.learning.frames import Matching, TermWeights
@@ -44,10 +47,13 @@ from dln_jax.models.latent_phase import (
 )
 from dln_jax.models.model import Parameters
 from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, FRAMES, TRAJECTORIES, FrameSplit, split, swinging_rod
+from dln_jax.training.hamiltonian.options import ImageOptions
+from dln_jax.training.pipeline import Fitted, Judged, Kind, png
+from dln_jax.training.results import OF_LOSSES, losses
+from dln_jax.types import require_seed
 from dln_jax.zoo.descriptions import Description, build, describe
+from dln_jax.zoo.images import with_components
 
-MODELS: tuple[Field, ...] = ("black-box-hnn", "phase-network")
-"""Models in the latent plane."""
 MATCHING = Matching(weights=TermWeights(field=10.0))
 """The same for both models. Weight, components and training length were chosen with seed 0 by validation films.
 Matching one step at a time, as published, was chosen over windows of ten steps, for which both models were alike (1e-6
@@ -106,7 +112,7 @@ def measure_pixels(
     inner, model = image_models(image_description(kind, components), components)
     fitted, held_out, tested = (compress(components, part.frames) for part in data)
     problem = learning_frames.problem(inner, fitted, held_out, MATCHING, seed=seed)
-    training = fit(problem, optimiser_of(steps), checkpoint=checkpoint, report=report)
+    training = fitting.fit(problem, optimiser_of(steps), checkpoint=checkpoint, report=report)
     parameters = training.parameters
     numbers, motions = frame_errors(model, parameters, data.test)
     window = jnp.asarray(learning_frames.windows(tested, MATCHING.window + 1))
@@ -120,24 +126,76 @@ def measure_pixels(
     return numbers, SeenFrames(model, parameters, motions, components, training.history)
 
 
-def figures_of(seen: dict[str, SeenFrames], data: FrameSplit, *, shown: int = 0) -> dict[str, Callable[[Path], None]]:
+def figures_of(seen: dict[str, SeenFrames], data: FrameSplit) -> dict[str, Callable[[Path], None]]:
     """`pixels.gif` (truth and every model's frames) and, for an energy, `pixels-injection.png`."""
     times = data.test.frames.shape[1] - 1
-    frames = {TRUTH: data.test.frames[shown, :times]}
-    frames |= {name: model.motions.frames[shown] for name, model in seen.items()}
-    figures = {"pixels.gif": lambda path: write_frame_gif(path, frames, FRAME_TIME * np.arange(times))}
+    frames = {TRUTH: data.test.frames[0, :times]}
+    frames |= {name: model.motions.frames[0] for name, model in seen.items()}
+    figures: dict[str, Callable[[Path], None]] = {
+        "pixels.gif": lambda path: write_frame_gif(path, frames, FRAME_TIME * np.arange(times))
+    }
     if hnn := seen.get("black-box-hnn"):
         # Start from a motion with little energy, so that three times as much is within the decoder's training data.
         ranges = np.abs(data.test.q).max(axis=1)
         quiet = int(np.argsort(ranges)[len(ranges) // 4])
         injected = inject_energy(hnn.model, hnn.parameters, data.test.pairs[quiet, 0], factor=3.0)
-        figures["pixels-injection.png"] = lambda path: write_figure(path, injection_figure(injected))
+        figures["pixels-injection.png"] = png(injection_figure, injected)
     return figures
 
 
-def draw_pixels(seen: dict[str, SeenFrames], data: FrameSplit, folder: Path, *, shown: int = 0) -> list[Path]:
-    """Writes the figures into a folder and returns their paths."""
-    figures = figures_of(seen, data, shown=shown)
-    for name, draw in figures.items():
-        draw(folder / name)
-    return [folder / name for name in figures]
+class Case(NamedTuple):
+    """Films, the model of their latent plane, and its optimiser."""
+
+    kind: str
+    optimiser: Adam
+    data: FrameSplit
+
+
+def prepare(options: ImageOptions) -> Case:
+    """Generates the films."""
+    require_seed(options.seed)
+    require_positive_if_given(options, ["steps", "trajectories"])
+    return Case(options.model, optimiser_of(options.steps), pixel_data(options.trajectories))
+
+
+def announce(case: Case) -> Iterator[str]:
+    """A line on the films and the model."""
+    train, validation, _ = case.data
+    yield f"pixels: {len(train.q)} films to train on, {len(validation.q)} to select by; {case.kind}, f32"
+
+
+def fit(case: Case, options: ImageOptions, folder: Path, mesh: Mesh | None) -> Fitted:
+    """Trains autoencoder and latent dynamics together, and measures them on the test films."""
+    kind, optimiser, data = case
+    known = identity(optimiser, [data.train.frames, data.validation.frames], model=kind, seed=options.seed)
+    with progress(optimiser.steps) as show:
+        numbers, seen = measure_pixels(
+            options.model,
+            data,
+            seed=options.seed,
+            steps=optimiser.steps,
+            checkpoint=Checkpoint(folder, known, options.resume),
+            report=lambda at: show(at.step, losses(at)),
+        )
+    description = image_description(options.model, seen.components)
+    return Fitted(description, with_components(seen.components, seen.parameters), (numbers, seen))
+
+
+def judge(case: Case, fitted: Fitted, options: ImageOptions, folder: Path) -> Judged:
+    """The test errors, and figures of the predicted films."""
+    numbers, seen = fitted.outcome
+    figures = {}
+    if options.figures:
+        best = min(seen.history, key=lambda at: at.validation).step
+        curve = png(training_curve, seen.history, best_step=best, unit="loss", **OF_LOSSES)
+        figures = {**figures_of({case.kind: seen}, case.data), "training.png": curve}
+    return Judged(
+        metrics={key: value for key, value in numbers.items() if np.isfinite(value)},
+        rows=lambda _: [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
+        title=f"test films, {case.kind}",
+        columns=("quantity", "value"),
+        figures=figures,
+    )
+
+
+IMAGES = Kind(prepare, announce, fit, judge)

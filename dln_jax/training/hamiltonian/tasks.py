@@ -39,7 +39,6 @@ from dln_jax.training.hamiltonian.measurements import (
 )
 from dln_jax.types import Hamiltonian, InputError, Needs
 
-PIXELS = "pixels"
 TASKS = (*PROTOCOLS, REAL, MEASURED)
 STARTS = 50
 """Largest number of test motions predicted."""

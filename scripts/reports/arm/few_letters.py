@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import every, label_indices, partition_labels, select
+from dln_jax.data.splits import every, label_indices, select
 from dln_jax.learning.online import appended, empty_replay
 from dln_jax.mechanics import closed_form
 from dln_jax.metrics.errors import mean_square
@@ -24,6 +24,7 @@ from dln_jax.types import InputError
 from scripts.reports.arm.rivals import IDENTIFIED, Rival, rivals, size
 from scripts.reports.case import Case, Findings, spread
 from scripts.reports.figures.letters import error_lines
+from scripts.reports.parts import partition_labels
 from scripts.reports.rows import Row
 
 COUNTS, SPEEDS = (1, 2, 3, 5, 8), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)

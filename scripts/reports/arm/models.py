@@ -18,9 +18,8 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import Driven, dynamics
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.definiteness import definiteness
-from dln_jax.metrics.errors import errors, mean_square, predictions
+from dln_jax.metrics.errors import errors, mean_square
 from dln_jax.metrics.latency import Latency, one_step
-from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.models.model import Model
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import two_link_arm
@@ -29,6 +28,7 @@ from dln_jax.types import Hamiltonian
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for
 from dln_jax.zoo.run import compiled
+from scripts.reports.predictions import predictions, rollout_metrics
 
 TRIGONOMETRIC = "trigonometric"
 TORQUE_NOISE = 0.05
@@ -215,7 +215,7 @@ def end_of(numbers: dict[str, float]) -> Curve:
 
 
 def on_the_test(energies: Driven, sets: Split, dtype=jnp.float64, *, H: Hamiltonian | None = None) -> dict[str, float]:
-    """Test errors and valid prediction times; `H` as for `predictions`."""
+    """Test errors and valid prediction times; `H` as for `prediction_program`."""
     predicted = predictions(energies, sets.test, dtype, H=H)
     return {**errors(predicted, sets.test), **rollout_metrics(dynamics(energies), sets.test, dtype=dtype)}
 

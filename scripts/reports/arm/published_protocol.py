@@ -14,13 +14,14 @@ from dln_jax.cli.progress import progress
 from dln_jax.data.splits import Split
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.errors import errors, predictions
+from dln_jax.metrics.errors import errors
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 from dln_jax.zoo.run import compiled
 from scripts.reports.arm.models import by_published_protocol, latency
 from scripts.reports.arm.table import ARM_UNITS
 from scripts.reports.case import Case, Findings
+from scripts.reports.predictions import predictions
 from scripts.reports.published import ARM, PUBLISHED_CODE, published
 from scripts.reports.rows import Row, unit_of
 

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import Split, partition_labels, select, split
+from dln_jax.data.splits import Split, select, split
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data, uniform_tests
+from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm.models import (
@@ -28,8 +28,10 @@ from scripts.reports.arm.models import (
     measure_split,
     measure_trigonometric,
 )
+from scripts.reports.arm.published_swings import uniform_tests
 from scripts.reports.case import Case, Findings, by_case, rows_in, rows_of
 from scripts.reports.figures.costs import error_against_time
+from scripts.reports.parts import partition_labels
 from scripts.reports.published import ARM, published
 from scripts.reports.rows import UNITS, Row, unit_of
 

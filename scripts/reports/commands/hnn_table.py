@@ -19,12 +19,12 @@ from dln_jax.cli.arguments import Unstated, choice, names_in, refuse_given, requ
 from dln_jax.cli.options import Drawn, Resumable
 from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import write_bytes
-from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
+from dln_jax.training.hamiltonian.tasks import REAL, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
 from scripts.reports.case import measure, rows_in, say_numbers
 from scripts.reports.hamiltonian.own_files import QUANTITIES, own_cases, with_bounds
-from scripts.reports.hamiltonian.table import SHOWN, TASKS, cases, table_rows
+from scripts.reports.hamiltonian.table import PIXELS, SHOWN, TASKS, cases, table_rows
 from scripts.reports.rows import Row, conditions, markdown, publish
 
 

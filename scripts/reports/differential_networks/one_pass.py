@@ -6,13 +6,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import activation
 from dln_jax.sizes import require_network
 from dln_jax.types import require_positive
 from scripts.reports.case import Case, Findings
 from scripts.reports.rows import Row
+from scripts.reports.turns import medians_in_turns
 
 INPUTS = (1, 2, 4, 7)
 BOUNDS = {2: 4.0, 7: 4.0}

@@ -8,19 +8,23 @@ from typing import Any
 import numpy as np
 
 from dln_jax.files import write_figure
+from dln_jax.models.latent_phase import Field
 from dln_jax.training.hamiltonian import pixels
-from dln_jax.training.hamiltonian.model_selection import description_of, models_of
+from dln_jax.training.hamiltonian.model_selection import POLYNOMIAL, description_of
 from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once
 from dln_jax.training.hamiltonian.recipes import RECIPES
-from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
+from dln_jax.training.hamiltonian.tasks import REAL, problem_of
 from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import require_positive
 from scripts.reports.case import Case, Findings, rows_of
 from scripts.reports.published import HAMILTONIAN, published
 from scripts.reports.rows import Row, unit_of
 
+PIXELS = "pixels"
 TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
 """The published tasks."""
+MODELS: tuple[Field, ...] = ("black-box-hnn", "phase-network")
+"""Models of every task, in addition to the one that suits the scene."""
 BOUNDS = {
     "spring/separable-hnn": {"energy_mse": 3.8e-5, "train_seconds": 5.0},
     "pendulum/separable-hnn": {"published_energy_mse": 2.5e-3, "train_seconds": 8.0},
@@ -55,10 +59,16 @@ def cases(
     listed = []
     for name in names:
         task = pixel_task if name == PIXELS else partial(phase_task, name, data=real_pendulum if name == REAL else None)
-        kinds = pixels.MODELS if name == PIXELS else models_of(name)
+        kinds = MODELS if name == PIXELS else models_of(name)
         measure = partial(task, seeds=seeds, folder=folder, **counts)
         listed.append(Case(name, measure, {f"{name}/{kind}": () for kind in kinds}))
     return listed
+
+
+def models_of(task: str) -> tuple[str, ...]:
+    """Models of a task; the first is the one that suits the scene."""
+    every = (RECIPES[task].suits, *MODELS)
+    return (*every, POLYNOMIAL) if task in ("spring", "pendulum") else every
 
 
 def phase_task(
@@ -84,13 +94,14 @@ def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folde
     """Measures the models of images, and draws an animation and figures."""
     data = pixels.pixel_data(trajectories)
     numbers, seen = {}, {}
-    for kind in pixels.MODELS:
+    for kind in MODELS:
         runs = [pixels.measure_pixels(kind, data, seed=seed, steps=steps) for seed in range(seeds)]
         numbers[kind], seen[kind] = medians(runs), runs[0][1]
-    energetic, baseline = (numbers[kind] for kind in pixels.MODELS)
+    energetic, baseline = (numbers[kind] for kind in MODELS)
     energetic["energy_mse_over_baseline"] = energetic["energy_mse"] / baseline["energy_mse"]
     if folder is not None:
-        pixels.draw_pixels(seen, data, folder)
+        for name, draw in pixels.figures_of(seen, data).items():
+            draw(folder / name)
     return Findings([row for kind, of_kind in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", of_kind)])
 
 

@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.trees import Tree, inertial_parameters, serial
-from dln_jax.metrics.latency import medians_in_turns
+from scripts.reports.turns import medians_in_turns
 
 STATES = 256
 RIVALS = {"inverse_dynamics": "rnea", "forward_dynamics": "aba"}

@@ -12,11 +12,11 @@ from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.metrics.latency import medians_in_turns
 from scripts.reports.case import Findings
 from scripts.reports.robots.arm import D, arm
 from scripts.reports.robots.pinocchio import RIVALS, Timed, call_all, pinocchio_functions, seconds_of_calls
 from scripts.reports.rows import Row, expect
+from scripts.reports.turns import medians_in_turns
 
 CASE = "seven-axis-tree"
 BATCH = 10_000

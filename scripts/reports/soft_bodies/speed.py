@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import Delaunay
 
-from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.softbody.mesh.shapes import beam
@@ -29,6 +28,7 @@ from scripts.reports.case import Findings
 from scripts.reports.rows import expect
 from scripts.reports.soft_bodies.common import cantilever_of, converges
 from scripts.reports.soft_bodies.gradients import crawling, crawling_scene, gait
+from scripts.reports.turns import medians_in_turns
 
 LANES = 64
 DT = 1 / 30

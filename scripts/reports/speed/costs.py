@@ -13,12 +13,13 @@ from jax import Array
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
-from dln_jax.metrics.latency import medians_in_turns, one_step
+from dln_jax.metrics.latency import one_step
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.pendulums import chain
 from dln_jax.types import Lagrangian
 from scripts.reports.case import Findings
 from scripts.reports.rows import Row
+from scripts.reports.turns import medians_in_turns
 
 BATCHES = (1, 10, 100, 1_000, 10_000, 100_000)
 SIZES = (2, 4, 7, 12)

@@ -9,13 +9,13 @@ import numpy as np
 from jax import Array
 
 from dln_jax.mechanics import natural
-from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.models.lagrangian import cholesky_factor
 from dln_jax.nn import differential_mlp as network
 from dln_jax.nn.activations import tanh
 from dln_jax.types import require_positive
 from scripts.reports.case import Case, Findings
 from scripts.reports.rows import Row
+from scripts.reports.turns import medians_in_turns
 
 SIZES = (1, 2, 4, 7, 12)
 BATCHES = {1: "single-call", 512: "training-step-batch-512"}

@@ -10,7 +10,6 @@ from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
-from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.tasks import Problem, problem_of
 from dln_jax.training.hamiltonian.training import train
@@ -19,6 +18,7 @@ from dln_jax.zoo.descriptions import build
 from scripts.reports.case import Findings
 from scripts.reports.figures.costs import cost_panels
 from scripts.reports.rows import Row
+from scripts.reports.turns import medians_in_turns
 
 SCENES = {"pendulum": 0.2, "double-pendulum": 0.04, "henon-heiles": 0.4, "two-body": 0.4}
 """Largest time step by scene, s; it is halved repeatedly."""

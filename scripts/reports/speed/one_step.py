@@ -25,7 +25,7 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
-from dln_jax.metrics.errors import errors, predictions
+from dln_jax.metrics.errors import errors
 from dln_jax.metrics.latency import one_step
 from dln_jax.precision import data_type
 from dln_jax.zoo.descriptions import build
@@ -34,6 +34,7 @@ from scripts.reports.arm.models import DEPTH, STEPS, TRIGONOMETRIC, WIDTHS, desc
 from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
 from scripts.reports.figures.costs import EXACT, cost_points
+from scripts.reports.predictions import predictions
 from scripts.reports.process import called
 from scripts.reports.rows import Row, unit_of
 

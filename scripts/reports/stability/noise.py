@@ -14,13 +14,13 @@ from dln_jax.data.schema import Trajectories, column
 from dln_jax.learning.linear import LinearFit, fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import mean_square
-from dln_jax.metrics.misfit import velocity_misfit
 from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import double_pendulum, two_link_arm
 from scripts.reports.case import Findings
 from scripts.reports.rows import expect
+from scripts.reports.stability.misfit import velocity_misfit
 
 LEVELS = (1e-4, 1e-2, 1e-1)
 """Standard deviations of the noise, relative to that of the quantity."""

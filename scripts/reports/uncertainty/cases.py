@@ -12,7 +12,7 @@ import numpy as np
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, load
-from dln_jax.data.splits import in_blocks, partition_labels, select, with_joints
+from dln_jax.data.splits import in_blocks, select, with_joints
 from dln_jax.data.splits import split as split_by_labels
 from dln_jax.learning import dynamics as problems
 from dln_jax.learning.engine.fit import fit
@@ -30,6 +30,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from scripts.reports.case import Case, Findings
+from scripts.reports.parts import partition_labels
 from scripts.reports.rows import Row
 from scripts.reports.uncertainty.arms import VELOCITY_SCALE, arm, motions, plant
 

@@ -12,7 +12,7 @@ from calls import command, refused
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
-from dln_jax.metrics.latency import medians_in_turns, one_step
+from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.pendulums import chain
@@ -32,6 +32,7 @@ from scripts.reports.rows import Row, markdown
 from scripts.reports.speed import costs as benchmark_costs
 from scripts.reports.speed import integrators as benchmark_integrators
 from scripts.reports.speed import one_step as benchmark_one_step
+from scripts.reports.turns import medians_in_turns
 
 
 def test_the_full_hessian_way_gives_the_same_torques(d=2):

@@ -22,7 +22,7 @@ from dln_jax.training.hamiltonian import model_selection as choice
 from dln_jax.training.hamiltonian import pixels as pixel_task
 from dln_jax.training.hamiltonian import tasks as hnn_tasks
 from dln_jax.training.hamiltonian import training as hnn_models
-from dln_jax.training.hamiltonian.model_selection import description_of, models_of
+from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.tasks import pieces, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
@@ -30,7 +30,7 @@ from dln_jax.zoo.run import load
 from scripts.reports.case import Findings, rows_of
 from scripts.reports.commands import hnn_table
 from scripts.reports.hamiltonian import table
-from scripts.reports.hamiltonian.table import BOUNDS, TASKS, table_rows
+from scripts.reports.hamiltonian.table import BOUNDS, TASKS, models_of, table_rows
 from scripts.reports.published import HAMILTONIAN
 from scripts.reports.rows import markdown
 
@@ -96,7 +96,7 @@ def workplace(tmp_path_factory):
         patch.setattr(hnn_tasks, "POINTS", 4)
         patch.setattr(choice, "DEGREES", (2, 3))
         patch.setattr(pixel_task, "measure_pixels", lambda kind, data, **options: (quick_pixels(kind), None))
-        patch.setattr(pixel_task, "draw_pixels", lambda seen, data, folder: None)
+        patch.setattr(pixel_task, "figures_of", lambda seen, data: {})
         patch.setattr(pixel_task, "pixel_data", lambda *options: None)
         yield folder
 

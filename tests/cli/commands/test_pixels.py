@@ -300,10 +300,11 @@ def test_end_to_end_with_a_tiny_budget(tmp_path, monkeypatch):
     assert all(np.isfinite(value) for key, value in numbers.items() if "standard_error" not in key)
     assert numbers["energy_mse"] > numbers["energy_floor"] and numbers["parameters"] > 1e5
     assert seen.motions.pairs.shape == (1, 12, 2 * PIXELS)
-    (written,) = pixel_task.draw_pixels({"phase-network": seen}, data, tmp_path)
-    assert written.name == "pixels.gif" and written.stat().st_size > 1000
+    ((name, draw),) = pixel_task.figures_of({"phase-network": seen}, data).items()
+    draw(tmp_path / name)
+    assert name == "pixels.gif" and (tmp_path / name).stat().st_size > 1000
     # The other kind has the same autoencoder, and an energy.
-    descriptions = (pixel_task.image_description(name, seen.components) for name in pixel_task.MODELS[::-1])
+    descriptions = (pixel_task.image_description(name, seen.components) for name in ("phase-network", "black-box-hnn"))
     same, energetic = (pixel_task.image_models(each, seen.components)[0] for each in descriptions)
     shapes = [jax.tree.map(jnp.shape, jax.eval_shape(model.init, jax.random.key(0))) for model in (same, energetic)]
     assert shapes[0]["decoder"] == shapes[1]["decoder"] and shapes[0]["encoder"] == shapes[1]["encoder"]

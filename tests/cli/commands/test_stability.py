@@ -8,12 +8,12 @@ import pytest
 from calls import command, refused
 from conftest import slow_among
 
-from dln_jax.metrics.misfit import velocity_misfit
 from dln_jax.types import InputError
 from scripts.reports.case import named
 from scripts.reports.commands import stability
 from scripts.reports.commands.stability import NAMES, cases
 from scripts.reports.rows import expect
+from scripts.reports.stability.misfit import velocity_misfit
 
 LONG = ("sizes", "float32", "lyapunov-time", "close-encounters", "batches")
 LONG += ("mass-conditions", "not-finite", "turned-angles", "noise")
