@@ -132,7 +132,8 @@ def of_run(folder: Path, wishes: Wishes) -> Chosen:
     needs = needs_from_json(run.description["needs"])
     d = len(needs.joints)
     B = None if needs.actuation is None else np.asarray(needs.actuation)
-    driven = _numbers(wishes.actuated, d) if wishes.actuated else np.flatnonzero(np.ones(d) if B is None else B.any(1))
+    usual = np.flatnonzero(np.ones(d) if B is None else B.any(axis=1)).tolist()
+    driven = _numbers(wishes.actuated, d) if wishes.actuated else usual
     if wishes.control is None:
         raise InputError(f"{folder} states no limits of the motors; give the largest force (--control), N m or N")
     model = equations.dynamics(run.energies, degrees_of_freedom=d)
@@ -140,12 +141,12 @@ def of_run(folder: Path, wishes: Wishes) -> Chosen:
     goal = hanging = wishes.goal
     if isinstance(model, Dynamics):
         energy = jax.jit(lambda q: model.energy(q, jnp.zeros(d)))
-        hanging, highest = extremes(lambda q: float(energy(q)), needs.joints, list(driven), ranges)
+        hanging, highest = extremes(lambda q: float(energy(q)), needs.joints, driven, ranges)
         goal = highest if goal is None else goal
     if goal is None:
         raise InputError(f"a {run.description['name']} has no energy, whose highest posture is the goal; give --goal")
     robot_layout = layout(
-        needs.joints, list(driven), goal=goal, hanging=hanging, rate=500.0, control=wishes.control, passive=False
+        needs.joints, driven, goal=goal, hanging=hanging, rate=500.0, control=wishes.control, passive=False
     )  # fmt: skip
     return _own(str(folder), run.description, run.parameters, robot_layout, wishes, [])
 

@@ -163,7 +163,7 @@ def _rates(
     q = jnp.asarray(goal)
     holding = jnp.linalg.lstsq(jax.jacfwd(accelerations, 1)(q, still), -accelerations(q, still))[0]
     stiffness, mobility = jax.jit(jax.jacfwd(accelerations, (0, 1)))(q, holding)
-    fall = math.sqrt(max(float(np.max(np.linalg.eigvals(np.asarray(stiffness)).real)), 0.0))
+    fall = math.sqrt(max(float(np.max(np.real(np.linalg.eigvals(np.asarray(stiffness))))), 0.0))
     own = np.abs(np.diag(np.asarray(mobility)) * (np.abs(B) @ size))
     return fall, own
 
@@ -270,7 +270,7 @@ def own_settings(numbers: OwnProblem, widths: Sequence[int] = (96, 96, 96)) -> V
 def described(numbers: OwnProblem) -> list[str]:
     """Lines on the numbers of a problem."""
 
-    def listed(values: Sequence[float], units: Mapping[JointKind, str]) -> str:
+    def listed(values: Sequence[float], units: Mapping[str, str]) -> str:
         pairs = zip(numbers.names, numbers.joints, values, strict=True)
         return ", ".join(f"{name} {value:.3g} {units[kind]}" for name, kind, value in pairs)
 
