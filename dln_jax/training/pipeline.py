@@ -119,6 +119,6 @@ def conclude(judged: Judged) -> None:
         if not judged.ended_by_user:
             raise FitRefused(judged.verdict)
         print(
-            "warning: refused, but training ended at your own --steps or --seconds, so the exit status is 0; "
-            "train longer before you use this model"
+            "warning: refused, but training ended at your own limit (--steps, --iterations or --seconds), so the exit "
+            "status is 0; train longer before you use this model"
         )

@@ -1,4 +1,4 @@
-"""Trains value functions of published plants, and saves and loads their run folders."""
+"""Trains value functions of published and of one's own plants, and saves, resumes and loads their run folders."""
 
 import dataclasses
 import functools
@@ -15,20 +15,27 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.optimal.fitted import Iteration, ValueProgress, fit_values
-from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant, ValueSettings, evaluate, starts
-from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal, hjb_policy
+from dln_jax.control.optimal.fitted import Iteration, IterationState, ValueProgress, fit_values
+from dln_jax.control.optimal.own_plants import OwnProblem
+from dln_jax.control.optimal.plants import Returns, ValuePlant, ValueSettings, Where, evaluate, starts
+from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, hjb_policy
 from dln_jax.control.optimal.residual import ResidualStage, discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.control.optimal.worst_case import Bounds, Disturbance, worst_disturbance
 from dln_jax.control.state_space import Law
-from dln_jax.files import as_type
+from dln_jax.files import as_type, finite, is_file
+from dln_jax.learning.engine.checkpoint import stored_rows
 from dln_jax.nn.activations import activation
+from dln_jax.training.value_plants import OTHER_NAMES, Chosen, OwnModel, plant_named, rebuilt, with_factors
 from dln_jax.types import InputError
-from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, save_tree
+from dln_jax.zoo.run import read_description, save
 
 VALUE = "value"
 """Stem of the pair of files in a run folder that holds the value function."""
-OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
+CHECKPOINT = "checkpoint_seed_{}"
+"""Stem of the pair of files that holds the state of a seed's iterations."""
 METHODS = ("fitted", "residual")
 ROUNDS = 6
 """Number of resamplings at the problem's own discount."""
@@ -57,6 +64,8 @@ class Stored:
     goal: tuple[float, ...] | None
     network: Family
     dtype: Literal["float32", "float64"]
+    own: OwnProblem | None = None
+    """Problem of one's own plant, whose model is in the same folder."""
 
 
 class Trained(NamedTuple):
@@ -77,6 +86,8 @@ class ValueRun:
     plant: ValuePlant
     network: ValueNetwork
     parameters: Any
+    own: Chosen | None = None
+    """One's own plant and its model."""
 
     @property
     def problem(self) -> ControlProblem:
@@ -94,36 +105,67 @@ class ValueRun:
         return jax.jit(hjb_policy(self.value_and_gradient, self.problem))
 
 
-def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
-    """The plant with this name, with a posture [d] other than upright as its goal, if requested.
-
-    Raises:
-        InputError: an unknown name (the message lists all), or a goal of the wrong length or that no control can hold.
-    """
-    name = OTHER_NAMES.get(name, name)
-    if name not in PLANTS:
-        raise InputError(f"plant '{name}' is unknown; choose from {', '.join(PLANTS)}")
-    plant = PLANTS[name]()
-    if goal is None:
-        return plant
-    d = len(plant.problem.goal) // 2
-    if len(goal) != d:
-        raise InputError(f"the goal has {len(goal)} coordinates; expected the posture of {name}, which has {d}")
-    return plant._replace(problem=at_goal(plant.problem, [*goal, *np.zeros(d)]))
-
-
 def family_of(plant: ValuePlant, family: Family) -> ValueNetwork:
     """The networks of a family for a plant."""
     return value_network(plant.problem, **{**dataclasses.asdict(family), "activation": activation(family.activation)})
 
 
-def usual(name: str, method: str) -> ValueSettings:
+def usual(chosen: Chosen, method: str) -> ValueSettings:
     """Default network and training settings of a plant."""
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
     if method == "residual":
-        return ValueSettings((24, 24), Iteration(), 30.0)
-    return FITS.get(OTHER_NAMES.get(name, name), FITS["cart-pole"])
+        return ValueSettings((24, 24), Iteration(), 30.0 if chosen.own is None else chosen.settings.scale)
+    return chosen.settings
+
+
+def worst_of(chosen: Chosen, share: float) -> Disturbance | None:
+    """The worst error of the plant's uncertain numbers up to a share of each; `None` for none.
+
+    Raises:
+        InputError: a share that is not between 0 and 1.
+    """
+    if not 0 <= share < 1:
+        raise InputError(f"robust is {share}; expected a share of masses and motors of at least 0 and less than 1")
+    if share == 0:
+        return None
+    ones = np.ones(len(chosen.uncertain))
+    return worst_disturbance(lambda x, u, p: chosen.altered(p)(x, u), ones, Bounds(parameters=share))
+
+
+class Kept(NamedTuple):
+    """Where the states of a training are stored."""
+
+    folder: Path
+    settings: Any
+    """JSON values that decide the result; a run with others is not continued."""
+    resume: bool
+
+    def store(self, seed: int, state: IterationState) -> None:
+        """Writes the state of a seed, for `restore`."""
+        tree = {"parameters": state.parameters, "optimiser": state.optimiser, "best": state.best}
+        facts = {"settings": finite(self.settings), "history": finite([list(at) for at in state.history])}
+        save_tree(self.folder, CHECKPOINT.format(seed), tree, facts, number=len(state.history))
+
+    def restore(self, seed: int, state: IterationState) -> IterationState:
+        """The stored state of a seed, or the one that it would start with.
+
+        Raises:
+            InputError: the stored run had other settings, or its files are damaged.
+        """
+        name = CHECKPOINT.format(seed)
+        if not (self.resume and is_file(self.folder / f"{name}.json")):
+            return state
+        manifest = load_manifest(self.folder, name)
+        if manifest.get("settings") != finite(self.settings):
+            raise InputError(f"{self.folder}: the run had another plant or other settings; start a new one")
+        like = {"parameters": state.parameters, "optimiser": state.optimiser, "best": state.best}
+        kind = tuple[int, float | None, float | None, float]
+        rows = stored_rows(self.folder / f"{name}.json", manifest, "history", kind)
+        history = [
+            ValueProgress(k, *(np.nan if n is None else n for n in (loss, score)), s) for k, loss, score, s in rows
+        ]
+        return IterationState(**load_tree(self.folder, name, like), history=history)
 
 
 def by_iteration(
@@ -133,16 +175,26 @@ def by_iteration(
     seeds: Sequence[int],
     report: Report,
     mesh: Mesh | None = None,
+    *,
+    disturbance: Disturbance | None = None,
+    kept: Kept | None = None,
 ) -> list[Trained]:
     """Fits value functions by fitted value iteration, one per seed; devices share the states."""
-    done, total = itertools.count(1), len(seeds) * numbers.iterations
+    total = len(seeds) * numbers.iterations
 
     def report_progress(at: ValueProgress) -> None:
-        report(next(done), total, f"cost and misfit {at.validation:.4g}")
+        report(numbers.iterations * place[0] + at.iteration, total, f"cost and misfit {at.validation:.4g}")
+
+    place = [-1]
+
+    def restore(seed: int, state: IterationState) -> IterationState:
+        place[0] += 1
+        return state if kept is None else kept.restore(seed, state)
 
     fits = fit_values(
-        plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, report=report_progress
-    )
+        plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, disturbance=disturbance,
+        report=report_progress, restore=restore, **({} if kept is None else {"store": kept.store}),
+    )  # fmt: skip
     return [
         Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
         for fit in fits
@@ -156,6 +208,8 @@ def by_equation(
     seeds: Sequence[int],
     report: Report,
     mesh: Mesh | None = None,
+    *,
+    disturbance: Disturbance | None = None,
 ) -> list[Trained]:
     """Fits value functions by the residual of the Hamilton-Jacobi-Bellman equation, one per seed.
 
@@ -174,35 +228,55 @@ def by_equation(
 
         solution = fit_hjb(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
-            discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=report_progress,
+            discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, disturbance=disturbance,
+            report=report_progress,
         )  # fmt: skip
         trained.append(Trained(solution.parameters, solution.validation, time.perf_counter() - began))
     return trained
 
 
-def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) -> dict[str, float]:
-    """Returns of a law in the published evaluation, from both kinds of starts; a failed start counts as NaN."""
+def measured(chosen: Chosen, law: Law, *, count: int = 100, seed: int = 0, share: float = 0.0) -> dict[str, float]:
+    """Returns of a law from both kinds of starts; a failed start counts as NaN.
+
+    With a share also on plants whose masses are larger and motors weaker by it, and the other way round.
+    """
     numbers: dict[str, float] = {}
+    where: Where
     for where in ("down", "uniform"):
-        evaluation = evaluate(plant, law, starts(plant, where, count, seed))
-        numbers |= {
-            f"{where}_return_mean": float(np.mean(evaluation.returns)),
-            f"{where}_return_median": float(np.median(evaluation.returns)),
-            f"{where}_return_worst": float(np.min(evaluation.returns)),
-            f"{where}_up_share": float(np.mean(np.isfinite(evaluation.settled))),
-            f"{where}_settled_median_seconds": float(np.median(evaluation.settled)),
-            f"{where}_control_most": evaluation.largest,
-        }
+        evaluation = evaluate(chosen.plant, law, starts(chosen.plant, where, count, seed))
+        numbers |= {f"{where}_{key}": value for key, value in summary(evaluation).items()}
+    for name, sign in (("heavy_weak", 1), ("light_strong", -1)) if share else ():
+        factors = [1 + sign * share * (-1 if of.startswith("strength") else 1) for of in chosen.uncertain]
+        plant = chosen.plant._replace(problem=with_factors(chosen, factors))
+        evaluation = evaluate(plant, law, starts(chosen.plant, "down", count, seed))
+        numbers |= {f"{name}_{key}": value for key, value in summary(evaluation).items()}
     return numbers
 
 
-def save_value(folder: Path, plant: str, goal: Sequence[float] | None, family: Family, parameters: Any) -> None:
-    """Writes value.json and value.safetensors."""
+def summary(evaluation: Returns) -> dict[str, float]:
+    """Numbers of an evaluation."""
+    return {
+        "return_mean": float(np.mean(evaluation.returns)),
+        "return_median": float(np.median(evaluation.returns)),
+        "return_worst": float(np.min(evaluation.returns)),
+        "up_share": float(np.mean(np.isfinite(evaluation.settled))),
+        "settled_median_seconds": float(np.median(evaluation.settled)),
+        "control_most": evaluation.largest,
+    }
+
+
+def save_value(
+    folder: Path, plant: str, goal: Sequence[float] | None, family: Family, parameters: Any, own: OwnModel | None = None
+) -> None:
+    """Writes value.json and value.safetensors, and the model of one's own plant."""
+    if own is not None:
+        save(folder, own.description, own.parameters)
     facts = {
         "plant": OTHER_NAMES.get(plant, plant),
         "goal": None if goal is None else list(goal),
         "network": {**dataclasses.asdict(family), "widths": list(family.widths)},
         "dtype": str(jax.tree.leaves(parameters)[0].dtype),
+        "own": None if own is None else dataclasses.asdict(own.problem),
     }
     save_tree(folder, VALUE, parameters, facts)
 
@@ -217,7 +291,8 @@ def load_value(folder: str | Path) -> ValueRun:
     path = folder / f"{VALUE}.json"
     stored = as_type(load_manifest(folder, VALUE), Stored, name=str(path), remedy=REMEDY)
     try:
-        plant = plant_named(stored.plant, stored.goal)
+        own = None if stored.own is None else rebuilt(stored.plant, _model_of(folder, stored.own))
+        plant = plant_named(stored.plant, stored.goal) if own is None else own.plant
         network = family_of(plant, Family(**dataclasses.asdict(stored.network)))
     except InputError as error:
         raise InputError(f"{path}: {error}; {REMEDY}") from None
@@ -227,4 +302,13 @@ def load_value(folder: str | Path) -> ValueRun:
         return jax.tree.map(lambda leaf: leaf.astype(dtype), network.init(key))
 
     like = jax.eval_shape(parameters, jax.random.key(0))
-    return ValueRun(stored.plant, plant, network, load_tree(folder, VALUE, like))
+    return ValueRun(stored.plant, plant, network, load_tree(folder, VALUE, like), own)
+
+
+def _model_of(folder: Path, problem: OwnProblem) -> OwnModel:
+    """The model in a value's folder, in its own precision whatever JAX's."""
+    description = read_description(folder)
+    with jax.enable_x64(True):
+        like = jax.eval_shape(build(description).init, jax.random.key(0))
+        parameters = jax.tree.map(np.asarray, load_tree(folder, MODEL, like))
+    return OwnModel(description, parameters, problem)

@@ -54,7 +54,7 @@ def test_names_in_options_are_those_of_the_library():
     assert set(functions.NAMES) == set(NAMED)
     assert set(identification.IDENTIFIED) == set(LAWS) - {"load"}
     choices = get_type_hints(train_value.TrainingOptions, include_extras=True)["plant"].__metadata__[0].metavar
-    assert set(choices.strip("{}").split(",")) == set(PLANTS)
+    assert set(choices.strip("{}").split(",")) == {*PLANTS, "FILE"}
     activations = get_type_hints(functions.Learned, include_extras=True)["activation"].__metadata__[0].metavar
     assert set(activations.strip("{}").split(",")) == set(ALL)
     models = get_args(get_type_hints(phase_spaces.Motion)["model"])

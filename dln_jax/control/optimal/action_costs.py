@@ -103,6 +103,13 @@ def weighted(cost: ActionCost, b: Any) -> ActionCost:
     return ActionCost(lambda u: b * cost.cost(u), lambda w: cost.policy(w / b), lambda w: b * cost.conjugate(w / b))
 
 
+def stretched(cost: ActionCost, a: Any) -> ActionCost:
+    """g(u / a), with a range of its own for every control: a [m], or one for all."""
+    a = np.asarray(a, float)
+    _require_scale(a=a.min())
+    return ActionCost(lambda u: cost.cost(u / a), lambda w: a * cost.policy(a * w), lambda w: cost.conjugate(a * w))
+
+
 def shifted(cost: ActionCost, c: Any) -> ActionCost:
     """g(u + c) - g(c): the range is shifted by -c."""
     c = jnp.asarray(c, float)

@@ -62,6 +62,8 @@ class Iteration(NamedTuple):
     """Weight of the slopes' misfit, in units of the box, relative to that of the values."""
     floor: float = 0.02
     """Share of the largest target added to every target in relative misfits."""
+    followed: float = 2.0
+    """Time for which the validation follows the policy, in units of `seconds`; V stands for the costs after it."""
     margin: float = 1.25
     """Factor on the box for drawing states and clipping trajectories; 1 as published, where the edges of the box affect
     the value inside."""
@@ -76,6 +78,20 @@ class ValueProgress(NamedTuple):
     """Mean cost of the policy from validation states, plus the mean of |V - cost|."""
     seconds: float
     """Time since the start, without compilation."""
+
+
+class IterationState(NamedTuple):
+    """State after some iterations of a seed; going on from it gives the same bits as never having stopped."""
+
+    parameters: Any
+    optimiser: Any
+    best: Any
+    """Parameters with the lowest validation so far."""
+    history: list[ValueProgress]
+
+
+Restore = Callable[[int, IterationState], IterationState]
+"""(seed, state before the first iteration) -> the state to go on from."""
 
 
 class FittedValue(NamedTuple):
@@ -104,6 +120,8 @@ def fit_values(
     disturbance: Disturbance | None = None,
     mesh: Mesh | None = None,
     report: Callable[[ValueProgress], None] = lambda progress: None,
+    restore: Restore = lambda seed, state: state,
+    store: Callable[[int, IterationState], None] = lambda seed, state: None,
 ) -> list[FittedValue]:
     """Runs the iterations for several seeds, one after the other, with a program that is compiled once.
 
@@ -119,6 +137,8 @@ def fit_values(
         disturbance: of the worst case, for a robust value.
         mesh: devices that share the states from which the policy is followed; all devices do the whole fits.
         report: called after every iteration.
+        restore: returns the state of a seed to go on from.
+        store: called with the state of a seed after every iteration.
 
     Raises:
         InputError: numbers out of range, or a value that was never finite.
@@ -145,21 +165,25 @@ def fit_values(
         def fit(seed: int) -> FittedValue:
             began, key = time.perf_counter(), jax.random.key(seed)
             current, state, validated = begin(key)
-            best, lowest, history = current, math.inf, []
-            for number in range(numbers.iterations):
+            current, state, best, history = restore(seed, IterationState(current, state, current, []))
+            history, spent = list(history), history[-1].seconds if history else 0.0
+            lowest = min((at.validation for at in history if math.isfinite(at.validation)), default=math.inf)
+            for number in range(len(history), numbers.iterations):
                 grown = number / max(numbers.iterations - 1, 1)
                 memory = jnp.asarray(numbers.first_memory ** (1 - grown) * numbers.memory**grown)
                 current, state, loss = advance(current, state, jax.random.fold_in(key, 2 + number), memory)
                 score = float(judge(current, validated))
                 if score < lowest:
                     best, lowest = current, score
-                history.append(ValueProgress(number + 1, float(loss), score, time.perf_counter() - began))
+                passed = spent + time.perf_counter() - began
+                history.append(ValueProgress(number + 1, float(loss), score, passed))
+                store(seed, IterationState(current, state, best, history))
                 report(history[-1])
             if not math.isfinite(lowest):
                 raise InputError(
                     "the cost of the policy was never finite; take a smaller dt, or a box that it can stay near"
                 )
-            return FittedValue(local(best, mesh), history, time.perf_counter() - began, compile_seconds)
+            return FittedValue(local(best, mesh), history, history[-1].seconds, compile_seconds)
 
         return [fit(seed) for seed in seeds]
 
@@ -238,6 +262,7 @@ def _robust(off: Array) -> Array:
 def _score(subject: _Subject, parameters: Any, x: Array) -> Array:
     """Mean cost of the policy from states x [N, n], plus the mean of |V - cost|."""
     problem, network, dt = subject.problem, subject.network, subject.numbers.dt
+    steps = round(subject.numbers.followed * subject.steps)
 
     def one(parameters: Any, x: Array) -> tuple[Array, Array]:
         value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
@@ -249,7 +274,9 @@ def _score(subject: _Subject, parameters: Any, x: Array) -> Array:
             return (after, total + weight * cost, weight * discount), None
 
         (last, total, weight), _ = jax.lax.scan(
-            forward, (x, jnp.zeros((), x.dtype), jnp.ones((), x.dtype)), length=2 * subject.steps
+            forward,
+            (x, jnp.zeros((), x.dtype), jnp.ones((), x.dtype)),
+            length=steps,
         )
         return value(x)[0], total + weight * value(last)[0]
 

@@ -2,8 +2,8 @@
 
 As in its program, angles are zero upright and enter the costs as π sin(θ/2), the action cost is that of limited
 controls with the weight b = 4 limit² R/π, and the cart's rail is a barrier in the state cost. The evaluation integrates
-by Euler's method at 250 Hz for 5 s, with controls at 125 Hz, clips states that are not on a circle to the box, and
-returns
+by Euler's method at 250 Hz for 5 s, with controls at 125 Hz, clips states that are not on a circle to the box
+(`Evaluation`), and returns
 
     - sum of dt (q(x) + g(u)),
 
@@ -20,14 +20,15 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.closed_loop import outcomes
+from dln_jax.control.closed_loop import UP, outcomes
 from dln_jax.control.optimal.action_costs import limited_atan
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.flow import limits
 from dln_jax.control.optimal.problem import ControlProblem, from_plant, rates
-from dln_jax.control.state_space import Law, circular
+from dln_jax.control.state_space import Law, circular, error
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.integrators import Tableau, runge_kutta
 from dln_jax.nn.activations import softplus
 from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from dln_jax.types import JointKind, Scalar
@@ -36,8 +37,7 @@ MARGIN = 1e-3
 """Margin of the action cost's range beyond the limit."""
 HORIZON = 5.0
 """Time in s after which a cost counts by the factor `share`."""
-RATE, SECONDS, HELD = 250.0, 5.0, 2
-"""Integrator steps per s of the evaluation, its length, and the steps for which a control is held."""
+EULER = Tableau(((0.0,),), (1.0,))
 Where = Literal["down", "uniform"]
 
 
@@ -51,17 +51,35 @@ class Starts(NamedTuple):
     """Half widths around the goal [n]."""
 
 
+class Evaluation(NamedTuple):
+    """Closed loop of an evaluation, by default the published one."""
+
+    rate: float = 250.0
+    """Integrator steps per s."""
+    seconds: float = 5.0
+    held: int = 2
+    """Steps for which a control is held."""
+    method: Tableau = EULER
+    clipped: bool = True
+    """Whether states that are not on a circle are clipped to the box; otherwise a run that leaves `positions` fails."""
+    positions: Any = None
+    """Limits of the coordinates [d, 2]; `None` for none."""
+    near: float = UP
+    """Largest angle from the goal that counts as up, rad."""
+
+
 class ValuePlant(NamedTuple):
-    """A control problem with its limit and initial states."""
+    """A control problem with its limits and initial states."""
 
     problem: ControlProblem
-    limit: float
-    """Limit of the control, N m or N."""
+    limit: Any
+    """Limit of the controls, N m or N; one, or [m]."""
     starts: Starts
-    angle: int
-    """Index of the pole's angle."""
+    angles: tuple[int, ...]
+    """Coordinates that have to be near the goal."""
     rest: float = 0.0
     """Cost per second of the published costs at the goal; the problem's costs are zero there."""
+    evaluation: Evaluation = Evaluation()
 
 
 class ValueSettings(NamedTuple):
@@ -81,6 +99,7 @@ class Returns(NamedTuple):
     largest: float
     """The largest control."""
     x: Float[np.ndarray, "N T n"]
+    u: Float[np.ndarray, "N T-1 m"]
 
 
 def pendulum() -> ValuePlant:
@@ -94,7 +113,7 @@ def pendulum() -> ValuePlant:
     )
     problem = _problem(rod, None, ("revolute",), (1.0, 0.1), 0.5, 2.5, 0.65, (math.pi, 8.0))
     starts = Starts((math.pi, 0.01), (1e-3, 1e-6), (math.pi, 0.01))
-    return ValuePlant(problem, 2.5, starts, 0)
+    return ValuePlant(problem, 2.5, starts, (0,))
 
 
 def cart_pole_on_rail() -> ValuePlant:
@@ -109,16 +128,16 @@ def cart_pole_on_rail() -> ValuePlant:
     problem = _problem(plant, scene.needs.actuation, joints, weights, 0.1, 12.0, 0.80, box, penalised)
     starts = Starts((0.0, math.pi, 0.0, 0.0), (1e-3, 5e-2, 1e-6, 1e-6), (0.15, math.pi, 0.01, 0.01))
     rest = 5 * 25.0 * 0.4**2 / (1 + math.exp(20 * 0.4))
-    return ValuePlant(problem, 12.0, starts, 1, rest)
+    return ValuePlant(problem, 12.0, starts, (1,), rest)
 
 
 def desktop_rotary_pendulum() -> ValuePlant:
     """A rotary pendulum of desktop size with 50 mN m; the costs are ours, as the published ones are not printed."""
     scene = rotary_pendulum(friction=1e-5)
-    box, weights = (math.pi, math.pi, 25.0, 40.0), (0.5, 1.0, 0.005, 0.01)
-    problem = _problem(scene.closed_form, scene.needs.actuation, scene.needs.joints, weights, 50.0, 0.05, 0.80, box)
+    box, weights = (math.pi, math.pi, 20.0, 30.0), (0.5, 1.0, 0.005, 0.01)
+    problem = _problem(scene.closed_form, scene.needs.actuation, scene.needs.joints, weights, 6e4, 0.05, 0.80, box)
     starts = Starts((0.0, math.pi, 0.0, 0.0), (1e-3, 5e-2, 1e-6, 1e-6), (0.3, math.pi, 0.01, 0.01))
-    return ValuePlant(problem, 0.05, starts, 1)
+    return ValuePlant(problem, 0.05, starts, (1,))
 
 
 PLANTS = {"pendulum": pendulum, "cart-pole": cart_pole_on_rail, "rotary-pendulum": desktop_rotary_pendulum}
@@ -127,7 +146,12 @@ _PENDULUM = Iteration(iterations=48, starts=1536, kept=6, slope_weight=0.1, floo
 _CART_POLE = _PENDULUM._replace(
     iterations=80, starts=2048, steps=250, dt=0.0125, seconds=1.5, first_memory=0.1, memory=5.0
 )
-FITS = {"pendulum": ValueSettings((96, 96, 96), _PENDULUM), "cart-pole": ValueSettings((96, 96, 96), _CART_POLE)}
+_ROTARY_PENDULUM = _CART_POLE._replace(dt=0.0075, seconds=0.9, first_memory=0.06, memory=3.0, followed=4.0)
+FITS = {
+    "pendulum": ValueSettings((96, 96, 96), _PENDULUM),
+    "cart-pole": ValueSettings((96, 96, 96), _CART_POLE),
+    "rotary-pendulum": ValueSettings((96, 96, 96), _ROTARY_PENDULUM),
+}
 """Settings of the fits by plant."""
 
 
@@ -136,31 +160,42 @@ def starts(plant: ValuePlant, where: Where, count: int = 100, seed: int = 0) -> 
     random, (mean, variance, widths) = np.random.default_rng(seed), plant.starts
     if where == "down":
         return np.asarray(mean) + np.sqrt(variance) * random.normal(size=(count, len(mean)))
-    return random.uniform(-1, 1, (count, len(mean))) * np.asarray(widths)
+    problem = plant.problem
+    x = np.asarray(problem.goal) + random.uniform(-1, 1, (count, len(mean))) * np.asarray(widths)
+    return np.clip(x, *limits(problem))
 
 
 def evaluate(plant: ValuePlant, law: Law, x: Any) -> Returns:
     """Returns of a law x [n] -> u [m] from states x [N, n]; NaN where it fails."""
-    problem, dt = plant.problem, 1 / RATE
-    low, high = limits(problem)
-    field = rates(problem)
+    problem, how = plant.problem, plant.evaluation
+    dt, angles = 1 / how.rate, np.array(plant.angles)
+    low, high = limits(problem) if how.clipped else (-np.inf, np.inf)
+    field, goal = rates(problem), jnp.asarray(problem.goal, float)
 
     def sample(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         x, total = carry
         u = jnp.clip(law(x), -plant.limit, plant.limit)
-        for _ in range(HELD):
+        step = runge_kutta(how.method, lambda t, x: field(x, u))
+        for _ in range(how.held):
             total = total - dt * (problem.state_cost(x) + plant.rest + problem.action_cost.cost(u))
-            x = jnp.clip(x + dt * field(x, u), low, high)
+            x = jnp.clip(step(0.0, x, dt), low, high)
         return (x, total), (x, u)
 
-    def run(x: Array) -> tuple[Array, Array, Array]:
-        steps = round(SECONDS * RATE / HELD)
+    def run(x: Array) -> tuple[Array, Array, Array, Array]:
+        steps = round(how.seconds * how.rate / how.held)
         (_, total), (later, u) = jax.lax.scan(sample, (x, jnp.zeros(())), length=steps)
-        return total, jnp.concatenate([x[None], later]), u
+        every = jnp.concatenate([x[None], later])
+        off = jnp.max(jnp.abs(jax.vmap(lambda x: error(x, goal, problem.joints))(every)[:, angles]), axis=1)
+        if how.positions is not None:
+            q = every[:, : len(how.positions)]
+            inside = jnp.all((q >= how.positions[:, 0]) & (q <= how.positions[:, 1]))
+            off = jnp.where(inside, off, jnp.inf)
+        return total, every, u, off
 
-    totals, states, controls = map(np.asarray, jax.jit(jax.vmap(run))(jnp.asarray(x, float)))
-    settled = outcomes(states[..., plant.angle], rate=RATE / HELD).seconds
-    return Returns(totals, settled, float(np.max(np.abs(controls))), states)
+    totals, states, controls, off = map(np.asarray, jax.jit(jax.vmap(run))(jnp.asarray(x, float)))
+    # Angles beyond a straight one are far, whatever their cosine.
+    settled = outcomes(np.minimum(off, np.pi), rate=how.rate / how.held, up=how.near).seconds
+    return Returns(totals, settled, float(np.max(np.abs(controls))), states, controls)
 
 
 def _problem(

@@ -1,6 +1,5 @@
 """Plants from MJCF and URDF files, or models of MuJoCo: layout, goal and limits are read from the model."""
 
-import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,13 @@ import numpy as np
 from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.mujoco_loop import compiled_model
 from dln_jax.control.plants.plant import Layout, Plant, layout
+from dln_jax.control.plants.postures import extremes
 from dln_jax.control.plants.simulated import simulated
 from dln_jax.data.robot_xml import parsed
 from dln_jax.data.robots import joint_names, opened, quiet
 from dln_jax.types import InputError
 
-TURNS = 8
-"""Angles of a joint from which the highest and the lowest posture are sought."""
 MOST_JOINTS = 4
-LEVEL = 1e-3
-"""Smallest share of the model's weight times its size that counts as a potential of a passive joint."""
 
 
 def mujoco_plant(
@@ -54,14 +50,42 @@ def mujoco_plant(
             motors without limits; a plant without a motor or a passive joint, or whose passive joints no gravity moves;
             a sample that is not a whole number of steps.
     """
+    mujoco, model, data, described, steps = _described(source, actuated, control, goal, hanging, rate, speed, True)
+    return _plant(mujoco, model, data, described, steps, hardware, seed)
+
+
+def layout_of_file(
+    path: Path,
+    actuated: Sequence[int | str] = (),
+    *,
+    control: Any = None,
+    goal: Any = None,
+    rate: float | None = None,
+) -> Layout:
+    """Returns the layout of an MJCF or URDF file, whose joints may all have a motor; arguments as `mujoco_plant`."""
+    return _described(path, actuated, control, goal, None, rate, np.inf, False)[3]
+
+
+def _described(
+    source: Any,
+    actuated: Sequence[int | str],
+    control: Any,
+    goal: Any,
+    hanging: Any,
+    rate: float | None,
+    speed: Any,
+    passive: bool,
+) -> tuple[Any, Any, Any, Layout, int]:
+    """MuJoCo, its model, its data, the layout of the plant, and the number of time steps in a sample."""
     mujoco, model = _model(source)
     names = joint_names(model)
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
         if kind not in kinds:
             raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected a plant of such joints alone")
-    if not 2 <= len(names) <= MOST_JOINTS:
-        raise InputError(f"the plant has {len(names)} joint(s); expected 2 to {MOST_JOINTS}, one of them passive")
+    if not 1 + passive <= len(names) <= MOST_JOINTS:
+        which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
+        raise InputError(f"the plant has {len(names)} joint(s); expected {which}")
     joints = [kinds[int(kind)] for kind in model.jnt_type]
     driven = _numbers(actuated, names) if len(actuated) else sorted(_actuators(mujoco, model))
     per_second = float(1 / model.opt.timestep if rate is None else rate)
@@ -71,15 +95,15 @@ def mujoco_plant(
     data = mujoco.MjData(model)
     ranges = np.where(np.asarray(model.jnt_limited, bool)[:, None], model.jnt_range, [-np.inf, np.inf])
     if goal is None or hanging is None:
-        lowest, highest = _extremes(mujoco, model, data, joints, driven, ranges)
+        lowest, highest = extremes(lambda q: _potential(mujoco, model, data, q), joints, driven, ranges)
         goal, hanging = highest if goal is None else goal, lowest if hanging is None else hanging
-    passive = len(driven) < len(joints)  # else the layout is refused
-    size = _control(mujoco, model, driven, names) if control is None and passive else control
+    refused = passive and len(driven) == len(joints)  # by the layout
+    size = _control(mujoco, model, driven, names) if control is None and not refused else control
     described = layout(
         joints, driven, goal=goal, hanging=hanging, rate=per_second, control=size, position=ranges, speed=speed,
-        names=names,
+        names=names, passive=passive,
     )  # fmt: skip
-    return _plant(mujoco, model, data, described, round(steps), hardware, seed)
+    return mujoco, model, data, described, round(steps)
 
 
 def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, hardware: Hardware, seed: int) -> Plant:
@@ -147,37 +171,8 @@ def _control(mujoco: Any, model: Any, driven: Sequence[int], names: Sequence[str
     return sizes
 
 
-def _extremes(
-    mujoco: Any, model: Any, data: Any, joints: Sequence[str], driven: Sequence[int], ranges: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Postures of least and of greatest potential energy; coordinates that do not matter stay at zero."""
-    from scipy.optimize import minimize
-
-    def potential(q: np.ndarray) -> float:
-        data.qpos[:] = q
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_energyPos(model, data)
-        return float(data.energy[0])
-
-    turns = 2 * np.pi / TURNS * np.arange(1 - TURNS // 2, TURNS // 2 + 1)
-    choices = [
-        [turn for turn in turns if low <= turn <= high] if kind == "revolute" else [float(np.clip(0.0, low, high))]
-        for kind, (low, high) in zip(joints, ranges, strict=True)
-    ]
-    grid = sorted(map(np.array, itertools.product(*choices)), key=lambda q: float(np.abs(q).sum()))
-    if not grid:
-        raise InputError("the limits of the joints exclude every posture of the search; give goal and hanging")
-    energies = np.array([potential(q) for q in grid])
-    size = float(np.ptp(energies))
-    for k in sorted(set(range(len(joints))) - set(driven)):
-        moved = [
-            abs(potential(q + np.pi / 2 * np.eye(len(joints))[k]) - e) for q, e in zip(grid, energies, strict=True)
-        ]
-        if not max(moved) > LEVEL * max(size, 1e-12):
-            raise InputError(f"gravity does not move the passive joint {k}; expected a plant that hangs and stands")
-    postures = []
-    for sign in (1.0, -1.0):
-        ties = np.flatnonzero(sign * energies <= (sign * energies).min() + 1e-9 * max(size, 1e-12))
-        best = minimize(lambda q: sign * potential(q) / size, grid[ties[0]], method="BFGS", options={"gtol": 1e-7})  # noqa: B023
-        postures.append(np.clip(np.where(np.abs(best.x) < 1e-9, 0.0, best.x), ranges[:, 0], ranges[:, 1]))
-    return postures[0], postures[1]
+def _potential(mujoco: Any, model: Any, data: Any, q: np.ndarray) -> float:
+    data.qpos[:] = q
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_energyPos(model, data)
+    return float(data.energy[0])

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.control.swing_up import parts_of
 from dln_jax.types import InputError, JointKind, Needs, require_positive
 
 
@@ -74,6 +73,7 @@ def layout(
     speed: Any = np.inf,
     stopping: float = 0.0,
     names: Sequence[str] = (),
+    passive: bool = True,
 ) -> Layout:
     """Returns a checked layout.
 
@@ -88,6 +88,7 @@ def layout(
         speed: largest rates, one for all or one each, 1/s or m/s.
         stopping: as `Limits.stopping`.
         names: of the coordinates; by default joint_0, joint_1, ...
+        passive: whether there has to be a coordinate without a motor, as a swing-up needs one.
 
     Raises:
         InputError: shapes that do not agree, a motor at a coordinate that is not there, no motor, no passive
@@ -98,11 +99,10 @@ def layout(
     names = tuple(names) or tuple(f"joint_{k}" for k in range(d))
     if any(not 0 <= k < d for k in chosen):
         raise InputError(f"actuated is {list(actuated)}; expected numbers of coordinates from 0 to {d - 1}")
-    if not chosen or len(chosen) == d:
+    if not chosen or (passive and len(chosen) == d):
         which = "no joint has a motor" if not chosen else f"all {d} joints have a motor, and none is passive"
         raise InputError(f"{which}; a swing-up needs a plant with a motor and with a joint without one")
     B = np.eye(d)[:, chosen]
-    parts_of(B)
     size = _sized("control", control, len(chosen))
     if not (np.isfinite(size) & (size > 0)).all():
         raise InputError(f"control is {size.tolist()}; expected finite, positive limits of the motors, N m or N")

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from dln_jax.figures import style
 from dln_jax.figures.closed_loops import angle_ticks
+from dln_jax.figures.values import LEVELS, colour_bar, path_curves, sides, surface
 
-LEVELS = 16
 LEAST_ERROR, MOST_ERROR = 1e-4, 1.0
 """Range of the colour scale of relative errors."""
 
@@ -41,20 +41,20 @@ def value_figure(
     highest = float(np.max(true))
     heights, torques = Normalize(0, highest), Normalize(-limit, limit)
     for axis, V, name in zip(axes[0], (fitted, true), ("fitted value", "value on a grid"), strict=True):
-        _surface(axis, nodes, V, heights, "YlGnBu")
-        axis.contour(*_sides(nodes), V.T, np.linspace(0, highest, LEVELS), colors="0.25", linewidths=0.35)
-        _paths(axis, paths)
+        surface(axis, nodes, V, heights, "YlGnBu")
+        axis.contour(*sides(nodes), V.T, np.linspace(0, highest, LEVELS), colors="0.25", linewidths=0.35)
+        path_curves(axis, paths)
         style.title(axis, name)
-    _bar(figure, ScalarMappable(heights, "YlGnBu"), axes[0, 1], "V")
+    colour_bar(figure, ScalarMappable(heights, "YlGnBu"), axes[0, 1], "V")
     for axis, torque, name in zip(axes[1], (u, best), ("fitted policy", "policy on a grid"), strict=True):
-        _surface(axis, nodes, torque, torques, "RdBu_r")
-        _paths(axis, paths)
+        surface(axis, nodes, torque, torques, "RdBu_r")
+        path_curves(axis, paths)
         style.title(axis, name)
-    _bar(figure, ScalarMappable(torques, "RdBu_r"), axes[1, 1], "u, N m")
+    colour_bar(figure, ScalarMappable(torques, "RdBu_r"), axes[1, 1], "u, N m")
     off = np.clip(np.abs(fitted - true) / np.maximum(true, 0.01 * highest), LEAST_ERROR, MOST_ERROR)
-    shown = _surface(axes[2, 0], nodes, off, LogNorm(LEAST_ERROR, MOST_ERROR), "inferno")
+    shown = surface(axes[2, 0], nodes, off, LogNorm(LEAST_ERROR, MOST_ERROR), "inferno")
     style.title(axes[2, 0], f"relative error, median {np.median(off):.1e}")
-    _bar(figure, shown, axes[2, 0], "|V - V*| / V*")
+    colour_bar(figure, shown, axes[2, 0], "|V - V*| / V*")
     for axis in (*axes[:2].flat, axes[2, 0]):
         axis.set(xlim=(-np.pi, np.pi), ylim=(nodes[0, 0, 1], nodes[0, -1, 1]))
         angle_ticks(axis.xaxis)
@@ -64,31 +64,6 @@ def value_figure(
         axis.set_xlabel("angle from upright, rad")
     _over_time(axes[2, 1], paths, seconds)
     return figure
-
-
-def _sides(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return nodes[:, 0, 0], nodes[0, :, 1]
-
-
-def _surface(axis: Axes, nodes: np.ndarray, values: np.ndarray, norm: Normalize, colours: str) -> ScalarMappable:
-    axis.grid(False)
-    return axis.pcolormesh(*_sides(nodes), values.T, norm=norm, cmap=colours, shading="gouraud", rasterized=True)
-
-
-def _bar(figure: Figure, shown: ScalarMappable, axis: Axes, label: str) -> None:
-    bar = figure.colorbar(shown, ax=axis, pad=0.02, aspect=28)
-    bar.set_label(label, fontsize=style.SMALL)
-    bar.ax.tick_params(labelsize=style.SMALL)
-    bar.outline.set_visible(False)
-
-
-def _paths(axis: Axes, paths: np.ndarray) -> None:
-    """Draws paths with wrapped angles, and gaps where an angle wraps."""
-    for path in paths:
-        angle = np.arctan2(np.sin(path[:, 0]), np.cos(path[:, 0]))
-        angle[1:][np.abs(np.diff(angle)) > np.pi] = np.nan
-        axis.plot(angle, path[:, 1], color=style.VERMILLION, linewidth=0.8, alpha=0.8)
-    axis.plot(0, 0, "o", color="white", markeredgecolor="black", markersize=4.5)
 
 
 def _over_time(axis: Axes, paths: np.ndarray, seconds: float) -> None:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from dln_jax.control.optimal.fitted import fit_values
 from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import interpolated
-from dln_jax.control.optimal.plants import FITS, PLANTS, SECONDS, ValuePlant, ValueSettings, evaluate, starts
+from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant, ValueSettings, evaluate, starts
 from dln_jax.control.optimal.problem import ValueAndGradient, hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.solvers.ending import reason
@@ -203,4 +203,6 @@ def draw_pendulum(curves: dict[str, Any]) -> Figure:
     """Draws the first seed's value beside the grid solution."""
     plant = PLANTS["pendulum"]()
     values, controls = (curves["V"], curves["truth"]), (curves["u"], curves["best"])
-    return value_figure(curves["nodes"], values, controls, curves["runs"], limit=plant.limit, seconds=SECONDS)
+    return value_figure(
+        curves["nodes"], values, controls, curves["runs"], limit=plant.limit, seconds=plant.evaluation.seconds
+    )

@@ -1,0 +1,243 @@
+"""Recovery of the board's plants by receding plans with a model that is identified on the way.
+
+The plan from hanging is followed first. Then, every `every` samples, `control.mpc` improves plans over a receding
+horizon from the present state, each from its own first guess, and the one with the lowest cost acts. A regulator holds
+the goal where its value is below a level.
+
+Nine numbers determine the motion of two links: with the known length l1,
+
+    a = I1 + m2 l1²,  I2,  h = m2 l1 r2,  w = g (m1 r1 + m2 l1),  viscous and dry friction,  the rotors' inertia
+
+They enter the torques linearly, and recursive least squares estimates them from second differences of the angles and
+the commanded torques, from a prior about the nominal plant. The row of the joint without a motor has no torque and no
+error of a torque, so it counts more.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control import (
+    Controller,
+    Plan,
+    TrajectoryProblem,
+    error,
+    field_of,
+    first_plan,
+    mpc,
+    sampled_lqr,
+    saturated,
+    with_differences,
+    with_prediction,
+)
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.integrators import CLASSICAL, MIDPOINT, advance, runge_kutta
+from dln_jax.scenes.pendulums import Links
+from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, at_goal, plant
+from scripts.reports.control.disturbed_board import GEAR, LONGEST
+from scripts.reports.control.planned import EVERY as OF_PLAN
+from scripts.reports.control.planned import Weights, follower
+
+STATE_COST = np.diag([10.0, 10.0, 1.0, 1.0])
+"""State cost of the regulator."""
+CUTOFF = 1000.0
+"""Cut-off of the differences, Hz: above the sampling rate, so that they are hardly filtered."""
+PRIOR = np.array([0.1, 0.1, 0.1, 0.1])
+"""Standard deviations of the inertial numbers before any motion, relative."""
+FRICTION = np.array([0.05, 0.05, 0.1, 0.1, 5e-5])
+"""Standard deviations of viscous and dry friction and of the rotors' inertia, N m s, N m, kg m²."""
+DRIVEN_ERROR, PASSIVE_ERROR = 1.0, 0.01
+"""Standard deviations of the torques of the joints with and without a motor about the model's, N m."""
+GRAVITY = 9.81
+
+
+class Replanning(NamedTuple):
+    """Numbers of the receding plans."""
+
+    every: int = 10
+    """Samples of the board between two plans, and per step of a plan."""
+    steps: int = 60
+    """Steps of the horizon."""
+    torque: float = 0.1
+    """Weights of the integrals of the squared torque and rates, and of the last state's angles and rates."""
+    rates: float = 0.01
+    angles_at_end: float = 300.0
+    rates_at_end: float = 30.0
+    level: float = 100.0
+    """Value of the regulator below which it acts."""
+    control_cost: float = 1.0
+    """Control cost of the regulator."""
+    pumps: tuple[float, ...] = (0.0, 3.0, -3.0)
+    """Amplitudes of the first guesses, N m: torques with the frequency of a small swing."""
+    identified: bool = True
+    """Whether the model is identified on the way."""
+
+
+class Estimate(NamedTuple):
+    """Memory of the least squares."""
+
+    numbers: Array
+    """Deviations from the nominal numbers in units of the prior's standard deviations [9]."""
+    covariance: Array
+    angles: Array
+    """The last three measured [3, 2], the newest first."""
+    torques: Array
+    """Past controls [LONGEST + 3], the newest first."""
+    seen: Array
+
+
+def nominal() -> tuple[np.ndarray, np.ndarray]:
+    """The nine numbers of the nominal plant, and their prior standard deviations."""
+    links = Links()
+    (m1, m2), (l1, _), (r1, r2), (I1, I2) = links.masses, links.lengths, links.centres, links.inertias
+    inertial = np.array([I1 + m2 * l1**2, I2, m2 * l1 * r2, GRAVITY * (m1 * r1 + m2 * l1)])
+    return np.concatenate([inertial, np.zeros(5)]), np.concatenate([PRIOR * inertial, FRICTION])
+
+
+def parts(p: Array, q: Array, qd: Array) -> tuple[Array, Array]:
+    """Mass matrix [2, 2] and the other torques [2] at rest accelerations, for the nine numbers."""
+    a, outer, h, w, *friction, rotor = p
+    cos, sin = jnp.cos(q[1]), jnp.sin(q[1])
+    coupling = outer + h * cos - GEAR * rotor
+    M = jnp.array([[a + outer + 2 * h * cos + (GEAR**2 + 1) * rotor, coupling], [coupling, outer + GEAR**2 * rotor]])
+    far = h / Links().lengths[0] * GRAVITY * jnp.sin(q[0] + q[1])
+    held = jnp.stack([w * jnp.sin(q[0]) + far - h * sin * qd[1] * (2 * qd[0] + qd[1]), far + h * sin * qd[0] ** 2])
+    viscous, dry = jnp.stack(friction[:2]), jnp.stack(friction[2:])
+    return M, held + viscous * qd + dry * jnp.arctan(100 * qd)
+
+
+def field_for(p: Array, B: Array) -> Any:
+    """(x, u) -> dx/dt for the nine numbers."""
+
+    def field(x: Array, u: Array) -> Array:
+        q, qd = jnp.split(x, 2)
+        M, held = parts(p, q, qd)
+        (a, b), (_, d) = M
+        f, g = B @ u - held
+        return jnp.concatenate([qd, jnp.stack([d * f - b * g, a * g - b * f]) / (a * d - b * b)])
+
+    return field
+
+
+def problem(field: Any, numbers: Replanning) -> TrajectoryProblem:
+    """The optimal control problem on (q, qd) with the torque as control, held for a step."""
+    dt = numbers.every / RATE
+
+    def off(x: Array) -> tuple[Array, Array]:
+        # Periodic, as a motion may come up from either side.
+        return jnp.sum(2 * (1 - jnp.cos(x[:2] - GOAL[:2]))), jnp.sum(x[2:] ** 2)
+
+    def cost(x: Array, u: Array) -> Array:
+        return dt * (numbers.torque * u[0] ** 2 + numbers.rates * off(x)[1])
+
+    def final_cost(x: Array) -> Array:
+        angles, rates = off(x)
+        return numbers.angles_at_end * angles + numbers.rates_at_end * rates
+
+    def step(x: Array, u: Array) -> Array:
+        return advance(runge_kutta(CLASSICAL, lambda t, x: field(x, u)), 0.0, x, dt, substeps=2)
+
+    return TrajectoryProblem(step, cost, final_cost, -LIMIT, LIMIT)
+
+
+def first_plans(receding: TrajectoryProblem, numbers: Replanning) -> Plan:
+    """Plans from hanging with every first guess, along a leading axis."""
+    t = numbers.every / RATE * np.arange(numbers.steps)
+    guesses = np.array(numbers.pumps)[:, None] * np.sin(2 * np.pi * t)
+    return jax.vmap(lambda u: first_plan(receding, np.zeros(4), u))(guesses[..., None])
+
+
+def updated(motor: Motor, estimate: Estimate, y: Array, u: Array, delay: Array, moved: Array) -> Estimate:
+    """The estimate after a measurement of the angles [2], before which u [1] was commanded."""
+    centre, size = nominal()
+    angles = jnp.concatenate([y[None], estimate.angles[:2]])
+    torques = jnp.concatenate([u, estimate.torques[:-1]])
+    q, dt = angles[1], 1 / RATE
+    qd, qdd = (angles[0] - angles[2]) / (2 * dt), (angles[0] - 2 * q + angles[2]) / dt**2
+    # A second difference sees the mean of the torques on both sides.
+    tau = plant(motor)[1] @ (torques[delay] + torques[delay + 1])[None] / 2
+
+    def torque(z: Array) -> Array:
+        M, held = parts(centre + size * z, q, qd)
+        return M @ qdd + held
+
+    zero = jnp.zeros(len(centre))
+    rows, rest = jax.jacfwd(torque)(zero), tau - torque(zero)
+    z, P = estimate.numbers, estimate.covariance
+    errors = {"shoulder": (DRIVEN_ERROR, PASSIVE_ERROR), "elbow": (PASSIVE_ERROR, DRIVEN_ERROR)}[motor]
+    for row, aim, deviation in zip(rows, rest, errors, strict=True):
+        # Errors of differences grow with the acceleration.
+        noise = deviation**2 + (1e-3 * jnp.max(jnp.abs(qdd)) * size[1] / PRIOR[1]) ** 2
+        gain = P @ row / (row @ P @ row + noise)
+        z, P = z + gain * (aim - row @ z), P - jnp.outer(gain, row @ P)
+    used = moved & (estimate.seen >= LONGEST)
+    z, P = jnp.where(used, z, estimate.numbers), jnp.where(used, (P + P.T) / 2, estimate.covariance)
+    return Estimate(z, P, angles, torques, estimate.seen + 1)
+
+
+def replanning(
+    motor: Motor,
+    weights: Weights,
+    plan: Plan,
+    numbers: Replanning = Replanning(),  # noqa: B008
+) -> Controller:
+    """The plan; after its end the regulator where its value is low, else receding plans; from the angles alone."""
+    scene, B = plant(motor)
+    known = field_of(dynamics(scene.closed_form), B)
+    at, joints = at_goal(motor, dynamics(scene.closed_form)), scene.needs.joints
+    control_cost = numbers.control_cost * np.eye(1)
+    regulator = sampled_lqr(at.A, at.B, STATE_COST, control_cost, 1 / RATE)
+    planned, last = follower(motor, weights, plan), OF_PLAN * len(plan.u)
+    centre, size = nominal()
+    driven = {"shoulder": 0, "elbow": 1}[motor]
+    start = first_plans(problem(field_for(jnp.asarray(centre), B), numbers), numbers)
+
+    def again(plans: Plan, x: Array, p: Array) -> tuple[Plan, Array]:
+        act = mpc(problem(field_for(p, B), numbers), step_lengths=0.5 ** np.arange(5))
+        u, plans = jax.vmap(act, in_axes=(None, 0))(x, plans)
+        best = jnp.argmin(jnp.where(jnp.isfinite(plans.cost), plans.cost, jnp.inf))
+        return plans, u[best]
+
+    def riccati(S: Array, p: Array) -> tuple[Array, Array]:
+        """One iteration towards the sampled regulator of the identified model: S and K."""
+        smooth = field_for(jnp.concatenate([p[:6], jnp.zeros(2), p[8:]]), B)
+        step = lambda x, u: runge_kutta(CLASSICAL, lambda t, x: smooth(x, u))(0.0, x, 1 / RATE)  # noqa: E731
+        A, b = jax.jacfwd(step, (0, 1))(jnp.asarray(GOAL), jnp.zeros(1))
+        R = control_cost / RATE + b.T @ S @ b
+        K = (b.T @ S @ A) / R
+        return STATE_COST / RATE + A.T @ S @ (A - b @ K), K
+
+    def act(memory: tuple[Any, ...], t: Array, y: Array) -> tuple[tuple[Any, ...], Array]:
+        inner, number, plans, held, S, p = memory
+        inner, by_plan = planned.act(inner, t, y)
+        due = (number >= last) & (number % numbers.every == 0)
+        plans, held = jax.lax.cond(due, again, lambda plans, y, p: (plans, held), plans, y, p)
+        S, K = riccati(S, p) if numbers.identified else (S, regulator.K)
+        off = error(y, jnp.asarray(GOAL), joints)
+        friction = p[6 + driven] * jnp.arctan(100 * y[2 + driven]) * numbers.identified
+        near = friction - K @ off
+        u = jnp.where(number < last, by_plan, jnp.where(off @ S @ off <= numbers.level, near, held))
+        u = saturated(u, -LIMIT, LIMIT)
+        return (inner, number + 1, plans, held, S, p), u
+
+    inside = Controller(
+        (planned.start, jnp.asarray(0), start, jnp.zeros(1), jnp.asarray(regulator.S), jnp.asarray(centre)), act
+    )
+    step = lambda x, u: runge_kutta(MIDPOINT, lambda t, x: known(x, u))(0.0, x, 1 / RATE)  # noqa: E731
+    predicting = with_prediction(inside, step, states=4, controls=1, max_delay=LONGEST)
+    seeing = with_differences(predicting, 2, rate=RATE, cutoff=CUTOFF, order=2)
+
+    def outside(memory: tuple[Any, ...], t: Array, y: Array) -> tuple[tuple[Any, ...], Array]:
+        estimate, u, (rates, late) = memory
+        if numbers.identified:
+            estimate = updated(motor, estimate, y[:2], u, late.delay, late.moved)
+            p = jnp.asarray(centre) + size * estimate.numbers
+            late = late._replace(inner=(*late.inner[:-1], p))
+        inner, u = seeing.act((rates, late), t, y[:2])
+        return (estimate, u, inner), u
+
+    nothing = jnp.zeros(len(centre)), jnp.eye(len(centre)), jnp.zeros((3, 2)), jnp.zeros(LONGEST + 3), jnp.asarray(0)
+    return Controller((Estimate(*nothing), jnp.zeros(1), seeing.start), outside)

@@ -1,0 +1,100 @@
+"""A value function of a file's plant: trained, interrupted, resumed, loaded, judged; and what is refused."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from calls import command, refused
+
+from dln_jax.cli.commands import train_value
+from dln_jax.control.optimal.problem import rates
+from dln_jax.training.value_training import verdict_of
+from dln_jax.training.values import Kept, load_value
+
+pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
+ROD = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.05"/>
+<inertial mass="1" pos="0 0 0.5" diaginertia="0.08333 0.08333 0.001"/></body></worldbody>
+<actuator><motor joint="hinge" ctrlrange="-2.5 2.5" ctrllimited="true"/></actuator></mujoco>"""
+TINY = ("--width", "3", "--depth", "1", "--iterations", "2", "--starts", "3", "--no-figures")
+
+
+@pytest.fixture
+def rod(tmp_path):
+    (tmp_path / "rod.xml").write_text(ROD)
+    return tmp_path / "rod.xml"
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Iterations of a moment."""
+    monkeypatch.setattr(
+        "dln_jax.control.optimal.own_plants.Iteration",
+        lambda **numbers: __import__("dln_jax.control.optimal.fitted", fromlist=["Iteration"]).Iteration(
+            **{**numbers, "starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}
+        ),
+    )
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, capsys, rod, brief, monkeypatch):
+    arguments = ("--plant", rod, *TINY, "--robust", "0.1")
+    command(train_value, *arguments, "--out", tmp_path / "whole")
+    output = capsys.readouterr().out
+    assert "hinge 2.5 N m" in output and "box, half widths: hinge 3.14 rad" in output and "verdict: " in output
+    store, count = Kept.store, []
+
+    def stop(self, seed, state):
+        store(self, seed, state)
+        count.append(seed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Kept, "store", stop)
+    with pytest.raises(SystemExit) as exit_:
+        command(train_value, *arguments, "--out", tmp_path / "cut")
+    assert exit_.value.code == 130 and len(count) == 1
+    assert "--resume" in capsys.readouterr().err
+    monkeypatch.setattr(Kept, "store", store)
+    command(train_value, "--out", tmp_path / "cut", "--resume")
+    whole, cut = (load_value(tmp_path / name) for name in ("whole", "cut"))
+    x = jnp.array([1.0, -0.5])
+    np.testing.assert_array_equal(whole.law(x), cut.law(x))
+    numbers = [json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("whole", "cut")]
+    assert numbers[0]["heavy_weak_return_mean"] == numbers[1]["heavy_weak_return_mean"]
+    # The model in the folder is the file's plant.
+    expected = (2.0 + 9.81 / 2 * np.sin(1.0) - 0.05 * -0.5) / (0.25 + 0.08333)
+    np.testing.assert_allclose(rates(whole.problem)(x, jnp.array([2.0])), [-0.5, expected], rtol=1e-6)
+
+
+def test_the_verdict_counts_the_starts_that_end_up():
+    numbers = {"down_up_share": 1.0, "uniform_up_share": 1.0}
+    assert verdict_of(numbers, 100).level == "good"
+    assert verdict_of(numbers | {"uniform_up_share": 0.99}, 100).level == "doubtful"
+    assert verdict_of(numbers | {"heavy_weak_up_share": 0.9, "light_strong_up_share": 1.0}, 100).level == "doubtful"
+    assert verdict_of(numbers | {"down_up_share": 0.89}, 100).level == "refused"
+    assert verdict_of(numbers | {"down_up_share": np.nan}, 100).level == "refused"
+
+
+MISTAKES = [
+    (("--actuated", "elbow"), "there is no joint 'elbow'"),
+    (("--control", "-1"), "expected finite positive numbers"),
+    (("--control", "1", "--goal", "0.6"), "the limits are"),
+    (("--positions", "1:0"), "expected LOW:HIGH or free"),
+    (("--positions", "free,free"), "2 ranges; the plant has 1 joints"),
+    (("--positions", "-1:1"), "is outside"),
+    (("--weights", "1"), "expected 2 positive numbers"),
+    (("--robust", "1.5"), "robust is 1.5"),
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), MISTAKES, ids=lambda value: value[0] if isinstance(value, tuple) else ""
+)
+def test_mistakes_are_one_line_and_leave_nothing(arguments, message, tmp_path, capsys, rod):
+    assert message in refused(capsys, train_value, "--plant", rod, *arguments, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_options_of_an_own_plant_need_one(capsys):
+    assert "--effort is an option of one's own plant" in refused(capsys, train_value, "--effort", "1")
+    assert "no such file" in refused(capsys, train_value, "--run", "/nowhere")
