@@ -28,7 +28,7 @@ def unrolled(body: Body, node: Node) -> set[Node]:
     if node in body.plan.beside and not body.source.libm:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
         body.source.functions.add("sin_cos")
-        body.spend(OPERATIONS["sin"].cost)
+        body.spend(sin=1)
         for scalar in pair:
             body.declared(body.name(scalar), "real", 0)
         body.line("elementary_sin_cos({}, &{}, &{});".format(body.read(node.args[0], _FIRST), *map(body.name, pair)))
@@ -50,16 +50,16 @@ def _scalar(body: Body, node: Node, root: Node) -> str:
     return _expression(body, node, [_scalar(body, arg, root) for arg in node.args])
 
 
-def combination(node: Node) -> tuple[Callable[..., str], int]:
-    """Returns a function that gives the C of two combined terms, and its floating-point operations."""
-    op = node.op.partition("_")[2]
-    return partial(expression, op, node.dtype), OPERATIONS[op].cost * (node.dtype == "real")
+def combination(node: Node) -> Callable[..., str]:
+    """Returns a function that gives the C of two combined terms."""
+    return partial(expression, node.op.partition("_")[2], node.dtype)
 
 
 def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False) -> str:
     """Returns the C of an elementwise operation on expressions."""
     operation = OPERATIONS[node.op]
-    body.spend(operation.cost * (node.dtype == "real" or node.args[0].dtype == "real"))
+    if node.dtype == "real" or node.args[0].dtype == "real":
+        body.spend(**{node.op: 1})
     if operation.function in VECTORISED and not body.source.libm:
         body.source.functions.add(node.op)
         return f"elementary_{node.op}({args[0]})"
@@ -102,7 +102,7 @@ def looped(body: Body, node: Node) -> None:
                 where[arg] = index if arg.size == node.size else np.zeros_like(index)
     target = body.kept(node)
     if node.op in VECTORISED and not body.source.libm:
-        body.spend(OPERATIONS[node.op].cost * node.size)
+        body.spend(**{node.op: node.size})
         body.source.arrays.add(node.op)
         body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")
         return

@@ -134,7 +134,7 @@ def _fused(nodes, readers, whole, unrolled, arrays) -> dict[Node, Node]:
     for node in reversed(nodes):
         if node.op not in OPERATIONS:
             continue
-        into = {root.get(reader, reader) for reader in readers[node]}
+        into = {root[reader] if reader in root else reader for reader in readers[node]}
         alone = len(into) != 1 or node in whole or node.op in VECTORISED or node.region != next(iter(into)).region
         if node in unrolled:
             depths[node] = 1 + max((depths.get(reader, _DEPTH) for reader in readers[node]), default=_DEPTH)
