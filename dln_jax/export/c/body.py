@@ -47,7 +47,7 @@ class Source:
     libm: bool
     finite: bool = False
     """Arguments and intermediate results are finite."""
-    iterations: int | None = None
+    loop_bound: int | None = None
     """Iterations after which loops without a bound end, with NaN."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
     functions: set[str] = field(default_factory=set)

@@ -171,7 +171,7 @@ def _while(body: Body, node: Node) -> None:
     number, loop = node.attribute, body.program.loops[node.attribute]
     names, inside = _stored(body, node, loop.carries), (*node.region, number)
     bound = _bound(node, loop)
-    stopped = body.source.iterations if bound is None else None
+    stopped = body.source.loop_bound if bound is None else None
     turns = stopped if bound is None else bound
     body.unbounded += turns is None
     if stopped:

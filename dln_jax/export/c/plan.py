@@ -127,14 +127,14 @@ def _is_scalar(node: Node) -> bool:
     return node.size == 1 and node.op not in ("dot_general", *_FACTORED) and node.op[:4] != "put_"
 
 
-def _fused(nodes, readers, whole, unrolled, arrays) -> dict[Node, Node]:
+def _fused(nodes: list[Node], readers: dict[Node, list[Node]], whole, unrolled, arrays) -> dict[Node, Node]:
     """Returns the last node of the loop, or of the expression of scalars, that an elementwise node is fused into."""
     root: dict[Node, Node] = {}
     depths = {node: 0 for node in nodes if node.op == "gather" and node in arrays and node in unrolled}
     for node in reversed(nodes):
         if node.op not in OPERATIONS:
             continue
-        into = {root[reader] if reader in root else reader for reader in readers[node]}
+        into = {root.get(reader, reader) for reader in readers[node]}
         alone = len(into) != 1 or node in whole or node.op in VECTORISED or node.region != next(iter(into)).region
         if node in unrolled:
             depths[node] = 1 + max((depths.get(reader, _DEPTH) for reader in readers[node]), default=_DEPTH)

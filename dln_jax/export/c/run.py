@@ -21,6 +21,7 @@ def export_run(
     iterations: int = ITERATIONS,
     libm: bool = False,
     casadi: bool = False,
+    finite: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
     """Exports the model in a run's folder by `export_c`, and returns the paths of the files.
@@ -33,7 +34,7 @@ def export_run(
         name: name of the export.
         precision: f32 or f64; default: the precision of the training.
         iterations: Newton steps of the implicit midpoint rule.
-        libm, casadi, overwrite: as for `export_c`.
+        libm, casadi, finite, overwrite: as for `export_c`.
 
     Raises:
         InputError: the folder holds no run, a function does not exist, or `export_c` refuses one.
@@ -47,5 +48,5 @@ def export_run(
     itself = casadi if functions else casadi and [function for function in chosen if not function.endswith(DERIVATIVES)]
     return export_c(
         chosen, directory, name=name, precision=precision, libm=libm, casadi=itself, overwrite=overwrite,
-        leave_out_large=functions is None,
+        finite=finite, leave_out_large=functions is None,
     )  # fmt: skip

@@ -226,10 +226,10 @@ def header(
 def stated(cost: Cost) -> str:
     """Returns the words for the most that a call takes."""
     names = ("additions", "multiplications", "divisions", "square_roots", "functions")
-    kinds = ", ".join(f"{getattr(cost, name)} {name.replace('_', ' ')}" for name in names if getattr(cost, name))
+    kinds = [f"{name.replace('_', ' ')} {getattr(cost, name)}" for name in names if getattr(cost, name)]
+    kinds += [f"unbounded loops, of which one iteration is counted {cost.unbounded_loops}"] * bool(cost.unbounded_loops)
     text = f"at most {cost.operations} floating-point operations, {cost.stack_bytes} bytes of stack"
-    loops = f"; counts one iteration of {cost.unbounded_loops} loops without a bound" * bool(cost.unbounded_loops)
-    return f"{text}{f' ({kinds})' * bool(kinds)}{loops}"
+    return text + f"\n   ({', '.join(kinds)})" * bool(kinds)
 
 
 def about(*paragraphs: str, left_out: Sequence[str]) -> str:
