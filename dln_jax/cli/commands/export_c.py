@@ -37,6 +37,8 @@ class Arguments:
     """Call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones."""
     casadi: bool = False
     """Add NAME_casadi.c: the functions with exact derivatives for CasADi's external and for acados."""
+    finite: bool = False
+    """Arguments are finite: skip the zeros of a derivative's structure. A NaN may then not reach all results."""
     overwrite: bool = False
     """Replace the files of an earlier export (files of a run are never replaced)."""
 
@@ -48,6 +50,7 @@ def main(options: Arguments) -> None:
     paths = export_run(
         options.run, options.out, functions=options.functions, name=options.name, precision=options.precision,
         iterations=options.iterations, temperature=options.temperature, libm=options.libm, casadi=options.casadi,
+        finite=options.finite,
         overwrite=options.overwrite,
     )  # fmt: skip
     print(f"{options.out}: {', '.join(path.name for path in paths)}")

@@ -4,6 +4,7 @@ A reading takes an integer array of positions, with one axis for each loop aroun
 transposes and gathers become indexing of that integer array, and constants are stored in the order of their reading.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from copy import copy
@@ -12,10 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dln_jax.export.c.interface import Cost
 from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, strides, values
+from dln_jax.export.c.operations import OPERATIONS, total
 from dln_jax.export.c.plan import Plan
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import C_TYPES, PRECISIONS, literal
+
+_FRAME = 512
+"""Bytes for saved registers, spilled vectors and helper functions."""
+_ALIGNMENT = 32
+"""Bytes; gcc aligns arrays for vectors."""
 
 
 class Called(NamedTuple):
@@ -24,7 +32,8 @@ class Called(NamedTuple):
     name: str
     results: list[Node]
     text: str
-    operations: int
+    operations: Counter[str]
+    unbounded: int
     bytes: int
     calls: set[Any]
     """Keys, in the source, of the functions that it calls directly or indirectly."""
@@ -38,6 +47,8 @@ class Source:
     libm: bool
     finite: bool = False
     """Arguments and intermediate results are finite."""
+    loop_bound: int | None = None
+    """Iterations after which loops without a bound end, with NaN."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
     functions: set[str] = field(default_factory=set)
     """Elementary functions called on scalars."""
@@ -81,8 +92,12 @@ class Body:
     inputs: dict[int, tuple[str, bool]]
     """Name of every argument, and whether it is passed by value."""
     lines: list[str] = field(default_factory=list)
-    operations: int = 0
-    bytes: int = 0
+    operations: Counter[str] = field(default_factory=Counter)
+    """Largest number of operations on real numbers, by their names in `operations.OPERATIONS`."""
+    unbounded: int = 0
+    """Loops without a bound on their iterations, of which one is counted."""
+    bytes: int = _FRAME
+    """Largest stack: variables, and what a compiler adds to them."""
     calls: set[Any] = field(default_factory=set)
     """Keys, in the source, of the functions that it calls directly or indirectly."""
     names: dict[Node, str] = field(default_factory=dict)
@@ -99,12 +114,19 @@ class Body:
     @contextmanager
     def block(self, text: str, turns: int = 1) -> Iterator[None]:
         """Opens a block that runs `turns` times, and closes it."""
-        turns_outside = self._turns
         self.line(f"{text} {{")
-        self._depth, self._turns = self._depth + 1, turns_outside * turns
-        yield
-        self._depth, self._turns = self._depth - 1, turns_outside
+        self._depth += 1
+        with self.repeated(turns):
+            yield
+        self._depth -= 1
         self.line("}")
+
+    @contextmanager
+    def repeated(self, turns: int) -> Iterator[None]:
+        """Counts the operations inside `turns` times."""
+        outside, self._turns = self._turns, self._turns * turns
+        yield
+        self._turns = outside
 
     @contextmanager
     def loops(self, extents: Mapping[str, int]) -> Iterator[None]:
@@ -114,20 +136,20 @@ class Body:
                 stack.enter_context(self.block(f"for (int {name} = 0; {name} < {extent}; ++{name})", extent))
             yield
 
-    def spend(self, operations: int) -> None:
-        """Counts floating-point operations."""
-        self.operations += operations * self._turns
+    def spend(self, **operations: int) -> None:
+        """Counts operations on real numbers, by name."""
+        self.operations.update({name: count * self._turns for name, count in operations.items()})
 
     def declared(self, name: str, dtype: str, size: int, value: str = "") -> None:
         """Declares an array, or a scalar if the size is 0; a scalar with a value is constant."""
-        self.bytes += max(size, 1) * (4 if self.source.precision == "f32" and dtype == "real" else 8)
-        self.line(
-            f"const {C_TYPES[dtype]} {name} = {value};"
-            if value
-            else f"{C_TYPES[dtype]} {name}[{size}];"
-            if size
-            else f"{C_TYPES[dtype]} {name};"
+        width = 4 if self.source.precision == "f32" and dtype == "real" else 8
+        self.bytes += -(-size * width // _ALIGNMENT) * _ALIGNMENT or width
+        array, start, constant = (
+            f"[{size}]" * bool(size),
+            f" = {value}" * bool(value),
+            "const " * bool(value and not size),
         )
+        self.line(f"{constant}{C_TYPES[dtype]} {name}{array}{start};")
 
     def kept(self, node: Node) -> str:
         """Returns the name of an array for a node: one that is free again, or a new one."""
@@ -216,6 +238,16 @@ class Body:
             for node, mask in self.plan.needed.items()
             if node.op == "project" and node.args[0] is loop and mask.any()
         }
+
+    @property
+    def cost(self) -> Cost:
+        """The most that a call takes."""
+        count, fused = self.operations, self.operations["multiply_add"]
+        functions = sum(count[name] for name in OPERATIONS if OPERATIONS[name].function and name != "sqrt")
+        return Cost(
+            total(count), count["add"] + count["sub"] + fused, count["mul"] + fused, count["div"], count["sqrt"],
+            functions, self.bytes, self.unbounded,
+        )  # fmt: skip
 
     def uses(self, node: Node) -> bool:
         """Returns whether anything reads a node."""

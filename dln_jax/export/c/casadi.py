@@ -34,7 +34,7 @@ from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
 from dln_jax.export.c.jaxprs import traced
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.templates import CASADI_DECLARATIONS, CASADI_FUNCTION
+from dln_jax.export.c.templates import CASADI_DECLARATIONS, CASADI_FUNCTION, stated
 from dln_jax.types import InputError
 
 Function = Callable[[Array], Array]
@@ -217,7 +217,7 @@ def _function(
                 names=", ".join(f'"{block.name}"' for block in blocks),
                 length=3 + max(0 if block.dense else block.columns for block in blocks),
                 sparsities=", ".join(f"{{{block.rows}, {block.columns}, {int(block.dense)}}}" for block in blocks),
-                operations=body.operations, bytes=body.bytes, inputs=len(inputs), outputs=len(outputs),
+                cost=stated(body.cost), inputs=len(inputs), outputs=len(outputs),
                 lines="\n".join(body.lines),
             )  # fmt: skip
         kib = body.bytes / 1024

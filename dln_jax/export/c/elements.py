@@ -18,30 +18,22 @@ _CHOICES = {
     "min": "elementary_choice(({0} < {1}) | ({0} != {0}), {0}, {1})",
 }
 """C without a branch, for loops, since a branch would prevent vectorisation."""
+_FIRST = np.array(0)
 _BOXES = 6
 """Largest number of boxes that become separate loops; more boxes are read through tables of positions."""
 
 
 def unrolled(body: Body, node: Node) -> set[Node]:
     """Writes a scalar: an expression of the scalars that are fused into it, and of variables; returns what it wrote."""
-    first = np.array(0)
     if node in body.plan.beside and not body.source.libm:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
         body.source.functions.add("sin_cos")
-        body.spend(OPERATIONS["sin"].cost)
+        body.spend(sin=1)
         for scalar in pair:
             body.declared(body.name(scalar), "real", 0)
-        body.line("elementary_sin_cos({}, &{}, &{});".format(body.read(node.args[0], first), *map(body.name, pair)))
+        body.line("elementary_sin_cos({}, &{}, &{});".format(body.read(node.args[0], _FIRST), *map(body.name, pair)))
         return {*pair}
-
-    def text_of(arg: Node) -> str:
-        if arg is not node and body.plan.root.get(arg) is not node:
-            return body.read(arg, first)
-        if arg.op == "take":
-            return f"{body.name(arg.args[0])}[{body.read(arg.args[1], first)}]"
-        return _expression(body, arg, list(map(text_of, arg.args)))
-
-    text = text_of(node)
+    text = _scalar(body, node, node)
     if node in body.plan.arrays:
         body.line(f"{body.kept(node)}[0] = {text};")
     else:
@@ -49,16 +41,25 @@ def unrolled(body: Body, node: Node) -> set[Node]:
     return {node}
 
 
-def combination(node: Node) -> tuple[Callable[..., str], int]:
-    """Returns a function that gives the C of two combined terms, and its floating-point operations."""
-    op = node.op.partition("_")[2]
-    return partial(expression, op, node.dtype), OPERATIONS[op].cost * (node.dtype == "real")
+def _scalar(body: Body, node: Node, root: Node) -> str:
+    """Returns the C expression of a scalar, which contains the scalars that are fused into the same root."""
+    if node is not root and body.plan.root.get(node) is not root:
+        return body.read(node, _FIRST)
+    if node.op == "take":
+        return f"{body.name(node.args[0])}[{body.read(node.args[1], _FIRST)}]"
+    return _expression(body, node, [_scalar(body, arg, root) for arg in node.args])
+
+
+def combination(node: Node) -> Callable[..., str]:
+    """Returns a function that gives the C of two combined terms."""
+    return partial(expression, node.op.partition("_")[2], node.dtype)
 
 
 def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False) -> str:
     """Returns the C of an elementwise operation on expressions."""
     operation = OPERATIONS[node.op]
-    body.spend(operation.cost * (node.dtype == "real" or node.args[0].dtype == "real"))
+    if node.dtype == "real" or node.args[0].dtype == "real":
+        body.spend(**{node.op: 1})
     if operation.function in VECTORISED and not body.source.libm:
         body.source.functions.add(node.op)
         return f"elementary_{node.op}({args[0]})"
@@ -101,7 +102,7 @@ def looped(body: Body, node: Node) -> None:
                 where[arg] = index if arg.size == node.size else np.zeros_like(index)
     target = body.kept(node)
     if node.op in VECTORISED and not body.source.libm:
-        body.spend(OPERATIONS[node.op].cost * node.size)
+        body.spend(**{node.op: node.size})
         body.source.arrays.add(node.op)
         body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")
         return
@@ -164,7 +165,7 @@ def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
         return
     boxes = [index] if stored else _boxes(node, index)
     for box in boxes if len(boxes) <= _BOXES else _by_source(node, index):
-        box = box.reshape(box.shape or (1,))
+        box = box.reshape([extent for extent in box.shape if extent > 1])
         names = _variables(box.shape)
         with body.loops(dict(zip(names, box.shape, strict=True))):
             body.line(f"{target}[{body.index(box, names)}] = {_moved(body, node, box, own, names)};")
@@ -172,7 +173,10 @@ def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
 
 def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequence[str] = ()) -> str:
     """Returns the C expression of elements; with `own`, of the sources of a gather that an array will hold."""
-    return body.read(*(read_source(node, positions) if own and node.op == "gather" else (node, positions)), names)
+    if not own or node.op != "gather":
+        return body.read(node, positions, names)
+    source, positions = read_source(node, positions)
+    return _scalar(body, source, node) if body.plan.root.get(source) is node else body.read(source, positions, names)
 
 
 def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:

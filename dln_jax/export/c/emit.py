@@ -1,5 +1,6 @@
 """Writes a planned program as the body of a C function, region by region."""
 
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
 
@@ -8,11 +9,11 @@ import numpy as np
 from dln_jax.export.c import elements, kernels, products
 from dln_jax.export.c.body import Body, Called, Source
 from dln_jax.export.c.elements import copied
-from dln_jax.export.c.nodes import Loop, Node
-from dln_jax.export.c.operations import OPERATIONS
+from dln_jax.export.c.nodes import Loop, Node, is_constant, values
+from dln_jax.export.c.operations import OPERATIONS, total
 from dln_jax.export.c.plan import plan_of
 from dln_jax.export.c.program import Program
-from dln_jax.export.c.text import C_TYPES
+from dln_jax.export.c.text import C_TYPES, failure, literal
 
 
 def body_of(
@@ -119,7 +120,8 @@ def _call(body: Body, node: Node) -> None:
     for name, result in zip(names, called.results, strict=True):
         body.declared(name, result.dtype, max(result.size, 1))
     body.line(f"{called.name}({', '.join([*map(body.pointer, node.args), *names])});")
-    body.spend(called.operations)
+    body.spend(**called.operations)
+    body.unbounded += called.unbounded
 
 
 def _part(source: Source, program: Program, results: list[Node]) -> Called:
@@ -132,7 +134,8 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
     lines = "\n".join([*unused, *body.lines])
     text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
     name = source.names.setdefault(text, f"part_{len(source.names)}")
-    return Called(name, results, f"\nstatic void {name}{text}", body.operations, body.bytes, body.calls)
+    written = f"\nstatic void {name}{text}"
+    return Called(name, results, written, body.operations, body.unbounded, body.bytes, body.calls)
 
 
 def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> list[str]:
@@ -167,12 +170,45 @@ def _carry_over(body: Body, loop: Loop, names: list[str], number: int) -> None:
 def _while(body: Body, node: Node) -> None:
     number, loop = node.attribute, body.program.loops[node.attribute]
     names, inside = _stored(body, node, loop.carries), (*node.region, number)
-    with body.block("for (;;)"):
+    bound = _bound(node, loop)
+    stopped = body.source.loop_bound if bound is None else None
+    turns = stopped if bound is None else bound
+    body.unbounded += turns is None
+    if stopped:
+        body.declared(f"t{number}", "int", 0)
+    with body.block(f"for (t{number} = 0;; ++t{number})" if stopped else "for (;;)"):
         done: set[Node] = set()
-        region(body, inside, done, ancestors(body, loop.conditions))
+        with body.repeated(1 if turns is None else turns + 1):
+            region(body, inside, done, ancestors(body, loop.conditions))
         body.line(f"if (!{body.read(loop.conditions[0], np.array(0))}) break;")
-        region(body, inside, done)
-        _carry_over(body, loop, names, number)
+        if stopped:
+            with body.block(f"if (t{number} == {stopped})"):
+                for name, carry in zip(names, loop.carries, strict=True):
+                    value = literal(failure(carry.dtype), body.source.precision, carry.dtype)
+                    body.line(f"for (int k_ = 0; k_ < {carry.size}; ++k_) {name}[k_] = {value};")
+                body.line("break;")
+        with body.repeated(1 if turns is None else turns):
+            region(body, inside, done)
+            _carry_over(body, loop, names, number)
+
+
+def _bound(node: Node, loop: Loop) -> int | None:
+    """Returns the largest number of iterations of a `while`, by a counter that its condition compares, or None."""
+    waiting, bounds = [*loop.conditions], []
+    while waiting:
+        test = waiting.pop()
+        if test.op == "and" and test.dtype == "bool":
+            waiting += test.args
+        elif test.op in ("lt", "le", "gt", "ge"):
+            counter, last = test.args if test.op in ("lt", "le") else test.args[::-1]
+            if counter.op == "carry" and counter in loop.carries and is_constant(last) and counter.dtype != "real":
+                place = loop.carries.index(counter)
+                start, after = node.args[place], loop.results[place]
+                steps = [arg for arg in after.args if arg is not counter] if after.op == "add" else []
+                if len(steps) == 1 and all(map(is_constant, (start, *steps))) and values(steps[0]) > 0:
+                    left = int(values(last)) - int(values(start)) + (test.op in ("le", "ge"))
+                    bounds.append(max(0, -(-left // int(values(steps[0])))))
+    return min(bounds, default=None)
 
 
 def _repeat(body: Body, node: Node) -> None:
@@ -194,14 +230,17 @@ def _repeat(body: Body, node: Node) -> None:
 def _branch(body: Body, node: Node) -> None:
     numbers = node.attribute
     names = _stored(body, node, body.program.loops[numbers[0]].results)
-    which = body.read(node.args[0], np.array(0))
+    which, before, most = body.read(node.args[0], np.array(0)), body.operations, Counter()
     for place, number in enumerate(numbers):
         test = f"if ({which} {'<=' if place == 0 else '=='} {place})" if place < len(numbers) - 1 else ""
+        body.operations = Counter()
         with body.block(("else " if place else "") + test):
             region(body, (*node.region, number))
             for index, (name, result) in enumerate(zip(names, body.program.loops[number].results, strict=True)):
                 if index in body.projected(node):
                     copied(body, result, name)
+        most = max(most, body.operations, key=total)
+    body.operations = before + most
 
 
 _CONTROL = {"call": _call, "while": _while, "repeat": _repeat, "branch": _branch}

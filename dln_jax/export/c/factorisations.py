@@ -6,8 +6,8 @@ from textwrap import dedent
 from dln_jax.export.c.body import Body
 from dln_jax.export.c.nodes import Node
 
-_SWEEPS = 7
-"""Jacobi sweeps that the operation count assumes; random matrices of 6 rows need 5 to 7, of 40 rows 8 to 10."""
+_SWEEPS = 16
+"""Most Jacobi sweeps; random matrices of 6 rows need 5 to 7, of 40 rows 8 to 10."""
 
 FUNCTIONS = {
     "cholesky": """
@@ -131,7 +131,7 @@ FUNCTIONS = {
     """,
     "eigh": """
     /* Eigenvectors of a symmetric matrix as columns [n, n], then ascending eigenvalues [n], by Jacobi's rotations;
-       all NaN where an element is not finite, or after 60 sweeps. `left` is a workspace of n n numbers */
+       all NaN where an element is not finite, or after $sweeps sweeps. `left` is a workspace of n n numbers */
     static void elementary_eigh(int n, const real *a, real *left, real *vectors)
     {
         real *values = vectors + n * n;
@@ -141,7 +141,7 @@ FUNCTIONS = {
             vectors[i] = i / n == i % n ? (real)1 : 0;
             finite &= a[i] - a[i] == 0;
         }
-        for (int sweep = 0; finite && rotated && sweep < 60; ++sweep) {
+        for (int sweep = 0; finite && rotated && sweep < $sweeps; ++sweep) {
             rotated = 0;
             for (int p = 0; p < n; ++p)
                 for (int q = p + 1; q < n; ++q) {
@@ -188,19 +188,42 @@ FUNCTIONS = {
 def definitions(names: Collection[str], suffix: str) -> str:
     """Returns the C text of the named functions."""
     text = "".join("\n" + dedent(FUNCTIONS[name]).strip() + "\n" for name in FUNCTIONS if name in names)
+    text = text.replace("$sweeps", str(_SWEEPS))
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
+def _eliminations(rows: int, columns: int) -> dict[str, int]:
+    steps = range(min(rows, columns))
+    return {
+        "div": sum(rows - k - 1 for k in steps),
+        "multiply_add": sum((rows - k - 1) * (columns - k - 1) for k in steps),
+    }
+
+
+def _reflections(m: int, n: int) -> dict[str, int]:
+    every = 2 * m * n * min(m, n)
+    return {"div": min(m, n) * (2 * m + 5), "multiply_add": every, "mul": every, "sqrt": 2 * min(m, n)}
+
+
 _SIZES = {
-    "cholesky": lambda a, _: (a[0], a[0] * (a[0] + 1) * (a[0] + 2) // 3),
-    "triangular_solve": lambda a, b, _: (*b, a[0] ** 2 * b[1]),
-    "lu": lambda a, _: (*a, 2 * a[0] ** 2 * a[1] // 3),
-    "permutation": lambda pivots, order: (*order, *pivots, 0),
-    "geqrf": lambda a, _: (*a, 2 * a[0] * a[1] * min(a)),
-    "householder_product": lambda a, tau, _: (*a, *tau, 2 * a[0] * a[1] * tau[0]),
-    "eigh": lambda a, _: (a[0], _SWEEPS * a[0] * (a[0] - 1) // 2 * (12 * a[0] + 20)),
-}
-"""The sizes that a C function takes, and its floating-point operations, from the shapes of arguments and result."""
+    "cholesky": lambda a, _: (
+        a[0], {"multiply_add": (a[0] ** 3 - a[0]) // 6, "div": a[0] * (a[0] - 1) // 2, "sqrt": a[0]}
+    ),
+    "triangular_solve": lambda a, b, _: (
+        *b, {"multiply_add": a[0] * (a[0] - 1) // 2 * b[1], "div": a[0] * b[1]}
+    ),
+    "lu": lambda a, _: (*a, _eliminations(*a)),
+    "permutation": lambda pivots, order: (*order, *pivots, {}),
+    "geqrf": lambda a, _: (*a, _reflections(*a)),
+    "householder_product": lambda a, tau, _: (
+        *a, *tau, {"multiply_add": 2 * a[0] * a[1] * tau[0], "mul": a[0] * a[1] * tau[0]}
+    ),
+    "eigh": lambda a, _: (a[0], {
+        name: _SWEEPS * a[0] * (a[0] - 1) // 2 * count
+        for name, count in {"mul": 8 * a[0] + 4, "add": 4 * a[0] + 9, "div": 5, "sqrt": 2}.items()
+    }),
+}  # fmt: skip
+"""The sizes that a C function takes, and at most its operations, from the shapes of arguments and result."""
 
 
 def _call(body: Body, node: Node) -> None:
@@ -219,7 +242,7 @@ def _call(body: Body, node: Node) -> None:
     prefix = "" if node.op in ("cholesky", "triangular_solve", "lu") else "elementary_"
     values = [*sizes, *map(int, node.attribute or ()), *map(body.pointer, node.args), *targets]
     body.line(f"{prefix}{node.op}({', '.join(map(str, values))});")
-    body.spend(operations)
+    body.spend(**operations)
 
 
 WRITERS = dict.fromkeys(FUNCTIONS, _call)

@@ -13,7 +13,7 @@ from dln_jax.export.c.text import C_TYPES, LARGEST, PRECISIONS, check_name, kind
 from dln_jax.export.exports import AGAIN, read_export
 from dln_jax.types import InputError
 
-FORMAT = 4
+FORMAT = 5
 """Version of the names and signatures in exported sources and of the JSON description."""
 KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
@@ -26,13 +26,30 @@ class Leaf(NamedTuple):
     shape: tuple[int, ...]
 
 
+class Cost(NamedTuple):
+    """The most that one call of a C function takes."""
+
+    operations: int = 0
+    """Floating-point operations, those of the source's own elementary functions included."""
+    additions: int = 0
+    """Additions and subtractions outside elementary functions; a multiply-add is one, and a multiplication."""
+    multiplications: int = 0
+    divisions: int = 0
+    square_roots: int = 0
+    functions: int = 0
+    """Calls of elementary functions; sine and cosine of one number are one call."""
+    stack_bytes: int = 0
+    """Stack of an optimised build, called functions included."""
+    unbounded_loops: int = 0
+    """Loops without a bound on their iterations; the numbers count one iteration of each."""
+
+
 class Signature(NamedTuple):
     """Arguments, results and cost of a C function."""
 
     arguments: tuple[Leaf, ...]
     results: tuple[Leaf, ...]
-    stack_bytes: int = 0
-    operations: int = 0
+    cost: Cost = Cost()
 
     @property
     def returns(self) -> bool:
@@ -102,8 +119,20 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
 def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
     """Returns the JSON description of an export, without digests."""
     # JSON makes lists of leaves and shapes, which are tuples.
-    stated = {key: function._asdict() for key, function in functions.items()}
+    stated = {
+        key: {"arguments": function.arguments, "results": function.results, **function.cost._asdict()}
+        for key, function in functions.items()
+    }
     return {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
+
+
+def stated_costs(directory: str | Path, *, name: str = "model") -> dict[str, Cost]:
+    """Returns the most that one call of each function of an export takes.
+
+    Raises:
+        InputError: as for `load_c`.
+    """
+    return {key: signature.cost for key, signature in read_interface(Path(directory), name)[1].items()}
 
 
 def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature], dict[str, bytes]]:
@@ -138,4 +167,7 @@ def _signature(stated: Any) -> Signature:
         return leaf
 
     arguments, results = (tuple(checked(*leaf) for leaf in stated[key]) for key in ("arguments", "results"))
-    return Signature(arguments, results)
+    numbers = {field: stated[field] for field in Cost._fields}
+    if not all(type(count) is int and count >= 0 for count in numbers.values()):
+        raise InputError(f"a cost is {numbers}")
+    return Signature(arguments, results, Cost(**numbers))

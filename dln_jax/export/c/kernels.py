@@ -9,6 +9,7 @@ from dln_jax.export.c import factorisations
 from dln_jax.export.c.body import Body
 from dln_jax.export.c.elements import combination, copied
 from dln_jax.export.c.nodes import Node
+from dln_jax.export.c.operations import OPERATIONS
 from dln_jax.export.c.products import summed
 from dln_jax.export.c.text import C_TYPES
 
@@ -63,8 +64,8 @@ def orderings(orders: Collection[tuple[str, ...]]) -> str:
 def _reduction(body: Body, node: Node) -> None:
     (a,) = node.args
     rows, count = a.shape
-    combine, cost = combination(node)
-    body.spend(cost * rows * (count - 1))
+    combine, op = combination(node), node.op.partition("_")[2]
+    body.spend(**{op: rows * (count - 1)} if node.dtype == "real" else {})
     at, kind = np.arange(a.size).reshape(a.shape), C_TYPES[node.dtype]
     target = _kept(body, node)
     with body.loops({"r_": rows}):
@@ -110,12 +111,13 @@ def _put(body: Body, node: Node) -> None:
     operand, targets, updates = node.args
     name, count = body.kept(node), updates.size
     copied(body, operand, name)
-    body.spend(count)
     index, at = np.arange(count), f"{name}[target_]"
+    op = node.op.partition("_")[2]
+    body.spend(**{op: count} if op in OPERATIONS and node.dtype == "real" else {})
     with body.loops({"k_": count}):
         body.line(f"const long long target_ = {body.read(targets, index, ['k_'])};")
         body.line(f"const {C_TYPES[node.dtype]} update_ = {body.read(updates, index, ['k_'])};")
-        new = "update_" if node.op == "put_set" else combination(node)[0](at, "update_")
+        new = "update_" if node.op == "put_set" else combination(node)(at, "update_")
         body.line(f"if (target_ >= 0) {at} = {new};")
 
 

@@ -12,7 +12,7 @@ from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_e
 from dln_jax.export.c.nodes import Loop, Node, Region, is_constant, values
 from dln_jax.export.c.primitives import Parameters
 from dln_jax.export.c.program import Part, Program
-from dln_jax.export.c.text import PRECISIONS, kind_of, limit
+from dln_jax.export.c.text import PRECISIONS, failure, kind_of
 from dln_jax.types import InputError
 
 _CALLS = {
@@ -112,8 +112,7 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
 def _failed(program: Program, aval: Any) -> Node:
     """Returns the value for an error that C cannot raise: NaN, the largest integer or true (EQX_ON_ERROR=nan)."""
     kind = kind_of(aval.dtype)
-    value = np.nan if kind == "real" else limit(kind, upper=True)
-    return program.broadcast(program.constant(value, kind), aval.shape)
+    return program.broadcast(program.constant(failure(kind), kind), aval.shape)
 
 
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:

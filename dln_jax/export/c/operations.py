@@ -8,7 +8,7 @@ x % 0 is x; NaN becomes 0; all bits are shifted out), and so does this C.
 
 import functools
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -140,6 +140,13 @@ OPERATIONS = {
     "to_bool": Operation("({0} != 0)", lambda x: x != 0, 0, "bool"),
 }
 """Operations by name."""
+
+
+def total(operations: Mapping[str, int]) -> int:
+    """Returns the floating-point operations of numbers of operations by name."""
+    return sum(OPERATIONS[name].cost * count for name, count in operations.items())
+
+
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
 """Operations that commute bit for bit, also in floating point."""
 TRANSCENDENTAL = frozenset(name for name, operation in OPERATIONS.items() if operation.function and name != "sqrt")

@@ -63,7 +63,7 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
         elif (node.size > 1 and (looped or node in whole)) or not (node in unrolled or _is_scalar(node)):
             arrays.add(node)
     arrays = {node for node in arrays if node.op not in ("input", "const")}
-    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), unrolled)
+    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), unrolled, arrays)
     arrays -= {node for node, into in root.items() if into is not node}
     levels, needed = _levels(nodes), _needed(program, nodes, unrolled, arrays, results)
     order: dict[Region, list[Node]] = {}
@@ -127,25 +127,32 @@ def _is_scalar(node: Node) -> bool:
     return node.size == 1 and node.op not in ("dot_general", *_FACTORED) and node.op[:4] != "put_"
 
 
-def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
-    """Returns the last node of the loop, or of the scalar expression, that an elementwise node is fused into."""
+def _fused(nodes: list[Node], readers: dict[Node, list[Node]], whole, unrolled, arrays) -> dict[Node, Node]:
+    """Returns the last node of the loop, or of the expression of scalars, that an elementwise node is fused into."""
     root: dict[Node, Node] = {}
-    depths: dict[Node, int] = {}
+    depths = {node: 0 for node in nodes if node.op == "gather" and node in arrays and node in unrolled}
     for node in reversed(nodes):
         if node.op not in OPERATIONS:
             continue
-        into = {root.get(reader) for reader in readers[node]}
-        alone = node in whole or node.op in VECTORISED or any(reader.op in VECTORISED for reader in readers[node])
-        same = all(reader.shape == node.shape and reader.region == node.region for reader in readers[node])
-        alone |= len(into) != 1 or not same
+        into = {root.get(reader, reader) for reader in readers[node]}
+        alone = len(into) != 1 or node in whole or node.op in VECTORISED or node.region != next(iter(into)).region
         if node in unrolled:
             depths[node] = 1 + max((depths.get(reader, _DEPTH) for reader in readers[node]), default=_DEPTH)
-            alone |= (
-                len(readers[node]) > 1 or depths[node] > _DEPTH or OPERATIONS[readers[node][0].op].repeats_arguments
-            )
+            alone |= depths[node] > _DEPTH or _is_read_again(node, readers[node])
             depths[node] = 0 if alone else depths[node]
-        root[node] = node if alone else next(iter(into)) or node
+        else:
+            alone |= any(reader not in root or reader.shape != node.shape for reader in readers[node])
+            alone |= any(reader.op in VECTORISED for reader in readers[node])
+        root[node] = node if alone else into.pop()
     return root
+
+
+def _is_read_again(node: Node, readers: list[Node]) -> bool:
+    """Returns whether a scalar occurs more than once in the C of its readers."""
+    if len(readers) > 1 or readers[0].op != "gather":
+        return len(readers) > 1 or OPERATIONS[readers[0].op].repeats_arguments
+    start = sum(arg.size for arg in readers[0].args[: readers[0].args.index(node)])
+    return bool((np.asarray(readers[0].value) == start).sum() > 1)
 
 
 def _levels(nodes: list[Node]) -> dict[Node, int]:

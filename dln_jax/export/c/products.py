@@ -35,7 +35,7 @@ def summed(body: Body, count: int, parts: int, add: Callable[[str, str], str]) -
     """
     whole = count // parts * parts if parts > 1 else 0
     if whole:
-        body.line(f"real part_[{parts}] = {{0}};")
+        body.declared("part_", "real", parts, "{0}")
         with body.block(f"for (int k_ = 0; k_ < {whole}; k_ += {parts})"):
             body.line(f"for (int c_ = 0; c_ < {parts}; ++c_) part_[c_] = {add('(k_ + c_)', 'part_[c_]')};")
         while parts := parts // 2:
@@ -78,7 +78,7 @@ def _parts(rows: int, columns: int, count: int) -> int:
 def _block(body: Body, rows: list[tuple[Node, int]], count: int, columns: int) -> None:
     """Writes rows of products with one matrix."""
     lanes, factor = _LANES[body.source.precision], rows[0][0].args[1]
-    body.spend(2 * len(rows) * count * columns)
+    body.spend(multiply_add=len(rows) * count * columns)
     start = 0
     while start < columns:
         width = min(_TILE, columns - start)
@@ -96,7 +96,7 @@ def _block(body: Body, rows: list[tuple[Node, int]], count: int, columns: int) -
             matrix = body.read(factor, at, names)
         with body.loops({"n_": tiles}):
             for number in range(len(rows)):
-                body.line(f"real s{number}_[{parts * wide}] = {{0}};")
+                body.declared(f"s{number}_", "real", parts * wide, "{0}")
             parted = {"p_": parts} if parts > 1 else {}
             with body.block(f"for (int k_ = 0; k_ < {count}; k_ += {parts})"), body.loops(parted):
                 for number, (node, row) in enumerate(rows):
@@ -121,13 +121,13 @@ def _many(body: Body, node: Node) -> None:
     """Writes a product of many rows, of a batch of matrices, or of integers or booleans."""
     a, b = node.args
     (batch, m, count), columns = a.shape, b.shape[2]
-    body.spend(2 * batch * m * count * columns * (node.dtype == "real"))
+    body.spend(multiply_add=batch * m * count * columns * (node.dtype == "real"))
     kind = C_TYPES[node.dtype]
     for start in range(0, columns, _TILE):
         width = min(_TILE, columns - start)
         i, j, k, c = np.meshgrid(*map(np.arange, (batch, m, count, width)), indexing="ij")
         with body.loops({"b_": batch, "r_": m}):
-            body.line(f"{kind} s_[{width}] = {{0}};")
+            body.declared("s_", node.dtype, width, "{0}")
             with body.loops({"k_": count}):
                 first = body.read(a, ((i * m + j) * count + k)[..., 0], ["b_", "r_", "k_"])
                 body.line(f"const {kind} x_ = {first};")
@@ -142,7 +142,7 @@ def _dots(body: Body, node: Node) -> None:
     """Writes a product with one column."""
     a, b = node.args
     batch, m, count = a.shape
-    body.spend(2 * batch * m * count)
+    body.spend(multiply_add=batch * m * count)
     parts = 2 * _LANES[body.source.precision]
     i, j, k = np.meshgrid(np.arange(batch), np.arange(m), np.arange(count), indexing="ij")
 

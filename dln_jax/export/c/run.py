@@ -26,6 +26,7 @@ def export_run(
     temperature: float | None = None,
     libm: bool = False,
     casadi: bool = False,
+    finite: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
     """Exports the model in a run's folder by `export_c`, and returns the paths of the files.
@@ -40,7 +41,7 @@ def export_run(
         iterations: Newton steps of the implicit midpoint rule.
         temperature: temperature of the C functions, °C, for a robot whose friction depends on it; default: the
             reference of its identification.
-        libm, casadi, overwrite: as for `export_c`.
+        libm, casadi, finite, overwrite: as for `export_c`.
 
     Raises:
         InputError: the folder holds no run, a function does not exist, a temperature that the model does not depend
@@ -59,5 +60,5 @@ def export_run(
     itself = casadi if functions else casadi and [function for function in chosen if not function.endswith(DERIVATIVES)]
     return export_c(
         chosen, directory, name=name, precision=precision, libm=libm, casadi=itself, overwrite=overwrite,
-        leave_out_large=functions is None,
+        finite=finite, leave_out_large=functions is None,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dln_jax.export.c.nodes import Node, is_all, is_constant, is_direct, is_uniform, zeros
-from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, TRANSCENDENTAL
+from dln_jax.export.c.operations import COMMUTATIVE, TRANSCENDENTAL
 from dln_jax.export.c.text import NUMPY_TYPES, UNSIGNED, limit
 
 if TYPE_CHECKING:
@@ -24,8 +24,16 @@ VECTOR_OF_FUNCTIONS = 4
 """Results with fewer elements are unrolled wherever their arguments lie; of functions of <math.h>, fewer than these."""
 _MOST_ZEROS = 16 * UNROLL_LIMIT
 """Largest number of elements, structural zeros included, of a result that is unrolled."""
+_MOST_SCALARS = 36
+"""Largest number of elements of an operation on scalars alone that is unrolled; larger ones are faster as loops."""
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "integer_div": 1, "or": 0, "xor": 0, "and": ...}
 """Number that leaves the other argument unchanged; for `and`, all bits of its kind are set."""
+
+_TRIVIAL = {
+    "mul": np.logical_or, "add": np.logical_or, "sub": np.logical_or, "div": lambda a, b: a, "neg": lambda a: a,
+    "select": lambda condition, a, b: a & b,
+}  # fmt: skip
+"""Where an operation on finite numbers costs nothing, from where its arguments are zero."""
 
 
 def neutral(op: str, dtype: str) -> Any:
@@ -45,13 +53,18 @@ def unrolls(program: "Program", op: str, args: tuple[Node, ...], shape: tuple[in
         return shape != () and size > 0
     if functions or size > _MOST_ZEROS:
         return False
-    if size <= UNROLL_LIMIT and any(arg.op == "gather" and not is_direct(arg) for arg in args):
+    scattered = (arg for arg in args if arg.op == "gather" and not is_direct(arg))
+    if size <= UNROLL_LIMIT and any(size <= _MOST_SCALARS or _is_mixed(arg) for arg in scattered):
         return True
-    trivial = np.zeros(size, bool)
-    if program.finite and OPERATIONS[op].dtype is None:
-        for arg in args:
-            trivial |= zeros(arg)
+    if not program.finite or op not in _TRIVIAL:
+        return False
+    trivial = _TRIVIAL[op](*(np.broadcast_to(zeros(arg), size) for arg in args))
     return bool(trivial.any()) and size - trivial.sum() <= UNROLL_LIMIT
+
+
+def _is_mixed(gather: Node) -> bool:
+    """Returns whether a gather reads arrays, which no loop can read without copying them."""
+    return any(arg.size > 1 or arg.op == "const" for arg in gather.args)
 
 
 def unrolls_product(program: "Program", a: Node, b: Node) -> bool:

@@ -58,6 +58,7 @@ def export_c(
     leave_out_large: bool = False,
     stack: int = STACK,
     finite: bool = False,
+    loop_bound: int | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
@@ -77,6 +78,8 @@ def export_c(
         stack: bytes of stack that a function may use; a plan over many steps may need more than the default.
         finite: arguments and intermediate results are finite numbers. Then 0 x = 0, and the zeros and ones of a
             derivative's structure cost nothing; a NaN or an infinity may not reach all results that it reaches in JAX.
+        loop_bound: bound on the iterations of a `while_loop` whose condition does not compare a counter with a
+            constant. A loop that needs more ends with NaN (integers: the largest; truth values: true).
         overwrite: replace existing files.
 
     Raises:
@@ -85,7 +88,7 @@ def export_c(
     """
     texts = source_files(
         functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi,
-        leave_out_large=leave_out_large, stack=stack, finite=finite,
+        leave_out_large=leave_out_large, stack=stack, finite=finite, loop_bound=loop_bound,
     )  # fmt: skip
     return write_exports(Path(directory), texts, overwrite=overwrite)
 
@@ -100,9 +103,10 @@ def source_files(
     leave_out_large: bool = False,
     stack: int = STACK,
     finite: bool = False,
+    loop_bound: int | None = None,
 ) -> dict[str, bytes]:
     """Returns the contents of the files by name; arguments as for `export_c`."""
-    require_positive(stack=stack)
+    require_positive(stack=stack, loop_bound=1 if loop_bound is None else loop_bound)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
     precision = precision or _precision(functions)
@@ -110,7 +114,7 @@ def source_files(
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     with computing_in(precision):
         source, signatures, texts, left_out = _exported(
-            functions, Source(precision, libm, finite), name, leave_out_large, stack
+            functions, Source(precision, libm, finite, loop_bound), name, leave_out_large, stack
         )
         version = importlib.metadata.version("dln-jax")
         written_by = f"Written by dln-jax {version}, C format {FORMAT}."
@@ -126,7 +130,7 @@ def source_files(
                 raise InputError("CasADi computes in double; export with precision f64")
             chosen = {key: functions[key] for key in signatures if casadi is True or key in casadi}
             source, text, left_out = external.external_functions(
-                name, chosen, Source("f64", libm, finite), stack=stack, leave_out=leave_out_large
+                name, chosen, Source("f64", libm, finite, loop_bound), stack=stack, leave_out=leave_out_large
             )
             title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
             files[f"{name}_casadi.c"] = title + preamble(source, name) + text
@@ -205,4 +209,4 @@ def _function(
     lines = "\n".join([*(f"    (void){leaf.name};" for leaf in leaves if leaf.name not in words), *body.lines])
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
-    return signature._replace(stack_bytes=body.bytes, operations=body.operations), text, total
+    return signature._replace(cost=body.cost), text, total

@@ -5,7 +5,7 @@ from math import prod
 
 from dln_jax.export.c import elementary, factorisations, kernels, operations
 from dln_jax.export.c.body import Source
-from dln_jax.export.c.interface import KINDS, Signature, declaration
+from dln_jax.export.c.interface import KINDS, Cost, Signature, declaration
 from dln_jax.export.c.text import PRECISIONS, comment, fill, table
 
 _PROMISES = """Functions of one state. Their workspace is on the stack, so they may run in several threads.
@@ -83,7 +83,7 @@ typedef long long int casadi_int;
     EXPORTED int f(const casadi_real **arg, casadi_real **res, casadi_int *integers, casadi_real *reals, int memory)
 """
 CASADI_FUNCTION = """
-/* {operations} floating-point operations, {bytes} bytes of stack */
+/* {cost} */
 static const char *const {symbol}_names[] = {{{names}}};
 static const casadi_int {symbol}_sparsities[][{length}] = {{{sparsities}}};
 DESCRIBED({symbol}, {inputs}, {outputs})
@@ -216,11 +216,20 @@ def header(
     declared = ""
     for key, signature in signatures.items():
         shapes = "".join(f"{leaf.name} {list(leaf.shape)}, " for leaf in signature.results if leaf.shape)
-        facts = f"{signature.operations} floating-point operations, {signature.stack_bytes} bytes of stack"
+        facts = stated(signature.cost)
         prototype = declaration(name, key, signature, PRECISIONS[precision][1])
         declared += f"\n/* {f'{shapes[:-2]}; ' if shapes else ''}{facts} */\n{prototype};\n"
     text = about(f"{name}.h", written_by, _PROMISES, left_out=left_out)
     return text + fill(_HEADER, precision, guard=f"{name.upper()}_H", declared=declared)
+
+
+def stated(cost: Cost) -> str:
+    """Returns the words for the most that a call takes."""
+    names = ("additions", "multiplications", "divisions", "square_roots", "functions")
+    kinds = [f"{name.replace('_', ' ')} {getattr(cost, name)}" for name in names if getattr(cost, name)]
+    kinds += [f"unbounded loops, of which one iteration is counted {cost.unbounded_loops}"] * bool(cost.unbounded_loops)
+    text = f"at most {cost.operations} floating-point operations, {cost.stack_bytes} bytes of stack"
+    return text + f"\n   ({', '.join(kinds)})" * bool(kinds)
 
 
 def about(*paragraphs: str, left_out: Sequence[str]) -> str:

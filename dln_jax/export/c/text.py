@@ -83,6 +83,11 @@ def limit(kind: str, *, upper: bool) -> Any:
     return limits.max if upper else limits.min
 
 
+def failure(kind: str) -> Any:
+    """Returns the value for a result that does not exist: NaN, the largest integer or true."""
+    return np.nan if kind == "real" else limit(kind, upper=True)
+
+
 def check_name(name: str, what: str = "name") -> str:
     """Returns a valid name in C, and raises InputError for any other."""
     taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|i|table|part)_?\d\w*|elementary_.*|.*_", name)

@@ -3,8 +3,9 @@
 Subjects: one-step (microseconds of single calls against test error, for every model and call path), throughput (batched
 states per second), scaling (cost against the number of joints), integrators (steps per second against energy drift and
 trajectory error), c (exported C: warm and cold calls, calls from Python, Jacobians, and Pinocchio where it is
-installed), and all of them. Compilation is timed apart, results are waited for, inputs vary, programs that are compared
-take turns, and medians count.
+installed), casadi (a Runge-Kutta step of the two-link arm with A and B, in our C and in CasADi's), and all of them.
+Compilation is timed apart, results are waited for, inputs vary, programs that are compared take turns, and medians
+count.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,7 +24,7 @@ from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import Case, Done, Findings, draw, measure
 from scripts.reports.rows import Row, conditions, markdown, publish
-from scripts.reports.speed import costs, exported_c, integrators, one_step
+from scripts.reports.speed import casadi_in_c, costs, exported_c, integrators, one_step
 
 SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Figure] | None]] = {
     "one-step": (one_step.measure, one_step.draw),
@@ -31,6 +32,7 @@ SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Fi
     "scaling": (costs.measure_scaling, None),
     "integrators": (integrators.measure, integrators.draw),
     "c": (exported_c.measure, exported_c.draw),
+    "casadi": (casadi_in_c.measure, None),
 }
 """Functions that measure (quick -> findings) and draw the subjects."""
 
@@ -39,7 +41,9 @@ SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Fi
 class Arguments(Folder):
     """What to measure, and for how long."""
 
-    subject: tyro.conf.Positional[Literal["one-step", "throughput", "scaling", "integrators", "c", "all"]] = "all"
+    subject: tyro.conf.Positional[Literal["one-step", "throughput", "scaling", "integrators", "c", "casadi", "all"]] = (
+        "all"
+    )
     """What is measured."""
     quick: bool = False
     """Fewer cases and repetitions: a look at whether everything runs, in two minutes."""
