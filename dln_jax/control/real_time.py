@@ -71,9 +71,10 @@ def prepare(
         for part in (slice(None, -1), slice(1, None))
     )
     states, u = followed(now, x, (plan.x[:-1], plan.u, jnp.zeros_like(plan.u), plan.K), _limited(problem))
-    last = followed(later, states[-1], (states[-1:], u[-1:], 0 * u[-1:], plan.K[-1:]), _limited(problem))[0]
+    knot = jax.tree.map(lambda rows: rows[-1], knots_of(later)[0])
+    last = problem.step(states[-1], u[-1], *knot)
     moved = plan._replace(
-        u=jnp.concatenate([u[1:], u[-1:]]), x=jnp.concatenate([states[1:], last[1:]]),
+        u=jnp.concatenate([u[1:], u[-1:]]), x=jnp.concatenate([states[1:], last[None]]),
         K=jnp.concatenate([plan.K[1:], plan.K[-1:]]),
     )  # fmt: skip
     for _ in range(iterations):
