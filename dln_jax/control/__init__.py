@@ -12,6 +12,7 @@ from dln_jax.control.closed_loop import (
 )
 from dln_jax.control.observers import with_differences, with_prediction
 from dln_jax.control.plan_limits import free_time, with_limits_of, worst_violation
+from dln_jax.control.real_time import feedback, improve, mpc, prepare
 from dln_jax.control.regulators import (
     Region,
     Regulator,
@@ -59,7 +60,7 @@ from dln_jax.control.tracking import (
     trusted,
     without_friction,
 )
-from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan, improve, mpc
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan
 
 __all__ = [
     "ClosedLoopRun",
@@ -84,6 +85,7 @@ __all__ = [
     "computed_torque",
     "energy_shaping",
     "error",
+    "feedback",
     "feed_forward",
     "field_of",
     "first_plan",
@@ -104,6 +106,7 @@ __all__ = [
     "parts_of",
     "passive_energy",
     "region_of_attraction",
+    "prepare",
     "regulated",
     "sampled_lqr",
     "saturated",

@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from dln_jax.control.riccati import Horizon
-from dln_jax.control.trajectories import TrajectoryProblem
+from dln_jax.control.trajectories import TrajectoryProblem, knots_of
 
 Rows = Callable[..., Array]
 
@@ -72,21 +72,26 @@ def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
 
 
 def constraints(problem: TrajectoryProblem, n: int, m: int) -> tuple[Rows, Rows, Callable[[int], Kinds]]:
-    """Returns (x, u) -> rows [P] of a step, x -> rows [E] of the end, and N -> the masks of all M rows."""
+    """Returns (x, u) -> rows [P] of a step, x -> rows [E] of the end, and N -> the masks of all M rows.
+
+    Rows of steps are those of limits of the controls, `path`, limits of the states and `states`.
+    """
     of_u, finite_u = _beyond(problem.lower, problem.upper)
     of_x, finite_x = _beyond(problem.lower_x, problem.upper_x)
+    _, last = knots_of(problem)
 
-    def on_state(x: Array) -> list[Array]:
-        return [of_x(x), *([problem.states(x)] if problem.states else [])]
+    def on_state(x: Array, *knot: Any) -> list[Array]:
+        return [of_x(x), *([problem.states(x, *knot)] if problem.states else [])]
 
-    def step_rows(x: Array, u: Array) -> Array:
-        return jnp.concatenate([of_u(u), *([problem.path(x, u)] if problem.path else []), *on_state(x)])
+    def step_rows(x: Array, u: Array, *knot: Any) -> Array:
+        path = [problem.path(x, u, *knot)] if problem.path else []
+        return jnp.concatenate([of_u(u), *path, *on_state(x, *knot)])
 
-    def end_rows(x: Array) -> Array:
-        return jnp.concatenate([*on_state(x), *([problem.end_below(x)] if problem.end_below else [])])
+    def end_rows(x: Array, *knot: Any) -> Array:
+        return jnp.concatenate([*on_state(x, *knot), *([problem.end_below(x, *knot)] if problem.end_below else [])])
 
     def size(function: Any, *shapes: int) -> int:
-        return jax.eval_shape(function, *(jnp.zeros(shape) for shape in shapes)).shape[0] if function else 0
+        return jax.eval_shape(function, *(jnp.zeros(shape) for shape in shapes), *last).shape[0] if function else 0
 
     def kinds(steps: int) -> Kinds:
         limits_u, limits_x = finite_u(m), finite_x(n)
@@ -117,42 +122,47 @@ def conditions(problem: TrajectoryProblem, shape: tuple[int, int, int], scale: A
     """Returns the functions for N steps of n states and m controls; Gauss-Newton unless `exact`: costs curve alone."""
     steps, n, m = shape
     step_rows, end_rows, kinds = constraints(problem, n, m)
-    equal = problem.end if problem.end is not None else (lambda x: jnp.zeros(0, x.dtype))
+    equal = problem.end if problem.end is not None else (lambda x, *knot: jnp.zeros(0, x.dtype))
+    knots, last = knots_of(problem)
 
     def of_both(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda xu, *rest: function(xu[:n], xu[n:], *rest)
 
-    def cost(x: Array, u: Array) -> Array:
-        return scale * problem.cost(x, u)
+    def cost(x: Array, u: Array, *knot: Any) -> Array:
+        return scale * problem.cost(x, u, *knot)
 
     def end_cost(x: Array) -> Array:
-        return scale * problem.final_cost(x)
+        return scale * problem.final_cost(x, *last)
 
     def values(x: Array, u: Array) -> Values:
-        rows = jax.vmap(step_rows)(x[:-1], u)
-        defects = jax.vmap(problem.step)(x[:-1], u) - x[1:]
-        total = jnp.sum(jax.vmap(cost)(x[:-1], u)) + end_cost(x[-1])
-        return Values(total, jnp.concatenate([rows.ravel(), end_rows(x[-1])]), defects, equal(x[-1]))
+        rows = jax.vmap(step_rows)(x[:-1], u, *knots)
+        defects = jax.vmap(problem.step)(x[:-1], u, *knots) - x[1:]
+        total = jnp.sum(jax.vmap(cost)(x[:-1], u, *knots)) + end_cost(x[-1])
+        return Values(total, jnp.concatenate([rows.ravel(), end_rows(x[-1], *last)]), defects, equal(x[-1], *last))
 
     def slopes(x: Array, u: Array) -> Slopes:
         both = jnp.concatenate([x[:-1], u], axis=1)
-        return Slopes(
-            jax.vmap(jax.jacfwd(of_both(problem.step)))(both), jax.vmap(jax.grad(of_both(cost)))(both),
-            jax.grad(end_cost)(x[-1]), jax.vmap(jax.jacfwd(of_both(step_rows)))(both), jax.jacfwd(end_rows)(x[-1]),
-            jax.jacfwd(equal)(x[-1]),
-        )  # fmt: skip
+        steps, cost_slopes, rows = (
+            jax.vmap(derivative(of_both(function)))(both, *knots)
+            for derivative, function in ((jax.jacfwd, problem.step), (jax.grad, cost), (jax.jacfwd, step_rows))
+        )
+        of_end = jax.grad(end_cost)(x[-1]), jax.jacfwd(end_rows)(x[-1], *last), jax.jacfwd(equal)(x[-1], *last)
+        return Slopes(steps, cost_slopes, of_end[0], rows, *of_end[1:])
 
-    def of_stage(x: Array, u: Array, price: Array, z: Array) -> Array:
-        return cost(x, u) + price @ problem.step(x, u) + z @ step_rows(x, u) if exact else cost(x, u)
+    def of_stage(x: Array, u: Array, price: Array, z: Array, *knot: Any) -> Array:
+        if not exact:
+            return cost(x, u, *knot)
+        return cost(x, u, *knot) + price @ problem.step(x, u, *knot) + z @ step_rows(x, u, *knot)
 
     def of_end(x: Array, z: Array, nu: Array) -> Array:
-        return end_cost(x) + z @ end_rows(x) + nu @ equal(x) if exact else end_cost(x)
+        return end_cost(x) + z @ end_rows(x, *last) + nu @ equal(x, *last) if exact else end_cost(x)
 
     def curvatures(x: Array, u: Array, prices: Array, z: Array, nu: Array) -> tuple[Array, Array]:
         both, (by_step, at_end) = jnp.concatenate([x[:-1], u], axis=1), split(z, steps, end_size)
-        return jax.vmap(jax.hessian(of_both(of_stage)))(both, prices, by_step), jax.hessian(of_end)(x[-1], at_end, nu)
+        of_steps = jax.vmap(jax.hessian(of_both(of_stage)))(both, prices, by_step, *knots)
+        return of_steps, jax.hessian(of_end)(x[-1], at_end, nu)
 
-    end_size = jax.eval_shape(end_rows, jnp.zeros(n)).shape[0]
+    end_size = jax.eval_shape(end_rows, jnp.zeros(n), *last).shape[0]
     return Conditions(values, slopes, curvatures, kinds(steps))
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.trajectories import Plan, TrajectoryProblem
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, knots_of
 from dln_jax.data.robots import Robot
 from dln_jax.types import InputError, Scalar, require_positive
 
@@ -69,20 +69,25 @@ def worst_violation(problem: TrajectoryProblem, plan: Plan, *, tolerance: float 
         tolerance: largest violation that counts as none.
     """
 
+    knots, last = knots_of(problem)
+
     def excesses(x: Array, u: Array) -> dict[str, Array]:
+        def at_knots(function: Callable[..., Array]) -> Array:
+            return jnp.concatenate([jax.vmap(function)(x[:-1], *knots), function(x[-1], *last)[None]])
+
         rows = {
             "the lower limit of control {i} at step {k}": problem.lower - u,
             "the upper limit of control {i} at step {k}": u - problem.upper,
             "the lower limit of state {i} at knot {k}": (problem.lower_x - x).at[0].set(-jnp.inf),
             "the upper limit of state {i} at knot {k}": (x - problem.upper_x).at[0].set(-jnp.inf),
-            "the dynamics of state {i} at step {k}": jnp.abs(jax.vmap(problem.step)(x[:-1], u) - x[1:]),
+            "the dynamics of state {i} at step {k}": jnp.abs(jax.vmap(problem.step)(x[:-1], u, *knots) - x[1:]),
         }
         optional: list[tuple[str, Any, Callable[[Any], Array]]] = [
-            ("path constraint {i} at step {k}", problem.path, lambda path: jax.vmap(path)(x[:-1], u)),
+            ("path constraint {i} at step {k}", problem.path, lambda path: jax.vmap(path)(x[:-1], u, *knots)),
             ("constraint {i} on the states at knot {k}", problem.states,
-             lambda states: jax.vmap(states)(x).at[0].set(-jnp.inf)),
-            ("inequality {i} of the end", problem.end_below, lambda below: below(x[-1])[None]),
-            ("equation {i} of the end", problem.end, lambda end: jnp.abs(end(x[-1]))[None]),
+             lambda states: at_knots(states).at[0].set(-jnp.inf)),
+            ("inequality {i} of the end", problem.end_below, lambda below: below(x[-1], *last)[None]),
+            ("equation {i} of the end", problem.end, lambda end: jnp.abs(end(x[-1], *last))[None]),
         ]  # fmt: skip
         return rows | {name: rows_of(function) for name, function, rows_of in optional if function is not None}
 

@@ -51,10 +51,8 @@ def least_cost(horizon: Horizon, free: Any = None) -> HorizonSolution:
         g, S, convex = value
         F, missed, gradient, curvature = stage
         q, Q = gradient + F.T @ (g + S @ missed), curvature + F.T @ S @ F
-        both, definite = _definite_solve(Q[n:, n:], jnp.concatenate([q[n:, None], Q[n:, :n]], axis=1))
-        k, K = -both[:, 0], -both[:, 1:]
-        before = Q[:n, :n] + Q[:n, n:] @ K
-        return (q[:n] + Q[:n, n:] @ k, (before + before.T) / 2, convex & definite), (k, K, g, S)
+        k, K, before, definite = eliminated(n, q, Q)
+        return (*before, convex & definite), (k, K, g, S)
 
     end = horizon.end_gradient, horizon.end_curvature, jnp.asarray(True)
     (g0, S0, convex), (k, K, g, S) = jax.lax.scan(back, end, horizon[:4], reverse=True)
@@ -74,6 +72,27 @@ def least_cost(horizon: Horizon, free: Any = None) -> HorizonSolution:
     _, (dx, du) = jax.lax.scan(forth, start, (horizon.slopes, horizon.missed, k, K))
     multipliers = g + jnp.einsum("kij,kj->ki", S, dx)
     return HorizonSolution(jnp.concatenate([start[None], dx]), du, K, multipliers, convex)
+
+
+def eliminated(n: int, q: Array, Q: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
+    """Eliminates the controls from q·(dx, du) + ½ (dx, du)ᵀ Q (dx, du), with n states.
+
+    Returns k and K of du = k + K dx, gradient and curvature of the rest, and whether there is one minimum.
+    """
+    both, definite = _definite_solve(Q[n:, n:], jnp.concatenate([q[n:, None], Q[n:, :n]], axis=1))
+    k, K = -both[:, 0], -both[:, 1:]
+    rest = Q[:n, :n] + Q[:n, n:] @ K
+    return k, K, (q[:n] + Q[:n, n:] @ k, (rest + rest.T) / 2), definite
+
+
+def made_convex(R: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Returns R plus a multiple of the identity: zero where R is positive definite, else enough by Gershgorin's discs."""
+    if len(R) == 1:
+        return jnp.abs(R)
+    diagonal = jnp.diagonal(R)
+    lowest = jnp.min(diagonal + jnp.abs(diagonal) - jnp.sum(jnp.abs(R), axis=1))
+    shift = jnp.where(jnp.isfinite(cholesky(R)).all(), 0.0, 2 * jnp.maximum(-lowest, 0.0))
+    return R + shift * jnp.eye(len(R), dtype=R.dtype)
 
 
 def _definite_solve(matrix: Array, b: Array) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from dln_jax.control.barrier import Iterate
 from dln_jax.control.conditions import Conditions, conditions
 from dln_jax.control.interior_point import Search, search, straight
 from dln_jax.control.riccati import HorizonSolution
-from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, first_plan
+from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, first_plan, followed, knots_of
 from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, require_positive
 
@@ -152,15 +152,9 @@ def _single(problem: TrajectoryProblem, x: Any, u: Any, iterations: int, toleran
 
     def motion(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
         """The motion under the gains of the step."""
-
-        def step(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
-            about, u, dx, du, K = stage
-            u = u + length * (du - K @ dx) + K @ (x - about)
-            return problem.step(x, u), (x, u)
-
+        k = length * (change.du - jnp.einsum("kij,kj->ki", change.K, change.dx[:-1]))
         first = at.x[0] + length * change.dx[0]
-        last, (x, u) = jax.lax.scan(step, first, (at.x[:-1], at.u, change.dx[:-1], change.du, change.K))
-        return jnp.concatenate([x, last[None]]), u
+        return followed(problem, first, (at.x[:-1], at.u, k, change.K), lambda u, _: u)
 
     return _solved(problem, plan.x, plan.u, motion, iterations, tolerance, exact)
 
@@ -170,10 +164,10 @@ def _solved(
     exact: bool,
 ) -> Shooting:  # fmt: skip
     require_positive(iterations=iterations, tolerance=tolerance)
-    shape = len(u), x.shape[1], u.shape[1]
+    shape, (knots, last_knot) = (len(u), x.shape[1], u.shape[1]), knots_of(problem)
 
     def cost(x: Array, u: Array) -> Array:
-        return jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1])
+        return jnp.sum(jax.vmap(problem.cost)(x[:-1], u, *knots)) + problem.final_cost(x[-1], *last_knot)
 
     gradients = jax.grad(cost, argnums=(0, 1))(x, u)
     scale = jnp.maximum(jnp.max(jnp.abs(jnp.concatenate([g.ravel() for g in gradients]))) / LARGEST_GRADIENT, 1.0)
@@ -230,7 +224,8 @@ def _require_start(problem: TrajectoryProblem, x: Array) -> None:
         for i in np.flatnonzero(fixed & (sign * (np.asarray(x) - limit) > 0))[:1]:
             raise InputError(f"state {i} starts at {x[i]:.6g}, {word} limit of {limit[i]:.6g}; start inside the limits")
     if problem.states is not None and fixed.all():
-        for i, excess in enumerate(np.asarray(jax.jit(problem.states)(x))):
+        first = jax.tree.map(lambda rows: rows[0], knots_of(problem)[0])
+        for i, excess in enumerate(np.asarray(jax.jit(problem.states)(x, *first))):
             if excess > 0:
                 raise InputError(f"constraint {i} on the states is {excess:.6g} at the start; expected zero or less")
 

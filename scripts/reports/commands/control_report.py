@@ -25,6 +25,8 @@ from scripts.reports.control import (
     mpc,
     planned,
     plans,
+    rail,
+    real_time,
     robustness,
     swing_ups,
     tracking,
@@ -51,6 +53,8 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
     "laws/in-c": laws_in_c.laws,
     "mpc/cart-pole": mpc.cart_pole_report,
     "plans/beside-ipopt": plans.plans,
+    "realtime/cart-pole": real_time.cart_pole_report,
+    "rail/cart-pole": rail.on_a_rail,
 }
 """Functions quick -> findings, by SUBJECT/NAME."""
 SUBJECTS = tuple(dict.fromkeys(name.split("/")[0] for name in MEASURES))

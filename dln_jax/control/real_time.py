@@ -1,0 +1,264 @@
+"""Model predictive control with constraints in real time: one iteration per sample, with a fixed number of operations.
+
+At a sample, the control follows from the measured state by the gains of the plan: `feedback`, a product of a matrix and
+a vector. Then, until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and
+improves it by an iteration of single shooting (the split is that of Diehl, Bock and Schlöder 2005). The iteration solves
+a smooth problem, in which limits of the controls are barriers and all other constraints c <= 0 are prices:
+
+    -μ log(-c)   and   min_t  w_1 t - μ log t - μ log(t - c)  +  w_2 max(c, 0)² / 2
+
+Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick 1968):
+as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. It has a closed form:
+with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So there is a plan at every
+sample, it needs no memory of multipliers, and it says whether it violates a constraint.
+
+An iteration is that of a Gauss-Newton regulator (Li and Todorov 2004) by Riccati's recursion. It takes the best of some
+step lengths, each of which is a motion, and raises the damping of the controls' Hessian if none lowers the cost.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from dln_jax.control.riccati import eliminated, made_convex
+from dln_jax.control.state_space import where_finite
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, followed, knots_of
+from dln_jax.solvers.ending import Ending
+from dln_jax.types import InputError, require_positive
+
+STEP_LENGTHS = (1.0, 0.3)
+BARRIER = 1e-3
+"""Default μ, in units of the cost: a control whose limit is worth p per unit stays μ / p away from it."""
+PRICES = 1e3, 1e3
+"""Prices (w_1, w_2) of the constraints of problems that state none."""
+MIN_DAMPING, MAX_DAMPING = 1e-9, 1e9
+TO_BOUNDARY, CLOSEST = 0.99, 1e-5
+"""Share of the distance to a limit that a control may go in an iteration, and its least distance from finite limits
+relative to their distance."""
+VIOLATED = 5.0
+"""Excess in units of δ that counts as a violation: the multiplier is then above nine tenths of the price."""
+
+
+def feedback(problem: TrajectoryProblem, plan: Plan, x: Array) -> Array:
+    """Returns the control [m] of the plan at a measured state [n] near its first; NaN if a state is not finite."""
+    return where_finite(_limited(problem)(plan.u[0] + plan.K[0] @ (x - plan.x[0]), plan.u[0]), x)
+
+
+def prepare(
+    problem: TrajectoryProblem, plan: Plan, x: Array, *, barrier: float = BARRIER, iterations: int = 1,
+    step_lengths: Any = STEP_LENGTHS,
+) -> Plan:  # fmt: skip
+    """Returns the plan for the next sample, after `feedback` at a state [n] was applied.
+
+    Args:
+        problem: over the horizon; its knots, if any, have N+2 rows, from this sample to the end of the next horizon.
+        plan: that gave the control.
+        x: measured state.
+        barrier, step_lengths: as for `improve`.
+        iterations: number of iterations.
+
+    Raises:
+        InputError: as for `improve`.
+    """
+    require_positive(iterations=iterations)
+    now, later = (
+        problem._replace(knots=jax.tree.map(lambda rows, part=part: rows[part], problem.knots))
+        for part in (slice(None, -1), slice(1, None))
+    )
+    states, u = followed(now, x, (plan.x[:-1], plan.u, jnp.zeros_like(plan.u), plan.K), _limited(problem))
+    knot = jax.tree.map(lambda rows: rows[-1], knots_of(later)[0])
+    last = problem.step(states[-1], u[-1], *knot)
+    moved = plan._replace(
+        u=jnp.concatenate([u[1:], u[-1:]]), x=jnp.concatenate([states[1:], last[None]]),
+        K=jnp.concatenate([plan.K[1:], plan.K[-1:]]),
+    )  # fmt: skip
+    for _ in range(iterations):
+        moved = improve(later, moved, barrier=barrier, step_lengths=step_lengths)
+    return moved
+
+
+def mpc(
+    problem: TrajectoryProblem, *, barrier: float = BARRIER, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
+) -> Callable[..., tuple[Array, Plan]]:
+    """Model predictive control: (state, plan) -> (control, plan of the next sample), by `feedback`, then `prepare`.
+
+    Start with a plan of `optimise`, `shoot` or `first_plan`, after some calls of `improve`. A problem with knots takes
+    them as a third argument, N+2 rows from the sample's on.
+
+    Args:
+        problem: over the horizon.
+        barrier, step_lengths: as for `improve`.
+        iterations: per call.
+    """
+
+    def act(x: Array, plan: Plan, knots: Any = None) -> tuple[Array, Plan]:
+        now = problem if knots is None else problem._replace(knots=knots)
+        after = prepare(now, plan, x, barrier=barrier, iterations=iterations, step_lengths=step_lengths)
+        return feedback(problem, plan, x), after
+
+    return act
+
+
+def improve(
+    problem: TrajectoryProblem, plan: Plan, *, barrier: float = BARRIER, step_lengths: Any = STEP_LENGTHS
+) -> Plan:
+    """Runs one iteration from the plan's first state; the cost, which includes barriers and prices, never rises.
+
+    Limits of the states have prices too: the problem's `soft` or 1e3, like all its constraints but the limits of the
+    controls. The plan's `ending` is `VIOLATED` if the plan violates a constraint (`worst_violation` says which),
+    `NOT_FINITE` if its cost is not finite, and otherwise undecided.
+
+    Args:
+        problem: over the horizon.
+        plan: such as one of `optimise`, `shoot` or `first_plan`.
+        barrier: μ, in units of the cost.
+        step_lengths: tried in an iteration [L].
+
+    Raises:
+        InputError: a first state with free components, or a barrier that is not positive.
+    """
+    require_positive(barrier=barrier)
+    if problem.free is not None:
+        raise InputError("a component of the first state is free, but in real time it is measured; leave `free` out")
+    n, m = plan.x.shape[1], plan.u.shape[1]
+    at_step, at_end = _smooth(problem, n, m, barrier)
+    (knots, last), limited = knots_of(problem), _limited(problem)
+    u = limited(plan.u, plan.u)
+
+    def total(x: Array, u: Array) -> tuple[Array, Array]:
+        """Cost with barriers and prices, and the largest excess."""
+        costs, excesses = jax.vmap(at_step.cost)(jnp.concatenate([x[:-1], u], axis=1), *knots)
+        end_cost, end_excess = at_end.cost(x[-1], *last)
+        return jnp.sum(costs) + end_cost, jnp.maximum(jnp.max(excesses), end_excess)
+
+    def back(value: tuple[Array, Array], stage: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        (g, S), (F, gradient, curvature) = value, stage
+        q, Q = gradient + F.T @ g, curvature + F.T @ S @ F
+        R = Q[n:, n:] + plan.damping * jnp.mean(jnp.abs(jnp.diagonal(Q[n:, n:]))) * jnp.eye(m, dtype=Q.dtype)
+        k, K, before, _ = eliminated(n, q, Q.at[n:, n:].set(made_convex(R)))
+        return before, (k, K)
+
+    def trial(length: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+        states, controls = followed(problem, plan.x[0], (plan.x[:-1], u, length * k, K), limited)
+        return states, controls, total(states, controls)
+
+    both = jnp.concatenate([plan.x[:-1], u], axis=1)
+    F = jax.vmap(jax.jacfwd(lambda xu, *knot: problem.step(xu[:n], xu[n:], *knot)))(both, *knots)
+    expansions = jax.vmap(at_step.expansion)(both, *knots)
+    _, (k, K) = jax.lax.scan(back, at_end.expansion(plan.x[-1], *last), (F, *expansions), reverse=True)
+    states, controls, (costs, excesses) = jax.vmap(trial)(jnp.asarray(step_lengths, u.dtype))
+    costs, (now, excess) = jnp.where(jnp.isfinite(costs), costs, jnp.inf), total(plan.x, u)
+    best = jnp.argmin(costs)
+    better = (costs[best] < now) | (jnp.isfinite(costs[best]) & ~jnp.isfinite(now))
+    x, u, cost, excess = (
+        jnp.where(better, new[best], old)
+        for new, old in ((states, plan.x), (controls, u), (costs, now), (excesses, excess))
+    )
+    damping = jnp.clip(jnp.where(better, plan.damping / 10, plan.damping * 10), MIN_DAMPING, MAX_DAMPING)
+    violated = jnp.where(excess > VIOLATED * _width(problem, barrier), Ending.VIOLATED, Ending.UNDECIDED)
+    return Plan(u, x, K, cost, damping, better, jnp.where(jnp.isfinite(cost), violated, Ending.NOT_FINITE))
+
+
+class _Smooth(NamedTuple):
+    """Cost of a step or of the end with its barriers and prices, of y = (x, u) or x."""
+
+    cost: Callable[..., tuple[Array, Array]]
+    """(y, knot) -> cost, and largest row of the constraints."""
+    expansion: Callable[..., tuple[Array, Array]]
+    """(y, knot) -> gradient, and Hessian of Gauss and Newton."""
+
+
+def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: float) -> tuple[_Smooth, _Smooth]:
+    """Returns the cost of a step and that of the end."""
+    w_1, w_2 = PRICES if problem.soft is None else problem.soft
+    width = _width(problem, barrier)
+
+    def wall(c: Array) -> tuple[Array, Array, Array]:
+        return -barrier * jnp.log(-c), -barrier / c, barrier / c**2
+
+    def price(c: Array) -> tuple[Array, Array, Array]:
+        beyond, r = jnp.maximum(c, 0.0), jnp.sqrt(c**2 + width**2)
+        # r - c without cancellation: (r + c) (r - c) = δ².
+        s = (width + jnp.where(c > 0, width**2 / (r + jnp.abs(c)), r + jnp.abs(c))) / 2
+        value = w_1 * (s + c) - barrier * jnp.log(s * (s + c)) + w_2 / 2 * beyond**2
+        return value, barrier / s + w_2 * beyond, barrier / s**2 * (1 - c / r) / 2 + jnp.where(c > 0, w_2, 0.0)
+
+    def priced(cost: Callable[..., Any], rows: list[Callable[..., Array]], limits: list[tuple[Any, ...]]) -> _Smooth:
+        # Derivatives of limits are constant, and each has one element.
+        boxes = [(law, signs, bounds) for law, signs, bounds in limits if len(bounds)]
+
+        def every(y: Array, *knot: Any) -> Array:
+            return jnp.concatenate([row(y, *knot) for row in rows])
+
+        def whole(y: Array, *knot: Any) -> tuple[Array, Array]:
+            terms = [(law, signs @ y - bounds) for law, signs, bounds in boxes]
+            terms += [(price, every(y, *knot))] if rows else []
+            worst = [jnp.max(c) for law, c in terms if law is price]
+            value = cost(y, *knot) + sum(jnp.sum(law(c)[0]) for law, c in terms)
+            return value, jnp.max(jnp.stack(worst)) if worst else jnp.full((), -jnp.inf, y.dtype)
+
+        def expansion(y: Array, *knot: Any) -> tuple[Array, Array]:
+            gradient, hessian = jax.grad(cost)(y, *knot), jax.hessian(cost)(y, *knot)
+            for law, signs, bounds in boxes:
+                _, slope, curvature = law(signs @ y - bounds)
+                gradient, hessian = gradient + signs.T @ slope, hessian + jnp.diag(jnp.abs(signs).T @ curvature)
+            if rows:
+                _, slope, curvature = price(every(y, *knot))
+                J = jax.jacfwd(every)(y, *knot)
+                gradient, hessian = gradient + J.T @ slope, hessian + J.T @ (curvature[:, None] * J)
+            return gradient, hessian
+
+        return _Smooth(whole, expansion)
+
+    def of_state(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda y, *knot: function(y[:n], *knot)
+
+    def of_both(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda y, *knot: function(y[:n], y[n:], *knot)
+
+    states = [of_state(problem.states)] if problem.states else []
+    path = [of_both(problem.path)] if problem.path else []
+    on_end = [problem.end_below] if problem.end_below else []
+    if end := problem.end:
+        on_end += [end, lambda x, *knot: -end(x, *knot)]
+    signs, bounds = _limits(problem.lower_x, problem.upper_x, n)
+    signs_u, bounds_u = _limits(problem.lower, problem.upper, m)
+    on_step = [
+        (price, np.pad(signs, ((0, 0), (0, m))), bounds), (wall, np.pad(signs_u, ((0, 0), (n, 0))), bounds_u)
+    ]  # fmt: skip
+    return (
+        priced(of_both(problem.cost), path + states, on_step),
+        priced(problem.final_cost, states + on_end, [(price, signs, bounds)]),
+    )
+
+
+def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array]:
+    """Returns signs [r, size] and bounds [r] of the finite limits as rows signs y - bounds; traced ones count as finite."""
+    signs, bounds = [], []
+    for sign, limit in ((-1.0, lower), (1.0, upper)):
+        known = np.ones(size, bool) if isinstance(limit, Tracer) else np.isfinite(np.broadcast_to(limit, size))
+        signs.append(sign * np.eye(size)[known])
+        bounds.append(sign * jnp.broadcast_to(jnp.asarray(limit, float), size)[np.flatnonzero(known)])
+    return np.concatenate(signs), jnp.concatenate(bounds)
+
+
+def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
+    """Returns (control, control before) -> control within its limits, and on the way to them."""
+    lower, upper = (jnp.asarray(limit, float) for limit in (problem.lower, problem.upper))
+    closest = CLOSEST * jnp.where(jnp.isfinite(upper - lower), upper - lower, 1.0)
+
+    def limited(u: Array, before: Array) -> Array:
+        low = jnp.maximum(lower + closest, before - TO_BOUNDARY * (before - lower))
+        return jnp.clip(u, low, jnp.minimum(upper - closest, before + TO_BOUNDARY * (upper - before)))
+
+    return limited
+
+
+def _width(problem: TrajectoryProblem, barrier: float) -> float:
+    """δ, over which a price rises."""
+    return 2 * barrier / (PRICES if problem.soft is None else problem.soft)[0]
