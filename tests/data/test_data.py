@@ -244,8 +244,8 @@ def test_temperature_is_one_for_all_joints_or_one_for_each():
     log = {"t": np.arange(3.0), "q": np.zeros((3, 2)), "trajectory": np.zeros(3, int)}
     common = schema.from_arrays({**log, "temperature": np.array([20.0, 21, 22])})
     np.testing.assert_array_equal(common.temperature, [[20, 20], [21, 21], [22, 22]])
-    own = schema.from_arrays({**log, "temperature": common.temperature + [0.0, 5.0]})
-    np.testing.assert_array_equal(select_samples(own, [2]).temperature, [[22, 27]])
+    own = schema.from_arrays({**log, "temperature": common.temperature + np.array([0.0, 5.0])})
+    np.testing.assert_array_equal(select_samples(own, np.array([2])).temperature, [[22, 27]])
     for wrong, message in (
         (np.zeros((3, 3)), r"temperature has shape \(3, 3\)"),
         (np.full(3, np.nan), "temperature has 3 NaN"),
