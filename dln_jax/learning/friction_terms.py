@@ -44,7 +44,7 @@ MOST_ROUNDS = 5
 WARMER = 10.0
 """Unit of temperature in the nonlinear unknowns, K."""
 LEAST_WARMTH = 1.0
-"""Least standard deviation of the temperature from which its effect is fitted, K."""
+"""Least standard deviation of every joint's temperature from which its effect is fitted, K."""
 
 
 class Terms(NamedTuple):
@@ -101,13 +101,15 @@ def reference_temperature(data: Trajectories) -> float:
     """Mean temperature of a log to 0.1 °C.
 
     Raises:
-        InputError: the log has no temperature, or one that hardly varies.
+        InputError: the log has no temperature, or that of a joint hardly varies.
     """
     if data.temperature is None:
         raise InputError("the data have no temperature, on which friction is to depend; add it (°C), or leave that out")
-    if not data.temperature.std() >= LEAST_WARMTH:
+    deviations = data.temperature.std(axis=0)
+    if not deviations.min() >= LEAST_WARMTH:
+        joint, deviation = int(np.argmin(deviations)) + 1, deviations.min()
         raise InputError(
-            f"the temperature has a standard deviation of {data.temperature.std():.2g} K; expected at least "
+            f"the temperature of joint {joint} has a standard deviation of {deviation:.2g} K; expected at least "
             f"{LEAST_WARMTH:g} K: record the warm robot too"
         )
     return round(float(data.temperature.mean()), 1)

@@ -145,3 +145,11 @@ def test_a_huge_file_is_refused_before_it_is_read(load, monkeypatch):
     monkeypatch.setattr(csv_tables, "MOST_BYTES", 40)
     with pytest.raises(InputError, match="store it as npz"):
         load(HEADER + ROWS)
+
+
+def test_temperatures_are_one_column_or_one_for_each_joint(load):
+    rows = "0,1,2,20,30\n0.1,5,6,21,31\n0.2,9,10,22,32\n"
+    each_joint = load("t [s],q1 [rad],q2 [rad],temperature1 [°C],temperature2_C\n" + rows)
+    np.testing.assert_array_equal(each_joint.temperature, [[20, 30], [21, 31], [22, 32]])
+    common = load("t [s],q1 [rad],q2 [rad],temperature [C],other\n" + rows)
+    np.testing.assert_array_equal(common.temperature, [[20, 20], [21, 21], [22, 22]])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.data.schema import time_derivative
-from dln_jax.data.splits import PER_SAMPLE, merged, select, split
+from dln_jax.data.splits import PER_SAMPLE, merged, select, select_samples, split
 from dln_jax.data.stated_needs import needs_from_json
+from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import double_pendulum, two_link_arm
 from dln_jax.scenes.poles import cart_pole
@@ -238,3 +238,18 @@ def test_free_swings_keep_or_lose_energy(friction):
 def test_boxes_of_no_size_are_refused(bound):
     with pytest.raises(InputError, match=f"{next(iter(bound))} is (0|nan)"):
         generators.uniform(two_link_arm(), **bound)
+
+
+def test_temperature_is_one_for_all_joints_or_one_for_each():
+    log = {"t": np.arange(3.0), "q": np.zeros((3, 2)), "trajectory": np.zeros(3, int)}
+    common = schema.from_arrays({**log, "temperature": np.array([20.0, 21, 22])})
+    np.testing.assert_array_equal(common.temperature, [[20, 20], [21, 21], [22, 22]])
+    own = schema.from_arrays({**log, "temperature": common.temperature + np.array([0.0, 5.0])})
+    np.testing.assert_array_equal(select_samples(own, np.array([2])).temperature, [[22, 27]])
+    for wrong, message in (
+        (np.zeros((3, 3)), r"temperature has shape \(3, 3\)"),
+        (np.full(3, np.nan), "temperature has 3 NaN"),
+        (np.full(3, -300.0), "below absolute zero"),
+    ):
+        with pytest.raises(InputError, match=message):
+            schema.from_arrays({**log, "temperature": wrong})

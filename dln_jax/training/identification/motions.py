@@ -132,12 +132,12 @@ def chosen_window(
 ) -> Chosen:
     """Chooses by the mean valid prediction time of inner held-out trajectories, or blocks of time of a single one.
 
-    A length is left out if its motions are not finite.
+    A length is left out if its motions are not finite. If all predict equally long, the first length is taken.
     """
     if len(np.unique(motions.trajectory)) == 1:
         train, motions = (in_blocks(part, 2 * FOLDS) for part in (train, motions))
     present, variance = np.unique(motions.trajectory), spread_of(motions)
-    times: dict[float | None, list[np.ndarray]] = {window: [] for window in (None, *WINDOWS)}
+    times: dict[float | None, list[np.ndarray]] = {window: [] for window in (*WINDOWS, None)}
     for fold in range(min(FOLDS, len(present))):
         rest = np.delete(present, slice(fold, None, FOLDS))
         inner, moved, held = select(train, rest), select(motions, rest), select(motions, present[fold::FOLDS])
