@@ -61,7 +61,6 @@ def fit_kernel(
     likelihood_samples: int = 60,
     iterations: int = 60,
     least_noise: float = 1e-4,
-    friction_scale: float = 1.0,
 ) -> KernelFit:
     """Fits the most likely energies and friction to measured torques, in float64.
 
@@ -75,8 +74,6 @@ def fit_kernel(
         least_noise: lower bound on a joint's noise, relative to its torque's deviation, for data without noise. If it
             is too low for the rounding of the equations, it is multiplied by `NOISIER` until it suffices; the result's
             noise holds the final value.
-        friction_scale: S of a coefficient is this value over the root mean square torque of one unit of the
-            coefficient, with the joints' torques in units of their deviations.
 
     Raises:
         InputError: torques that do not vary, a number of joints that differs from the data's, friction by load, or a
@@ -84,18 +81,17 @@ def fit_kernel(
     """
     from scipy.linalg import cho_solve
 
-    require_positive(
-        samples=samples, likelihood_samples=likelihood_samples, iterations=iterations, least_noise=least_noise,
-        friction_scale=friction_scale,
-    )  # fmt: skip
+    counts = {"samples": samples, "likelihood_samples": likelihood_samples, "iterations": iterations}
+    require_positive(**counts, least_noise=least_noise)
     if needs.degrees_of_freedom != train.degrees_of_freedom:
         raise InputError(f"the needs have {needs.degrees_of_freedom} joints, the data {train.degrees_of_freedom}")
     began = time.perf_counter()
     with jax.enable_x64(True):
         unit = np.asarray(torque_scale(train))
         columns = _friction(needs, train.qd)
+        # S of a coefficient: 1 over the root mean square torque of one unit of it, in units of the deviations.
         sizes = np.sqrt(np.mean(np.sum((columns / unit[:, None]) ** 2, axis=1), axis=0))
-        deviations = friction_scale / np.where(sizes > 0, sizes, 1.0)
+        deviations = 1.0 / np.where(sizes > 0, sizes, 1.0)
         every = _equations(train, columns * deviations, samples)
         some = _equations(train, columns * deviations, min(samples, likelihood_samples))
         unknowns = likeliest(needs, serial, some, unit, iterations=iterations, least_noise=least_noise)

@@ -1,19 +1,18 @@
 """Phase-space models behind an autoencoder, which learn coordinates from images (Greydanus, Dzamba and Yosinski 2019,
 "Hamiltonian Neural Networks", section on pixels).
 
-    published:  (z_q, z_p) = encoder(x_1, x_2),                    (x_1, x_2)_hat = decoder(z_q, z_p)
-    framewise:  z_q = encoder(x_1),  z_p = encoder(x_2) - z_q,     x_1_hat = decoder(z_q),  x_2_hat = decoder(z_q + z_p)
-    both:       d(z_q, z_p) / d frame = rates(z_q, z_p)
+    z_q = encoder(x_1),  z_p = encoder(x_2) - z_q,     x_1_hat = decoder(z_q),  x_2_hat = decoder(z_q + z_p)
+    d(z_q, z_p) / d frame = rates(z_q, z_p)
 
-x_1, x_2 [n / 2] are consecutive frames; the second one determines the velocity. In the framewise autoencoder the
-momentum is the change of the coordinate per frame for any parameters; the published one has to learn this. Both
-networks have four layers, the hidden ones residual:
+x_1, x_2 [n / 2] are consecutive frames; the second one determines the velocity. The momentum is the change of the
+coordinate per frame for any parameters; the published autoencoder, (z_q, z_p) = encoder(x_1, x_2), has to learn this.
+Both networks have four layers, the hidden ones residual:
 
     h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
 
 The rates come from an energy of one coordinate, or from a network: any `Model`. The unit of latent time is a frame.
-The networks see images as differences from the mean image, divided by their typical size. Images may enter as their
-principal components: fewer numbers with nearly the same distances, up to the variance that is lost,
+The networks see numbers divided by their typical size. Images enter as their principal components: fewer numbers with
+nearly the same distances, up to the variance that is lost,
 
     c = B (x - mean),   x_hat = mean + Bᵀ c,   rows of B [C, n]: the eigenvectors of the covariance, largest first
 """
@@ -121,60 +120,44 @@ def _slowed_rates(system: PhaseRates, rate: float) -> PhaseRates:
 
 def make_latent_phase(
     field: Model,
-    mean: Float[np.ndarray, " n"],
+    count: int,
     *,
-    framewise: bool = False,
     scale: float = 0.2,
     width: int = 200,
     activation: Activation | str = silu,
-    momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
 ) -> LatentModel:
     """Returns the (init, apply) pair of an autoencoder with a phase model of one coordinate in its latent plane.
 
     Args:
         field: model of the latent plane, from `latent_field`.
-        mean: mean of the two frames over the training data.
-        framewise: encode the frames one by one; the published autoencoder encodes both at once.
-        scale: typical difference of a pixel from its mean.
+        count: numbers of a frame, n / 2, with a mean of zero.
+        scale: their typical size.
         width: hidden units per layer of both networks.
-        momentum_scale: typical size of z_p if that of z_q is 1; framewise it follows from z_q.
 
     Raises:
-        InputError: a width or scale that is not positive, or a mean that is not of two frames.
+        InputError: a number that is not positive.
     """
-    require_positive(scale=scale, momentum_scale=momentum_scale)
+    require_positive(count=count, scale=scale)
     require_network(width=width, depth=2)
     activation = activation_of(activation)
-    n = len(mean)
-    if n % 2 or n == 0:
-        raise InputError(f"mean has {n} pixels; expected those of two frames")
-    # The networks see rows: two with a frame each, or one with both frames.
-    rows = 2 if framewise else 1
-    if framewise:
-        mean = (mean[: n // 2] + mean[n // 2 :]) / 2
 
     @hk.without_apply_rng
     @hk.transform
     def encoder(x: Float[Array, " n"]) -> tuple[Latent, Latent]:
-        centred = (x.reshape(rows, -1) - jnp.asarray(mean, x.dtype)) / scale
-        z = _residual_network(centred, width, 2 // rows, activation, "encoder")
-        if framewise:
-            return z[0], z[1] - z[0]
-        return z[0, :1], momentum_scale * z[0, 1:]
+        z = _residual_network(x.reshape(2, -1) / scale, width, 1, activation, "encoder")
+        return z[0], z[1] - z[0]
 
     @hk.without_apply_rng
     @hk.transform
     def decoder(q: Latent, p: Latent) -> Float[Array, " n"]:
-        z = jnp.stack([q, q + p]) if framewise else jnp.concatenate([q, p / momentum_scale])[None]
-        differences = _residual_network(z, width, n // rows, activation, "decoder")
-        return (jnp.asarray(mean, q.dtype) + scale * differences).ravel()
+        return (scale * _residual_network(jnp.stack([q, q + p]), width, count, activation, "decoder")).ravel()
 
     def init(key: Array) -> Parameters:
         first, second, third = jax.random.split(key, 3)
         z = jnp.zeros(1, dtype)
         return {
-            "encoder": encoder.init(first, jnp.zeros(n, dtype)),
+            "encoder": encoder.init(first, jnp.zeros(2 * count, dtype)),
             "decoder": decoder.init(second, z, z),
             "field": field.init(third),
         }

@@ -31,6 +31,15 @@ def unit_of(metric: str, units: Mapping[str, str]) -> str:
     return units.get(metric, "s" if metric.endswith("_seconds") else "µs" if metric.endswith("_us") else "")
 
 
+def number(metric: str, value: int | float) -> str:
+    """Formats a metric for a table."""
+    if isinstance(value, int):
+        return f"{value:,}"
+    if any(word in metric for word in ("_mse", "_nmse", "_loss", "spread", "error", "eigenvalue", "condition")):
+        return f"{value:.2e}"
+    return f"{value:,.2f}" if "share" in metric or metric.startswith("vpt") else f"{value:,.1f}"
+
+
 def print_numbers(
     rows: Iterable[Sequence[str]], *, title: str | None = None, columns: Sequence[str] = ("quantity", "value", "unit")
 ) -> None:

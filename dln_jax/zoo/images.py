@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
@@ -67,14 +66,11 @@ def make_image_model(
     require_positive(pixels=pixels, components=components)
     if pixels * components > MOST_NUMBERS:
         raise InputError(f"{components} components of {pixels} pixels are more than {MOST_NUMBERS:,} numbers")
-    common: dict[str, Any] = {"momentum_scale": momentum_scale, "dtype": dtype}
-    moving = latent_field(field, width=field_width, depth=field_depth, activation=field_activation, **common)
+    size: dict[str, Any] = {"width": field_width, "depth": field_depth, "activation": field_activation}
+    moving = latent_field(field, **size, momentum_scale=momentum_scale, dtype=dtype)
 
     def of_coefficients(scale: float) -> LatentModel:
-        mean = np.zeros(2 * components)
-        return make_latent_phase(
-            moving, mean, framewise=True, scale=scale, width=width, activation=activation, **common
-        )
+        return make_latent_phase(moving, components, scale=scale, width=width, activation=activation, dtype=dtype)
 
     unit = of_coefficients(1.0)
 

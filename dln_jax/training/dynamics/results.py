@@ -24,7 +24,7 @@ from dln_jax.training.dynamics.task import Task
 from dln_jax.training.dynamics.verdict import TorqueVerdict, judge_torques
 from dln_jax.training.low_latency_calls import low_latency_metrics
 from dln_jax.training.pipeline import png
-from dln_jax.training.results import cost_metrics, unit_of
+from dln_jax.training.results import cost_metrics, number, unit_of
 from dln_jax.training.uncertainty import uncertainty_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -227,17 +227,3 @@ def rows(metrics: dict[str, float | int], task: Task) -> list[tuple[str, ...]]:
     calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
     lines.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
     return lines
-
-
-def number(metric: str, value: int | float) -> str:
-    """Formats a metric for the table."""
-    if isinstance(value, int):
-        return f"{value:,}"
-    tiny = any(word in metric for word in ("_mse", "_nmse", "error", "eigenvalue", "condition"))
-    return (
-        f"{value:.2e}"
-        if tiny
-        else f"{value:,.2f}"
-        if "share" in metric or metric.startswith("vpt")
-        else f"{value:,.1f}"
-    )

@@ -1,6 +1,5 @@
 """Trains a differential network or an ensemble, as a kind of the pipeline: the model, its errors, speed, figures."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +28,7 @@ from dln_jax.scale.devices import device_lines
 from dln_jax.training.functions.options import Options
 from dln_jax.training.functions.task import NAMED, Task, of_named, prepare
 from dln_jax.training.pipeline import Fitted, Judged, Kind, png
-from dln_jax.training.results import OF_LOSSES, cost_metrics, settings_of, unit_of
+from dln_jax.training.results import OF_LOSSES, cost_metrics, number, settings_of, unit_of
 from dln_jax.zoo.descriptions import describe
 from dln_jax.zoo.run import load
 
@@ -169,13 +168,6 @@ UNITS = {
     "validation_loss": "units of the fit",
 }
 """Units of metrics, in those of the data."""
-
-
-def number(metric: str, value: int | float) -> str:
-    """Formats a metric for the table."""
-    if isinstance(value, int):
-        return f"{value:,}"
-    return f"{value:.2e}" if re.search("_mse|_loss|spread", metric) else f"{value:,.1f}"
 
 
 FUNCTIONS = Kind(prepare, announce, fit, judge)
