@@ -36,10 +36,12 @@ from dln_jax.control import (
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, MIDPOINT, advance, runge_kutta
 from dln_jax.scenes.pendulums import Links
-from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, at_goal, plant
-from scripts.reports.control.disturbed_board import GEAR, LONGEST
+from scripts.reports.case import Findings
+from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, at_goal, criteria, plant, play, score
+from scripts.reports.control.disturbed_board import CRITERIA, GEAR, LONGEST, robustness
 from scripts.reports.control.planned import EVERY as OF_PLAN
-from scripts.reports.control.planned import Weights, follower
+from scripts.reports.control.planned import Weights, follower, search
+from scripts.reports.rows import Row
 
 STATE_COST = np.diag([10.0, 10.0, 1.0, 1.0])
 """State cost of the regulator."""
@@ -52,6 +54,8 @@ FRICTION = np.array([0.05, 0.05, 0.1, 0.1, 5e-5])
 DRIVEN_ERROR, PASSIVE_ERROR = 1.0, 0.01
 """Standard deviations of the torques of the joints with and without a motor about the model's, N m."""
 GRAVITY = 9.81
+PLANNED_SECONDS = 1.6
+"""Horizon of the plan from hanging, s."""
 
 
 class Replanning(NamedTuple):
@@ -161,7 +165,7 @@ def updated(motor: Motor, estimate: Estimate, y: Array, u: Array, delay: Array, 
     tau = plant(motor)[1] @ (torques[delay] + torques[delay + 1])[None] / 2
 
     def torque(z: Array) -> Array:
-        M, held = parts(centre + size * z, q, qd)
+        M, held = parts(jnp.asarray(centre) + size * z, q, qd)
         return M @ qdd + held
 
     zero = jnp.zeros(len(centre))
@@ -241,3 +245,14 @@ def replanning(
 
     nothing = jnp.zeros(len(centre)), jnp.eye(len(centre)), jnp.zeros((3, 2)), jnp.zeros(LONGEST + 3), jnp.asarray(0)
     return Controller((Estimate(*nothing), jnp.zeros(1), seeing.start), outside)
+
+
+def replanned(motor: Motor, quick: bool) -> Findings:
+    """Shares of successes by criterion of the recovery by receding plans, and their mean."""
+    name = plant(motor)[0].name
+    _, plan, weights = search(motor, (PLANNED_SECONDS,), (Weights(),), guesses=1)
+    controller = replanning(motor, weights, plan)
+    shares = robustness(motor, controller, every=10 if quick else 1)
+    case = f"replanning/{name}"
+    rows = [Row(case, f"share_{key}", shares[key]) for key in (*CRITERIA, "mean")]
+    return Findings([*rows, Row(case, "score_undisturbed", score(criteria(motor, play(motor, controller))))])
