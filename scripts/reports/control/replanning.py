@@ -54,6 +54,8 @@ FRICTION = np.array([0.05, 0.05, 0.1, 0.1, 5e-5])
 DRIVEN_ERROR, PASSIVE_ERROR = 1.0, 0.01
 """Standard deviations of the torques of the joints with and without a motor about the model's, N m."""
 GRAVITY = 9.81
+LEVELS: dict[Motor, float] = {"elbow": 300.0, "shoulder": 100.0}
+"""Levels of the regulator's value, of two that were tried for the acrobot on one in five of the table's plants."""
 PLANNED_SECONDS = 1.6
 """Horizon of the plan from hanging, s."""
 
@@ -251,7 +253,7 @@ def replanned(motor: Motor, quick: bool) -> Findings:
     """Shares of successes by criterion of the recovery by receding plans, and their mean."""
     name = plant(motor)[0].name
     _, plan, weights = search(motor, (PLANNED_SECONDS,), (Weights(),), guesses=1)
-    controller = replanning(motor, weights, plan)
+    controller = replanning(motor, weights, plan, Replanning(level=LEVELS[motor]))
     shares = robustness(motor, controller, every=10 if quick else 1)
     case = f"replanning/{name}"
     rows = [Row(case, f"share_{key}", shares[key]) for key in (*CRITERIA, "mean")]
