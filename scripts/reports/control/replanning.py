@@ -1,7 +1,7 @@
-"""Recovery of the board's plants by receding plans with a model that is identified on the way.
+"""Recovery of the board's plants by model predictive control, whose model is identified on the way.
 
-The plan from hanging is followed first. Then, every `every` samples, `control.mpc` improves plans over a receding
-horizon from the present state, each from its own first guess, and the one with the lowest cost acts. A regulator holds
+The plan from hanging is followed first. Then, every `every` samples, `control.mpc` improves plans over the coming
+seconds from the present state, each from its own first guess, and the one with the lowest cost acts. A regulator holds
 the goal where its value is below a level.
 
 Nine numbers determine the motion of two links: with the known length l1,
@@ -55,13 +55,13 @@ DRIVEN_ERROR, PASSIVE_ERROR = 1.0, 0.01
 """Standard deviations of the torques of the joints with and without a motor about the model's, N m."""
 GRAVITY = 9.81
 LEVELS: dict[Motor, float] = {"elbow": 300.0, "shoulder": 100.0}
-"""Levels of the regulator's value, of two that were tried for the acrobot on one in five of the table's plants."""
+"""Levels of the regulator's value, chosen for the acrobot on one in five of the table's runs."""
 PLANNED_SECONDS = 1.6
 """Horizon of the plan from hanging, s."""
 
 
 class Replanning(NamedTuple):
-    """Numbers of the receding plans."""
+    """Numbers of the model predictive control."""
 
     every: int = 10
     """Samples of the board between two plans, and per step of a plan."""
@@ -149,11 +149,11 @@ def problem(field: Any, numbers: Replanning) -> TrajectoryProblem:
     return TrajectoryProblem(step, cost, final_cost, -LIMIT, LIMIT)
 
 
-def first_plans(receding: TrajectoryProblem, numbers: Replanning) -> Plan:
+def first_plans(horizon: TrajectoryProblem, numbers: Replanning) -> Plan:
     """Plans from hanging with every first guess, along a leading axis."""
     t = numbers.every / RATE * np.arange(numbers.steps)
     guesses = np.array(numbers.pumps)[:, None] * np.sin(2 * np.pi * t)
-    return jax.vmap(lambda u: first_plan(receding, np.zeros(4), u))(guesses[..., None])
+    return jax.vmap(lambda u: first_plan(horizon, np.zeros(4), u))(guesses[..., None])
 
 
 def updated(motor: Motor, estimate: Estimate, y: Array, u: Array, delay: Array, moved: Array) -> Estimate:
@@ -190,7 +190,7 @@ def replanning(
     plan: Plan,
     numbers: Replanning = Replanning(),  # noqa: B008
 ) -> Controller:
-    """The plan; after its end the regulator where its value is low, else receding plans; from the angles alone."""
+    """The plan; after its end the regulator where its value is low, else model predictive control; from the angles."""
     scene, B = plant(motor)
     known = field_of(dynamics(scene.closed_form), B)
     at, joints = at_goal(motor, dynamics(scene.closed_form)), scene.needs.joints
@@ -250,7 +250,7 @@ def replanning(
 
 
 def replanned(motor: Motor, quick: bool) -> Findings:
-    """Shares of successes by criterion of the recovery by receding plans, and their mean."""
+    """Shares of successes by criterion of the recovery by model predictive control, and their mean."""
     name = plant(motor)[0].name
     _, plan, weights = search(motor, (PLANNED_SECONDS,), (Weights(),), guesses=1)
     controller = replanning(motor, weights, plan, Replanning(level=LEVELS[motor]))
