@@ -185,7 +185,9 @@ def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
             (key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in numbers.items()
         ],
         title=f"returns from {options.starts} starts hanging, and anywhere",
-        verdict=verdict,
+        # The evaluation of a stored value function reports the verdict; a training refuses.
+        verdict=verdict if case.stored is None else None,
+        lines=() if case.stored is None else (verdict.line,),
         figures={
             "value.png": png(value_slice_of, run, own),
             "closed-loop.png": png(closed_loop, run, own),

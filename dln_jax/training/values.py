@@ -162,9 +162,8 @@ class Kept(NamedTuple):
         like = {"parameters": state.parameters, "optimiser": state.optimiser, "best": state.best}
         kind = tuple[int, float | None, float | None, float]
         rows = stored_rows(self.folder / f"{name}.json", manifest, "history", kind)
-        history = [
-            ValueProgress(k, *(np.nan if n is None else n for n in (loss, score)), s) for k, loss, score, s in rows
-        ]
+        numbers = [[np.nan if number is None else number for number in row] for row in rows]
+        history = [ValueProgress(int(k), loss, score, seconds) for k, loss, score, seconds in numbers]
         return IterationState(**load_tree(self.folder, name, like), history=history)
 
 
@@ -193,7 +192,7 @@ def by_iteration(
 
     fits = fit_values(
         plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, disturbance=disturbance,
-        report=report_progress, restore=restore, **({} if kept is None else {"store": kept.store}),
+        report=report_progress, restore=restore, store=(lambda seed, state: None) if kept is None else kept.store,
     )  # fmt: skip
     return [
         Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)

@@ -177,7 +177,7 @@ def fit_values(
                     best, lowest = current, score
                 passed = spent + time.perf_counter() - began
                 history.append(ValueProgress(number + 1, float(loss), score, passed))
-                store(seed, IterationState(current, state, best, history))
+                store(seed, IterationState(current, state, best, list(history)))
                 report(history[-1])
             if not math.isfinite(lowest):
                 raise InputError(

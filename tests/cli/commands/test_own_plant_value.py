@@ -8,9 +8,13 @@ import pytest
 from calls import command, refused
 
 from dln_jax.cli.commands import train_value
+from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.problem import rates
+from dln_jax.training.value_plants import Wishes, of_file, of_run, with_factors
 from dln_jax.training.value_training import verdict_of
 from dln_jax.training.values import Kept, load_value
+from dln_jax.types import InputError
+from dln_jax.zoo.run import save
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
 ROD = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.05"/>
@@ -30,9 +34,7 @@ def brief(monkeypatch):
     """Iterations of a moment."""
     monkeypatch.setattr(
         "dln_jax.control.optimal.own_plants.Iteration",
-        lambda **numbers: __import__("dln_jax.control.optimal.fitted", fromlist=["Iteration"]).Iteration(
-            **{**numbers, "starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}
-        ),
+        lambda **numbers: Iteration(**{**numbers, "starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}),
     )
 
 
@@ -98,3 +100,19 @@ def test_mistakes_are_one_line_and_leave_nothing(arguments, message, tmp_path, c
 def test_options_of_an_own_plant_need_one(capsys):
     assert "--effort is an option of one's own plant" in refused(capsys, train_value, "--effort", "1")
     assert "no such file" in refused(capsys, train_value, "--run", "/nowhere")
+
+
+def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
+    known = of_file(rod, Wishes())
+    save(tmp_path, known.own.description, known.own.parameters)
+    stored = of_run(tmp_path, Wishes(control=2.5))
+    for name in ("goal", "hanging", "scale", "weights", "box", "limits"):
+        np.testing.assert_allclose(getattr(stored.own.problem, name), getattr(known.own.problem, name), atol=1e-5)
+    x, u = jnp.array([0.7, 1.0]), jnp.array([1.5])
+    np.testing.assert_allclose(rates(stored.plant.problem)(x, u), rates(known.plant.problem)(x, u), rtol=1e-9)
+    # A body of 1.2 times the mass accelerates by the gravity as before, by the motor 1 / 1.2 as much.
+    heavy = with_factors(known, [1.2, 1.0])
+    ratio = heavy.actuation(x)[1, 0] / known.plant.problem.actuation(x)[1, 0]
+    assert float(ratio) == pytest.approx(1 / 1.2, rel=1e-9)
+    with pytest.raises(InputError, match="states no limits of the motors"):
+        of_run(tmp_path, Wishes())

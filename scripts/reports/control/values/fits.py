@@ -15,6 +15,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from dln_jax.control.optimal.fitted import fit_values
+from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import interpolated
 from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant, ValueSettings, evaluate, starts
@@ -27,14 +28,16 @@ from scripts.reports.figures.values import value_figure
 from scripts.reports.rows import Row, expect
 
 SEEDS = 3
-PUBLISHED = {"pendulum": -30.96, "cart-pole": -25.05}
+PUBLISHED = {"pendulum": -30.96, "cart-pole": -25.05, "rotary-pendulum": None}
 """Mean returns of the published policies from downward starts, re-run; the draw of the starts hardly matters."""
-TO_REACH = {"pendulum": -30.9, "cart-pole": -25.0}
+TO_REACH = {"pendulum": -30.9, "cart-pole": -25.0, "rotary-pendulum": None}
 """Mean returns to reach."""
 CLOSE = 1e-2
 """Bound on the median relative error of V over states."""
 LEAST = 1e-2
 """States whose V is below this share of the largest are left out of relative errors, as their V is near zero."""
+HORIZON, FOLLOWED = 2.5, 8.0
+"""Horizon of the direct optimisations, s, and time for which policies are followed."""
 GRIDS = (101, 201, 401)
 EDGE = 12.0
 """Rate that no trajectory from the box exceeds, rad/s."""
@@ -101,19 +104,39 @@ def pendulum(quick: bool) -> Findings:
     return Findings(rows, {**curves, "best": np.asarray(interpolated(fine.grid, fine.u, nodes))})
 
 
-def cart_pole(quick: bool) -> Findings:
-    """Compares the cart-pole's value with direct optimisation from starts all around the circle."""
-    plant, fit, seeds = PLANTS["cart-pole"](), FITS["cart-pole"], 1 if quick else SEEDS
+def beside_shooting(name: str, quick: bool) -> Findings:
+    """Compares a value with direct optimisation from starts all around the circle."""
+    plant, fit, seeds = PLANTS[name](), FITS[name], 1 if quick else SEEDS
     if quick:
         numbers = fit.numbers._replace(iterations=3, starts=128, seconds=0.5, steps=50)
         fit = fit._replace(widths=(24, 24), numbers=numbers)
     training = trained(plant, fit, seeds)
     x = starts(plant, "uniform", 4 if quick else 100)
-    truth = _direct(plant, training.values, x, iterations=5 if quick else 25)
+    truth = _direct(plant, training.values, x, dt=fit.numbers.dt, iterations=5 if quick else 25)
     of_all = [np.asarray(_V(value)(x)) for value in training.values]
-    case = "value/cart-pole"
+    case = f"value/{name}"
     rows = [*_returns(case, plant, training), *_errors(case, of_all, truth, truth > LEAST * truth.max())]
+    costs = [policy_costs(plant, value, x, dt=fit.numbers.dt) for value in training.values]
+    rows.append(
+        Row(case, "policy_cost_over_shooting", float(np.median([np.mean(cost) for cost in costs]) / truth.mean()))
+    )
     return Findings(rows)
+
+
+def policy_costs(plant: ValuePlant, value: ValueAndGradient, x: np.ndarray, *, dt: float) -> Float[np.ndarray, " N"]:
+    """Discounted costs of a value's policy from states x [N, n] over `FOLLOWED` s, by the Runge-Kutta method."""
+    problem, law = plant.problem, _law(plant, value)
+    step, discount = flow(problem, dt), np.exp(-problem.discount * dt)
+
+    def sample(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
+        x, total, weight = carry
+        after, cost = step(x, law(x))
+        return (after, total + weight * cost, weight * discount), None
+
+    def one(x: Array) -> Array:
+        return jax.lax.scan(sample, (x, jnp.zeros(()), jnp.ones(())), length=round(FOLLOWED / dt))[0][1]
+
+    return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(x, float)))
 
 
 def states_of_box(plant: ValuePlant, count: int) -> Float[np.ndarray, "A B 2"]:
@@ -136,10 +159,12 @@ def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None =
     return solve_on_grid(plant.problem, points, low=[-angle, -EDGE], high=[angle, EDGE], limit=plant.limit, start=start)
 
 
-def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, iterations: int) -> np.ndarray:
+def _direct(
+    plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, dt: float, iterations: int
+) -> np.ndarray:
     """Lowest cost of direct optimisations that start from the controls of the values' policies."""
-    dt = 0.0125
-    guesses = np.stack([followed(plant.problem, _law(plant, value), x, dt=dt, steps=200) for value in values])
+    steps = round(HORIZON / dt)
+    guesses = np.stack([followed(plant.problem, _law(plant, value), x, dt=dt, steps=steps) for value in values])
     return np.min(direct_values(plant.problem, x, guesses, limit=plant.limit, dt=dt, iterations=iterations), axis=0)
 
 
