@@ -96,15 +96,7 @@ def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
         return [*start, *(program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in left)]
     outer, number, carries = _opened(program, args, start)
     turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
-    slices = []
-    for array in stacked:
-        size = array.size // length
-        offsets = program.constant(np.arange(size).reshape(array.shape[1:]), "index")
-        first = program.elementwise("mul", turn, size)
-        taken = indexing.take(program, _without_known(array), program.elementwise("add", first, offsets))
-        mask, numbers = (part.reshape(length, size) for part in known(array))
-        same = mask.all(0) & (numbers == numbers[0]).all(0) & (program.finite and array.op == "gather")
-        slices.append(_with_known(program, taken, same, numbers[0]))
+    slices = [_slice_of(program, array, turn, length) for array in stacked]
     _, results, steady = _steady(
         program, start, carries, lambda inside: program.inline(program, parameters["jaxpr"], [*fixed, *inside, *slices])
     )
@@ -116,15 +108,19 @@ def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
     return [_with_known(program, node, *one) for node, one in zip(projected, steady, strict=True)]
 
 
-def _without_known(array: Node) -> Node:
-    """Returns the array whose memory a loop can index, where this one replaces some of its elements by constants."""
-    whole = (
-        [arg for arg in array.args if arg.shape == array.shape and arg.op != "const"] if array.op == "gather" else []
-    )
-    mask, index = ~known(array)[0], np.arange(array.size)
-    if len(whole) == 1 and array.args[0] is whole[0] and (np.asarray(array.value).ravel() == index)[mask].all():
-        return whole[0]
-    return array
+def _slice_of(program: Program, array: Node, turn: Node, length: int) -> Node:
+    """Returns the part of a stacked array in an iteration; elements that are the same in all of them are constants."""
+    size, shape, index = array.size // length, array.shape[1:], np.arange(array.size)
+    mask, numbers = (part.reshape(length, size) for part in known(array))
+    same = mask.all(0) & (numbers == numbers[0]).all(0) & program.finite
+    whole = array
+    if same.any() and array.op == "gather" and array.args[0].shape == array.shape and array.args[0].op != "const":
+        # The array whose elements these constants replace lies in memory; this one would have to be copied.
+        whole = array.args[0] if ((np.ravel(array.value) == index) | np.tile(same, length)).all() else array
+    first = program.elementwise("mul", turn, size)
+    offsets = program.constant(np.arange(size).reshape(shape), "index")
+    taken = indexing.take(program, whole, program.elementwise("add", first, offsets))
+    return _with_known(program, taken, same, numbers[0])
 
 
 def _cond(program: Program, parameters: Parameters, which: Node, *operands: Node) -> list[Node]:

@@ -58,6 +58,15 @@ def powers_of_a_triangle(x):
     return last, lax.scan(lambda v, m: (m.T @ v, v[1]), jnp.stack([x, x, x]), every)
 
 
+def a_loop_after_a_loop_whose_output_is_moved(x):
+    """Constants stand in some steps of the second loop's array, or differ from step to step, or are in all of them."""
+    _, every = lax.scan(lambda v, _: (v * x, v), jnp.stack([x, x + 1, x - 1]), length=4)
+    shifted = jnp.concatenate([every[:-1], jnp.zeros((1, 3))])
+    numbered = jnp.concatenate([every[:, :2], jnp.arange(4.0)[:, None]], axis=1)
+    masked = jnp.concatenate([every[:, :1], jnp.full((4, 1), 2.0), every[:, 2:]], axis=1)
+    return [lax.scan(lambda v, y: (v * y + y[::-1], v), every[0], part) for part in (shifted, numbered, masked)]
+
+
 def batched_products(a, b):
     placed = jnp.zeros((3, 4, 4)).at[:, 0, 1].set(a).at[:, 2, 2].set(1.0)
     return jax.vmap(lambda m, c: m @ (SPARSE + jnp.diag(c)) @ m.T)(placed, b), jnp.einsum("bij,jk->bik", placed, SPARSE)
@@ -78,6 +87,7 @@ PROGRAMS = {
     "tangents_in_a_scan": (tangents_in_a_scan, (np.zeros(3), np.zeros(4))),
     "tangents_in_a_while_loop": (tangents_in_a_while_loop, (np.zeros(4),)),
     "powers_of_a_triangle": (powers_of_a_triangle, (np.zeros(()),)),
+    "moved_output": (a_loop_after_a_loop_whose_output_is_moved, (np.zeros(()),)),
     "batched_products": (batched_products, (np.zeros(3), np.zeros((3, 4)))),
     "solved": (solved, (np.zeros(2),)),
     "inverse_dynamics_jacobian": ARM["inverse_dynamics_jacobian"],
