@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from jax.dtypes import float0
 
-from dln_jax.export.c import indexing, linear_algebra, primitives
+from dln_jax.export.c import control_flow, indexing, linear_algebra, primitives
 from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at
-from dln_jax.export.c.nodes import Loop, Node, Region, is_constant, values
+from dln_jax.export.c.nodes import Node, is_constant, values
 from dln_jax.export.c.primitives import Parameters
 from dln_jax.export.c.program import Part, Program
 from dln_jax.export.c.text import PRECISIONS, failure, kind_of
@@ -44,7 +44,7 @@ def program_of(
         InputError: the jaxpr has no C: an unsupported primitive (the message names the line that made it), random
             numbers, an unsupported dtype, or a shape that is unknown at compile time.
     """
-    program = Program(real=PRECISIONS[precision][0], repeated=repeated, finite=finite)
+    program = Program(real=PRECISIONS[precision][0], repeated=repeated, finite=finite, inline=_inline)
     inputs = [
         program.make("input", variable.aval.shape, kind_of(variable.aval.dtype), attribute=number)
         for number, variable in enumerate(closed.jaxpr.invars)
@@ -55,13 +55,13 @@ def program_of(
 def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
     """Returns the results of a closed jaxpr."""
     jaxpr = closed.jaxpr
-    known: dict[Any, Node] = dict(zip(jaxpr.invars, args, strict=True))
+    nodes: dict[Any, Node] = dict(zip(jaxpr.invars, args, strict=True))
 
     def read(variable: Any) -> Node:
-        return _constant(program, variable.val, variable.aval) if hasattr(variable, "val") else known[variable]
+        return _constant(program, variable.val, variable.aval) if hasattr(variable, "val") else nodes[variable]
 
     for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
-        known[variable] = _constant(program, value, variable.aval)
+        nodes[variable] = _constant(program, value, variable.aval)
     for equation in jaxpr.eqns:
         try:
             results = _apply(program, equation, [read(variable) for variable in equation.invars])
@@ -71,7 +71,7 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
         for variable, result in zip(equation.outvars, results, strict=True):
             expected = tuple(variable.aval.shape), kind_of(variable.aval.dtype)
             assert (result.shape, result.dtype) == expected, f"{equation.primitive.name} became {result}"
-            known[variable] = result
+            nodes[variable] = result
     return [read(variable) for variable in jaxpr.outvars]
 
 
@@ -133,7 +133,7 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     key = program.lowered[call]
     shapes = [(result.shape, result.dtype) for result in program.parts[key].results]
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
-    return _projections(program, program.make("call", (), "int", passed, attribute=key), shapes)
+    return control_flow.projections(program, program.make("call", (), "int", passed, attribute=key), shapes)
 
 
 def _custom_linear_solve(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
@@ -141,82 +141,6 @@ def _custom_linear_solve(program: Program, parameters: Parameters, *args: Node) 
     before = lengths.matvec + lengths.vecmat
     constants, right = args[before : before + lengths.solve], args[sum(lengths) :]
     return _inline(program, jaxprs.solve, [*constants, *right])
-
-
-def _opened(program: Program, nodes: Sequence[Node], start: Sequence[Node] = ()) -> tuple[Region, int, list[Node]]:
-    """Returns the region around a new loop or branch that reads these nodes, its number, and its carries."""
-    number = len(program.loops)
-    program.loops[number] = Loop([], [], [])
-    outer = max((program.floor, *(node.region for node in nodes)), key=len)
-    return (
-        outer,
-        number,
-        [
-            program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=(*outer, number))
-            for index, carry in enumerate(start)
-        ],
-    )
-
-
-def _projections(program: Program, node: Node, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
-    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
-
-
-def _while(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
-    split = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
-    of_condition, of_body, start = args[: split[0]], args[split[0] : split[1]], args[split[1] :]
-    outer, number, carries = _opened(program, args, start)
-    (condition,) = _inline(program, parameters["cond_jaxpr"], [*of_condition, *carries])
-    results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
-    program.loops[number] = Loop(carries, [condition], results)
-    loop = program.make("while", (), "int", start, attribute=number, region=outer)
-    return _projections(program, loop, [(carry.shape, carry.dtype) for carry in start])
-
-
-def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
-    length, inner = parameters["length"], parameters["jaxpr"].jaxpr
-
-    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
-        return sum(a.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
-
-    # Counted, because releases of JAX store these numbers differently; stacked arrays differ in shape inside.
-    count = alike(parameters["results"], inner.outvars)
-    constants = alike(args, inner.invars) - count
-    fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
-    if length == 0:
-        left = parameters["results"][count:]
-        return [*start, *(program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in left)]
-    outer, number, carries = _opened(program, args, start)
-    turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
-    slices = []
-    for array in stacked:
-        size = array.size // length
-        offsets = program.constant(np.arange(size).reshape(array.shape[1:]), "index")
-        first = program.elementwise("mul", turn, size)
-        slices.append(indexing.take(program, array, program.elementwise("add", first, offsets)))
-    results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
-    program.loops[number] = Loop(carries, [], results, length, parameters["reverse"])
-    loop = program.make("repeat", (), "int", start, attribute=number, region=outer)
-    return _projections(program, loop, [(aval.shape, kind_of(aval.dtype)) for aval in parameters["results"]])
-
-
-def _cond(program: Program, parameters: Parameters, which: Node, *operands: Node) -> list[Node]:
-    branches = parameters["branches"]
-    if len(branches) == 1 or which.op == "const":
-        chosen = int(np.clip(which.value, 0, len(branches) - 1)) if which.value is not None else 0
-        return _inline(program, branches[chosen], operands)
-    floor, outer = program.floor, max((program.floor, which.region, *(node.region for node in operands)), key=len)
-    numbers, every = [], []
-    for closed in branches:
-        _, number, _ = _opened(program, [])
-        program.floor = (*outer, number)
-        numbers.append(number)
-        every.append(_inline(program, closed, operands))
-    program.floor = floor
-    for number, results in zip(numbers, every, strict=True):
-        program.loops[number] = Loop([], [], results)
-    branch = program.make("branch", (), "int", [which], attribute=tuple(numbers), region=outer)
-    return _projections(program, branch, [(result.shape, result.dtype) for result in every[0]])
 
 
 def _platform(program: Program, parameters: Parameters) -> Node:
@@ -229,9 +153,7 @@ _RULES = {
     **primitives.RULES,
     **indexing.RULES,
     **linear_algebra.RULES,
+    **control_flow.RULES,
     "platform_index": _platform,
-    "while": _while,
-    "scan": _scan,
-    "cond": _cond,
     "custom_linear_solve": _custom_linear_solve,
 }

@@ -75,13 +75,21 @@ def is_uniform(node: Node) -> bool:
     return node.op == "gather" and node.value is not None and bool((node.value == node.value.flat[0]).all())
 
 
+def known(node: Node) -> tuple[np.ndarray, np.ndarray]:
+    """Returns which elements [size] are constants, and their values, zero for the others."""
+    if node.op == "const":
+        return np.ones(node.size, bool), np.asarray(node.value).ravel()
+    if node.op == "gather":
+        masks, numbers = zip(*map(known, node.args), strict=True)
+        positions = np.asarray(node.value).ravel()
+        return np.concatenate(masks)[positions], np.concatenate(numbers)[positions]
+    return np.zeros(node.size, bool), np.zeros(node.size)
+
+
 def zeros(node: Node) -> np.ndarray:
     """Returns which elements [size] are known to be zero."""
-    if node.op == "const":
-        return np.asarray(node.value).ravel() == 0
-    if node.op == "gather":
-        return np.concatenate([zeros(arg) for arg in node.args])[np.asarray(node.value).ravel()]
-    return np.zeros(node.size, bool)
+    mask, numbers = known(node)
+    return mask & (numbers == 0)
 
 
 def is_direct(node: Node) -> bool:

@@ -62,6 +62,8 @@ class Program:
     """Called programs by their `identity`, the attribute of a `call`."""
     lowered: dict[Any, bytes] = field(default_factory=dict)
     """Identities of called programs, by the `id` of the jaxpr and the constant arguments."""
+    inline: Any = None
+    """(program, closed jaxpr, arguments) -> results."""
     finite: bool = False
     """Whether arguments and intermediate results are finite, so that 0 x = 0."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)

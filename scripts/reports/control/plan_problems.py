@@ -48,7 +48,7 @@ class Steps(NamedTuple):
     substeps: int = 1
 
 
-def runge_kutta(rates: Formula, dt: float, substeps: int = 1) -> Formula:
+def runge_kutta(rates: Formula, dt: Any, substeps: int = 1) -> Formula:
     """The step of the classical method for CasADi."""
 
     def step(f: Any, x: Any, u: Any) -> list[Any]:

@@ -30,7 +30,7 @@ by_precision = pytest.mark.parametrize("precision", TYPES)
 
 
 def source(precision: str) -> str:
-    """`evaluate_NAME(n, x, y)` for each function."""
+    """`evaluate_NAME(n, x, y)` for each function, and for sines [n] and cosines [n] of the same numbers."""
     _, real, suffix = TYPES[precision]
     loops = "".join(
         f"void evaluate_{name}(int n, const real *x, real *y);\n"
@@ -38,13 +38,18 @@ def source(precision: str) -> str:
         f"{{\n    elementary_{name}_each(n, x, y);\n}}\n"
         for name in VECTORISED
     )
+    loops += (
+        "void evaluate_sin_cos(int n, const real *x, real *y);\n"
+        "void evaluate_sin_cos(int n, const real *x, real *y)\n"
+        "{\n    for (int i = 0; i < n; ++i) elementary_sin_cos(x[i], &y[i], &y[n + i]);\n}\n"
+    )
     return (
         f"#include <float.h>\n#include <math.h>\n#include <stdint.h>\ntypedef {real} real;\n"
         f"#if defined FP_FAST_FMA{suffix.upper()} && !defined UNFUSED\n"
         f"#define MULTIPLY_ADD(a, b, c) fma{suffix}(a, b, c)\n#else\n"
         "#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"
         "#ifdef __cplusplus\n#define RESTRICT\n#else\n#define RESTRICT restrict\n#endif\n"
-        f"{definitions([], precision, arrays=VECTORISED)}"
+        f"{definitions(['sin_cos'], precision, arrays=VECTORISED)}"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif\n{loops}#ifdef __cplusplus\n}}\n#endif\n'
     )
 
@@ -62,7 +67,7 @@ def evaluate(tmp_path_factory):
         return ctypes.CDLL(str(built))
 
     def call(name, x, fused=True):
-        y = np.empty_like(x)
+        y = np.empty_like(x, shape=(2, x.size) if name == "sin_cos" else None)
         function = getattr(library("f64" if x.dtype == np.float64 else "f32", fused), f"evaluate_{name}")
         function(ctypes.c_int(x.size), ctypes.c_void_p(x.ctypes.data), ctypes.c_void_p(y.ctypes.data))
         return y
@@ -161,6 +166,18 @@ def test_limits_signs_and_nan(evaluate, name, precision):
     y = evaluate(name, np.array([0.0, -0.0, np.inf, -np.inf, np.nan, payload], numpy_type))
     np.testing.assert_array_equal(y, np.array([*LIMITS[name], np.nan, np.nan], numpy_type))
     assert [np.signbit(value) for value in y[:2]] == [np.signbit(value) for value in LIMITS[name][:2]]
+
+
+@needs_compiler
+@by_precision
+@pytest.mark.parametrize("fused", [False, True])
+def test_sine_and_cosine_together_are_those_apart(evaluate, precision, fused):
+    numpy_type = TYPES[precision][0]
+    x = np.concatenate([points("sin", precision), np.array([0.0, -0.0, np.inf, np.nan, 1e7, -1e30], numpy_type)])
+    together = evaluate("sin_cos", x, fused)
+    for name, y in zip(("sin", "cos"), together, strict=True):
+        np.testing.assert_array_equal(y, evaluate(name, x, fused))
+        np.testing.assert_array_equal(np.signbit(y[:-4]), np.signbit(evaluate(name, x, fused)[:-4]))
 
 
 @needs_compiler

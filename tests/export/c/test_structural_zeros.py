@@ -51,6 +51,22 @@ def tangents_in_a_while_loop(x):
     return jax.jacfwd(newton)(jnp.abs(x) + 1)
 
 
+def powers_of_a_triangle(x):
+    """The product stays triangular, with ones in its last row's corner; each step's matrix goes to another loop."""
+    step = jnp.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).at[0, 1].set(x).at[1, 1].set(x)
+    last, every = lax.scan(lambda m, _: (m @ step, m @ step), jnp.eye(3), length=4)
+    return last, lax.scan(lambda v, m: (m.T @ v, v[1]), jnp.stack([x, x, x]), every)
+
+
+def a_loop_after_a_loop_whose_output_is_moved(x):
+    """Constants stand in some steps of the second loop's array, or differ from step to step, or are in all of them."""
+    _, every = lax.scan(lambda v, _: (v * x, v), jnp.stack([x, x + 1, x - 1]), length=4)
+    shifted = jnp.concatenate([every[:-1], jnp.zeros((1, 3))])
+    numbered = jnp.concatenate([every[:, :2], jnp.arange(4.0)[:, None]], axis=1)
+    masked = jnp.concatenate([every[:, :1], jnp.full((4, 1), 2.0), every[:, 2:]], axis=1)
+    return [lax.scan(lambda v, y: (v * y + y[::-1], v), every[0], part) for part in (shifted, numbered, masked)]
+
+
 def batched_products(a, b):
     placed = jnp.zeros((3, 4, 4)).at[:, 0, 1].set(a).at[:, 2, 2].set(1.0)
     return jax.vmap(lambda m, c: m @ (SPARSE + jnp.diag(c)) @ m.T)(placed, b), jnp.einsum("bij,jk->bik", placed, SPARSE)
@@ -70,6 +86,8 @@ PROGRAMS = {
     "hessian": (hessian, (np.zeros(5),)),
     "tangents_in_a_scan": (tangents_in_a_scan, (np.zeros(3), np.zeros(4))),
     "tangents_in_a_while_loop": (tangents_in_a_while_loop, (np.zeros(4),)),
+    "powers_of_a_triangle": (powers_of_a_triangle, (np.zeros(()),)),
+    "moved_output": (a_loop_after_a_loop_whose_output_is_moved, (np.zeros(()),)),
     "batched_products": (batched_products, (np.zeros(3), np.zeros((3, 4)))),
     "solved": (solved, (np.zeros(2),)),
     "inverse_dynamics_jacobian": ARM["inverse_dynamics_jacobian"],
@@ -110,6 +128,13 @@ def test_a_double_integrator_has_a_linearisation_without_operations():
         return jnp.concatenate([x[:3] + 0.1 * x[3:], x[3:] + 0.1 * u])
 
     assert operations(lambda x, u: jax.jacfwd(step, argnums=(0, 1))(x, u), np.zeros(6), np.zeros(3)) == 0
+
+
+def test_what_a_loop_leaves_zero_costs_nothing_in_it_nor_in_the_loop_that_follows():
+    """Per iteration of the first loop three products and an addition, of the second two products and an addition."""
+    for finite, most in ((True, 4 * (3 + 1 + 2 + 1)), (False, np.inf)):
+        spent = operations(powers_of_a_triangle, np.zeros(()), finite=finite)
+        assert spent <= most and (finite or spent >= 4 * (27 + 15))
 
 
 @pytest.mark.parametrize("name", MECHANICS)

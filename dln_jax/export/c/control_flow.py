@@ -1,0 +1,146 @@
+"""Rules for loops and branches, which stay loops and branches of the program.
+
+With finite arguments (`Program.finite`), elements of a loop's arrays that keep a known value are constants inside the
+loop and after it, so that the zeros of a derivative's structure cost nothing there.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from dln_jax.export.c import indexing
+from dln_jax.export.c.nodes import Loop, Node, Region, known
+from dln_jax.export.c.primitives import Parameters
+from dln_jax.export.c.program import Program
+from dln_jax.export.c.text import kind_of
+
+
+def _opened(program: Program, nodes: Sequence[Node], start: Sequence[Node] = ()) -> tuple[Region, int, list[Node]]:
+    """Returns the region around a new loop or branch that reads these nodes, its number, and its carries."""
+    number = len(program.loops)
+    program.loops[number] = Loop([], [], [])
+    outer = max((program.floor, *(node.region for node in nodes)), key=len)
+    return (
+        outer,
+        number,
+        [
+            program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=(*outer, number))
+            for index, carry in enumerate(start)
+        ],
+    )
+
+
+def projections(program: Program, node: Node, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
+    """Returns the results of a loop, a branch or a call."""
+    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
+
+
+def _with_known(program: Program, node: Node, mask: np.ndarray, numbers: np.ndarray) -> Node:
+    """Returns the node with constants in place of the elements under a mask [size]."""
+    if not mask.any():
+        return node
+    index = np.arange(node.size)
+    both = [node, program.constant(numbers, node.dtype)]
+    return program.gather(both, np.where(mask, index + node.size, index).reshape(node.shape))
+
+
+def _steady(
+    program: Program, start: Sequence[Node], carries: Sequence[Node], body: Callable[[list[Node]], list[Node]]
+) -> tuple[list[Node], list[Node], list[tuple[np.ndarray, np.ndarray]]]:
+    """Returns the carries inside a loop, the results of its body, and which elements keep a known value, with values.
+
+    They are assumed to be all that are known at the start; those that the body changes are dropped until none is.
+    """
+    steady = [known(node) for node in start]
+    steady = [(mask & (program.finite and mask.size > 1), numbers) for mask, numbers in steady]
+    while True:
+        inside = [_with_known(program, carry, *one) for carry, one in zip(carries, steady, strict=True)]
+        results = body(inside)
+        after = [known(result) for result in results[: len(start)]]
+        kept = [
+            (mask & still & (numbers == new), numbers)
+            for (mask, numbers), (still, new) in zip(steady, after, strict=True)
+        ]
+        if all(np.array_equal(one[0], other[0]) for one, other in zip(steady, kept, strict=True)):
+            return inside, results, steady
+        steady = kept
+
+
+def _while(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
+    split = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
+    of_condition, of_body, start = args[: split[0]], args[split[0] : split[1]], args[split[1] :]
+    outer, number, carries = _opened(program, args, start)
+    inside, results, steady = _steady(
+        program, start, carries, lambda inside: program.inline(program, parameters["body_jaxpr"], [*of_body, *inside])
+    )
+    (condition,) = program.inline(program, parameters["cond_jaxpr"], [*of_condition, *inside])
+    program.loops[number] = Loop(carries, [condition], results)
+    loop = program.make("while", (), "int", start, attribute=number, region=outer)
+    projected = projections(program, loop, [(carry.shape, carry.dtype) for carry in start])
+    return [_with_known(program, node, *one) for node, one in zip(projected, steady, strict=True)]
+
+
+def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
+    length, inner = parameters["length"], parameters["jaxpr"].jaxpr
+
+    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+        return sum(a.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
+
+    # Counted, because releases of JAX store these numbers differently; stacked arrays differ in shape inside.
+    count = alike(parameters["results"], inner.outvars)
+    constants = alike(args, inner.invars) - count
+    fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
+    if length == 0:
+        left = parameters["results"][count:]
+        return [*start, *(program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in left)]
+    outer, number, carries = _opened(program, args, start)
+    turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
+    slices = [_slice_of(program, array, turn, length) for array in stacked]
+    _, results, steady = _steady(
+        program, start, carries, lambda inside: program.inline(program, parameters["jaxpr"], [*fixed, *inside, *slices])
+    )
+    program.loops[number] = Loop(carries, [], results, length, parameters["reverse"])
+    loop = program.make("repeat", (), "int", start, attribute=number, region=outer)
+    projected = projections(program, loop, [(aval.shape, kind_of(aval.dtype)) for aval in parameters["results"]])
+    stacked = [known(result) for result in results[count:]]
+    steady += [(np.tile(mask & program.finite, length), np.tile(numbers, length)) for mask, numbers in stacked]
+    return [_with_known(program, node, *one) for node, one in zip(projected, steady, strict=True)]
+
+
+def _slice_of(program: Program, array: Node, turn: Node, length: int) -> Node:
+    """Returns the part of a stacked array in an iteration; elements that are the same in all of them are constants."""
+    size, shape, index = array.size // length, array.shape[1:], np.arange(array.size)
+    mask, numbers = (part.reshape(length, size) for part in known(array))
+    same = mask.all(0) & (numbers == numbers[0]).all(0) & program.finite
+    whole = array
+    if same.any() and array.op == "gather" and array.args[0].shape == array.shape and array.args[0].op != "const":
+        # The array whose elements these constants replace lies in memory; this one would have to be copied.
+        whole = array.args[0] if ((np.ravel(array.value) == index) | np.tile(same, length)).all() else array
+    first = program.elementwise("mul", turn, size)
+    offsets = program.constant(np.arange(size).reshape(shape), "index")
+    taken = indexing.take(program, whole, program.elementwise("add", first, offsets))
+    return _with_known(program, taken, same, numbers[0])
+
+
+def _cond(program: Program, parameters: Parameters, which: Node, *operands: Node) -> list[Node]:
+    branches = parameters["branches"]
+    if len(branches) == 1 or which.op == "const":
+        chosen = int(np.clip(which.value, 0, len(branches) - 1)) if which.value is not None else 0
+        return program.inline(program, branches[chosen], operands)
+    floor, outer = program.floor, max((program.floor, which.region, *(node.region for node in operands)), key=len)
+    numbers, every = [], []
+    for closed in branches:
+        _, number, _ = _opened(program, [])
+        program.floor = (*outer, number)
+        numbers.append(number)
+        every.append(program.inline(program, closed, operands))
+    program.floor = floor
+    for number, results in zip(numbers, every, strict=True):
+        program.loops[number] = Loop([], [], results)
+    branch = program.make("branch", (), "int", [which], attribute=tuple(numbers), region=outer)
+    return projections(program, branch, [(result.shape, result.dtype) for result in every[0]])
+
+
+RULES = {"while": _while, "scan": _scan, "cond": _cond}
+"""Rules by the name of the primitive."""
