@@ -44,13 +44,13 @@ VIOLATED = 5.0
 """Excess in units of δ that counts as a violation: the multiplier is then above nine tenths of the price."""
 
 
-def feedback(problem: TrajectoryProblem, plan: Plan, x: Array) -> Array:
+def feedback(problem: TrajectoryProblem, plan: Plan, x: Any) -> Array:
     """Returns the control [m] of the plan at a measured state [n] near its first; NaN if a state is not finite."""
-    return where_finite(_limited(problem)(plan.u[0] + plan.K[0] @ (x - plan.x[0]), plan.u[0]), x)
+    return where_finite(_limited(problem)(plan.u[0] + plan.K[0] @ (x - plan.x[0]), plan.u[0]), jnp.asarray(x, float))
 
 
 def prepare(
-    problem: TrajectoryProblem, plan: Plan, x: Array, *, barrier: float = BARRIER, iterations: int = 1,
+    problem: TrajectoryProblem, plan: Plan, x: Any, *, barrier: Any = BARRIER, iterations: int = 1,
     step_lengths: Any = STEP_LENGTHS,
 ) -> Plan:  # fmt: skip
     """Returns the plan for the next sample, after `feedback` at a state [n] was applied.
@@ -66,6 +66,7 @@ def prepare(
         InputError: as for `improve`.
     """
     require_positive(iterations=iterations)
+    x = jnp.asarray(x, float)
     now, later = (
         problem._replace(knots=jax.tree.map(lambda rows, part=part: rows[part], problem.knots))
         for part in (slice(None, -1), slice(1, None))
@@ -83,7 +84,7 @@ def prepare(
 
 
 def mpc(
-    problem: TrajectoryProblem, *, barrier: float = BARRIER, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
+    problem: TrajectoryProblem, *, barrier: Any = BARRIER, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
 ) -> Callable[..., tuple[Array, Plan]]:
     """Model predictive control: (state, plan) -> (control, plan of the next sample), by `feedback`, then `prepare`.
 
@@ -96,7 +97,7 @@ def mpc(
         iterations: per call.
     """
 
-    def act(x: Array, plan: Plan, knots: Any = None) -> tuple[Array, Plan]:
+    def act(x: Any, plan: Plan, knots: Any = None) -> tuple[Array, Plan]:
         now = problem if knots is None else problem._replace(knots=knots)
         after = prepare(now, plan, x, barrier=barrier, iterations=iterations, step_lengths=step_lengths)
         return feedback(problem, plan, x), after
@@ -105,7 +106,7 @@ def mpc(
 
 
 def improve(
-    problem: TrajectoryProblem, plan: Plan, *, barrier: float = BARRIER, step_lengths: Any = STEP_LENGTHS
+    problem: TrajectoryProblem, plan: Plan, *, barrier: Any = BARRIER, step_lengths: Any = STEP_LENGTHS
 ) -> Plan:
     """Runs one iteration from the plan's first state; the cost, which includes barriers and prices, never rises.
 
@@ -116,13 +117,14 @@ def improve(
     Args:
         problem: over the horizon.
         plan: such as one of `optimise`, `shoot` or `first_plan`.
-        barrier: μ, in units of the cost.
+        barrier: μ, in units of the cost; it may be traced, to fall from iteration to iteration.
         step_lengths: tried in an iteration [L].
 
     Raises:
         InputError: a first state with free components, or a barrier that is not positive.
     """
-    require_positive(barrier=barrier)
+    if not isinstance(barrier, Tracer):
+        require_positive(barrier=barrier)
     if problem.free is not None:
         raise InputError("a component of the first state is free, but in real time it is measured; leave `free` out")
     n, m = plan.x.shape[1], plan.u.shape[1]
@@ -173,7 +175,7 @@ class _Smooth(NamedTuple):
     """(y, knot) -> gradient, and Hessian of Gauss and Newton."""
 
 
-def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: float) -> tuple[_Smooth, _Smooth]:
+def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_Smooth, _Smooth]:
     """Returns the cost of a step and that of the end."""
     w_1, w_2 = PRICES if problem.soft is None else problem.soft
     width = _width(problem, barrier)
@@ -259,6 +261,6 @@ def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
     return limited
 
 
-def _width(problem: TrajectoryProblem, barrier: float) -> float:
+def _width(problem: TrajectoryProblem, barrier: Any) -> Any:
     """δ, over which a price rises."""
     return 2 * barrier / (PRICES if problem.soft is None else problem.soft)[0]

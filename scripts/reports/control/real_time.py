@@ -7,7 +7,7 @@ loop with a finer simulation. Times are CPU times of a call in this process, sin
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control import Plan, TrajectoryProblem, feedback, first_plan, improve, integrated, prepare, shoot
-from dln_jax.export.c.interface import read_interface
+from dln_jax.export.c.interface import Signature, read_interface
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from scripts.reports.case import Findings
@@ -110,27 +110,35 @@ def closed(act: Callable[[np.ndarray], tuple[np.ndarray, float]], x: np.ndarray)
 FINE = jax.jit(integrated(lambda x, u: jnp.stack(rates_of(Sizes())(jnp, x, u)), DT, substeps=4))
 
 
-def starting(problem: TrajectoryProblem) -> tuple[Callable[[Any], Plan], Callable[[Plan], Plan]]:
-    """Returns start -> plan of `shoot` from a straight line, and plan -> plan after some iterations."""
-    line, still = np.linspace(HANGING, 0 * HANGING, STEPS + 1), np.zeros((STEPS, 1))
+def starting(problem: TrajectoryProblem, steps: int = STEPS) -> tuple[Callable[[Any], Plan], Callable[[Plan], Plan]]:
+    """Returns start -> plan of `shoot` from straight lines to both sides, and plan -> plan after some iterations."""
+    line, other = (np.linspace(HANGING, [0, angle, 0, 0], steps + 1) for angle in (0.0, 2 * np.pi))
+    still = np.zeros((steps, 1))
     settle = lambda plan: jax.lax.fori_loop(0, SETTLING, lambda _, plan: improve(problem, plan, barrier=BARRIER), plan)  # noqa: E731
-    return jax.jit(lambda x: shoot(problem, x, line, still).plan), jax.jit(settle)
+    solve = lambda x: shoot(problem, x, line, still, starts=(other[None], still[None])).plan  # noqa: E731
+    return jax.jit(solve), jax.jit(settle)
 
 
-def in_c(problem: TrajectoryProblem, plan: Plan, folder: Path, **settings: Any) -> Any:
-    """Exports `feedback` and `prepare` and returns them, with their operations and bytes of stack."""
-
-    def respond(x: Any, u: Any, states: Any, gains: Any) -> Any:
-        return feedback(problem, plan._replace(u=u, x=states, K=gains), x)
+def renewed(problem: TrajectoryProblem, plan: Plan, **settings: Any) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """`prepare` as a function of arrays, (x, controls, states, gains, damping, knots if any), and example arguments."""
 
     def renew(x: Any, u: Any, states: Any, gains: Any, damping: Any, knots: Any = None) -> Any:
         now = problem if knots is None else problem._replace(knots=knots)
         after = prepare(now, plan._replace(u=u, x=states, K=gains, damping=damping), x, **settings)
         return {"controls": after.u, "next": after.x, "feedback": after.K, "size": after.damping, "ending": after.ending}
 
-    memory = tuple(map(np.asarray, (plan.x[0], plan.u, plan.x, plan.K, plan.damping)))
-    knots = () if problem.knots is None else (np.asarray(problem.knots),)
-    export_c({"respond": (respond, memory[:-1]), "renew": (renew, (*memory, *knots))}, folder, stack=STACK)
+    knots = () if problem.knots is None else (problem.knots,)
+    return renew, tuple(map(np.asarray, (plan.x[0], plan.u, plan.x, plan.K, plan.damping, *knots)))
+
+
+def in_c(problem: TrajectoryProblem, plan: Plan, folder: Path, **settings: Any) -> tuple[Any, Mapping[str, Signature]]:
+    """Exports `feedback` and `prepare`, and returns the compiled functions and their signatures, which state the cost."""
+
+    def respond(x: Any, u: Any, states: Any, gains: Any) -> Any:
+        return feedback(problem, plan._replace(u=u, x=states, K=gains), x)
+
+    renew, examples = renewed(problem, plan, **settings)
+    export_c({"respond": (respond, examples[:4]), "renew": (renew, examples)}, folder, stack=STACK)
     return load_c(folder), read_interface(folder, "model")[1]
 
 
@@ -166,14 +174,15 @@ def cart_pole_report(quick: bool) -> Findings:
         rows.append(Row(case, "operations", signature.operations, expected="floating-point, of a call"))
         rows.append(Row(case, "stack_bytes", signature.stack_bytes, "B"))
     for name in ("ipopt", "fatrop", "hpipm"):
-        found = []
-        for x in drawn[: 1 if quick else RIVAL_LOOPS]:
-            plan = solve(x)
-            first = np.append(np.concatenate([plan.x[:-1], plan.u], axis=1).ravel(), plan.x[-1])
-            act = hpipm(planned, roots, first) if name == "hpipm" else to_the_end(name, planned, roots, first)
-            found.append(closed(act, x))
+        make = hpipm(planned, roots) if name == "hpipm" else to_the_end(name, planned, roots)
+        found = [closed(make(unknowns(solve(x))), x) for x in drawn[: 1 if quick else RIVAL_LOOPS]]
         rows += _rows(f"realtime/cart-pole/{name}", found, None)
     return Findings(rows)
+
+
+def unknowns(plan: Plan) -> np.ndarray:
+    """x_0, u_0, x_1, ..., x_N."""
+    return np.append(np.concatenate([plan.x[:-1], plan.u], axis=1).ravel(), plan.x[-1])
 
 
 def _rows(case: str, loops: list[Loop], bound: float | None) -> list[Row]:
