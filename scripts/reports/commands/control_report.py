@@ -16,6 +16,7 @@ from dln_jax.cli.options import Drawn, Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.control import (
+    arm_in_real_time,
     contacts,
     energy_laws,
     estimates,
@@ -52,6 +53,7 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
     "laws/in-c": laws_in_c.laws,
     "plans/beside-ipopt": plans.plans,
     "realtime/cart-pole": real_time.cart_pole_report,
+    "realtime/seven-axis": arm_in_real_time.seven_axis_report,
     "rail/cart-pole": rail.on_a_rail,
 }
 """Functions quick -> findings, by SUBJECT/NAME."""

@@ -5,6 +5,7 @@ A cart-pole between walls: the plant of Lutter et al. 2021 (arXiv 2105.04682), 1
 loop with a finer simulation. Times are CPU times of a call in this process, since other programs may share the machine.
 """
 
+import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -17,7 +18,6 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control import Plan, TrajectoryProblem, feedback, first_plan, improve, integrated, prepare, shoot
-from dln_jax.export.c.interface import Signature, read_interface
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from scripts.reports.case import Findings
@@ -131,15 +131,25 @@ def renewed(problem: TrajectoryProblem, plan: Plan, **settings: Any) -> tuple[Ca
     return renew, tuple(map(np.asarray, (plan.x[0], plan.u, plan.x, plan.K, plan.damping, *knots)))
 
 
-def in_c(problem: TrajectoryProblem, plan: Plan, folder: Path, **settings: Any) -> tuple[Any, Mapping[str, Signature]]:
-    """Exports `feedback` and `prepare`, and returns the compiled functions and their signatures, which state the cost."""
+class Effort(NamedTuple):
+    """Cost of a call, from the header of an export."""
+
+    operations: int
+    """Floating-point operations; all loops have a fixed number of turns."""
+    stack_bytes: int
+
+
+def in_c(problem: TrajectoryProblem, plan: Plan, folder: Path, **settings: Any) -> tuple[Any, Mapping[str, Effort]]:
+    """Exports `feedback` and `prepare`, and returns the compiled functions and the costs of their calls."""
 
     def respond(x: Any, u: Any, states: Any, gains: Any) -> Any:
         return feedback(problem, plan._replace(u=u, x=states, K=gains), x)
 
     renew, examples = renewed(problem, plan, **settings)
     export_c({"respond": (respond, examples[:4]), "renew": (renew, examples)}, folder, stack=STACK)
-    return load_c(folder), read_interface(folder, "model")[1]
+    stated = r"(\d+) floating-point operations, (\d+) bytes of stack[^/]*/\s*\w+ model_(\w+)\("
+    efforts = {name: Effort(*map(int, numbers)) for *numbers, name in re.findall(stated, (folder / "model.h").read_text())}
+    return load_c(folder), efforts
 
 
 def of_c(functions: Any, plan: Plan) -> Callable[..., tuple[np.ndarray, float]]:
@@ -166,13 +176,13 @@ def cart_pole_report(quick: bool) -> Findings:
     rows: list[Row] = []
     drawn = starts(1 if quick else LOOPS)
     with tempfile.TemporaryDirectory() as place:
-        functions, signatures = in_c(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER)
+        functions, efforts = in_c(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER)
     loops = [closed(of_c(functions, settle(solve(x))), x) for x in drawn]
     rows += _rows("realtime/cart-pole/c", loops, TO_REACH_MS)
-    for name, signature in signatures.items():
+    for name, effort in efforts.items():
         case = f"realtime/cart-pole/c-{name}"
-        rows.append(Row(case, "operations", signature.operations, expected="floating-point, of a call"))
-        rows.append(Row(case, "stack_bytes", signature.stack_bytes, "B"))
+        rows.append(Row(case, "operations", effort.operations, expected="floating-point, of a call"))
+        rows.append(Row(case, "stack_bytes", effort.stack_bytes, "B"))
     for name in ("ipopt", "fatrop", "hpipm"):
         make = hpipm(planned, roots) if name == "hpipm" else to_the_end(name, planned, roots)
         found = [closed(make(unknowns(solve(x))), x) for x in drawn[: 1 if quick else RIVAL_LOOPS]]
