@@ -1,6 +1,6 @@
 """Problems of optimal trajectories with constraints, and plans: trees of arrays, so that everything is traceable.
 
-    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
+min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 """
 
 from collections.abc import Callable

@@ -52,7 +52,9 @@ def test_iterations_approach_the_optimum_as_the_barrier_falls():
 
 def test_prices_have_their_closed_forms():
     """The price minimises w t - μ log t - μ log(t - c) over t; slope and curvature are its derivatives."""
-    step, _ = _smooth(BLOCK._replace(cost=lambda x, u: 0 * x[0], soft=(2.0, 0.0), lower=-np.inf, upper=np.inf), 2, 1, 0.1)
+    step, _ = _smooth(
+        BLOCK._replace(cost=lambda x, u: 0 * x[0], soft=(2.0, 0.0), lower=-np.inf, upper=np.inf), 2, 1, 0.1
+    )
     slope = jax.jit(jax.grad(lambda y: step.cost(y)[0]))
     for speed in (-3.0, 0.55, 0.6, 2.0):
         c, y = speed - 0.6, jnp.array([0.0, speed, 0.0])

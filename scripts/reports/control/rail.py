@@ -19,7 +19,19 @@ from dln_jax.control.closed_loop import outcomes
 from dln_jax.control.mujoco_loop import compiled_model
 from scripts.reports.case import Findings
 from scripts.reports.control.plans import in_jax
-from scripts.reports.control.real_time import BARRIER, DT, HANGING, LIMIT, RAIL, STEPS, Sizes, cart_pole, in_c, of_c, starting
+from scripts.reports.control.real_time import (
+    BARRIER,
+    DT,
+    HANGING,
+    LIMIT,
+    RAIL,
+    STEPS,
+    Sizes,
+    cart_pole,
+    in_c,
+    of_c,
+    starting,
+)
 from scripts.reports.rows import Row, expect
 
 CART, ROD, LENGTH = 0.8, 0.15, 0.5
@@ -126,7 +138,9 @@ def on_a_rail(quick: bool) -> Findings:
     solve, settle = starting(problem)
     step = jax.jit(problem.step)
     with tempfile.TemporaryDirectory() as place:
-        functions, _ = in_c(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER)
+        functions, _ = in_c(
+            problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER
+        )
     drawn = starts(5 if quick else RUNS)
     # Gains need a reserve of force, and room for what the plan does not know.
     careful = in_jax(cart_pole(known(), ROOM)._replace(limit=(RESERVED * LIMIT,)))
@@ -152,5 +166,11 @@ def _rows(case: str, runs: list[Run]) -> list[Row]:
         expect(case, "farthest_m", words, farthest.max(), RAIL, "m"),
         Row(case, "seconds_median", found.median, "s"),
         Row(case, "seconds_worst", found.worst, "s"),
-        Row(case, "p99_ms", float(np.percentile(np.concatenate([run.milliseconds for run in runs]), 99)), "ms", expected="CPU"),
+        Row(
+            case,
+            "p99_ms",
+            float(np.percentile(np.concatenate([run.milliseconds for run in runs]), 99)),
+            "ms",
+            expected="CPU",
+        ),
     ]

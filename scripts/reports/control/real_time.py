@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from dln_jax.control import Plan, TrajectoryProblem, feedback, first_plan, improve, integrated, prepare, shoot
 from dln_jax.export.c.load import load_c
@@ -125,7 +124,13 @@ def renewed(problem: TrajectoryProblem, plan: Plan, **settings: Any) -> tuple[Ca
     def renew(x: Any, u: Any, states: Any, gains: Any, damping: Any, knots: Any = None) -> Any:
         now = problem if knots is None else problem._replace(knots=knots)
         after = prepare(now, plan._replace(u=u, x=states, K=gains, damping=damping), x, **settings)
-        return {"controls": after.u, "next": after.x, "feedback": after.K, "size": after.damping, "ending": after.ending}
+        return {
+            "controls": after.u,
+            "next": after.x,
+            "feedback": after.K,
+            "size": after.damping,
+            "ending": after.ending,
+        }
 
     knots = () if problem.knots is None else (problem.knots,)
     return renew, tuple(map(np.asarray, (plan.x[0], plan.u, plan.x, plan.K, plan.damping, *knots)))
@@ -148,7 +153,9 @@ def in_c(problem: TrajectoryProblem, plan: Plan, folder: Path, **settings: Any) 
     renew, examples = renewed(problem, plan, **settings)
     export_c({"respond": (respond, examples[:4]), "renew": (renew, examples)}, folder, stack=STACK)
     stated = r"(\d+) floating-point operations, (\d+) bytes of stack[^/]*/\s*\w+ model_(\w+)\("
-    efforts = {name: Effort(*map(int, numbers)) for *numbers, name in re.findall(stated, (folder / "model.h").read_text())}
+    efforts = {
+        name: Effort(*map(int, numbers)) for *numbers, name in re.findall(stated, (folder / "model.h").read_text())
+    }
     return load_c(folder), efforts
 
 
@@ -176,7 +183,9 @@ def cart_pole_report(quick: bool) -> Findings:
     rows: list[Row] = []
     drawn = starts(1 if quick else LOOPS)
     with tempfile.TemporaryDirectory() as place:
-        functions, efforts = in_c(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER)
+        functions, efforts = in_c(
+            problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER
+        )
     loops = [closed(of_c(functions, settle(solve(x))), x) for x in drawn]
     rows += _rows("realtime/cart-pole/c", loops, TO_REACH_MS)
     for name, effort in efforts.items():
