@@ -1,16 +1,16 @@
 """Model predictive control with constraints in real time: one iteration per sample, with a fixed number of operations.
 
-At a sample, the control follows from the measured state by the gains of the plan: `feedback`, a product of a matrix and
-a vector. Then, until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and
-improves it by an iteration of single shooting (the split is that of Diehl, Bock and Schlöder 2005). The iteration solves
-a smooth problem, in which limits of the controls are barriers and all other constraints c <= 0 are prices:
+At a sample, the control follows from the measured state by the gains of the plan: `feedback`, a product of a matrix
+and a vector. Then, until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and
+improves it by an iteration of single shooting (the split is that of Diehl, Bock and Schlöder 2005). The iteration
+solves a smooth problem, in which limits of the controls are barriers and all other constraints c <= 0 are prices:
 
     -μ log(-c)   and   min_t  w_1 t - μ log t - μ log(t - c)  +  w_2 max(c, 0)² / 2
 
-Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick 1968):
-as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. It has a closed form:
-with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So there is a plan at every
-sample, it needs no memory of multipliers, and it says whether it violates a constraint.
+Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick
+1968): as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. It has a
+closed form: with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So there is
+a plan at every sample, it needs no memory of multipliers, and it says whether it violates a constraint.
 
 An iteration is that of a Gauss-Newton regulator (Li and Todorov 2004) by Riccati's recursion. It takes the best of some
 step lengths, each of which is a motion, and raises the damping of the controls' Hessian if none lowers the cost.
@@ -240,7 +240,7 @@ def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_
 
 
 def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array]:
-    """Returns signs [r, size] and bounds [r] of the finite limits as rows signs y - bounds; traced ones count as finite."""
+    """Returns signs [r, size] and bounds [r] of the finite limits as rows signs y - bounds; traced limits are finite."""
     signs, bounds = [], []
     for sign, limit in ((-1.0, lower), (1.0, upper)):
         known = np.ones(size, bool) if isinstance(limit, Tracer) else np.isfinite(np.broadcast_to(limit, size))

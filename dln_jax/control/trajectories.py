@@ -56,7 +56,7 @@ class TrajectoryProblem(NamedTuple):
 
 
 def knots_of(problem: TrajectoryProblem) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Returns the additional arguments of functions at the steps, with an axis [N], and at the end; both may be empty."""
+    """Returns the last arguments of functions at the steps, with an axis [N], and at the end: none without knots."""
     if problem.knots is None:
         return (), ()
     return (jax.tree.map(lambda rows: rows[:-1], problem.knots),), (jax.tree.map(lambda rows: rows[-1], problem.knots),)

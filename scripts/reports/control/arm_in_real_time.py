@@ -1,8 +1,8 @@
 """A seven-axis arm that tracks a reference beyond its limits, by predictive control in C with 10 knots.
 
-Controls are accelerations, so that steps are linear; torques, from the inverse dynamics of the known tree, are constraints
-that depend on the state. Knots carry the reference. Between samples of 20 ms, computed torque at 1 kHz applies the
-acceleration. The reference leaves the range of two joints and asks for more torque than two motors have.
+Controls are accelerations, so that steps are linear; torques, from the inverse dynamics of the known tree, are
+constraints that depend on the state. Knots carry the reference. Between samples of 20 ms, computed torque at 1 kHz
+applies the acceleration. The reference leaves the range of two joints.
 """
 
 import tempfile

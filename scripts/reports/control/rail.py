@@ -42,8 +42,8 @@ NOISE, TURN, TICK = np.array([1e-4, 1e-3]), 2 * np.pi / 4096, 2.5e-5
 CORRECTIONS = 0.5, 0.15
 """Shares of an innovation that correct the coordinates, and their rates within a sample."""
 WALL, ROOM, RESERVED = 0.03, 0.1, 0.7
-"""Distance that receding plans and one plan with its gains keep from the ends of the rail, m, and the share of the force
-that the latter plans with."""
+"""Distance that receding plans and one plan with its gains keep from the ends of the rail, m, and the share of the
+force that the latter plans with."""
 LONG = 180
 """Steps of these plans."""
 SOLID = 'contype="0" conaffinity="0"'

@@ -1,8 +1,9 @@
 """Predictive control with constraints in real time, in C, beside IPOPT, fatrop and HPIPM on the same problem.
 
-A cart-pole between walls: the plant of Lutter et al. 2021 (arXiv 2105.04682), 12 N, rail of +-0.5 m, 100 Hz, a horizon of
-1.2 s in 120 steps. All controllers start with the plan of `shoot` from the start at rest, and then swing up in a closed
-loop with a finer simulation. Times are CPU times of a call in this process, since other programs may share the machine.
+A cart-pole between walls: the plant of Lutter et al. 2021 (arXiv 2105.04682), 12 N, rail of +-0.5 m, 100 Hz, a horizon
+of 1.2 s in 120 steps. All controllers start with the plan of `shoot` from the start at rest, and then swing up in a
+closed loop with a finer simulation. Times are CPU times of a call in this process, since other programs may share the
+machine.
 """
 
 import re

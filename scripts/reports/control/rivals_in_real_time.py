@@ -1,8 +1,8 @@
 """Rivals of predictive control through CasADi: IPOPT and fatrop to their end, HPIPM in one iteration per sample.
 
-All start from their solution at the sample before, shifted by a step. HPIPM's derivatives are generated C, compiled with
--O1; those of IPOPT and fatrop run in CasADi's virtual machine, since compilers take minutes for straight lines of this
-length. Times are those of the solvers' calls.
+All start from their solution at the sample before, shifted by a step. HPIPM's derivatives are generated C, compiled
+with -O1; those of IPOPT and fatrop run in CasADi's virtual machine, since compilers take minutes for straight lines of
+this length. Times are those of the solvers' calls.
 """
 
 import time
