@@ -240,7 +240,7 @@ def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_
 
 
 def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array]:
-    """Returns signs [r, size] and bounds [r] of the finite limits as rows signs y - bounds; traced limits are finite."""
+    """Returns signs [r, size] and bounds [r] of the finite limits, rows signs y - bounds; traced limits are finite."""
     signs, bounds = [], []
     for sign, limit in ((-1.0, lower), (1.0, upper)):
         known = np.ones(size, bool) if isinstance(limit, Tracer) else np.isfinite(np.broadcast_to(limit, size))

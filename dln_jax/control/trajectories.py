@@ -21,11 +21,11 @@ FIRST_DAMPING = 1e-3
 class TrajectoryProblem(NamedTuple):
     """Dynamics, costs and limits of a trajectory."""
 
-    step: Callable[[Array, Array], Array]
+    step: Callable[..., Array]
     """(x [n], u [m]) -> x' [n], for example of an integrator."""
-    cost: Callable[[Array, Array], Scalar]
+    cost: Callable[..., Scalar]
     """(x, u) -> cost of one step."""
-    final_cost: Callable[[Array], Scalar]
+    final_cost: Callable[..., Scalar]
     """x -> cost of the last state."""
     lower: Any = -jnp.inf
     """Lower limits of the controls, [m] or one for all."""
@@ -33,13 +33,13 @@ class TrajectoryProblem(NamedTuple):
     lower_x: Any = -jnp.inf
     """Lower limits of the states x_1 to x_N, [n] or one for all; hard, like those of the controls."""
     upper_x: Any = jnp.inf
-    path: Callable[[Array, Array], Array] | None = None
+    path: Callable[..., Array] | None = None
     """(x, u) -> [p], not above zero at every step, such as limits of a torque that depends on the state."""
-    states: Callable[[Array], Array] | None = None
+    states: Callable[..., Array] | None = None
     """x -> [r], not above zero at x_1 to x_N, such as distances to obstacles with their sign reversed."""
-    end_below: Callable[[Array], Array] | None = None
+    end_below: Callable[..., Array] | None = None
     """x_N -> [e], not above zero."""
-    end: Callable[[Array], Array] | None = None
+    end: Callable[..., Array] | None = None
     """x_N -> [q], zero; always hard."""
     soft: tuple[float, float] | None = (1e3, 1e3)
     """Weights (w_1, w_2) of w_1 t + w_2 t² / 2 for the excess t of `path`, `states` and `end_below`; None: hard.

@@ -48,8 +48,6 @@ LONG = 180
 """Steps of these plans."""
 SOLID = 'contype="0" conaffinity="0"'
 
-Sensed = tuple[np.ndarray, np.ndarray]
-
 
 def model() -> Any:
     """The plant, without ends of the rail: a cart beyond them is seen."""
@@ -112,8 +110,8 @@ def with_gains(problem: TrajectoryProblem) -> Callable[[Plan], Plan]:
 
     @jax.jit
     def regulated(plan: Plan) -> Plan:
-        slopes = jax.vmap(jax.jacfwd(problem.step, argnums=(0, 1)))(plan.x[:-1], plan.u)
-        return plan._replace(K=-time_varying_lqr(*slopes, Q, R, 2000 * Q).K)
+        A, B = jax.vmap(jax.jacfwd(problem.step, argnums=(0, 1)))(plan.x[:-1], plan.u)
+        return plan._replace(K=-time_varying_lqr(A, B, Q, R, 2000 * Q).K)
 
     return regulated
 

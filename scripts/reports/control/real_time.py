@@ -75,7 +75,8 @@ def cart_pole(sizes: Sizes = Sizes(), margin: float = MARGIN) -> Planned:  # noq
     wall = np.array([RAIL - margin, *[np.inf] * 3])
     return Planned(
         "cart-pole", tuple(HANGING), (0.0,) * 4, STEPS, Steps(rates_of(sizes), DT),
-        lambda f, x, u: sum(root**2 for root in roots(f, x, u)), lambda f, x: sum(root**2 for root in roots(f, x, None)),
+        lambda f, x, u: sum(root**2 for root in roots(f, x, u)),
+        lambda f, x: sum(root**2 for root in roots(f, x, None)),
         (LIMIT,), -wall, wall,
     )  # fmt: skip
 
