@@ -1,16 +1,16 @@
 """Model predictive control with constraints in real time: one iteration per sample, with a fixed number of operations.
 
-At a sample, the control follows from the measured state by the gains of the plan: `feedback`, a product of a matrix and
-a vector. Then, until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and
-improves it by an iteration of single shooting (the split is that of Diehl, Bock and Schlöder 2005). The iteration solves
-a smooth problem, in which limits of the controls are barriers and all other constraints c <= 0 are prices:
+At a sample, the control follows from the measured state by the gains of the plan: `feedback`, a product of a matrix
+and a vector. Then, until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and
+improves it by an iteration of single shooting (the split is that of Diehl, Bock and Schlöder 2005). The iteration
+solves a smooth problem, in which limits of the controls are barriers and all other constraints c <= 0 are prices:
 
     -μ log(-c)   and   min_t  w_1 t - μ log t - μ log(t - c)  +  w_2 max(c, 0)² / 2
 
-Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick 1968):
-as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. It has a closed form:
-with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So there is a plan at every
-sample, it needs no memory of multipliers, and it says whether it violates a constraint.
+Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick
+1968): as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. It has a
+closed form: with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So there is
+a plan at every sample, it needs no memory of multipliers, and it says whether it violates a constraint.
 
 An iteration is that of a Gauss-Newton regulator (Li and Todorov 2004) by Riccati's recursion. It takes the best of some
 step lengths, each of which is a motion, and raises the damping of the controls' Hessian if none lowers the cost.
@@ -44,13 +44,13 @@ VIOLATED = 5.0
 """Excess in units of δ that counts as a violation: the multiplier is then above nine tenths of the price."""
 
 
-def feedback(problem: TrajectoryProblem, plan: Plan, x: Array) -> Array:
+def feedback(problem: TrajectoryProblem, plan: Plan, x: Any) -> Array:
     """Returns the control [m] of the plan at a measured state [n] near its first; NaN if a state is not finite."""
-    return where_finite(_limited(problem)(plan.u[0] + plan.K[0] @ (x - plan.x[0]), plan.u[0]), x)
+    return where_finite(_limited(problem)(plan.u[0] + plan.K[0] @ (x - plan.x[0]), plan.u[0]), jnp.asarray(x, float))
 
 
 def prepare(
-    problem: TrajectoryProblem, plan: Plan, x: Array, *, barrier: float = BARRIER, iterations: int = 1,
+    problem: TrajectoryProblem, plan: Plan, x: Any, *, barrier: Any = BARRIER, iterations: int = 1,
     step_lengths: Any = STEP_LENGTHS,
 ) -> Plan:  # fmt: skip
     """Returns the plan for the next sample, after `feedback` at a state [n] was applied.
@@ -66,6 +66,7 @@ def prepare(
         InputError: as for `improve`.
     """
     require_positive(iterations=iterations)
+    x = jnp.asarray(x, float)
     now, later = (
         problem._replace(knots=jax.tree.map(lambda rows, part=part: rows[part], problem.knots))
         for part in (slice(None, -1), slice(1, None))
@@ -83,7 +84,7 @@ def prepare(
 
 
 def mpc(
-    problem: TrajectoryProblem, *, barrier: float = BARRIER, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
+    problem: TrajectoryProblem, *, barrier: Any = BARRIER, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
 ) -> Callable[..., tuple[Array, Plan]]:
     """Model predictive control: (state, plan) -> (control, plan of the next sample), by `feedback`, then `prepare`.
 
@@ -96,7 +97,7 @@ def mpc(
         iterations: per call.
     """
 
-    def act(x: Array, plan: Plan, knots: Any = None) -> tuple[Array, Plan]:
+    def act(x: Any, plan: Plan, knots: Any = None) -> tuple[Array, Plan]:
         now = problem if knots is None else problem._replace(knots=knots)
         after = prepare(now, plan, x, barrier=barrier, iterations=iterations, step_lengths=step_lengths)
         return feedback(problem, plan, x), after
@@ -105,7 +106,7 @@ def mpc(
 
 
 def improve(
-    problem: TrajectoryProblem, plan: Plan, *, barrier: float = BARRIER, step_lengths: Any = STEP_LENGTHS
+    problem: TrajectoryProblem, plan: Plan, *, barrier: Any = BARRIER, step_lengths: Any = STEP_LENGTHS
 ) -> Plan:
     """Runs one iteration from the plan's first state; the cost, which includes barriers and prices, never rises.
 
@@ -116,13 +117,14 @@ def improve(
     Args:
         problem: over the horizon.
         plan: such as one of `optimise`, `shoot` or `first_plan`.
-        barrier: μ, in units of the cost.
+        barrier: μ, in units of the cost; it may be traced, to fall from iteration to iteration.
         step_lengths: tried in an iteration [L].
 
     Raises:
         InputError: a first state with free components, or a barrier that is not positive.
     """
-    require_positive(barrier=barrier)
+    if not isinstance(barrier, Tracer):
+        require_positive(barrier=barrier)
     if problem.free is not None:
         raise InputError("a component of the first state is free, but in real time it is measured; leave `free` out")
     n, m = plan.x.shape[1], plan.u.shape[1]
@@ -173,7 +175,7 @@ class _Smooth(NamedTuple):
     """(y, knot) -> gradient, and Hessian of Gauss and Newton."""
 
 
-def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: float) -> tuple[_Smooth, _Smooth]:
+def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_Smooth, _Smooth]:
     """Returns the cost of a step and that of the end."""
     w_1, w_2 = PRICES if problem.soft is None else problem.soft
     width = _width(problem, barrier)
@@ -238,7 +240,7 @@ def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: float) -> tuple
 
 
 def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array]:
-    """Returns signs [r, size] and bounds [r] of the finite limits as rows signs y - bounds; traced ones count as finite."""
+    """Returns signs [r, size] and bounds [r] of the finite limits, rows signs y - bounds; traced limits are finite."""
     signs, bounds = [], []
     for sign, limit in ((-1.0, lower), (1.0, upper)):
         known = np.ones(size, bool) if isinstance(limit, Tracer) else np.isfinite(np.broadcast_to(limit, size))
@@ -259,6 +261,6 @@ def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
     return limited
 
 
-def _width(problem: TrajectoryProblem, barrier: float) -> float:
+def _width(problem: TrajectoryProblem, barrier: Any) -> Any:
     """δ, over which a price rises."""
     return 2 * barrier / (PRICES if problem.soft is None else problem.soft)[0]

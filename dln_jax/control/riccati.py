@@ -86,7 +86,7 @@ def eliminated(n: int, q: Array, Q: Array) -> tuple[Array, Array, tuple[Array, A
 
 
 def made_convex(R: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Returns R plus a multiple of the identity: zero where R is positive definite, else enough by Gershgorin's discs."""
+    """Returns R, or R plus enough of the identity (by Gershgorin's discs) where R is not positive definite."""
     if len(R) == 1:
         return jnp.abs(R)
     diagonal = jnp.diagonal(R)

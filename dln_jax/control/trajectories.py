@@ -1,6 +1,6 @@
 """Problems of optimal trajectories with constraints, and plans: trees of arrays, so that everything is traceable.
 
-    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
+min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 """
 
 from collections.abc import Callable
@@ -21,11 +21,11 @@ FIRST_DAMPING = 1e-3
 class TrajectoryProblem(NamedTuple):
     """Dynamics, costs and limits of a trajectory."""
 
-    step: Callable[[Array, Array], Array]
+    step: Callable[..., Array]
     """(x [n], u [m]) -> x' [n], for example of an integrator."""
-    cost: Callable[[Array, Array], Scalar]
+    cost: Callable[..., Scalar]
     """(x, u) -> cost of one step."""
-    final_cost: Callable[[Array], Scalar]
+    final_cost: Callable[..., Scalar]
     """x -> cost of the last state."""
     lower: Any = -jnp.inf
     """Lower limits of the controls, [m] or one for all."""
@@ -33,13 +33,13 @@ class TrajectoryProblem(NamedTuple):
     lower_x: Any = -jnp.inf
     """Lower limits of the states x_1 to x_N, [n] or one for all; hard, like those of the controls."""
     upper_x: Any = jnp.inf
-    path: Callable[[Array, Array], Array] | None = None
+    path: Callable[..., Array] | None = None
     """(x, u) -> [p], not above zero at every step, such as limits of a torque that depends on the state."""
-    states: Callable[[Array], Array] | None = None
+    states: Callable[..., Array] | None = None
     """x -> [r], not above zero at x_1 to x_N, such as distances to obstacles with their sign reversed."""
-    end_below: Callable[[Array], Array] | None = None
+    end_below: Callable[..., Array] | None = None
     """x_N -> [e], not above zero."""
-    end: Callable[[Array], Array] | None = None
+    end: Callable[..., Array] | None = None
     """x_N -> [q], zero; always hard."""
     soft: tuple[float, float] | None = (1e3, 1e3)
     """Weights (w_1, w_2) of w_1 t + w_2 t² / 2 for the excess t of `path`, `states` and `end_below`; None: hard.
@@ -56,7 +56,7 @@ class TrajectoryProblem(NamedTuple):
 
 
 def knots_of(problem: TrajectoryProblem) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Returns the additional arguments of functions at the steps, with an axis [N], and at the end; both may be empty."""
+    """Returns the last arguments of functions at the steps, with an axis [N], and at the end: none without knots."""
     if problem.knots is None:
         return (), ()
     return (jax.tree.map(lambda rows: rows[:-1], problem.knots),), (jax.tree.map(lambda rows: rows[-1], problem.knots),)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import TrajectoryProblem, field_of, integrated, mpc, shoot, time_varying_lqr
+from dln_jax.control import TrajectoryProblem, field_of, integrated, shoot, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
 from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
@@ -66,10 +66,6 @@ def test_a_guess_that_is_no_motion_comes_to_the_optimum_of_single_shooting():
     found = from_a_straight_line()
     assert found.converged and found.defect < 1e-8 and np.abs(found.plan.u).max() <= 10.0
     assert (np.abs(found.plan.u) > 9.999).any() and np.cos(found.plan.x[-1, 1]) > 0.999
-    # Regulators iterated from it, by the motion and its feedback alone, stay there.
-    _, moved = jax.jit(mpc(swing_up(), iterations=1))(jnp.asarray(DOWN), found.plan)
-    assert float(moved.cost) == pytest.approx(float(found.plan.cost), rel=1e-7)
-    np.testing.assert_allclose(moved.u[:-1], found.plan.u[1:], atol=2e-2)
 
 
 @pytest.mark.slow

@@ -16,13 +16,13 @@ from dln_jax.cli.options import Drawn, Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.control import (
+    arm_in_real_time,
     contacts,
     energy_laws,
     estimates,
     foreign_plants,
     laws_in_c,
     learned,
-    mpc,
     planned,
     plans,
     rail,
@@ -53,9 +53,9 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
     **{f"robustness/{name}": partial(robustness.robust, motor) for name, motor in MOTORS.items()},
     **{f"replanning/{name}": partial(replanning.replanned, motor) for name, motor in MOTORS.items()},
     "laws/in-c": laws_in_c.laws,
-    "mpc/cart-pole": mpc.cart_pole_report,
     "plans/beside-ipopt": plans.plans,
     "realtime/cart-pole": real_time.cart_pole_report,
+    "realtime/seven-axis": arm_in_real_time.seven_axis_report,
     "rail/cart-pole": rail.on_a_rail,
 }
 """Functions quick -> findings, by SUBJECT/NAME."""

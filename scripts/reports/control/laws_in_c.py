@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import Gains, Reference, computed_torque, feed_forward
+from dln_jax.control import Gains, Reference, computed_torque, feed_forward, first_plan
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
@@ -24,7 +24,8 @@ from dln_jax.mechanics.trees import tree_system
 from dln_jax.scenes.pendulums import chain
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
-from scripts.reports.control.mpc import STACK, one_call
+from scripts.reports.control.plans import in_jax
+from scripts.reports.control.real_time import HANGING, STACK, STEPS, cart_pole, renewed
 from scripts.reports.control.swing_ups import SWING_UPS, law_of, parts_of_law
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
 from scripts.reports.rows import Row, expect
@@ -33,8 +34,6 @@ from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs
 AGREEMENT = 1e-10
 """Largest difference of C and JAX at random states, relative to the largest control."""
 STATES = 8
-STEPS = 80
-"""Steps of a plan."""
 LEAST_EVICTED = 32
 """Minimum memory, MiB, that is read before a cold call to evict the caches."""
 
@@ -89,8 +88,9 @@ def value_policy() -> Law:
 
 
 def one_iteration() -> Law:
-    """A call of `mpc` with one iteration for a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
-    return Law(*one_call(STEPS), 1e-4)
+    """A call of `prepare` for a cart-pole between walls over 1.2 s: (x, plan) -> plan."""
+    problem = in_jax(cart_pole())
+    return Law(*renewed(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1)))), 1e-4)
 
 
 LAWS: dict[str, Callable[[], Law]] = {

@@ -14,12 +14,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import Plan, first_plan
+from dln_jax.control import Plan, TrajectoryProblem, first_plan, time_varying_lqr
 from dln_jax.control.closed_loop import outcomes
 from dln_jax.control.mujoco_loop import compiled_model
 from scripts.reports.case import Findings
 from scripts.reports.control.plans import in_jax
-from scripts.reports.control.real_time import DT, HANGING, LIMIT, RAIL, STEPS, Sizes, cart_pole, in_c, of_c, starting
+from scripts.reports.control.real_time import (
+    BARRIER,
+    DT,
+    HANGING,
+    LIMIT,
+    RAIL,
+    STEPS,
+    Sizes,
+    cart_pole,
+    in_c,
+    of_c,
+    starting,
+)
 from scripts.reports.rows import Row, expect
 
 CART, ROD, LENGTH = 0.8, 0.15, 0.5
@@ -29,11 +41,12 @@ NOISE, TURN, TICK = np.array([1e-4, 1e-3]), 2 * np.pi / 4096, 2.5e-5
 """Standard deviations of the encoders' noise, m and rad, and their resolutions, rad and m."""
 CORRECTIONS = 0.5, 0.15
 """Shares of an innovation that correct the coordinates, and their rates within a sample."""
-WALL = 0.03
-"""Distance that plans keep from the ends of the rail, m."""
+WALL, ROOM, RESERVED = 0.03, 0.1, 0.7
+"""Distance that receding plans and one plan with its gains keep from the ends of the rail, m, and the share of the
+force that the latter plans with."""
+LONG = 180
+"""Steps of these plans."""
 SOLID = 'contype="0" conaffinity="0"'
-
-Sensed = tuple[np.ndarray, np.ndarray]
 
 
 def model() -> Any:
@@ -91,6 +104,18 @@ def swing_up(
     return Run(np.stack(states), np.array(times))
 
 
+def with_gains(problem: TrajectoryProblem) -> Callable[[Plan], Plan]:
+    """Returns plan -> plan with the gains of regulators along it, which do not know the limits."""
+    Q, R = np.diag([4.0, 1.0, 0.1, 0.01]) * DT, np.eye(1) * 1e-3 * DT
+
+    @jax.jit
+    def regulated(plan: Plan) -> Plan:
+        A, B = jax.vmap(jax.jacfwd(problem.step, argnums=(0, 1)))(plan.x[:-1], plan.u)
+        return plan._replace(K=-time_varying_lqr(A, B, Q, R, 2000 * Q).K)
+
+    return regulated
+
+
 def along(plan: Plan, top: Plan) -> Callable[[np.ndarray], tuple[np.ndarray, float]]:
     """The plan with its gains, then the gain of a plan that stands upright."""
     u, about, K = (np.asarray(array) for array in (plan.u, plan.x, plan.K))
@@ -111,17 +136,21 @@ def on_a_rail(quick: bool) -> Findings:
     solve, settle = starting(problem)
     step = jax.jit(problem.step)
     with tempfile.TemporaryDirectory() as place:
-        functions, _ = in_c(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan")
-    top = settle(first_plan(problem, jnp.zeros(4), np.zeros((STEPS, 1))))
+        functions, _ = in_c(
+            problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER
+        )
     drawn = starts(5 if quick else RUNS)
-    plans = [settle(solve(x)) for x in drawn]
+    # Gains need a reserve of force, and room for what the plan does not know.
+    careful = in_jax(cart_pole(known(), ROOM)._replace(limit=(RESERVED * LIMIT,)))
+    solve_carefully, regulate = starting(careful, LONG)[0], with_gains(careful)
+    top = regulate(first_plan(careful, jnp.zeros(4), np.zeros((LONG, 1))))
     ways = {
-        "receding-plans": lambda plan: of_c(functions, plan),
-        "plan-and-gains": lambda plan: along(plan, top),
+        "receding-plans": lambda x: of_c(functions, settle(solve(x))),
+        "plan-and-gains": lambda x: along(regulate(solve_carefully(x)), top),
     }
     rows: list[Row] = []
     for way, controller in ways.items():
-        runs = [swing_up(plant, controller(plan), step, x, seed) for seed, (x, plan) in enumerate(zip(drawn, plans, strict=True))]
+        runs = [swing_up(plant, controller(x), step, x, seed) for seed, x in enumerate(drawn)]
         rows += _rows(f"rail/{way}", runs)
     return Findings(rows)
 
@@ -135,5 +164,11 @@ def _rows(case: str, runs: list[Run]) -> list[Row]:
         expect(case, "farthest_m", words, farthest.max(), RAIL, "m"),
         Row(case, "seconds_median", found.median, "s"),
         Row(case, "seconds_worst", found.worst, "s"),
-        Row(case, "p99_ms", float(np.percentile(np.concatenate([run.milliseconds for run in runs]), 99)), "ms", expected="CPU"),
+        Row(
+            case,
+            "p99_ms",
+            float(np.percentile(np.concatenate([run.milliseconds for run in runs]), 99)),
+            "ms",
+            expected="CPU",
+        ),
     ]

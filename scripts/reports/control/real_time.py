@@ -1,23 +1,23 @@
 """Predictive control with constraints in real time, in C, beside IPOPT, fatrop and HPIPM on the same problem.
 
-A cart-pole between walls: the plant of Lutter et al. 2021 (arXiv 2105.04682), 12 N, rail of +-0.5 m, 100 Hz, a horizon of
-1.2 s in 120 steps. All controllers start with the plan of `shoot` from the start at rest, and then swing up in a closed
-loop with a finer simulation. Times are CPU times of a call in this process, since other programs may share the machine.
+A cart-pole between walls: the plant of Lutter et al. 2021 (arXiv 2105.04682), 12 N, rail of +-0.5 m, 100 Hz, a horizon
+of 1.2 s in 120 steps. All controllers start with the plan of `shoot` from the start at rest, and then swing up in a
+closed loop with a finer simulation. Times are CPU times of a call in this process, since other programs may share the
+machine.
 """
 
+import re
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from dln_jax.control import Plan, TrajectoryProblem, feedback, first_plan, improve, integrated, prepare, shoot
-from dln_jax.export.c.interface import read_interface
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from scripts.reports.case import Findings
@@ -75,7 +75,8 @@ def cart_pole(sizes: Sizes = Sizes(), margin: float = MARGIN) -> Planned:  # noq
     wall = np.array([RAIL - margin, *[np.inf] * 3])
     return Planned(
         "cart-pole", tuple(HANGING), (0.0,) * 4, STEPS, Steps(rates_of(sizes), DT),
-        lambda f, x, u: sum(root**2 for root in roots(f, x, u)), lambda f, x: sum(root**2 for root in roots(f, x, None)),
+        lambda f, x, u: sum(root**2 for root in roots(f, x, u)),
+        lambda f, x: sum(root**2 for root in roots(f, x, None)),
         (LIMIT,), -wall, wall,
     )  # fmt: skip
 
@@ -110,28 +111,54 @@ def closed(act: Callable[[np.ndarray], tuple[np.ndarray, float]], x: np.ndarray)
 FINE = jax.jit(integrated(lambda x, u: jnp.stack(rates_of(Sizes())(jnp, x, u)), DT, substeps=4))
 
 
-def starting(problem: TrajectoryProblem) -> tuple[Callable[[Any], Plan], Callable[[Plan], Plan]]:
-    """Returns start -> plan of `shoot` from a straight line, and plan -> plan after some iterations."""
-    line, still = np.linspace(HANGING, 0 * HANGING, STEPS + 1), np.zeros((STEPS, 1))
+def starting(problem: TrajectoryProblem, steps: int = STEPS) -> tuple[Callable[[Any], Plan], Callable[[Plan], Plan]]:
+    """Returns start -> plan of `shoot` from straight lines to both sides, and plan -> plan after some iterations."""
+    line, other = (np.linspace(HANGING, [0, angle, 0, 0], steps + 1) for angle in (0.0, 2 * np.pi))
+    still = np.zeros((steps, 1))
     settle = lambda plan: jax.lax.fori_loop(0, SETTLING, lambda _, plan: improve(problem, plan, barrier=BARRIER), plan)  # noqa: E731
-    return jax.jit(lambda x: shoot(problem, x, line, still).plan), jax.jit(settle)
+    solve = lambda x: shoot(problem, x, line, still, starts=(other[None], still[None])).plan  # noqa: E731
+    return jax.jit(solve), jax.jit(settle)
 
 
-def in_c(problem: TrajectoryProblem, plan: Plan, folder: Path, **settings: Any) -> Any:
-    """Exports `feedback` and `prepare` and returns them, with their operations and bytes of stack."""
-
-    def respond(x: Any, u: Any, states: Any, gains: Any) -> Any:
-        return feedback(problem, plan._replace(u=u, x=states, K=gains), x)
+def renewed(problem: TrajectoryProblem, plan: Plan, **settings: Any) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """`prepare` as a function of arrays, (x, controls, states, gains, damping, knots if any), and example arguments."""
 
     def renew(x: Any, u: Any, states: Any, gains: Any, damping: Any, knots: Any = None) -> Any:
         now = problem if knots is None else problem._replace(knots=knots)
         after = prepare(now, plan._replace(u=u, x=states, K=gains, damping=damping), x, **settings)
-        return {"controls": after.u, "next": after.x, "feedback": after.K, "size": after.damping, "ending": after.ending}
+        return {
+            "controls": after.u,
+            "next": after.x,
+            "feedback": after.K,
+            "size": after.damping,
+            "ending": after.ending,
+        }
 
-    memory = tuple(map(np.asarray, (plan.x[0], plan.u, plan.x, plan.K, plan.damping)))
-    knots = () if problem.knots is None else (np.asarray(problem.knots),)
-    export_c({"respond": (respond, memory[:-1]), "renew": (renew, (*memory, *knots))}, folder, stack=STACK)
-    return load_c(folder), read_interface(folder, "model")[1]
+    knots = () if problem.knots is None else (problem.knots,)
+    return renew, tuple(map(np.asarray, (plan.x[0], plan.u, plan.x, plan.K, plan.damping, *knots)))
+
+
+class Effort(NamedTuple):
+    """Cost of a call, from the header of an export."""
+
+    operations: int
+    """Floating-point operations; all loops have a fixed number of turns."""
+    stack_bytes: int
+
+
+def in_c(problem: TrajectoryProblem, plan: Plan, folder: Path, **settings: Any) -> tuple[Any, Mapping[str, Effort]]:
+    """Exports `feedback` and `prepare`, and returns the compiled functions and the costs of their calls."""
+
+    def respond(x: Any, u: Any, states: Any, gains: Any) -> Any:
+        return feedback(problem, plan._replace(u=u, x=states, K=gains), x)
+
+    renew, examples = renewed(problem, plan, **settings)
+    export_c({"respond": (respond, examples[:4]), "renew": (renew, examples)}, folder, stack=STACK)
+    stated = r"(\d+) floating-point operations, (\d+) bytes of stack[^/]*/\s*\w+ model_(\w+)\("
+    efforts = {
+        name: Effort(*map(int, numbers)) for *numbers, name in re.findall(stated, (folder / "model.h").read_text())
+    }
+    return load_c(folder), efforts
 
 
 def of_c(functions: Any, plan: Plan) -> Callable[..., tuple[np.ndarray, float]]:
@@ -158,22 +185,25 @@ def cart_pole_report(quick: bool) -> Findings:
     rows: list[Row] = []
     drawn = starts(1 if quick else LOOPS)
     with tempfile.TemporaryDirectory() as place:
-        functions, signatures = in_c(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER)
+        functions, efforts = in_c(
+            problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), Path(place) / "plan", barrier=BARRIER
+        )
     loops = [closed(of_c(functions, settle(solve(x))), x) for x in drawn]
     rows += _rows("realtime/cart-pole/c", loops, TO_REACH_MS)
-    for name, signature in signatures.items():
+    for name, effort in efforts.items():
         case = f"realtime/cart-pole/c-{name}"
-        rows.append(Row(case, "operations", signature.operations, expected="floating-point, of a call"))
-        rows.append(Row(case, "stack_bytes", signature.stack_bytes, "B"))
+        rows.append(Row(case, "operations", effort.operations, expected="floating-point, of a call"))
+        rows.append(Row(case, "stack_bytes", effort.stack_bytes, "B"))
     for name in ("ipopt", "fatrop", "hpipm"):
-        found = []
-        for x in drawn[: 1 if quick else RIVAL_LOOPS]:
-            plan = solve(x)
-            first = np.append(np.concatenate([plan.x[:-1], plan.u], axis=1).ravel(), plan.x[-1])
-            act = hpipm(planned, roots, first) if name == "hpipm" else to_the_end(name, planned, roots, first)
-            found.append(closed(act, x))
+        make = hpipm(planned, roots) if name == "hpipm" else to_the_end(name, planned, roots)
+        found = [closed(make(unknowns(solve(x))), x) for x in drawn[: 1 if quick else RIVAL_LOOPS]]
         rows += _rows(f"realtime/cart-pole/{name}", found, None)
     return Findings(rows)
+
+
+def unknowns(plan: Plan) -> np.ndarray:
+    """x_0, u_0, x_1, ..., x_N."""
+    return np.append(np.concatenate([plan.x[:-1], plan.u], axis=1).ravel(), plan.x[-1])
 
 
 def _rows(case: str, loops: list[Loop], bound: float | None) -> list[Row]:

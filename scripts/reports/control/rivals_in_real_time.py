@@ -1,11 +1,13 @@
 """Rivals of predictive control through CasADi: IPOPT and fatrop to their end, HPIPM in one iteration per sample.
 
-All start from their solution at the sample before, shifted by a step. Functions are generated C, compiled by the same
-compiler. Times are those of the solvers' calls.
+All start from their solution at the sample before, shifted by a step. HPIPM's derivatives are generated C, compiled
+with -O1; those of IPOPT and fatrop run in CasADi's virtual machine, since compilers take minutes for straight lines of
+this length. Times are those of the solvers' calls.
 """
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -13,7 +15,7 @@ import numpy as np
 
 from scripts.reports.control.plan_problems import Planned, Steps, runge_kutta
 
-COMPILED = {"jit": True, "compiler": "shell", "jit_options": {"flags": "-O3 -march=native", "compiler": "gcc"}}
+COMPILED = {"jit": True, "compiler": "shell", "jit_options": {"flags": "-O1 -march=native", "compiler": "gcc"}}
 QUIET = {
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3},
     "fatrop": {"fatrop.print_level": 0, "fatrop.mu_init": 1e-3, "structure_detection": "auto", "expand": True},
@@ -36,6 +38,8 @@ class Horizon(NamedTuple):
 
 Controller = Callable[[np.ndarray], tuple[np.ndarray, float]]
 """Measured state -> control, and the CPU seconds of the call."""
+Make = Callable[[np.ndarray], Controller]
+"""Unknowns of a first solution -> controller."""
 
 
 def horizon(problem: Planned, residuals: Callable[..., list[Any]]) -> Horizon:
@@ -67,17 +71,16 @@ def shifted(w: np.ndarray, n: int, m: int) -> np.ndarray:
     return np.concatenate([w[n + m :], w[-m - n : -n], w[-n:]])
 
 
-def to_the_end(name: str, problem: Planned, residuals: Callable[..., list[Any]], first: np.ndarray) -> Controller:
-    """A controller by "ipopt" or "fatrop", warm-started; `first` are the unknowns of the first solution."""
+def to_the_end(name: str, problem: Planned, residuals: Callable[..., list[Any]]) -> Make:
+    """Controllers by "ipopt" or "fatrop", warm-started."""
     n, m = len(problem.x0), len(problem.limit)
     of = horizon(problem, residuals)
     options = {"print_time": 0, **QUIET[name]}
     if name == "fatrop":
         options["equality"] = [True] * of.gaps.numel()
-    solver = ca.nlpsol("solver", name, {"x": of.unknowns, "f": of.cost, "g": of.gaps}, options | COMPILED)
-    memory: dict[str, Any] = {"x0": first}
+    solver = ca.nlpsol("solver", name, {"x": of.unknowns, "f": of.cost, "g": of.gaps}, options)
 
-    def act(x: np.ndarray) -> tuple[np.ndarray, float]:
+    def act(memory: dict[str, Any], x: np.ndarray) -> tuple[np.ndarray, float]:
         lower, upper = of.lower.copy(), of.upper.copy()
         lower[:n] = upper[:n] = x
         guess = memory["x0"].copy()
@@ -93,10 +96,10 @@ def to_the_end(name: str, problem: Planned, residuals: Callable[..., list[Any]],
         memory["lam_g0"] = np.append(g[n:], g[-n:])
         return u, seconds
 
-    return act
+    return lambda first: partial(act, {"x0": first})
 
 
-def hpipm(problem: Planned, residuals: Callable[..., list[Any]], first: np.ndarray) -> Controller:
+def hpipm(problem: Planned, residuals: Callable[..., list[Any]]) -> Make:
     """One Gauss-Newton step of sequential quadratic programming per sample, whose program HPIPM solves to its end."""
     n, m, N = len(problem.x0), len(problem.limit), problem.steps
     of = horizon(problem, residuals)
@@ -105,9 +108,8 @@ def hpipm(problem: Planned, residuals: Callable[..., list[Any]], first: np.ndarr
     expand = ca.Function("expand", [of.unknowns], [H, gradient, A, of.gaps], COMPILED)
     options = {"N": N, "nx": [n] * (N + 1), "nu": [m] * N + [0], "ng": [0] * (N + 1), "print_time": 0}
     solver = ca.conic("solver", "hpipm", {"h": H.sparsity(), "a": A.sparsity()}, options)
-    memory = {"w": first}
 
-    def act(x: np.ndarray) -> tuple[np.ndarray, float]:
+    def act(memory: dict[str, np.ndarray], x: np.ndarray) -> tuple[np.ndarray, float]:
         w = memory["w"].copy()
         began = time.process_time()
         h, g, a, gaps = expand(w)
@@ -119,4 +121,4 @@ def hpipm(problem: Planned, residuals: Callable[..., list[Any]], first: np.ndarr
         memory["w"] = shifted(w, n, m)
         return w[n : n + m], seconds
 
-    return act
+    return lambda first: partial(act, {"w": first})

@@ -4,13 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Gains, Reference, TrajectoryProblem, feed_forward, first_plan
-from dln_jax.control import mpc as predicting
+from dln_jax.control import Gains, Reference, TrajectoryProblem, feed_forward, field_of, first_plan
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.poles import rotary_pendulum
-from scripts.reports.control import arm_loop, laws_in_c, mpc, tracking
+from dln_jax.scenes.poles import cart_pole, rotary_pendulum
+from scripts.reports.control import arm_loop, laws_in_c, real_time, tracking
 from scripts.reports.robots.arm import Motion
 
 
@@ -18,15 +17,10 @@ def planning():
     """A pendulum's plan, moved on and improved."""
     field = lambda x, u: jnp.stack([x[1], jnp.sin(x[0]) + u[0]])  # noqa: E731
     problem = TrajectoryProblem(
-        lambda x, u: x + 0.1 * field(x, u), lambda x, u: x @ x + u @ u, lambda x: 9 * x @ x, -0.5, 0.5
-    )
-    plan, act = first_plan(problem, np.zeros(2), np.zeros((3, 1))), predicting(problem, step_lengths=(1.0, 0.3))
-
-    def law(x, u, about, K):
-        control, found = act(x, plan._replace(u=u, x=about, K=K))
-        return {"control": control, "planned": found.u, "states": found.x}
-
-    return laws_in_c.Law(law, tuple(map(np.asarray, (np.zeros(2), plan.u, plan.x, plan.K))), 0.2)
+        lambda x, u: x + 0.1 * field(x, u), lambda x, u: x @ x + u @ u, lambda x: 9 * x @ x, -0.5, 0.5,
+        states=lambda x: x[1:] - 0.3,
+    )  # fmt: skip
+    return laws_in_c.Law(*real_time.renewed(problem, first_plan(problem, np.zeros(2), np.zeros((3, 1)))), 0.2)
 
 
 def test_laws_agree(tmp_path):
@@ -40,12 +34,14 @@ def test_laws_agree(tmp_path):
         assert row.passed and row.value < 1e-12, name
 
 
-def test_the_carts_friction_is_that_of_each_joint():
-    scene, qd = mpc.scene(), jnp.array([2.0, 3.0])
-    friction = dynamics(scene.energies).friction(jnp.zeros(2), qd)
-    np.testing.assert_allclose(friction, [0.1 * 2.0, 1e-3 * 3.0], rtol=1e-12)
-    drawn = mpc.starts(2000)
-    np.testing.assert_allclose(drawn.mean(axis=0), mpc.HANGING, atol=0.02)
+def test_the_cart_pole_of_the_report_is_that_of_the_scenes():
+    scene = cart_pole(cart_mass=0.57, pole_mass=0.127, length=0.16825)
+    x, u = jnp.array([0.1, 2.0, 0.5, -3.0]), jnp.array([2.0])
+    expected = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
+    free = real_time.rates_of(real_time.Sizes(damping=(0.0, 0.0)))
+    np.testing.assert_allclose(jnp.stack(free(jnp, x, u)), expected(x, u), rtol=1e-10)
+    drawn = real_time.starts(2000)
+    np.testing.assert_allclose(drawn.mean(axis=0), real_time.HANGING, atol=0.02)
     np.testing.assert_allclose(drawn.var(axis=0), [1e-3, 5e-2, 1e-6, 1e-6], rtol=0.15)
 
 

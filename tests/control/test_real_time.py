@@ -1,0 +1,134 @@
+"""Predictive control in real time: optima of its smooth problem, constraints, knots, and operations in C."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control import TrajectoryProblem, feedback, first_plan, improve, mpc, prepare, shoot, worst_violation
+from dln_jax.control.real_time import BARRIER, _smooth
+from dln_jax.solvers.ending import Ending, reason
+from dln_jax.types import InputError
+
+N, DT = 20, 0.1
+BLOCK = TrajectoryProblem(
+    lambda x, u: jnp.stack([x[0] + DT * x[1] + DT**2 / 2 * u[0], x[1] + DT * u[0]]),
+    lambda x, u: DT * (x[0] ** 2 + 0.1 * u @ u),
+    lambda x: 5 * x @ x,
+    -1.5,
+    1.5,
+    upper_x=np.array([np.inf, 0.6]),
+)
+"""A mass of 1 kg, drawn from -1 m to the origin by at most 1.5 N, at most at 0.6 m/s."""
+START = np.array([-1.0, 0.0])
+
+
+@functools.cache
+def improving(barrier):
+    def many(x):
+        plan = first_plan(BLOCK, x, np.zeros((N, 1)))
+        return jax.lax.fori_loop(
+            0, 40, lambda k, plan: improve(BLOCK, plan, barrier=jnp.maximum(barrier, 1e-1 * 0.5**k)), plan
+        )
+
+    return jax.jit(many)
+
+
+def test_iterations_approach_the_optimum_as_the_barrier_falls():
+    """The gap of a barrier method is at most μ times the number of constraints."""
+    best = jax.jit(lambda: shoot(BLOCK, START, np.tile(START, (N + 1, 1)), np.zeros((N, 1))))()
+    plain = lambda plan: sum(map(BLOCK.cost, plan.x[:-1], plan.u)) + BLOCK.final_cost(plan.x[-1])  # noqa: E731
+    gaps = []
+    for barrier in (1e-2, 1e-4):
+        plan = improving(barrier)(START)
+        assert np.abs(plan.u).max() < 1.5 and plan.x[:, 1].max() < 0.6
+        assert int(plan.ending) == Ending.UNDECIDED
+        gaps.append(float(plain(plan) - best.plan.cost))
+        assert 0 < gaps[-1] < barrier * 3 * N
+    assert gaps[1] < gaps[0] / 20
+
+
+def test_prices_have_their_closed_forms():
+    """The price minimises w t - μ log t - μ log(t - c) over t; slope and curvature are its derivatives."""
+    step, _ = _smooth(
+        BLOCK._replace(cost=lambda x, u: 0 * x[0], soft=(2.0, 0.0), lower=-np.inf, upper=np.inf), 2, 1, 0.1
+    )
+    slope = jax.jit(jax.grad(lambda y: step.cost(y)[0]))
+    for speed in (-3.0, 0.55, 0.6, 2.0):
+        c, y = speed - 0.6, jnp.array([0.0, speed, 0.0])
+        t = max(c, 0.0) + np.geomspace(1e-6, 10.0, 400_000)
+        lowest = np.min(2.0 * t - 0.1 * np.log(t) - 0.1 * np.log(t - c))
+        assert float(step.cost(y)[0]) == pytest.approx(lowest, abs=1e-6)
+        gradient, hessian = step.expansion(y)
+        np.testing.assert_allclose(gradient, slope(y), rtol=1e-9, atol=1e-12)
+        numeric = (slope(y.at[1].add(1e-5)) - slope(y.at[1].add(-1e-5)))[1] / 2e-5
+        assert float(hessian[1, 1]) == pytest.approx(float(numeric), rel=1e-5, abs=1e-8)
+
+
+def test_feedback_is_the_derivative_of_the_optimal_control():
+    start, step = np.array([-0.2, 0.1]), 1e-4  # near enough for a force within the limits
+    plan = improving(1e-2)(start)
+    for axis in np.eye(2):
+        ahead, behind = (improving(1e-2)(start + way * step * axis).u[0] for way in (1, -1))
+        moved = feedback(BLOCK, plan, start + step * axis) - feedback(BLOCK, plan, start - step * axis)
+        np.testing.assert_allclose(moved, ahead - behind, rtol=2e-2)
+
+
+def test_a_loop_settles_within_its_constraints_in_spite_of_pushes():
+    act, plan, x = jax.jit(mpc(BLOCK)), improving(BARRIER)(START), jnp.asarray(START)
+    random, controls = np.random.default_rng(0), []
+    for _ in range(60):
+        u, plan = act(x, plan)
+        controls.append(float(u[0]))
+        x = BLOCK.step(x, u) + 1e-3 * random.normal(size=2)
+        assert x[1] < 0.61
+    assert np.abs(controls).max() <= 1.5 and max(controls) > 1.0 and np.abs(x).max() < 0.02
+
+
+def test_a_sample_without_feasible_plan_says_so():
+    lost = improving(BARRIER)(jnp.array([-1.0, 2.0]))  # faster than allowed, and 1.5 N brake in 0.9 s
+    assert np.isfinite(lost.u).all() and reason(lost.ending).startswith("ended where constraints are violated")
+    assert worst_violation(BLOCK, lost).startswith("the upper limit of state 1 at knot 1 is violated by 1.2")
+
+
+def test_a_control_is_nan_where_the_state_is():
+    plan = improving(BARRIER)(START)
+    assert np.isnan(feedback(BLOCK, plan, START * np.nan)).all()
+    assert int(prepare(BLOCK, plan, jnp.asarray(START) * np.nan).ending) == Ending.NOT_FINITE
+
+
+def test_knots_move_a_reference_and_constraints_that_depend_on_time():
+    """A gate that opens at 1 s: the mass waits before it, in plans of `shoot` and in real time alike."""
+    t = DT * np.arange(N + 41)
+    timed = BLOCK._replace(
+        step=lambda x, u, t: BLOCK.step(x, u), cost=lambda x, u, t: BLOCK.cost(x, u), upper_x=np.inf,
+        final_cost=lambda x, t: BLOCK.final_cost(x), states=lambda x, t: jnp.where(t < 1.0, x[:1] + 0.5, -1.0),
+        soft=(50.0, 0.0),
+    )  # fmt: skip
+    first = timed._replace(knots=t[: N + 1])
+    solved = jax.jit(lambda: shoot(first, START, np.tile(START, (N + 1, 1)), np.zeros((N, 1))))()
+    assert solved.converged and solved.plan.x[9, 0] <= -0.5 + 1e-6 < solved.plan.x[12, 0]
+    plan, x, act = first_plan(first, START, np.zeros((N, 1))), jnp.asarray(START), jax.jit(mpc(timed))
+    for _ in range(25):
+        plan = jax.jit(functools.partial(improve, first))(plan)
+    np.testing.assert_allclose(plan.x, solved.plan.x, atol=5e-2)
+    for k in range(40):
+        assert k * DT >= 1.0 or x[0] < -0.49
+        u, plan = act(x, plan, t[k : k + N + 2])
+        x = BLOCK.step(x, u)
+    assert abs(x[0]) < 0.02
+
+
+def test_an_equation_of_the_end_holds_within_the_width_of_its_price():
+    problem = BLOCK._replace(final_cost=lambda x: 0 * x[0], end=lambda x: x, upper_x=np.inf)
+    plan = first_plan(problem, START, np.zeros((N, 1)))
+    plan = jax.jit(lambda: jax.lax.fori_loop(0, 60, lambda _, plan: improve(problem, plan), plan))()
+    assert np.abs(plan.x[-1]).max() < 1e-4 and int(plan.ending) == Ending.UNDECIDED
+
+
+def test_a_free_first_state_is_refused():
+    free = BLOCK._replace(free=np.array([True, False]))
+    with pytest.raises(InputError, match="in real time it is measured"):
+        improve(free, first_plan(BLOCK, START, np.zeros((N, 1))))
