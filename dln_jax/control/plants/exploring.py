@@ -16,11 +16,10 @@ from jax import Array
 
 from dln_jax.control.closed_loop import Controller
 from dln_jax.control.exploration import smooth_noise
-from dln_jax.control.observers import with_differences
+from dln_jax.control.plants.estimators import by_differences
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, compiled, run
 from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of
-from dln_jax.control.plants.tuning import cutoff_for
 from dln_jax.control.swing_up import energy_shaping, upright_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics
@@ -135,7 +134,7 @@ def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
 
 def _rates(layout: Layout) -> Controller:
     """Passes on measurements and their rates."""
-    return with_differences(lambda x: x, len(layout.joints), rate=layout.rate, cutoff=cutoff_for(layout.rate))
+    return by_differences(layout)(lambda x: x)
 
 
 def _with(law: Callable[[Array, Array], Array], layout: Layout) -> Controller:

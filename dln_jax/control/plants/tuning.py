@@ -4,9 +4,11 @@
 2. Every set is tried from a few starts near hanging, with the hardware's limits, resolution, noise and delay.
 3. The best sets are tried again with motors that are stronger or weaker than the model says. The margin of a set is
    the largest such error up to which every trial succeeds; the set with the largest margin is chosen.
+4. Plans with feedback (`planned`) are tried first. If their margin is below `ENOUGH`, energy laws are tried likewise,
+   and the larger margin decides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -14,15 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.closed_loop import Controller, Hardware, simulate
-from dln_jax.control.observers import with_differences
+from dln_jax.control.closed_loop import Controller, Hardware, simulate, stateless
+from dln_jax.control.plants.estimators import Estimator, by_differences
 from dln_jax.control.plants.plant import Layout
+from dln_jax.control.plants.planned import followed, follower, plans_of
 from dln_jax.control.plants.runs import HELD, TOLERANCE
-from dln_jax.control.plants.scales import RANGES, circle, scales_of, swing_up_numbers
-from dln_jax.control.plants.simulated import ACTIVE_SPREAD, SPREAD
+from dln_jax.control.plants.scales import RANGES, Scales, circle, scales_of, swing_up_numbers
+from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.regulators import Regulator
-from dln_jax.control.state_space import Law, error, field_of
-from dln_jax.control.swing_up import SwingUpNumbers, Upright, law_at, upright_of
+from dln_jax.control.state_space import error, field_of
+from dln_jax.control.swing_up import Upright, law_at, upright_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, require_positive, require_seed
 
@@ -31,20 +34,37 @@ ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 STARTS = 2
 """Starts of a set in the first round."""
 FINALISTS = 8
-ROUNDS = 4
+ROUNDS = 2
 """First rounds, at most, until `FINALISTS` sets have succeeded."""
-FASTEST_FILTER = 50.0
-"""Cut-off frequency of measured rates, Hz, and at most a quarter of the samples' rate."""
+ENOUGH = 0.2
+"""Margin of the plans with which no energy law is tried."""
+PLANS = 8
+"""Number of plans, at most, that are tried with feedback."""
+
+
+class Way(NamedTuple):
+    """A way of swinging up, whose settings trials choose."""
+
+    name: str
+    draw: Callable[[np.random.Generator, int], list[Any]]
+    """(random, count) -> settings, trees of arrays of equal shapes."""
+    controller: Callable[[Any], Controller]
+    """Settings, perhaps traced -> controller of states."""
+    numbers: Callable[[Any], tuple[Mapping[str, float], Regulator]]
+    """Settings -> their numbers, and the regulator at the goal."""
 
 
 class Tuned(NamedTuple):
-    """Settings that swing the model up, and how safely."""
+    """A controller that swings the model up, and how safely."""
 
-    law: Law
-    """(q, qd) -> u."""
-    numbers: SwingUpNumbers
+    controller: Controller
+    """Of the measurements."""
+    way: str
+    """"energy" or "plan"."""
+    numbers: Mapping[str, float]
+    """What was chosen, in SI units."""
     regulator: Regulator
-    upright: Upright
+    """At the goal."""
     trials: int
     """Number of simulated trials."""
     worked: float
@@ -55,23 +75,14 @@ class Tuned(NamedTuple):
     """Median time until the goal at the model's own strength, s."""
 
 
-def cutoff_for(rate: float) -> float:
-    """Cut-off frequency of the rates, Hz, from the rate of the samples."""
-    return min(FASTEST_FILTER, rate / 4)
-
-
-def controller_of(law: Law, layout: Layout) -> Controller:
-    """The law with rates from differences of the measurements."""
-    return with_differences(law, len(layout.joints), rate=layout.rate, cutoff=cutoff_for(layout.rate))
-
-
 def tune(
     model: Dynamics | PlainDynamics,
     layout: Layout,
     hardware: Hardware = Hardware(),  # noqa: B008
     *,
-    sets: int = 128,
-    seconds: float = 8.0,
+    estimator: Estimator | None = None,
+    sets: int = 32,
+    seconds: float = 6.0,
     substeps: int = 1,
     seed: int = 0,
 ) -> Tuned:
@@ -81,6 +92,7 @@ def tune(
         model: known or learned, with friction if the plant has it.
         layout: of the plant: its motors, goal, limits and rate.
         hardware: noise, resolution and delay; the limits are those of the layout.
+        estimator: makes a controller of measurements from one of states, such as `by_filter`; by default by differences.
         sets: number of sets in a first round.
         seconds: duration of a trial, within which a plant has to be up and stay for a second.
         substeps: Runge-Kutta steps a sample.
@@ -95,22 +107,85 @@ def tune(
         raise InputError(f"seconds is {seconds}; expected more than the {HELD:g} s for which a plant has to stay up")
     lower, upper = layout.limits.control.T
     upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
-    scales, random = scales_of(upright, layout), np.random.default_rng([seed, 31])
+    scales, estimator = scales_of(upright, layout), estimator or by_differences(layout)
+    best, refused, trials = None, [], 0
+    for make in (by_plan, by_energy):
+        try:
+            way = make(upright, layout, scales, seed)
+            trial = trial_of(
+                lambda settings, way=way: estimator(way.controller(settings)), upright.model, layout, hardware,
+                seconds=seconds, substeps=substeps,
+            )  # fmt: skip
+            found = _chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed)
+        except InputError as error:
+            refused.append(str(error))
+            continue
+        trials += found.trials
+        best = found if best is None or found.margin > best.margin else best
+        if best.margin >= ENOUGH:
+            break
+    if best is None:
+        raise InputError("; ".join(refused))
+    return best._replace(trials=trials)
+
+
+def by_energy(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
+    """Energy laws and a regulator."""
+    # One set of smoothing and compensation for all: they are no arrays of the trial.
+    plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
+
+    def draw(random: np.random.Generator, count: int) -> list[Any]:
+        settings = [swing_up_numbers(upright, layout, scales, one) for one in _draws(random, count)]
+        arrays = [((one.gains, one.level, one.kick, one.surplus), regulator) for one, regulator in settings]
+        return [jax.tree.map(lambda leaf: np.asarray(leaf, float), one) for one in arrays]
+
+    def controller(settings: Any) -> Controller:
+        (gains, level, kick, surplus), regulator = settings
+        numbers = plain._replace(gains=gains, level=level, kick=kick, surplus=surplus)
+        return stateless(law_at(upright, layout.joints, numbers, regulator))
+
+    def numbers(settings: Any) -> tuple[dict[str, float], Regulator]:
+        (gains, level, kick, surplus), regulator = settings
+        named = {**gains._asdict(), "level": level, "kick": kick, "surplus": surplus}
+        return {name: float(value) for name, value in named.items()}, regulator
+
+    return Way("energy", draw, controller, numbers)
+
+
+def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
+    """Plans with feedback; raises as `plans_of`."""
+    plans = plans_of(upright, layout, scales, seed=seed)[:PLANS]
+    plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
+
+    def draw(random: np.random.Generator, count: int) -> list[Any]:
+        chosen = [plans[k % len(plans)] for k in range(count)]
+        return followed(chosen, upright, layout, scales, _draws(random, count), spread_of(layout))[0]
+
+    def numbers(settings: Any) -> tuple[dict[str, float], Regulator]:
+        return {"seconds": len(settings.u) / layout.rate, "level": float(settings.level)}, settings.goal
+
+    return Way("plan", draw, lambda settings: follower(upright, layout, plain, settings), numbers)
+
+
+def _chosen(
+    way: Way, trial: Any, estimator: Estimator, layout: Layout, *, sets: int, seconds: float, seed: int
+) -> Tuned:  # fmt: skip
+    """The settings of one way with the largest margin."""
+    random = np.random.default_rng([seed, 31])
     lanes = max(sets * STARTS, FINALISTS * len(ERRORS) * STARTS)
-    program = jax.jit(jax.vmap(trial_of(upright, layout, hardware, seconds=seconds, substeps=substeps)))
-    settings: list[tuple[SwingUpNumbers, Regulator]] = []
+    program = jax.jit(jax.vmap(trial))
+    settings: list[Any] = []
     times = np.zeros((0, STARTS))
     trials = 0
 
-    def tried(chosen: list[tuple[SwingUpNumbers, Regulator]], errors: tuple[float, ...], starts: int) -> np.ndarray:
-        """Times [set, error, start]; idle lanes repeat the first trial."""
+    def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> np.ndarray:
+        """Times [set, error, start]; idle lanes repeat the first trials."""
         nonlocal trials
-        numbers = [(_traced(one), regulator) for one, regulator in chosen]
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *numbers)
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
         count = len(chosen) * len(errors) * starts
         place = np.arange(lanes) % count
         which, error_of, start_of = np.unravel_index(place, (len(chosen), len(errors), starts))
-        drawn = layout.hanging + _spread(layout) * random.normal(size=(starts, len(layout.joints)))
+        drawn = layout.hanging + spread_of(layout) * random.normal(size=(starts, len(layout.joints)))
         keys = jax.random.split(jax.random.key(int(random.integers(2**31))), lanes)
         parts = jax.tree.map(lambda leaf: leaf[which], stacked)
         result = program(parts, drawn[start_of], 1 + np.array(errors)[error_of], keys)
@@ -118,8 +193,7 @@ def tune(
         return np.asarray(result)[:count].reshape(len(chosen), len(errors), starts)
 
     for _ in range(ROUNDS):
-        drawn = _draws(random, sets)
-        fresh = [swing_up_numbers(upright, layout, scales, numbers) for numbers in drawn]
+        fresh = way.draw(random, sets)
         settings += fresh
         times = np.concatenate([times, tried(fresh, (0.0,), STARTS)[:, 0]])
         if np.isfinite(times).all(axis=1).sum() >= FINALISTS:
@@ -127,9 +201,9 @@ def tune(
     good = np.isfinite(times).all(axis=1)
     if not good.any():
         raise InputError(
-            f"none of {len(settings)} sets of gains swings the model up within {seconds:g} s and its limits in "
-            f"{trials} trials, of which {np.isfinite(times).mean():.0%} came up; a stronger motor, wider limits, more "
-            "time or a better model may"
+            f"none of {len(settings)} sets of numbers swings the model up by {way.name} within {seconds:g} s and its "
+            f"limits in {trials} trials, of which {np.isfinite(times).mean():.0%} came up; a stronger motor, wider "
+            "limits, more time or a better model may"
         )
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(FINALISTS, int(good.sum()))]
     starts = max(STARTS, lanes // (FINALISTS * len(ERRORS)))
@@ -137,38 +211,41 @@ def tune(
     margins = np.array([_margin(np.isfinite(one).all(axis=1)) for one in final])
     share = np.isfinite(final).mean(axis=(1, 2))
     nominal = np.median(final[:, 0], axis=1)
-    order = np.lexsort((nominal, -share, -margins))
-    choice = int(order[0])
+    choice = int(np.lexsort((nominal, -share, -margins))[0])
     if margins[choice] < 0:
         raise InputError(
-            f"of {trials} trials, no set of gains brings all {starts} starts up at the model's own strength: the best "
-            f"reaches {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; a stronger motor or wider limits may"
+            f"of {trials} trials by {way.name}, no set of numbers brings all {starts} starts up at the model's own "
+            f"strength: the best reaches {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; a stronger motor or wider "
+            "limits may"
         )
-    numbers, regulator = settings[best[choice]]
-    law = law_at(upright, layout.joints, numbers, regulator)
-    worked = float(good.mean())
-    return Tuned(law, numbers, regulator, upright, trials, worked, float(margins[choice]), float(nominal[choice]))
+    selected = jax.tree.map(jnp.asarray, settings[best[choice]])
+    numbers, regulator = way.numbers(selected)
+    return Tuned(
+        estimator(way.controller(selected)), way.name, numbers, regulator, trials, float(good.mean()),
+        float(margins[choice]), float(nominal[choice]),
+    )  # fmt: skip
 
 
 def trial_of(
-    upright: Upright, layout: Layout, hardware: Hardware, *, seconds: float, substeps: int
+    controller: Callable[[Any], Controller],
+    model: Dynamics | PlainDynamics,
+    layout: Layout,
+    hardware: Hardware,
+    *,
+    seconds: float,
+    substeps: int,
 ) -> Callable[[Any, Array, Array, Array], Array]:
     """(traced settings, start [d], strength of the motors, key) -> time in s until the goal, infinite if never."""
     B, d = layout.actuation, len(layout.joints)
     lower, upper = layout.limits.control.T
-    field = field_of(upright.model, B)
+    field = field_of(model, B)
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
     angles = np.array([kind == "revolute" for kind in layout.joints])
     has_limits = np.isfinite(layout.limits.position).any() or np.isfinite(layout.limits.rate).any()
-    # One set of smoothing and compensation for all: they are no arrays of the trial.
-    plain = swing_up_numbers(upright, layout, scales_of(upright, layout), {name: 1.0 for name in RANGES})[0]
 
     def trial(settings: Any, start: Array, strength: Array, key: Array) -> Array:
-        (gains, level, kick, surplus), regulator = settings
-        numbers = plain._replace(gains=gains, level=level, kick=kick, surplus=surplus)
-        controller = controller_of(law_at(upright, layout.joints, numbers, regulator), layout)
         run = simulate(
-            lambda x, u: field(x, strength * u), controller, jnp.concatenate([start, jnp.zeros(d)]),
+            lambda x, u: field(x, strength * u), controller(settings), jnp.concatenate([start, jnp.zeros(d)]),
             seconds=seconds, rate=layout.rate, controls=B.shape[1], hardware=limited, key=key, substeps=substeps,
         )  # fmt: skip
         off = jax.vmap(lambda x: error(x[:d], layout.goal, layout.joints))(run.x)
@@ -186,21 +263,11 @@ def trial_of(
     return trial
 
 
-def _traced(numbers: SwingUpNumbers) -> Any:
-    return jax.tree.map(
-        lambda leaf: np.asarray(leaf, float), (numbers.gains, numbers.level, numbers.kick, numbers.surplus)
-    )
-
-
 def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:
     """Sets of numbers, alternately with the energy of the passive part and of the whole plant."""
     low, high = np.log(np.array(list(RANGES.values()))).T
     rows = np.exp(random.uniform(low, high, size=(count, len(RANGES))))
     return [{**dict(zip(RANGES, row, strict=True)), "total": float(k % 2)} for k, row in enumerate(rows)]
-
-
-def _spread(layout: Layout) -> np.ndarray:
-    return np.where((layout.actuation != 0).any(axis=1), ACTIVE_SPREAD, SPREAD)
 
 
 def _margin(succeeded: np.ndarray) -> float:

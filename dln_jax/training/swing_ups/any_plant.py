@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware
+from dln_jax.control.estimate import extended, from_log, unscented
+from dln_jax.control.plants.estimators import by_differences, by_filter
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
-from dln_jax.control.plants.tuning import Tuned, controller_of, tune
+from dln_jax.control.plants.tuning import Tuned, tune
 from dln_jax.data.encoders import noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, prepare
@@ -19,6 +21,10 @@ from dln_jax.types import InputError, require_positive
 
 SECONDS = 10.0
 """Duration of a trial, s."""
+FILTERS = {"extended": extended, "unscented": unscented}
+ESTIMATORS = (*FILTERS, "differences")
+BAND = 3.0
+"""Factor of the filter's torque band, for the errors of a model that a short log does not show."""
 
 
 class Learned(NamedTuple):
@@ -38,6 +44,7 @@ def learn_to_swing_up(
     plant: Plant,
     exploration: Exploration = Exploration(),  # noqa: B008
     *,
+    estimator: str = "extended",
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
 ) -> Learned:
@@ -46,12 +53,15 @@ def learn_to_swing_up(
     Args:
         plant: any; it is guarded.
         exploration: settings.
+        estimator: one of `ESTIMATORS`, from which the law gets its states.
         seed: of the noise and of the trials.
         say: is told every step in a line.
 
     Raises:
-        InputError: as for `explore`, `prepare`, `identified` and `tune`.
+        InputError: as for `explore`, `prepare`, `identified`, `from_log` and `tune`, or an unknown estimator.
     """
+    if estimator not in ESTIMATORS:
+        raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
     began = time.perf_counter()
     explored = explore(plant, model_of, exploration, seed=seed)
     recording = explored.recording
@@ -64,10 +74,17 @@ def learn_to_swing_up(
     say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     hardware = Hardware(encoder_noise=noise, delay=prepared.delay)
-    tuned = tune(fitted.dynamics, plant.layout, hardware, seed=seed)
+    make = by_differences(plant.layout)
+    if estimator in FILTERS:
+        process = from_log(
+            fitted.dynamics, recording, actuation=plant.layout.actuation, delay=prepared.delay
+        ).process  # fmt: skip
+        process = process._replace(disturbance=BAND * process.disturbance)
+        make = by_filter(plant.layout, process, delay=prepared.delay, make=FILTERS[estimator])
+    tuned = tune(fitted.dynamics, plant.layout, hardware, estimator=make, seed=seed)
     say(
-        f"tuned: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin {tuned.margin:.0%}, up in "
-        f"{tuned.seconds:.2f} s"
+        f"tuned by {tuned.way}: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin "
+        f"{tuned.margin:.0%}, up in {tuned.seconds:.2f} s"
     )
     return Learned(explored, prepared, fitted, tuned, hardware, time.perf_counter() - began)
 
@@ -86,7 +103,7 @@ def try_plant(
 
     Args:
         make: seed -> a simulated plant with its own start and noise.
-        tuned: the law.
+        tuned: the controller.
         starts: number of plants.
         seed: of the first plant; the others follow.
         seconds: duration.
@@ -97,6 +114,6 @@ def try_plant(
     require_positive(starts=starts)
     plants = [make(seed + number) for number in range(starts)]
     layout = plants[0].layout
-    controller = controller_of(tuned.law, layout)
-    runs = run(plants, compiled(controller, layout), start_of(controller, starts), seconds=seconds)
+    act = compiled(tuned.controller, layout)
+    runs = run(plants, act, start_of(tuned.controller, starts), seconds=seconds)
     return judged_runs(runs, layout, seconds=seconds), runs
