@@ -1,6 +1,6 @@
 """Plants of any origin as four callables: adapters, safety, exploration, tuning and trials."""
 
-from dln_jax.control.plants.estimators import Estimator, by_differences, by_filter
+from dln_jax.control.plants.estimators import ESTIMATORS, Estimator, by_differences, by_filter, estimator_of
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.guarded import Stopped, guarded
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
@@ -11,6 +11,7 @@ from dln_jax.control.plants.simulated import plant_of, simulated
 from dln_jax.control.plants.tuning import Tuned, tune
 
 __all__ = [
+    "ESTIMATORS",
     "Estimator",
     "Exploration",
     "Explored",
@@ -24,6 +25,7 @@ __all__ = [
     "by_differences",
     "by_filter",
     "compiled",
+    "estimator_of",
     "explore",
     "guarded",
     "gymnasium_plant",

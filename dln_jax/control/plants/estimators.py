@@ -1,20 +1,26 @@
 """From controllers of states to controllers of measurements, for the plants of a layout."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.estimate import Filter, Process, belief, extended, with_estimate
+from dln_jax.control.estimate import Filter, Process, belief, extended, from_log, unscented, with_estimate
 from dln_jax.control.observers import with_differences
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.state_space import Law
+from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.types import InputError
 
 Estimator = Callable[[Law | Controller], Controller]
 """Law or controller of (q, qd) -> controller of measurements of q."""
 FASTEST_FILTER = 50.0
 """Cut-off frequency of differences, Hz, and at most a quarter of the samples' rate."""
+FILTERS: Mapping[str, Callable[[Process], Filter]] = {"extended": extended, "unscented": unscented}
+ESTIMATORS = (*FILTERS, "differences")
+"""Names of `estimator_of`."""
 UNSURE = 1.0
 """Standard deviation of the first estimate: coordinates, and rates in 1/s or m/s."""
 
@@ -41,3 +47,34 @@ def by_filter(
     start = belief(np.concatenate([layout.hanging, np.zeros(d)]), np.full(2 * d, UNSURE))
     settings: Any = {"controls": m, "measurements": d, "lower": lower, "upper": upper, "delay": delay}
     return lambda law: with_estimate(law, make(process), start, **settings)
+
+
+def estimator_of(
+    name: str,
+    layout: Layout,
+    model: Dynamics | PlainDynamics,
+    recording: Trajectories,
+    *,
+    delay: int,
+    wider: float = 1.0,
+) -> Estimator:
+    """Returns the estimator with a name, with the noise of a recording.
+
+    Args:
+        name: one of `ESTIMATORS`.
+        layout: of the plant.
+        model: in the filter.
+        recording: q and commanded torques.
+        delay: samples after which a control begins to act.
+        wider: factor of the torque band, for errors of the model that the recording does not show.
+
+    Raises:
+        InputError: another name, or as for `from_log`.
+    """
+    if name not in ESTIMATORS:
+        raise InputError(f"estimator is {name!r:.40}; choose from {', '.join(ESTIMATORS)}")
+    if name == "differences":
+        return by_differences(layout)
+    process = from_log(model, recording, actuation=layout.actuation, delay=delay).process
+    process = process._replace(disturbance=wider * process.disturbance)
+    return by_filter(layout, process, delay=delay, make=FILTERS[name])

@@ -13,14 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float
 
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.exploration import smooth_noise
+from dln_jax.control.energy_shaping import energy_shaping
 from dln_jax.control.plants.estimators import by_differences
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, compiled, run
 from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of
-from dln_jax.control.swing_up import energy_shaping, upright_of
+from dln_jax.control.swing_up import upright_of
+from dln_jax.data.encoders import low_pass
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive, require_seed
@@ -113,6 +115,14 @@ def explore(
             f"least {SHORTEST:g} s: widen its limits or weaken its motors"
         )
     return Explored(recording_of(runs, layout), tuple(stopped))
+
+
+def smooth_noise(
+    shape: tuple[int, ...], *, rate: float, bandwidth: float, random: np.random.Generator
+) -> Float[np.ndarray, "N m"]:
+    """Normal noise of unit deviation below a frequency, [N, m] at a rate in Hz."""
+    noise = low_pass(random.normal(size=shape), rate=rate, cutoff=bandwidth)
+    return noise / noise.std(axis=0)
 
 
 def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.control.swing_up import parts_of
+from dln_jax.control.energy_shaping import parts_of
 from dln_jax.types import InputError, JointKind, Needs, require_positive
 
 

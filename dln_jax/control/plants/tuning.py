@@ -18,8 +18,8 @@ from jax import Array
 
 from dln_jax.control.closed_loop import Controller, Hardware, simulate, stateless
 from dln_jax.control.plants.estimators import Estimator, by_differences
-from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.planned import followed, follower, plans_of
+from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.runs import HELD, TOLERANCE
 from dln_jax.control.plants.scales import RANGES, Scales, circle, scales_of, swing_up_numbers
 from dln_jax.control.plants.simulated import spread_of
@@ -92,7 +92,7 @@ def tune(
         model: known or learned, with friction if the plant has it.
         layout: of the plant: its motors, goal, limits and rate.
         hardware: noise, resolution and delay; the limits are those of the layout.
-        estimator: makes a controller of measurements from one of states, such as `by_filter`; by default by differences.
+        estimator: makes a controller of measurements from one of states, such as `by_filter`; by default differences.
         sets: number of sets in a first round.
         seconds: duration of a trial, within which a plant has to be up and stay for a second.
         substeps: Runge-Kutta steps a sample.

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.estimate import extended, from_log, unscented
-from dln_jax.control.plants.estimators import by_differences, by_filter
+from dln_jax.control.plants.estimators import ESTIMATORS, estimator_of
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
@@ -21,8 +20,6 @@ from dln_jax.types import InputError, require_positive
 
 SECONDS = 10.0
 """Duration of a trial, s."""
-FILTERS = {"extended": extended, "unscented": unscented}
-ESTIMATORS = (*FILTERS, "differences")
 BAND = 3.0
 """Factor of the filter's torque band, for the errors of a model that a short log does not show."""
 
@@ -53,7 +50,7 @@ def learn_to_swing_up(
     Args:
         plant: any; it is guarded.
         exploration: settings.
-        estimator: one of `ESTIMATORS`, from which the law gets its states.
+        estimator: one of `plants.ESTIMATORS`, from which the law gets its states.
         seed: of the noise and of the trials.
         say: is told every step in a line.
 
@@ -74,13 +71,9 @@ def learn_to_swing_up(
     say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     hardware = Hardware(encoder_noise=noise, delay=prepared.delay)
-    make = by_differences(plant.layout)
-    if estimator in FILTERS:
-        process = from_log(
-            fitted.dynamics, recording, actuation=plant.layout.actuation, delay=prepared.delay
-        ).process  # fmt: skip
-        process = process._replace(disturbance=BAND * process.disturbance)
-        make = by_filter(plant.layout, process, delay=prepared.delay, make=FILTERS[estimator])
+    make = estimator_of(
+        estimator, plant.layout, fitted.dynamics, recording, delay=prepared.delay, wider=BAND
+    )  # fmt: skip
     tuned = tune(fitted.dynamics, plant.layout, hardware, estimator=make, seed=seed)
     say(
         f"tuned by {tuned.way}: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin "
