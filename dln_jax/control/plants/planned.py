@@ -1,10 +1,12 @@
 """Swing-ups by a plan: an optimal trajectory from hanging to the goal, feedback along it, and a regulator at its end.
 
-    min  |error_N|² weights + integral lambda (|u / u_max|² + rates²) dt,   |u| <= `SHARE` u_max
+    min  |error_N|² weight + integral lambda (effort |u / u_max|² + rates²) dt,   |u| <= `SHARE` u_max
 
 in the units of `scales`. Guesses of the controls are drawn, and solved together by iterative linear-quadratic
-regulators. The feedback is the time-varying regulator of the samples; its cost to go at the end is that of the goal's.
-A regulator about hanging brings the plant to rest first, and again if the goal is lost.
+regulators. Plans with the smallest feedback gains come first, because gains are large where the motors hardly reach the
+passive joints, and an error of phase turns their sign. The feedback is the time-varying regulator of the samples; its
+cost to go at the end is that of the goal's. A regulator about hanging brings the plant to rest first, and again if the
+goal is lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,8 +28,8 @@ from dln_jax.control.tracking import friction_compensation, without_friction
 from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan, improve
 from dln_jax.types import InputError
 
-DURATION = 8.0
-"""Duration of a plan, in units of 1 / lambda."""
+DURATIONS = (8.0, 14.0, 20.0)
+"""Durations of plans, in units of 1 / lambda; a longer one is tried if no shorter one arrives."""
 FINENESS = 15.0
 """Steps of a plan per 1 / lambda."""
 SHARE = 0.7
@@ -37,6 +39,8 @@ INSIDE = 0.8
 GUESSES, ITERATIONS, LENGTHS = 16, 100, 0.5 ** np.arange(6)
 CLOSE = 0.1
 """Largest error of a plan's end, in units of the coordinates."""
+EFFORTS = (1.0, 0.1)
+"""Weights of the controls in plans by turns: gentle plans, and firm ones."""
 AT_END, RATES, BEYOND = 300.0, 0.003, 100.0
 """Weights of the errors at the end, of the rates, and of coordinates outside their share of the limits."""
 LOST = 1.0
@@ -58,42 +62,45 @@ class Followed(NamedTuple):
 
 
 def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0) -> list[Plan]:
-    """Plans from hanging to the goal that arrive, the cheapest first; raises `InputError` if none does."""
+    """Plans from hanging to the goal that arrive, the least sensitive first; raises `InputError` if none does."""
     d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
     every = steps_of(layout, scales)
     dt, goal, units = every / layout.rate, np.asarray(upright.at.x), _units(scales)
     step = integrated(_compensated(upright), dt, substeps=2)
     low, high = INSIDE * layout.limits.position.T
 
-    def cost(x: Array, u: Array) -> Array:
-        beyond = jnp.maximum(x[:d] - high, 0.0) + jnp.maximum(low - x[:d], 0.0)
-        running = jnp.sum((u / size) ** 2) + RATES * jnp.sum((x[d:] / units[d:]) ** 2)
-        return dt * scales.fall * running + BEYOND * jnp.sum((beyond / units[:d]) ** 2)
-
     def end(x: Array) -> Array:
         return AT_END * jnp.sum(((x - goal) / units) ** 2)
 
-    problem = TrajectoryProblem(step, cost, end, lower=-SHARE * size, upper=SHARE * size)
     start = np.concatenate([layout.hanging, np.zeros(d)])
 
     @jax.jit
     @jax.vmap
-    def solved(u: Array) -> Plan:
+    def solved(u: Array, weight: Array) -> Plan:
+        def cost(x: Array, u: Array) -> Array:
+            beyond = jnp.maximum(x[:d] - high, 0.0) + jnp.maximum(low - x[:d], 0.0)
+            running = weight * jnp.sum((u / size) ** 2) + RATES * jnp.sum((x[d:] / units[d:]) ** 2)
+            return dt * scales.fall * running + BEYOND * jnp.sum((beyond / units[:d]) ** 2)
+
+        problem = TrajectoryProblem(step, cost, end, lower=-SHARE * size, upper=SHARE * size)
         again = lambda _, plan: improve(problem, plan, step_lengths=LENGTHS)  # noqa: E731
         return jax.lax.fori_loop(0, ITERATIONS, again, first_plan(problem, start, u))
 
     random = np.random.default_rng([seed, 41])
     sizes = np.geomspace(0.03, 0.5, GUESSES)[:, None, None]
-    guesses = sizes * size * random.normal(size=(GUESSES, round(DURATION / scales.fall / dt), len(size)))
-    plans = jax.tree.map(np.asarray, solved(guesses))
-    off = np.abs((plans.x[:, -1] - goal) / units).max(axis=1)
-    good = [k for k in np.argsort(plans.cost) if off[k] <= CLOSE]
-    if not good:
-        raise InputError(
-            f"no plan of {DURATION / scales.fall:.3g} s leads from hanging to the goal: the best ends "
-            f"{np.nanmin(off):.2g} rad or m away; a stronger motor or wider limits may"
-        )
-    return [jax.tree.map(lambda leaf: leaf[k], plans) for k in good]  # noqa: B023
+    nearest = np.inf
+    for duration in DURATIONS:
+        guesses = sizes * size * random.normal(size=(GUESSES, round(duration / scales.fall / dt), len(size)))
+        plans = jax.tree.map(np.asarray, solved(guesses, np.resize(EFFORTS, GUESSES)))
+        off = np.abs((plans.x[:, -1] - goal) / units).max(axis=1)
+        largest = np.abs(plans.K * units / size[:, None]).max(axis=(1, 2, 3))
+        if good := [k for k in np.argsort(largest) if off[k] <= CLOSE]:
+            return [jax.tree.map(lambda leaf: leaf[k], plans) for k in good]  # noqa: B023
+        nearest = np.nanmin([nearest, *off])
+    raise InputError(
+        f"no plan of {DURATIONS[-1] / scales.fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} of "
+        "a coordinate's size away; a stronger motor or wider limits may"
+    )
 
 
 def steps_of(layout: Layout, scales: Scales) -> int:

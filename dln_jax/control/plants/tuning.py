@@ -1,9 +1,11 @@
 """Chooses a swing-up's gains, catch region and regulator by simulated trials of a model, in one compiled program.
 
 1. Numbers without units (`scales.RANGES`) are drawn; scales of the model make gains and a regulator of them.
-2. Every set is tried from a few starts near hanging, with the hardware's limits, resolution, noise and delay.
-3. The best sets are tried again with motors that are stronger or weaker than the model says. The margin of a set is
-   the largest such error up to which every trial succeeds; the set with the largest margin is chosen.
+2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
+   are stronger or weaker than the model says by `FIRST_ERRORS`. Weight is wrong by the share `WEIGHT` of that, the
+   other way round.
+3. The best sets are tried again with more errors and starts. The margin of a set is the largest error up to which every
+   trial succeeds; the set with the largest margin is chosen.
 4. Plans with feedback (`planned`) are tried first. If their margin is below `ENOUGH`, energy laws are tried likewise,
    and the larger margin decides.
 """
@@ -24,15 +26,18 @@ from dln_jax.control.plants.runs import HELD, TOLERANCE
 from dln_jax.control.plants.scales import RANGES, Scales, circle, scales_of, swing_up_numbers
 from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.regulators import Regulator
-from dln_jax.control.state_space import error, field_of
+from dln_jax.control.state_space import error
 from dln_jax.control.swing_up import Upright, law_at, upright_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, require_positive, require_seed
 
 ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 """Relative errors of the motors' strength in the second round."""
+FIRST_ERRORS = (0.15, -0.15)
+WEIGHT = 0.125
+"""Relative error of gravity over that of the motors' strength."""
 STARTS = 2
-"""Starts of a set in the first round."""
+"""Starts of a set with each error in the second round, at least."""
 FINALISTS = 8
 ROUNDS = 2
 """First rounds, at most, until `FINALISTS` sets have succeeded."""
@@ -81,7 +86,7 @@ def tune(
     hardware: Hardware = Hardware(),  # noqa: B008
     *,
     estimator: Estimator | None = None,
-    sets: int = 32,
+    sets: int = 64,
     seconds: float = 6.0,
     substeps: int = 1,
     seed: int = 0,
@@ -172,10 +177,10 @@ def _chosen(
 ) -> Tuned:  # fmt: skip
     """The settings of one way with the largest margin."""
     random = np.random.default_rng([seed, 31])
-    lanes = max(sets * STARTS, FINALISTS * len(ERRORS) * STARTS)
+    lanes = max(sets * len(FIRST_ERRORS), FINALISTS * len(ERRORS) * STARTS)
     program = jax.jit(jax.vmap(trial))
     settings: list[Any] = []
-    times = np.zeros((0, STARTS))
+    times = np.zeros((0, len(FIRST_ERRORS)))
     trials = 0
 
     def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> np.ndarray:
@@ -188,14 +193,14 @@ def _chosen(
         drawn = layout.hanging + spread_of(layout) * random.normal(size=(starts, len(layout.joints)))
         keys = jax.random.split(jax.random.key(int(random.integers(2**31))), lanes)
         parts = jax.tree.map(lambda leaf: leaf[which], stacked)
-        result = program(parts, drawn[start_of], 1 + np.array(errors)[error_of], keys)
+        result = program(parts, drawn[start_of], np.array(errors)[error_of], keys)
         trials += count
         return np.asarray(result)[:count].reshape(len(chosen), len(errors), starts)
 
     for _ in range(ROUNDS):
         fresh = way.draw(random, sets)
         settings += fresh
-        times = np.concatenate([times, tried(fresh, (0.0,), STARTS)[:, 0]])
+        times = np.concatenate([times, tried(fresh, FIRST_ERRORS, 1)[:, :, 0]])
         if np.isfinite(times).all(axis=1).sum() >= FINALISTS:
             break
     good = np.isfinite(times).all(axis=1)
@@ -235,18 +240,23 @@ def trial_of(
     seconds: float,
     substeps: int,
 ) -> Callable[[Any, Array, Array, Array], Array]:
-    """(traced settings, start [d], strength of the motors, key) -> time in s until the goal, infinite if never."""
+    """(traced settings, start [d], error of the model, key) -> time in s until the goal, infinite if never."""
     B, d = layout.actuation, len(layout.joints)
     lower, upper = layout.limits.control.T
-    field = field_of(model, B)
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
     angles = np.array([kind == "revolute" for kind in layout.joints])
     has_limits = np.isfinite(layout.limits.position).any() or np.isfinite(layout.limits.rate).any()
 
-    def trial(settings: Any, start: Array, strength: Array, key: Array) -> Array:
+    def trial(settings: Any, start: Array, wrong: Array, key: Array) -> Array:
+        def field(x: Array, u: Array) -> Array:
+            q, qd = jnp.split(x, 2)
+            weight = model.inverse_dynamics(q, jnp.zeros(d), jnp.zeros(d))
+            tau = (1 + wrong) * (B @ u) + WEIGHT * wrong * weight
+            return jnp.concatenate([qd, model.forward_dynamics(q, qd, tau)])
+
         run = simulate(
-            lambda x, u: field(x, strength * u), controller(settings), jnp.concatenate([start, jnp.zeros(d)]),
-            seconds=seconds, rate=layout.rate, controls=B.shape[1], hardware=limited, key=key, substeps=substeps,
+            field, controller(settings), jnp.concatenate([start, jnp.zeros(d)]), seconds=seconds, rate=layout.rate,
+            controls=B.shape[1], hardware=limited, key=key, substeps=substeps,
         )  # fmt: skip
         off = jax.vmap(lambda x: error(x[:d], layout.goal, layout.joints))(run.x)
         away = ~(jnp.max(jnp.abs(off[:, angles]), axis=1) <= TOLERANCE)  # NaN is away

@@ -20,7 +20,7 @@ from dln_jax.types import InputError, require_positive
 
 SECONDS = 10.0
 """Duration of a trial, s."""
-BAND = 3.0
+BAND = 10.0
 """Factor of the filter's torque band, for the errors of a model that a short log does not show."""
 
 
