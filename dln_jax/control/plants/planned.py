@@ -41,8 +41,9 @@ CLOSE = 0.1
 """Largest error of a plan's end, in units of the coordinates."""
 EFFORTS = (1.0, 0.1)
 """Weights of the controls in plans by turns: gentle plans, and firm ones."""
-AT_END, RATES, BEYOND = 300.0, 0.003, 100.0
-"""Weights of the errors at the end, of the rates, and of coordinates outside their share of the limits."""
+AT_END, RATES, POSTURE, BEYOND = 300.0, 0.003, 0.02, 100.0
+"""Weights of the errors at the end, of the rates, of active coordinates away from the goal, where an acrobot's motor
+hardly reaches its passive joint, and of coordinates outside their share of the limits."""
 LOST = 1.0
 """Distance from the plan or the goal in an angle, rad, beyond which the plant hangs and starts again."""
 
@@ -78,8 +79,10 @@ def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0)
     @jax.vmap
     def solved(u: Array, weight: Array) -> Plan:
         def cost(x: Array, u: Array) -> Array:
+            away = ((x - goal) / units)[np.array(upright.parts.active)]
             beyond = jnp.maximum(x[:d] - high, 0.0) + jnp.maximum(low - x[:d], 0.0)
             running = weight * jnp.sum((u / size) ** 2) + RATES * jnp.sum((x[d:] / units[d:]) ** 2)
+            running += POSTURE * jnp.sum(away**2)
             return dt * scales.fall * running + BEYOND * jnp.sum((beyond / units[:d]) ** 2)
 
         problem = TrajectoryProblem(step, cost, end, lower=-SHARE * size, upper=SHARE * size)
@@ -98,8 +101,8 @@ def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0)
             return [jax.tree.map(lambda leaf: leaf[k], plans) for k in good]  # noqa: B023
         nearest = np.nanmin([nearest, *off])
     raise InputError(
-        f"no plan of {DURATIONS[-1] / scales.fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} of "
-        "a coordinate's size away; a stronger motor or wider limits may"
+        f"no plan of {DURATIONS[-1] / scales.fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} "
+        "of a coordinate's size away; a stronger motor or wider limits may"
     )
 
 
