@@ -6,12 +6,10 @@ from typing import Any
 import numpy as np
 
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.estimate import Filter, Process, belief, extended, from_log, unscented, with_estimate
+from dln_jax.control.estimate import Filter, Process, belief, extended, unscented, with_estimate
 from dln_jax.control.observers import with_differences
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.state_space import Law
-from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError
 
 Estimator = Callable[[Law | Controller], Controller]
@@ -49,32 +47,22 @@ def by_filter(
     return lambda law: with_estimate(law, make(process), start, **settings)
 
 
-def estimator_of(
-    name: str,
-    layout: Layout,
-    model: Dynamics | PlainDynamics,
-    recording: Trajectories,
-    *,
-    delay: int,
-    wider: float = 1.0,
-) -> Estimator:
-    """Returns the estimator with a name, with the noise of a recording.
+def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: int) -> Estimator:
+    """Returns the estimator with a name.
 
     Args:
         name: one of `ESTIMATORS`.
         layout: of the plant.
-        model: in the filter.
-        recording: q and commanded torques.
+        process: for the filters.
         delay: samples after which a control begins to act.
-        wider: factor of the torque band, for errors of the model that the recording does not show.
 
     Raises:
-        InputError: another name, or as for `from_log`.
+        InputError: another name, or a filter without a process.
     """
     if name not in ESTIMATORS:
         raise InputError(f"estimator is {name!r:.40}; choose from {', '.join(ESTIMATORS)}")
     if name == "differences":
         return by_differences(layout)
-    process = from_log(model, recording, actuation=layout.actuation, delay=delay).process
-    process = process._replace(disturbance=wider * process.disturbance)
+    if process is None:
+        raise InputError(f"the filter {name!r} needs a process, such as that of estimate.from_log")
     return by_filter(layout, process, delay=delay, make=FILTERS[name])

@@ -118,8 +118,8 @@ def followed(
     scales: Scales,
     numbers: Sequence[Mapping[str, float]],
     spread: Any,
-) -> tuple[list[Followed], SwingUpNumbers]:
-    """Feedback about plans, from numbers without units; all have one smoothing and compensation of friction.
+) -> list[Followed]:
+    """Feedback about plans, from numbers without units.
 
     Args:
         chosen: plans from hanging, one for each set of numbers.
@@ -152,15 +152,17 @@ def followed(
     costs = [(one.state_cost, one.control_cost) for one in settings]
     Q, R = map(np.stack, zip(*costs, strict=True))
     rows = along(np.stack([plan.u for plan in chosen]), Q, R, np.stack([goal.S for goal in goals]))
-    rows = jax.tree.map(np.asarray, rows)
+    x, u, K, S, level = map(np.asarray, rows)
     return [
-        Followed(*(leaf[k] for leaf in rows), goals[k], lqr(below.A, below.B, *costs[k])) for k in range(len(costs))
-    ], settings[0]
+        Followed(x[k], u[k], K[k], S[k], level[k], goal, lqr(below.A, below.B, *costs[k]))
+        for k, goal in enumerate(goals)
+    ]
 
 
 def follower(upright: Upright, layout: Layout, settings: SwingUpNumbers, plan: Followed) -> Controller:
     """The controller of states x that swings up by a plan, whose arrays may be traced."""
     joints, angles = layout.joints, np.array([kind == "revolute" for kind in layout.joints])
+    plan = jax.tree.map(jnp.asarray, plan)
     rest = jnp.concatenate([jnp.asarray(layout.hanging), jnp.zeros(len(joints))])
     hold, wait = regulated(plan.goal, upright.at.x, upright.at.u, joints), regulated(plan.hanging, rest, 0.0, joints)
     begins, last = value(Regulator(plan.K[0], plan.S), rest, joints), len(plan.u)

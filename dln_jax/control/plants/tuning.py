@@ -164,7 +164,7 @@ def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
 
     def draw(random: np.random.Generator, count: int) -> list[Any]:
         chosen = [plans[k % len(plans)] for k in range(count)]
-        return followed(chosen, upright, layout, scales, _draws(random, count), spread_of(layout))[0]
+        return followed(chosen, upright, layout, scales, _draws(random, count), spread_of(layout))
 
     def numbers(settings: Any) -> tuple[dict[str, float], Regulator]:
         return {"seconds": len(settings.u) / layout.rate, "level": float(settings.level)}, settings.goal

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware
+from dln_jax.control.estimate import from_log
 from dln_jax.control.plants.estimators import ESTIMATORS, estimator_of
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Plant
@@ -32,7 +33,7 @@ class Learned(NamedTuple):
     fitted: FittedPlant
     tuned: Tuned
     hardware: Hardware
-    """As estimated from the recording: the delay, and the noise of the measurements."""
+    """As estimated from the recording: the delay, and the noise of measurements and motors."""
     seconds: float
     """Time for all steps, s."""
 
@@ -70,10 +71,13 @@ def learn_to_swing_up(
     fitted = identified(prepared.train, plant.layout.needs, chain=True)
     say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
-    hardware = Hardware(encoder_noise=noise, delay=prepared.delay)
-    make = estimator_of(
-        estimator, plant.layout, fitted.dynamics, recording, delay=prepared.delay, wider=BAND
-    )  # fmt: skip
+    B = plant.layout.actuation
+    process = from_log(fitted.dynamics, recording, actuation=B, delay=prepared.delay).process
+    band = np.asarray(process.disturbance)
+    # What the model does not explain of the driven joints acts as noise of the motors in the trials.
+    hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=prepared.delay)
+    wide = process._replace(disturbance=BAND * band)
+    make = estimator_of(estimator, plant.layout, wide, delay=prepared.delay)
     tuned = tune(fitted.dynamics, plant.layout, hardware, estimator=make, seed=seed)
     say(
         f"tuned by {tuned.way}: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin "

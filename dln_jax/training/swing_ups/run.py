@@ -20,6 +20,7 @@ from dln_jax.control.desktop_plants import (
     motion_of,
     try_starts,
 )
+from dln_jax.control.estimate import from_log
 from dln_jax.control.plants.estimators import ESTIMATORS, Estimator, estimator_of
 from dln_jax.control.tracking import without_friction
 from dln_jax.data import schema
@@ -85,7 +86,10 @@ def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, flo
     store(folder, got)
     errors = errors_along(plant, got.dynamics, test_motions(plant, seed=task.seed))
     late = plant.hardware.delay if got.prepared is None else got.prepared.delay
-    estimator = estimator_of(task.estimator, plant.layout, got.dynamics, recording, delay=late)
+    process = None
+    if task.estimator != "differences":
+        process = from_log(got.dynamics, recording, actuation=plant.layout.actuation, delay=late).process
+    estimator = estimator_of(task.estimator, plant.layout, process, delay=late)
     law = law_of(plant, got.dynamics, estimator)
     tried = try_starts(plant, got.dynamics, starts=task.starts, seed=task.seed, estimator=estimator)
     metrics = {
