@@ -14,7 +14,6 @@ from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up import upright_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole
-from dln_jax.types import InputError
 
 MODEL = dynamics(cart_pole(cart_mass=0.6, pole_mass=0.15, length=0.25, friction=0.002).closed_form)
 
@@ -74,11 +73,3 @@ def test_a_plant_that_was_not_at_rest_hangs_first_and_then_swings_up(planned):
         run = simulated(planned, start)
         assert np.abs(np.remainder(run.x[-100:, 1] + np.pi, 2 * np.pi) - np.pi).max() < 0.05
         assert np.abs(run.x[:, 0]).max() < 0.6
-
-
-@pytest.mark.slow
-def test_a_motor_with_which_no_plan_arrives_is_refused():
-    plant = rail(0.01)
-    upright, scales = scaled(plant)
-    with pytest.raises(InputError, match="no plan of .* leads from hanging to the goal"):
-        plans_of(upright, plant, scales)
