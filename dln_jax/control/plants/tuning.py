@@ -121,12 +121,12 @@ def tune(
                 lambda settings, way=way: estimator(way.controller(settings)), upright.model, layout, hardware,
                 seconds=seconds, substeps=substeps,
             )  # fmt: skip
-            found = _chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed)
+            result = _chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed)
         except InputError as error:
             refused.append(str(error))
             continue
-        trials += found.trials
-        best = found if best is None or found.margin > best.margin else best
+        trials += result.trials
+        best = result if best is None or result.margin > best.margin else best
         if best.margin >= ENOUGH:
             break
     if best is None:
