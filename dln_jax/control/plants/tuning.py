@@ -2,12 +2,13 @@
 
 1. Numbers without units (`scales.RANGES`) are drawn; scales of the model make gains and a regulator of them.
 2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
-   are stronger or weaker than the model says by `FIRST_ERRORS`. Weight is wrong by the share `WEIGHT` of that, the
+   are stronger or weaker than the model says. Weight is wrong by the share `WEIGHT` of that, the
    other way round.
 3. The best sets are tried again with more errors and starts. The margin of a set is the largest error up to which every
    trial succeeds; the set with the largest margin is chosen.
-4. Plans with feedback (`planned`) are tried first. If their margin is below `ENOUGH`, energy laws are tried likewise,
-   and the larger margin decides.
+4. Plans with feedback (`planned`) are tried first, and taken if they stand every error. Otherwise energy laws are tried
+   as well, with right models in the first round, because few sets work. One with a margin of `LEAST` or more is taken:
+   it acts in any state, and a wrong model costs it time where it throws a plan off. Else the larger margin decides.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,16 +34,15 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 """Relative errors of the motors' strength in the second round."""
-FIRST_ERRORS = (0.15, -0.15)
 WEIGHT = 0.125
 """Relative error of gravity over that of the motors' strength."""
 STARTS = 2
 """Starts of a set with each error in the second round, at least."""
 FINALISTS = 8
-ROUNDS = 2
+ROUNDS = 4
 """First rounds, at most, until `FINALISTS` sets have succeeded."""
-ENOUGH = 0.2
-"""Margin of the plans with which no energy law is tried."""
+LEAST = 0.1
+"""Smallest margin of an energy law that is taken in place of a plan."""
 PLANS = 8
 """Number of plans, at most, that are tried with feedback."""
 
@@ -57,6 +57,8 @@ class Way(NamedTuple):
     """Settings, perhaps traced -> controller of states."""
     numbers: Callable[[Any], tuple[Mapping[str, float], Regulator]]
     """Settings -> their numbers, and the regulator at the goal."""
+    errors: tuple[float, ...]
+    """Errors in the first round, one trial each."""
 
 
 class Tuned(NamedTuple):
@@ -113,7 +115,7 @@ def tune(
     lower, upper = layout.limits.control.T
     upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
     scales, estimator = scales_of(upright, layout), estimator or by_differences(layout)
-    best, refused, trials = None, [], 0
+    results, refused = [], []
     for make in (by_plan, by_energy):
         try:
             way = make(upright, layout, scales, seed)
@@ -121,17 +123,15 @@ def tune(
                 lambda settings, way=way: estimator(way.controller(settings)), upright.model, layout, hardware,
                 seconds=seconds, substeps=substeps,
             )  # fmt: skip
-            result = _chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed)
+            results.append(_chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed))
         except InputError as error:
             refused.append(str(error))
-            continue
-        trials += result.trials
-        best = result if best is None or result.margin > best.margin else best
-        if best.margin >= ENOUGH:
+        if results and results[-1].margin == max(ERRORS):
             break
-    if best is None:
+    if not results:
         raise InputError("; ".join(refused))
-    return best._replace(trials=trials)
+    best = max(results, key=lambda one: (one.way == "energy" and one.margin >= LEAST, one.margin))
+    return best._replace(trials=sum(one.trials for one in results))
 
 
 def by_energy(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
@@ -154,7 +154,7 @@ def by_energy(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Wa
         named = {**gains._asdict(), "level": level, "kick": kick, "surplus": surplus}
         return {name: float(value) for name, value in named.items()}, regulator
 
-    return Way("energy", draw, controller, numbers)
+    return Way("energy", draw, controller, numbers, (0.0, 0.0))
 
 
 def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
@@ -169,7 +169,7 @@ def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
     def numbers(settings: Any) -> tuple[dict[str, float], Regulator]:
         return {"seconds": len(settings.u) / layout.rate, "level": float(settings.level)}, settings.goal
 
-    return Way("plan", draw, lambda settings: follower(upright, layout, plain, settings), numbers)
+    return Way("plan", draw, lambda settings: follower(upright, layout, plain, settings), numbers, (0.15, -0.15))
 
 
 def _chosen(
@@ -177,10 +177,10 @@ def _chosen(
 ) -> Tuned:  # fmt: skip
     """The settings of one way with the largest margin."""
     random = np.random.default_rng([seed, 31])
-    lanes = max(sets * len(FIRST_ERRORS), FINALISTS * len(ERRORS) * STARTS)
+    lanes = max(sets * len(way.errors), FINALISTS * len(ERRORS) * STARTS)
     program = jax.jit(jax.vmap(trial))
     settings: list[Any] = []
-    times = np.zeros((0, len(FIRST_ERRORS)))
+    times = np.zeros((0, len(way.errors)))
     trials = 0
 
     def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> np.ndarray:
@@ -200,7 +200,7 @@ def _chosen(
     for _ in range(ROUNDS):
         fresh = way.draw(random, sets)
         settings += fresh
-        times = np.concatenate([times, tried(fresh, FIRST_ERRORS, 1)[:, :, 0]])
+        times = np.concatenate([times, tried(fresh, way.errors, 1)[:, :, 0]])
         if np.isfinite(times).all(axis=1).sum() >= FINALISTS:
             break
     good = np.isfinite(times).all(axis=1)
