@@ -106,7 +106,7 @@ def test_a_motor_that_is_too_weak_is_refused_with_the_number_of_trials(monkeypat
         raise InputError("no plan arrives")
 
     monkeypatch.setattr("dln_jax.control.plants.tuning.plans_of", refuse)
-    with pytest.raises(InputError, match=r"no plan arrives; none of 8 sets .* in 16 trials, of which 0% came up"):
+    with pytest.raises(InputError, match=r"no plan arrives; none of 16 sets .* in 32 trials, of which 0% came up"):
         tune(model(), rail(control=0.01), sets=4, seconds=2.0)
 
 
