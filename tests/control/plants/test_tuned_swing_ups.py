@@ -105,7 +105,7 @@ def test_a_motor_that_is_too_weak_is_refused_with_the_number_of_trials(monkeypat
     def refuse(*_, **__):
         raise InputError("no plan arrives")
 
-    monkeypatch.setattr("dln_jax.control.plants.tuning.plans_of", refuse)
+    monkeypatch.setattr("dln_jax.control.plants.ways.plans_of", refuse)
     with pytest.raises(InputError, match=r"no plan arrives; none of 16 sets .* in 32 trials, of which 0% came up"):
         tune(model(), rail(control=0.01), sets=4, seconds=2.0)
 
