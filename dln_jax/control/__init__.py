@@ -10,6 +10,14 @@ from dln_jax.control.closed_loop import (
     simulate,
     stateless,
 )
+from dln_jax.control.energy_shaping import (
+    EnergyGains,
+    Parts,
+    energy_shaping,
+    partial_linearisation,
+    parts_of,
+    passive_energy,
+)
 from dln_jax.control.observers import with_differences, with_prediction
 from dln_jax.control.plan_limits import free_time, with_limits_of, worst_violation
 from dln_jax.control.real_time import feedback, improve, mpc, prepare
@@ -36,17 +44,7 @@ from dln_jax.control.state_space import (
     saturated,
     where_finite,
 )
-from dln_jax.control.swing_up import (
-    EnergyGains,
-    Parts,
-    SwingUp,
-    SwingUpNumbers,
-    energy_shaping,
-    partial_linearisation,
-    parts_of,
-    passive_energy,
-    swing_up,
-)
+from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, swing_up
 from dln_jax.control.tracking import (
     Gains,
     Judgement,

@@ -15,19 +15,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.closed_loop import (
-    ClosedLoopRun,
-    Controller,
-    Hardware,
-    Outcomes,
-    hanging_starts,
-    outcomes,
-    simulate,
-)
-from dln_jax.control.estimate import Filter, Process, belief, extended, with_estimate
-from dln_jax.control.observers import with_differences
-from dln_jax.control.state_space import Law, field_of
-from dln_jax.control.swing_up import EnergyGains, SwingUp, SwingUpNumbers, swing_up
+from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, hanging_starts, outcomes, simulate
+from dln_jax.control.energy_shaping import EnergyGains
+from dln_jax.control.plants.estimators import Estimator, by_differences
+from dln_jax.control.plants.plant import Layout, Plant, layout
+from dln_jax.control.plants.simulated import plant_of
+from dln_jax.control.state_space import field_of
+from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, swing_up
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
@@ -39,8 +33,6 @@ TURN = 2 * np.pi / 2048
 """Resolution of an encoder, rad."""
 SECONDS = 10.0
 """Duration of a swing-up's simulation, s."""
-CUTOFF = 50.0
-"""Cut-off frequency of the rates, which are differences of encoder readings, Hz."""
 HOLDING = 1.0
 """Last part of a run in which the pole is held upright, s."""
 POSTURES = 65
@@ -65,6 +57,14 @@ class DesktopPlant(NamedTuple):
     """Numbers of its swing-up, tuned by a random search with the analytic model."""
     position: float
     """Standard deviation of the driven coordinate's initial value, m or rad."""
+
+    @property
+    def layout(self) -> Layout:
+        """What is known before it has moved."""
+        return layout(
+            self.scene.needs.joints, [0], goal=np.zeros(2), hanging=[0.0, np.pi], rate=self.rate,
+            control=self.hardware.upper,
+        )  # fmt: skip
 
 
 class Tried(NamedTuple):
@@ -130,29 +130,21 @@ def nominal_model(plant: DesktopPlant) -> Dynamics:
     return dynamics(plant.nominal(**plant.sizes).closed_form)
 
 
-def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics) -> SwingUp:
-    """Returns the plant's swing-up by a model; raises as `swing_up`."""
+def simulated_plant(plant: DesktopPlant, *, seed: int = 0) -> Plant:
+    """The plant as four callables, as for any plant; the seed sets its starts and its noise."""
+    return plant_of(
+        model_of_plant(plant), plant.layout, substeps=plant.substeps, hardware=plant.hardware, seed=seed
+    )  # fmt: skip
+
+
+def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, estimator: Estimator | None = None) -> SwingUp:
+    """Returns the plant's swing-up by a model, by default with rates by differences; raises as `swing_up`."""
     angle = np.linspace(-np.pi, np.pi, POSTURES)
     needs, hardware = plant.scene.needs, plant.hardware
     return swing_up(
         model, needs.actuation, needs.joints, np.zeros(2), plant.numbers,
         postures=np.stack([np.zeros(POSTURES), angle], axis=1), lower=hardware.lower, upper=hardware.upper,
-    )  # fmt: skip
-
-
-def differences(plant: DesktopPlant) -> Callable[[Law], Controller]:
-    """Rates by differences of the encoder readings and a low-pass."""
-    return lambda law: with_differences(law, 2, rate=plant.rate, cutoff=CUTOFF)
-
-
-def estimated(
-    plant: DesktopPlant, process: Process, make: Callable[[Process], Filter] = extended
-) -> Callable[[Law], Controller]:
-    """States by a filter of the encoder readings, with the process of a log (`control.estimate.from_log`)."""
-    hardware, start = plant.hardware, belief([0.0, np.pi, 0.0, 0.0], [1.0, np.pi, 1.0, 1.0])
-    return lambda law: with_estimate(
-        law, make(process), start, controls=1, measurements=2, lower=hardware.lower, upper=hardware.upper,
-        delay=hardware.delay,
+        estimator=estimator or by_differences(plant.layout),
     )  # fmt: skip
 
 
@@ -161,14 +153,10 @@ def motion_of(
     model: Dynamics | PlainDynamics,
     *,
     seconds: float = SECONDS,
-    estimator: Callable[[Law], Controller] | None = None,
+    estimator: Estimator | None = None,
 ) -> Callable[[Array, Array], ClosedLoopRun]:
-    """(initial state [4], key of the noise) -> a run of the true plant with the model's law.
-
-    An estimator, such as `estimated`, makes a controller of encoder readings from the law; without one, rates are
-    differences of the readings.
-    """
-    controller = (estimator or differences(plant))(law_of(plant, model).law)
+    """(initial state [4], key of the noise) -> a run of the true plant with the model's law; as for `law_of`."""
+    controller = law_of(plant, model, estimator).controller
     B = np.asarray(plant.scene.needs.actuation)
     field = field_of(model_of_plant(plant), B)
 
@@ -188,7 +176,7 @@ def try_starts(
     starts: int = 1000,
     seed: int = 0,
     seconds: float = SECONDS,
-    estimator: Callable[[Law], Controller] | None = None,
+    estimator: Estimator | None = None,
 ) -> Tried:
     """Runs swing-ups from random states near hanging, with independent noise; `estimator` as for `motion_of`."""
     run = motion_of(plant, model, seconds=seconds, estimator=estimator)

@@ -1,13 +1,4 @@
-"""Swing-up of plants with passive joints by energy, with a known or learned model: the same functions for all models.
-
-Collocated partial feedback linearisation gives the active joints any acceleration a (Spong 1995, "The swing up control
-problem for the acrobot"). The passive rows of the equations of motion, without motors, determine the other
-accelerations. With h = c + g + friction,
-
-    qdd_p = -M_pp⁻¹ (M_pa a + h_p),   tau_a = M_aa a + M_ap qdd_p + h_a
-
-The passive part, with the active joints locked, has the energy E = ½ qd_pᵀ M_pp qd_p + V. Accelerating the active
-joints does work on it at the rate -qd_pᵀ M_pa a, so that a = k (E - E*) M_ap qd_p drives E to that of the goal.
+"""Swing-ups by energy: a whole law, or a controller with an estimator, from a known or learned model.
 
 `swing_up` makes a whole law from a model:
 
@@ -27,118 +18,17 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.control.closed_loop import Controller, stateless
+from dln_jax.control.energy_shaping import EnergyGains, Parts, energy_shaping, parts_of, with_energy
 from dln_jax.control.regulators import Regulator, lqr, regulated, switched, value
-from dln_jax.control.state_space import Law, Linearisation, field_of, holding_controls, linearise, where_finite
+from dln_jax.control.state_space import Law, Linearisation, field_of, holding_controls, linearise
 from dln_jax.control.tracking import GAIN, definite, friction_compensation, without_friction
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.solvers.elimination import solve
-from dln_jax.types import InputError, JointKind, Scalar, Vector
+from dln_jax.types import InputError, JointKind, Vector
 
 NEWTON_STEPS = 20
 FARTHEST = 0.1
 """Largest distance of a model's equilibrium from the goal, rad or m."""
-
-
-class EnergyGains(NamedTuple):
-    """Gains of the accelerations of the active joints."""
-
-    energy: float
-    """1/(kg m² J s) for revolute joints; maps M_ap qd_p times the energy's error to an acceleration."""
-    proportional: float
-    """1/s²."""
-    derivative: float
-    """1/s."""
-    total: Any = None
-    """Whether the energy is that of the whole plant, as for acrobots (Spong), and the coupling that of the goal; 0 or
-    1, possibly traced. `None`: the energy of the passive part, as for poles on a driven base."""
-
-
-class Parts(NamedTuple):
-    """Indices of the driven and of the passive coordinates."""
-
-    active: tuple[int, ...]
-    passive: tuple[int, ...]
-
-
-def parts_of(actuation: Any) -> Parts:
-    """Derives the parts from the matrix [d, u] in tau = B u, if every motor drives one coordinate.
-
-    Raises:
-        InputError: motors that drive several coordinates, or no passive one.
-    """
-    B = np.asarray(actuation, float)
-    driven = (B != 0).sum(axis=1)
-    active = tuple(np.flatnonzero(driven).tolist())
-    if B.ndim != 2 or (driven > 1).any() or ((B != 0).sum(axis=0) != 1).any() or len(active) == len(B):
-        raise InputError(
-            f"actuation is {B.tolist()}; expected motors that drive one coordinate each, and some coordinate without"
-        )
-    return Parts(active, tuple(np.setdiff1d(np.arange(len(B)), active).tolist()))
-
-
-def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Vector, Array], Array]:
-    """(q, qd, accelerations of the active joints) -> their forces, exact where M_pp is regular."""
-    active, passive = map(np.array, parts)
-
-    def forces(q: Vector, qd: Vector, a: Array) -> Array:
-        M = plant.mass_matrix(q)
-        h = plant.inverse_dynamics(q, qd, jnp.zeros_like(qd))
-        coupling = M[np.ix_(active, passive)]
-        others = -solve(M[np.ix_(passive, passive)], coupling.T @ a + h[passive])
-        return where_finite(M[np.ix_(active, active)] @ a + coupling @ others + h[active], q, qd)
-
-    return forces
-
-
-def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector, Vector], Scalar]:
-    """(q, qd) -> energy of the passive part in J, with the active joints locked at the goal, relative to the goal."""
-    active, passive = map(np.array, parts)
-    goal = jnp.asarray(goal, float)
-
-    def energy(q: Vector, qd: Vector) -> Scalar:
-        held = q.at[active].set(goal[active])
-        moving = jnp.zeros_like(qd).at[passive].set(qd[passive])
-        return plant.energy(held, moving) - plant.energy(goal, jnp.zeros_like(qd))
-
-    return energy
-
-
-def energy_shaping(
-    plant: Dynamics | PlainDynamics,
-    parts: Parts,
-    goal: Sequence[float] | Array,
-    gains: EnergyGains,
-    *,
-    surplus: Any = 0.0,
-) -> Callable[[Vector, Vector], Array]:
-    """(q, qd) -> forces that bring the passive joints to the goal's energy, and the active joints to the goal.
-
-    Args:
-        plant: a known or learned model with energies; its friction is compensated at the active joints.
-        parts: driven and passive joints.
-        goal: posture [d].
-        gains: of the accelerations.
-        surplus: target energy of the passive joints above that of the goal, J, which compensates their losses.
-
-    Raises:
-        InputError: a model without energies.
-    """
-    plant, (active, passive) = _with_energy(plant), map(np.array, parts)
-    forces, energy = partial_linearisation(plant, parts), passive_energy(plant, parts, goal)
-    goal = jnp.asarray(goal, float)
-    home = goal[active]
-
-    def law(q: Vector, qd: Vector) -> Array:
-        coupling, error = plant.mass_matrix(q)[np.ix_(active, passive)], energy(q, qd) - surplus
-        if gains.total is not None:
-            whole = plant.energy(q, qd) - plant.energy(goal, jnp.zeros_like(qd)) - surplus
-            at_goal = plant.mass_matrix(goal)[np.ix_(active, passive)]
-            coupling, error = jnp.where(gains.total, at_goal, coupling), jnp.where(gains.total, whole, error)
-        pumping = gains.energy * error * (coupling @ qd[passive])
-        a = pumping - gains.proportional * (q[active] - home) - gains.derivative * qd[active]
-        return forces(q, qd, a)
-
-    return law
 
 
 class SwingUpNumbers(NamedTuple):
@@ -167,6 +57,8 @@ class SwingUp(NamedTuple):
     """A swing-up law with its equilibrium and regulator."""
 
     law: Law
+    controller: Controller
+    """Of measurements, by the estimator; without one, of states."""
     equilibrium: Float[Array, " two_d"]
     """The model's own equilibrium near the goal."""
     controls: Float[Array, " m"]
@@ -223,11 +115,12 @@ def swing_up(
     numbers: SwingUpNumbers,
     *,
     postures: Any,
+    estimator: Callable[[Law], Controller] = stateless,
     lower: Any = -jnp.inf,
     upper: Any = jnp.inf,
     tolerance: float = 1e-6,
 ) -> SwingUp:
-    """Returns the law x -> u of a swing-up by a model.
+    """Returns the law x -> u of a swing-up by a model, and its controller of measurements.
 
     Args:
         model: known or learned, with friction or without.
@@ -236,6 +129,7 @@ def swing_up(
         goal: posture [d].
         numbers: gains and costs.
         postures: [n, d], postures of a swing-up, in which the model has to be usable.
+        estimator: law -> controller of measurements, such as `plants.by_filter`; by default states are measured.
         lower: lower limits of the controls.
         upper: upper limits of the controls.
         tolerance: of the equilibrium, in N m or N.
@@ -249,7 +143,8 @@ def swing_up(
     )  # fmt: skip
     with jax.ensure_compile_time_eval():
         regulator = lqr(upright.at.A, upright.at.B, numbers.state_cost, numbers.control_cost)
-    return SwingUp(law_at(upright, joints, numbers, regulator), upright.at.x, upright.at.u, regulator)
+    law = law_at(upright, joints, numbers, regulator)
+    return SwingUp(law, estimator(law), upright.at.x, upright.at.u, regulator)
 
 
 def upright_of(
@@ -266,7 +161,7 @@ def upright_of(
     parts, B = parts_of(actuation), np.asarray(actuation, float)
     # Values that depend on the model only are computed now, even if gains or the level are being traced.
     with jax.ensure_compile_time_eval():
-        model = _with_energy(model)
+        model = with_energy(model)
         sound = np.asarray(jax.jit(jax.vmap(lambda q: definite(model, q)))(jnp.asarray(postures, float)))
         if not sound.all():
             raise InputError(
@@ -314,9 +209,3 @@ def law_at(upright: Upright, joints: tuple[JointKind, ...], numbers: SwingUpNumb
         upright.model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation
     )  # fmt: skip
     return lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2))
-
-
-def _with_energy(model: Dynamics | PlainDynamics) -> Dynamics:
-    if not isinstance(model, Dynamics):
-        raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
-    return model

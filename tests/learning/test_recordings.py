@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from dln_jax.control.desktop_plants import desktop_plant, model_of_plant
-from dln_jax.control.exploration import Excitation, explore
 from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
 from dln_jax.learning.recordings import identified, learned, prepare
 from dln_jax.models.trigonometric import make_trigonometric
+from dln_jax.training.swing_ups.learned import recorded
 from dln_jax.types import InputError
 
 PLANT = desktop_plant("rotary-pendulum")
@@ -19,7 +19,7 @@ MODEL = make_trigonometric(PLANT.scene.needs)
 
 @pytest.fixture(scope="module")
 def recording():
-    return explore(PLANT, PLANT.numbers.gains, Excitation(seconds=6.0, episodes=3), seed=0)[0]
+    return recorded(PLANT, seconds=12.0, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def prepared(recording):
 @pytest.mark.slow
 def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
     assert prepared.delay == PLANT.hardware.delay
-    assert len(np.unique(prepared.train.trajectory)) == 2 and len(np.unique(prepared.validation.trajectory)) == 1
+    assert len(np.unique(prepared.train.trajectory)) == 5 and len(np.unique(prepared.validation.trajectory)) == 1
     left = deviations(TRUTH, cut_momentum_windows(prepared.train))
     assert (left < 0.02 * prepared.train.tau[:, 0].std()).all()
 

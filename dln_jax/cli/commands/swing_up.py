@@ -1,10 +1,11 @@
 """Swing up a pole with a model that was learned from it: explore the plant, learn, design a controller, close the loop.
 
-The simulated plants have dry friction, limits, encoders, noise and torques that act a sample late, at 500 Hz. A rough
-model explores; only q and the commanded torques are recorded. Models: delan (a structured deep Lagrangian network with
-friction), identified (linear in its parameters), analytic (the nominal dimensions, no friction), known (the plant
-itself). All use the same energy law, regulator and friction compensation, with the same gains. A run folder gets
-data.npz, the model, metrics.json, config.json, and a figure and an animation of the runs.
+The simulated plants have dry friction, limits, encoders, noise and torques that act a sample late, at 500 Hz. They are
+explored without a model; only q and the commanded torques are recorded. Models: delan (a structured deep Lagrangian
+network with friction), identified (linear in its parameters), analytic (the nominal dimensions, no friction), known
+(the plant itself). All use the same energy law, regulator and friction compensation, with the same gains, and get their
+states from a Kalman filter of the model. A run folder gets data.npz, the model, metrics.json, config.json, and a figure
+and an animation of the runs.
 
 --plant also takes an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
 passive joint. MuJoCo simulates it, with encoders and torques that act a sample late. It is explored without a model of
@@ -36,8 +37,10 @@ class Arguments(Folder, Drawn):
     """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
     model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None
     """The model from which the controller is designed (default: delan; of a file, identified)."""
+    estimator: Annotated[str, choice(("extended", "unscented", "differences"))] = "extended"
+    """Where the law's states come from: a Kalman filter of the encoders' readings, or their differences."""
     seconds_of_data: float = 30.0
-    """Seconds of motion to learn from, at 500 Hz, including an episode for validation."""
+    """Seconds of motion to learn from, at least 12, including an episode for validation."""
     starts: int = 100
     """Number of starts near hanging at rest."""
     seed: int = 0
@@ -54,7 +57,9 @@ def main(options: Arguments) -> None:
         if options.actuated is not None or options.control is not None:
             raise InputError(f"--actuated and --control belong to a file; --plant is {options.plant!r:.40}")
         model = options.model or "delan"
-        task = run.asked(options.plant, model, options.seconds_of_data, options.starts, options.seed)
+        task = run.asked(
+            options.plant, model, options.seconds_of_data, options.starts, options.seed, options.estimator
+        )  # fmt: skip
         with command_folder(options, "swing_up") as folder:
             run.swing_up(task, folder, figures=options.figures)
             print(f"run folder: {folder}")
@@ -63,7 +68,8 @@ def main(options: Arguments) -> None:
         raise InputError(f"--model is {options.model!r:.40}; the model of a file is identified")
     actuated = options.actuated.split(",") if options.actuated else ()
     of_plant = of_file.asked(
-        file, actuated, options.control, options.seconds_of_data, options.starts, options.seed
+        file, actuated, options.control, options.seconds_of_data, options.starts, options.seed,
+        options.estimator,
     )  # fmt: skip
     with command_folder(options, "swing_up") as folder:
         of_file.swing_up_file(of_plant, folder, figures=options.figures)

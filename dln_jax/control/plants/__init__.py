@@ -1,5 +1,6 @@
 """Plants of any origin as four callables: adapters, safety, exploration, tuning and trials."""
 
+from dln_jax.control.plants.estimators import ESTIMATORS, Estimator, by_differences, by_filter, estimator_of
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.guarded import Stopped, guarded
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
@@ -7,9 +8,11 @@ from dln_jax.control.plants.outside_loops import gymnasium_plant, hardware_plant
 from dln_jax.control.plants.plant import Layout, Limits, Plant, layout
 from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
 from dln_jax.control.plants.simulated import plant_of, simulated
-from dln_jax.control.plants.tuning import Tuned, controller_of, tune
+from dln_jax.control.plants.tuning import Tuned, tune
 
 __all__ = [
+    "ESTIMATORS",
+    "Estimator",
     "Exploration",
     "Explored",
     "Layout",
@@ -19,8 +22,10 @@ __all__ = [
     "Stopped",
     "Trials",
     "Tuned",
+    "by_differences",
+    "by_filter",
     "compiled",
-    "controller_of",
+    "estimator_of",
     "explore",
     "guarded",
     "gymnasium_plant",

@@ -13,15 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float
 
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.exploration import smooth_noise
-from dln_jax.control.observers import with_differences
+from dln_jax.control.energy_shaping import energy_shaping
+from dln_jax.control.plants.estimators import by_differences
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, compiled, run
 from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of
-from dln_jax.control.plants.tuning import cutoff_for
-from dln_jax.control.swing_up import energy_shaping, upright_of
+from dln_jax.control.swing_up import upright_of
+from dln_jax.data.encoders import low_pass
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive, require_seed
@@ -116,6 +117,14 @@ def explore(
     return Explored(recording_of(runs, layout), tuple(stopped))
 
 
+def smooth_noise(
+    shape: tuple[int, ...], *, rate: float, bandwidth: float, random: np.random.Generator
+) -> Float[np.ndarray, "N m"]:
+    """Normal noise of unit deviation below a frequency, [N, m] at a rate in Hz."""
+    noise = low_pass(random.normal(size=shape), rate=rate, cutoff=bandwidth)
+    return noise / noise.std(axis=0)
+
+
 def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
     """Joins runs into one log of q and commanded torques."""
     q = np.concatenate([one.y for one in runs])
@@ -135,7 +144,7 @@ def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
 
 def _rates(layout: Layout) -> Controller:
     """Passes on measurements and their rates."""
-    return with_differences(lambda x: x, len(layout.joints), rate=layout.rate, cutoff=cutoff_for(layout.rate))
+    return by_differences(layout)(lambda x: x)
 
 
 def _with(law: Callable[[Array, Array], Array], layout: Layout) -> Controller:

@@ -20,9 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.control.energy_shaping import EnergyGains, passive_energy
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.regulators import Regulator, lqr
-from dln_jax.control.swing_up import EnergyGains, SwingUpNumbers, Upright, passive_energy
+from dln_jax.control.swing_up import SwingUpNumbers, Upright
 from dln_jax.control.tracking import GAIN, without_friction
 from dln_jax.types import InputError
 

@@ -39,7 +39,6 @@ def simulated(
     """
     random = np.random.default_rng([seed, 29])
     d, m = layout.actuation.shape
-    driven = (layout.actuation != 0).any(axis=1)
     step = np.broadcast_to(np.asarray(hardware.encoder_step, float), d)
     queue: deque[np.ndarray] = deque()
     count = [0]
@@ -48,7 +47,7 @@ def simulated(
         count[0] = 0
         queue.clear()
         queue.extend([np.zeros(m)] * hardware.delay)
-        begin(layout.hanging + np.where(driven, ACTIVE_SPREAD, SPREAD) * random.normal(size=d))
+        begin(layout.hanging + spread_of(layout) * random.normal(size=d))
 
     def read() -> np.ndarray:
         q = np.asarray(coordinates(), float) + hardware.encoder_noise * random.normal(size=d)
@@ -60,6 +59,11 @@ def simulated(
         count[0] += 1
 
     return Plant(layout, reset, read, act, lambda: count[0] / layout.rate)
+
+
+def spread_of(layout: Layout) -> np.ndarray:
+    """Standard deviations of the coordinates at a start [d]."""
+    return np.where((layout.actuation != 0).any(axis=1), ACTIVE_SPREAD, SPREAD)
 
 
 def plant_of(

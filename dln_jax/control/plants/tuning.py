@@ -1,12 +1,17 @@
 """Chooses a swing-up's gains, catch region and regulator by simulated trials of a model, in one compiled program.
 
 1. Numbers without units (`scales.RANGES`) are drawn; scales of the model make gains and a regulator of them.
-2. Every set is tried from a few starts near hanging, with the hardware's limits, resolution, noise and delay.
-3. The best sets are tried again with motors that are stronger or weaker than the model says. The margin of a set is
-   the largest such error up to which every trial succeeds; the set with the largest margin is chosen.
+2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
+   are stronger or weaker than the model says. Weight is wrong by the share `WEIGHT` of that, the
+   other way round.
+3. The best sets are tried again with more errors and starts. The margin of a set is the largest error up to which every
+   trial succeeds; the set with the largest margin is chosen.
+4. Plans with feedback (`planned`) are tried first, and taken if they stand every error. Otherwise energy laws are tried
+   as well, with right models in the first round, because few sets work. One with a margin of `LEAST` or more is taken:
+   it acts in any state, and a wrong model costs it time where it throws a plan off. Else the larger margin decides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -15,36 +20,42 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.closed_loop import Controller, Hardware, simulate
-from dln_jax.control.observers import with_differences
+from dln_jax.control.plants.estimators import Estimator, by_differences
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.runs import HELD, TOLERANCE
-from dln_jax.control.plants.scales import RANGES, circle, scales_of, swing_up_numbers
-from dln_jax.control.plants.simulated import ACTIVE_SPREAD, SPREAD
+from dln_jax.control.plants.scales import circle, scales_of
+from dln_jax.control.plants.simulated import spread_of
+from dln_jax.control.plants.ways import Way, by_energy, by_plan
 from dln_jax.control.regulators import Regulator
-from dln_jax.control.state_space import Law, error, field_of
-from dln_jax.control.swing_up import SwingUpNumbers, Upright, law_at, upright_of
+from dln_jax.control.state_space import error
+from dln_jax.control.swing_up import upright_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, require_positive, require_seed
 
 ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 """Relative errors of the motors' strength in the second round."""
+WEIGHT = 0.125
+"""Relative error of gravity over that of the motors' strength."""
 STARTS = 2
-"""Starts of a set in the first round."""
+"""Starts of a set with each error in the second round, at least."""
 FINALISTS = 8
 ROUNDS = 4
 """First rounds, at most, until `FINALISTS` sets have succeeded."""
-FASTEST_FILTER = 50.0
-"""Cut-off frequency of measured rates, Hz, and at most a quarter of the samples' rate."""
+LEAST = 0.1
+"""Smallest margin of an energy law that is taken in place of a plan."""
 
 
 class Tuned(NamedTuple):
-    """Settings that swing the model up, and how safely."""
+    """A controller that swings the model up, and how safely."""
 
-    law: Law
-    """(q, qd) -> u."""
-    numbers: SwingUpNumbers
+    controller: Controller
+    """Of the measurements."""
+    way: str
+    """"energy" or "plan"."""
+    numbers: Mapping[str, float]
+    """What was chosen, in SI units."""
     regulator: Regulator
-    upright: Upright
+    """At the goal."""
     trials: int
     """Number of simulated trials."""
     worked: float
@@ -55,23 +66,14 @@ class Tuned(NamedTuple):
     """Median time until the goal at the model's own strength, s."""
 
 
-def cutoff_for(rate: float) -> float:
-    """Cut-off frequency of the rates, Hz, from the rate of the samples."""
-    return min(FASTEST_FILTER, rate / 4)
-
-
-def controller_of(law: Law, layout: Layout) -> Controller:
-    """The law with rates from differences of the measurements."""
-    return with_differences(law, len(layout.joints), rate=layout.rate, cutoff=cutoff_for(layout.rate))
-
-
 def tune(
     model: Dynamics | PlainDynamics,
     layout: Layout,
     hardware: Hardware = Hardware(),  # noqa: B008
     *,
-    sets: int = 128,
-    seconds: float = 8.0,
+    estimator: Estimator | None = None,
+    sets: int = 64,
+    seconds: float = 6.0,
     substeps: int = 1,
     seed: int = 0,
 ) -> Tuned:
@@ -81,6 +83,7 @@ def tune(
         model: known or learned, with friction if the plant has it.
         layout: of the plant: its motors, goal, limits and rate.
         hardware: noise, resolution and delay; the limits are those of the layout.
+        estimator: makes a controller of measurements from one of states, such as `by_filter`; by default differences.
         sets: number of sets in a first round.
         seconds: duration of a trial, within which a plant has to be up and stay for a second.
         substeps: Runge-Kutta steps a sample.
@@ -95,41 +98,63 @@ def tune(
         raise InputError(f"seconds is {seconds}; expected more than the {HELD:g} s for which a plant has to stay up")
     lower, upper = layout.limits.control.T
     upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
-    scales, random = scales_of(upright, layout), np.random.default_rng([seed, 31])
-    lanes = max(sets * STARTS, FINALISTS * len(ERRORS) * STARTS)
-    program = jax.jit(jax.vmap(trial_of(upright, layout, hardware, seconds=seconds, substeps=substeps)))
-    settings: list[tuple[SwingUpNumbers, Regulator]] = []
-    times = np.zeros((0, STARTS))
+    scales, estimator = scales_of(upright, layout), estimator or by_differences(layout)
+    results, refused = [], []
+    for make in (by_plan, by_energy):
+        try:
+            way = make(upright, layout, scales, seed)
+            trial = trial_of(
+                lambda settings, way=way: estimator(way.controller(settings)), upright.model, layout, hardware,
+                seconds=seconds, substeps=substeps,
+            )  # fmt: skip
+            results.append(_chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed))
+        except InputError as error:
+            refused.append(str(error))
+        if results and results[-1].margin == max(ERRORS):
+            break
+    if not results:
+        raise InputError("; ".join(refused))
+    best = max(results, key=lambda one: (one.way == "energy" and one.margin >= LEAST, one.margin))
+    return best._replace(trials=sum(one.trials for one in results))
+
+
+def _chosen(
+    way: Way, trial: Any, estimator: Estimator, layout: Layout, *, sets: int, seconds: float, seed: int
+) -> Tuned:  # fmt: skip
+    """The settings of one way with the largest margin."""
+    random = np.random.default_rng([seed, 31])
+    lanes = max(sets * len(way.errors), FINALISTS * len(ERRORS) * STARTS)
+    program = jax.jit(jax.vmap(trial))
+    settings: list[Any] = []
+    times = np.zeros((0, len(way.errors)))
     trials = 0
 
-    def tried(chosen: list[tuple[SwingUpNumbers, Regulator]], errors: tuple[float, ...], starts: int) -> np.ndarray:
-        """Times [set, error, start]; idle lanes repeat the first trial."""
+    def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> np.ndarray:
+        """Times [set, error, start]; idle lanes repeat the first trials."""
         nonlocal trials
-        numbers = [(_traced(one), regulator) for one, regulator in chosen]
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *numbers)
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
         count = len(chosen) * len(errors) * starts
         place = np.arange(lanes) % count
         which, error_of, start_of = np.unravel_index(place, (len(chosen), len(errors), starts))
-        drawn = layout.hanging + _spread(layout) * random.normal(size=(starts, len(layout.joints)))
+        drawn = layout.hanging + spread_of(layout) * random.normal(size=(starts, len(layout.joints)))
         keys = jax.random.split(jax.random.key(int(random.integers(2**31))), lanes)
         parts = jax.tree.map(lambda leaf: leaf[which], stacked)
-        result = program(parts, drawn[start_of], 1 + np.array(errors)[error_of], keys)
+        result = program(parts, drawn[start_of], np.array(errors)[error_of], keys)
         trials += count
         return np.asarray(result)[:count].reshape(len(chosen), len(errors), starts)
 
     for _ in range(ROUNDS):
-        drawn = _draws(random, sets)
-        fresh = [swing_up_numbers(upright, layout, scales, numbers) for numbers in drawn]
+        fresh = way.draw(random, sets)
         settings += fresh
-        times = np.concatenate([times, tried(fresh, (0.0,), STARTS)[:, 0]])
+        times = np.concatenate([times, tried(fresh, way.errors, 1)[:, :, 0]])
         if np.isfinite(times).all(axis=1).sum() >= FINALISTS:
             break
     good = np.isfinite(times).all(axis=1)
     if not good.any():
         raise InputError(
-            f"none of {len(settings)} sets of gains swings the model up within {seconds:g} s and its limits in "
-            f"{trials} trials, of which {np.isfinite(times).mean():.0%} came up; a stronger motor, wider limits, more "
-            "time or a better model may"
+            f"none of {len(settings)} sets of numbers swings the model up by {way.name} within {seconds:g} s and its "
+            f"limits in {trials} trials, of which {np.isfinite(times).mean():.0%} came up; a stronger motor, wider "
+            "limits, more time or a better model may"
         )
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(FINALISTS, int(good.sum()))]
     starts = max(STARTS, lanes // (FINALISTS * len(ERRORS)))
@@ -137,39 +162,47 @@ def tune(
     margins = np.array([_margin(np.isfinite(one).all(axis=1)) for one in final])
     share = np.isfinite(final).mean(axis=(1, 2))
     nominal = np.median(final[:, 0], axis=1)
-    order = np.lexsort((nominal, -share, -margins))
-    choice = int(order[0])
+    choice = int(np.lexsort((nominal, -share, -margins))[0])
     if margins[choice] < 0:
         raise InputError(
-            f"of {trials} trials, no set of gains brings all {starts} starts up at the model's own strength: the best "
-            f"reaches {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; a stronger motor or wider limits may"
+            f"of {trials} trials by {way.name}, no set of numbers brings all {starts} starts up at the model's own "
+            f"strength: the best reaches {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; a stronger motor or wider "
+            "limits may"
         )
-    numbers, regulator = settings[best[choice]]
-    law = law_at(upright, layout.joints, numbers, regulator)
-    worked = float(good.mean())
-    return Tuned(law, numbers, regulator, upright, trials, worked, float(margins[choice]), float(nominal[choice]))
+    selected = jax.tree.map(jnp.asarray, settings[best[choice]])
+    numbers, regulator = way.numbers(selected)
+    return Tuned(
+        estimator(way.controller(selected)), way.name, numbers, regulator, trials, float(good.mean()),
+        float(margins[choice]), float(nominal[choice]),
+    )  # fmt: skip
 
 
 def trial_of(
-    upright: Upright, layout: Layout, hardware: Hardware, *, seconds: float, substeps: int
+    controller: Callable[[Any], Controller],
+    model: Dynamics | PlainDynamics,
+    layout: Layout,
+    hardware: Hardware,
+    *,
+    seconds: float,
+    substeps: int,
 ) -> Callable[[Any, Array, Array, Array], Array]:
-    """(traced settings, start [d], strength of the motors, key) -> time in s until the goal, infinite if never."""
+    """(traced settings, start [d], error of the model, key) -> time in s until the goal, infinite if never."""
     B, d = layout.actuation, len(layout.joints)
     lower, upper = layout.limits.control.T
-    field = field_of(upright.model, B)
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
     angles = np.array([kind == "revolute" for kind in layout.joints])
     has_limits = np.isfinite(layout.limits.position).any() or np.isfinite(layout.limits.rate).any()
-    # One set of smoothing and compensation for all: they are no arrays of the trial.
-    plain = swing_up_numbers(upright, layout, scales_of(upright, layout), {name: 1.0 for name in RANGES})[0]
 
-    def trial(settings: Any, start: Array, strength: Array, key: Array) -> Array:
-        (gains, level, kick, surplus), regulator = settings
-        numbers = plain._replace(gains=gains, level=level, kick=kick, surplus=surplus)
-        controller = controller_of(law_at(upright, layout.joints, numbers, regulator), layout)
+    def trial(settings: Any, start: Array, wrong: Array, key: Array) -> Array:
+        def field(x: Array, u: Array) -> Array:
+            q, qd = jnp.split(x, 2)
+            weight = model.inverse_dynamics(q, jnp.zeros(d), jnp.zeros(d))
+            tau = (1 + wrong) * (B @ u) + WEIGHT * wrong * weight
+            return jnp.concatenate([qd, model.forward_dynamics(q, qd, tau)])
+
         run = simulate(
-            lambda x, u: field(x, strength * u), controller, jnp.concatenate([start, jnp.zeros(d)]),
-            seconds=seconds, rate=layout.rate, controls=B.shape[1], hardware=limited, key=key, substeps=substeps,
+            field, controller(settings), jnp.concatenate([start, jnp.zeros(d)]), seconds=seconds, rate=layout.rate,
+            controls=B.shape[1], hardware=limited, key=key, substeps=substeps,
         )  # fmt: skip
         off = jax.vmap(lambda x: error(x[:d], layout.goal, layout.joints))(run.x)
         away = ~(jnp.max(jnp.abs(off[:, angles]), axis=1) <= TOLERANCE)  # NaN is away
@@ -184,23 +217,6 @@ def trial_of(
         return jnp.where(fine, last, jnp.inf)
 
     return trial
-
-
-def _traced(numbers: SwingUpNumbers) -> Any:
-    return jax.tree.map(
-        lambda leaf: np.asarray(leaf, float), (numbers.gains, numbers.level, numbers.kick, numbers.surplus)
-    )
-
-
-def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:
-    """Sets of numbers, alternately with the energy of the passive part and of the whole plant."""
-    low, high = np.log(np.array(list(RANGES.values()))).T
-    rows = np.exp(random.uniform(low, high, size=(count, len(RANGES))))
-    return [{**dict(zip(RANGES, row, strict=True)), "total": float(k % 2)} for k, row in enumerate(rows)]
-
-
-def _spread(layout: Layout) -> np.ndarray:
-    return np.where((layout.actuation != 0).any(axis=1), ACTIVE_SPREAD, SPREAD)
 
 
 def _margin(succeeded: np.ndarray) -> float:

@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware
+from dln_jax.control.estimate import from_log
+from dln_jax.control.plants.estimators import ESTIMATORS, estimator_of
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
-from dln_jax.control.plants.tuning import Tuned, controller_of, tune
+from dln_jax.control.plants.tuning import Tuned, tune
 from dln_jax.data.encoders import noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, prepare
@@ -19,6 +21,8 @@ from dln_jax.types import InputError, require_positive
 
 SECONDS = 10.0
 """Duration of a trial, s."""
+BAND = 10.0
+"""Factor of the filter's torque band, for the errors of a model that a short log does not show."""
 
 
 class Learned(NamedTuple):
@@ -29,7 +33,7 @@ class Learned(NamedTuple):
     fitted: FittedPlant
     tuned: Tuned
     hardware: Hardware
-    """As estimated from the recording: the delay, and the noise of the measurements."""
+    """As estimated from the recording: the delay, and the noise of measurements and motors."""
     seconds: float
     """Time for all steps, s."""
 
@@ -38,6 +42,7 @@ def learn_to_swing_up(
     plant: Plant,
     exploration: Exploration = Exploration(),  # noqa: B008
     *,
+    estimator: str = "extended",
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
 ) -> Learned:
@@ -46,12 +51,15 @@ def learn_to_swing_up(
     Args:
         plant: any; it is guarded.
         exploration: settings.
+        estimator: one of `plants.ESTIMATORS`, from which the law gets its states.
         seed: of the noise and of the trials.
         say: is told every step in a line.
 
     Raises:
-        InputError: as for `explore`, `prepare`, `identified` and `tune`.
+        InputError: as for `explore`, `prepare`, `identified`, `from_log` and `tune`, or an unknown estimator.
     """
+    if estimator not in ESTIMATORS:
+        raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
     began = time.perf_counter()
     explored = explore(plant, model_of, exploration, seed=seed)
     recording = explored.recording
@@ -63,11 +71,17 @@ def learn_to_swing_up(
     fitted = identified(prepared.train, plant.layout.needs, chain=True)
     say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
-    hardware = Hardware(encoder_noise=noise, delay=prepared.delay)
-    tuned = tune(fitted.dynamics, plant.layout, hardware, seed=seed)
+    B = plant.layout.actuation
+    process = from_log(fitted.dynamics, recording, actuation=B, delay=prepared.delay).process
+    band = np.asarray(process.disturbance)
+    # What the model does not explain of the driven joints acts as noise of the motors in the trials.
+    hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=prepared.delay)
+    wide = process._replace(disturbance=BAND * band)
+    make = estimator_of(estimator, plant.layout, wide, delay=prepared.delay)
+    tuned = tune(fitted.dynamics, plant.layout, hardware, estimator=make, seed=seed)
     say(
-        f"tuned: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin {tuned.margin:.0%}, up in "
-        f"{tuned.seconds:.2f} s"
+        f"tuned by {tuned.way}: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin "
+        f"{tuned.margin:.0%}, up in {tuned.seconds:.2f} s"
     )
     return Learned(explored, prepared, fitted, tuned, hardware, time.perf_counter() - began)
 
@@ -86,7 +100,7 @@ def try_plant(
 
     Args:
         make: seed -> a simulated plant with its own start and noise.
-        tuned: the law.
+        tuned: the controller.
         starts: number of plants.
         seed: of the first plant; the others follow.
         seconds: duration.
@@ -97,6 +111,6 @@ def try_plant(
     require_positive(starts=starts)
     plants = [make(seed + number) for number in range(starts)]
     layout = plants[0].layout
-    controller = controller_of(tuned.law, layout)
-    runs = run(plants, compiled(controller, layout), start_of(controller, starts), seconds=seconds)
+    act = compiled(tuned.controller, layout)
+    runs = run(plants, act, start_of(tuned.controller, starts), seconds=seconds)
     return judged_runs(runs, layout, seconds=seconds), runs

@@ -8,14 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control.closed_loop import ClosedLoopRun
-from dln_jax.control.desktop_plants import DesktopPlant, model_of_plant, nominal_model
-from dln_jax.control.exploration import Excitation, explore
+from dln_jax.control.closed_loop import ClosedLoopRun, Controller, simulate
+from dln_jax.control.desktop_plants import DesktopPlant, model_of_plant, nominal_model, simulated_plant
+from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.control.state_space import field_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import Report, silent
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, learned, prepare
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.training.swing_ups.any_plant import model_of
 from dln_jax.types import InputError
 
 MODELS = ("delan", "identified", "analytic", "known")
@@ -85,7 +86,24 @@ def errors_along(plant: DesktopPlant, model: Dynamics, runs: ClosedLoopRun) -> E
     return Errors(float(torque / of_torque), float(acceleration / of_acceleration))
 
 
+def recorded(plant: DesktopPlant, *, seconds: float, seed: int) -> Trajectories:
+    """An exploration, as of any plant."""
+    return explore(simulated_plant(plant, seed=seed), model_of, Exploration(seconds=seconds), seed=seed).recording
+
+
 def test_motions(plant: DesktopPlant, *, seed: int, seconds: float = 12.0) -> ClosedLoopRun:
-    """True motions of another exploration, as test data."""
-    excitation = Excitation(seconds=seconds, episodes=2, surplus=(0.0, 0.5))
-    return explore(plant, plant.numbers.gains, excitation, seed=seed + TEST_SEED)[1]
+    """True motions [E, N] under the torques of another exploration, replayed without noise from hanging."""
+    blind = Exploration(seconds=seconds, blind=(0.4, 0.8), surplus=())
+    recording = explore(
+        simulated_plant(plant, seed=seed + TEST_SEED), model_of, blind, seed=seed + TEST_SEED
+    ).recording  # fmt: skip
+    B = np.asarray(plant.scene.needs.actuation)
+    episodes = [recording.tau[recording.trajectory == k] @ B for k in np.unique(recording.trajectory)]
+    samples = min(map(len, episodes))
+    replay = lambda u: Controller(jnp.asarray(0), lambda k, t, y: (k + 1, u[k]))  # noqa: E731
+    lab = plant.hardware._replace(control_noise=0.0)
+    run = lambda u: simulate(  # noqa: E731
+        field_of(model_of_plant(plant), B), replay(u), np.array([0.0, np.pi, 0.0, 0.0]), seconds=samples / plant.rate,
+        rate=plant.rate, controls=B.shape[1], hardware=lab, substeps=plant.substeps,
+    )  # fmt: skip
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(np.stack([u[:samples] for u in episodes])))

@@ -19,8 +19,6 @@ from dln_jax.training.swing_ups.run import LEAST_SECONDS
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
 
-LEAST = 3 * LEAST_SECONDS
-"""Shortest data, s: six episodes of two seconds."""
 ENCODER_STEP = 2 * np.pi / 4096
 """Resolution of the simulated encoders, rad; 0.1 mm of a rail has the size of a thousandth of a turn."""
 
@@ -31,18 +29,25 @@ class FileTask(NamedTuple):
     make: Callable[[int], Plant]
     """Seed of start and noise -> plant."""
     exploration: Exploration
+    estimator: str
     starts: int
     seed: int
 
 
 def asked(
-    file: Path, actuated: Sequence[str], control: float | None, seconds_of_data: float, starts: int, seed: int
-) -> FileTask:  # fmt: skip
+    file: Path,
+    actuated: Sequence[str],
+    control: float | None,
+    seconds_of_data: float,
+    starts: int,
+    seed: int,
+    estimator: str = "extended",
+) -> FileTask:
     """Checks the arguments of a command before anything is written; raises as `mujoco_plant`."""
     require_positive(starts=starts)
     require_seed(seed)
-    if not LEAST <= seconds_of_data < np.inf:
-        raise InputError(f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST:g} s: six episodes")
+    if not LEAST_SECONDS <= seconds_of_data < np.inf:
+        raise InputError(f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: six episodes")
     hardware = Hardware(encoder_step=ENCODER_STEP, delay=1)
 
     def make(number: int) -> Plant:
@@ -50,7 +55,7 @@ def asked(
 
     slides = np.array([kind == "prismatic" for kind in make(0).layout.joints])
     hardware = hardware._replace(encoder_step=np.where(slides, 1e-4, ENCODER_STEP))
-    return FileTask(make, Exploration(seconds=seconds_of_data), starts, seed)
+    return FileTask(make, Exploration(seconds=seconds_of_data), estimator, starts, seed)
 
 
 def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, float]:
@@ -59,7 +64,7 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
     layout = plant.layout
     driven = [name for name, row in zip(layout.names, layout.actuation, strict=True) if row.any()]
     print(f"joints {', '.join(layout.names)}, motor at {', '.join(driven)}; goal {np.round(layout.goal, 4).tolist()}")
-    learned = learn_to_swing_up(plant, task.exploration, seed=task.seed, say=print)
+    learned = learn_to_swing_up(plant, task.exploration, estimator=task.estimator, seed=task.seed, say=print)
     for reason in learned.explored.stopped:
         print(f"stopped: {reason}")
     schema.save(folder / "data.npz", learned.explored.recording)
@@ -77,11 +82,10 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
         "tuning_margin": tuned.margin,
         "learning_seconds": learned.seconds,
     }
-    gains = {**tuned.numbers.gains._asdict(), "level": tuned.numbers.level, "kick": tuned.numbers.kick}
     write_json(folder / "metrics.json", metrics)
     write_json(
         folder / "law.json",
-        {name: float(value) for name, value in gains.items()} | {"K": np.asarray(tuned.regulator.K).tolist()},
+        {"way": tuned.way, **tuned.numbers, "K": np.asarray(tuned.regulator.K).tolist()},
     )
     print(
         f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s: median {median:.2f} s, worst "

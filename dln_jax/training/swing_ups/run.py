@@ -20,7 +20,8 @@ from dln_jax.control.desktop_plants import (
     motion_of,
     try_starts,
 )
-from dln_jax.control.exploration import Excitation, explore
+from dln_jax.control.estimate import from_log
+from dln_jax.control.plants.estimators import ESTIMATORS, Estimator, estimator_of
 from dln_jax.control.tracking import without_friction
 from dln_jax.data import schema
 from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
@@ -29,14 +30,12 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.sizes import require_memory
-from dln_jax.training.swing_ups.learned import MODELS, Obtained, errors_along, obtain, test_motions
+from dln_jax.training.swing_ups.learned import MODELS, Obtained, errors_along, obtain, recorded, test_motions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
 
-EPISODE = 6.0
-"""Approximate duration of an episode, s."""
-LEAST_SECONDS = 4.0
-"""Shortest data, s: two episodes, one of them for validation."""
+LEAST_SECONDS = 12.0
+"""Shortest data, s: six episodes of two seconds."""
 UNITS = {"cart-pole": "N", "rotary-pendulum": "N m"}
 """Unit of the control."""
 FILMED = 4.0
@@ -49,36 +48,36 @@ class SwingUpTask(NamedTuple):
     plant: DesktopPlant
     name: str
     model: str
-    excitation: Excitation
+    seconds: float
+    """Duration of the exploration, s."""
+    estimator: str
     starts: int
     seed: int
 
 
-def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int) -> SwingUpTask:
+def asked(
+    plant: str, model: str, seconds_of_data: float, starts: int, seed: int, estimator: str = "extended"
+) -> SwingUpTask:  # fmt: skip
     """Checks the arguments of a command before anything is written; errors are one line."""
     chosen = desktop_plant(plant)
     if model not in MODELS:
         raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
+    if estimator not in ESTIMATORS:
+        raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
     require_positive(starts=starts)
     require_seed(seed)
     if not LEAST_SECONDS <= seconds_of_data < np.inf:
-        raise InputError(
-            f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: two episodes, one of them "
-            "to select by"
-        )
+        raise InputError(f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: six episodes")
     require_memory(f"{seconds_of_data:.3g} s of motion at 500 Hz", 1000.0 * 500 * seconds_of_data)
-    episodes = max(2, round(seconds_of_data / EPISODE))
-    return SwingUpTask(
-        chosen, NAMES[plant], model, Excitation(seconds=seconds_of_data, episodes=episodes), starts, seed
-    )
+    return SwingUpTask(chosen, NAMES[plant], model, seconds_of_data, estimator, starts, seed)
 
 
 def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, float]:
     """Explores, learns, swings up and writes the results; returns the metrics."""
     plant = task.plant
-    recording, _ = explore(plant, plant.numbers.gains, task.excitation, seed=task.seed)
+    recording = recorded(plant, seconds=task.seconds, seed=task.seed)
     schema.save(folder / "data.npz", recording)
-    print(f"{task.name}: {task.excitation.seconds:g} s of q and torques in {task.excitation.episodes} episodes")
+    print(f"{task.name}: {task.seconds:g} s of q and torques in {len(recording.label)} episodes")
     with progress(STEPS) as show:
         got = obtain(
             plant, task.model, recording, seed=task.seed,
@@ -86,8 +85,13 @@ def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, flo
         )  # fmt: skip
     store(folder, got)
     errors = errors_along(plant, got.dynamics, test_motions(plant, seed=task.seed))
-    law = law_of(plant, got.dynamics)
-    tried = try_starts(plant, got.dynamics, starts=task.starts, seed=task.seed)
+    late = plant.hardware.delay if got.prepared is None else got.prepared.delay
+    process = None
+    if task.estimator != "differences":
+        process = from_log(got.dynamics, recording, actuation=plant.layout.actuation, delay=late).process
+    estimator = estimator_of(task.estimator, plant.layout, process, delay=late)
+    law = law_of(plant, got.dynamics, estimator)
+    tried = try_starts(plant, got.dynamics, starts=task.starts, seed=task.seed, estimator=estimator)
     metrics = {
         "learning_seconds": got.seconds,
         "torque_nmse": errors.torque_nmse,
@@ -98,7 +102,7 @@ def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, flo
     write_json(folder / "metrics.json", metrics)
     summarise(task, got, metrics)
     if figures:
-        draw(task, got.dynamics, folder)
+        draw(task, got.dynamics, estimator, folder)
     return metrics
 
 
@@ -111,6 +115,7 @@ def metrics_of(tried: Tried) -> dict[str, float]:
         "median_seconds": outcomes.median,
         "worst_seconds": outcomes.worst,
         "farthest": float(np.max(tried.farthest)),
+        "effort_at_goal": float(np.median(tried.effort)),
     }
 
 
@@ -137,10 +142,10 @@ def summarise(task: SwingUpTask, got: Obtained, metrics: dict[str, float]) -> No
     )
 
 
-def draw(task: SwingUpTask, model: Dynamics, folder: Path) -> None:
+def draw(task: SwingUpTask, model: Dynamics, estimator: Estimator, folder: Path) -> None:
     """Writes a figure of some runs, and an animation of the first."""
     plant, lab = task.plant, task.plant.hardware
-    runs = some_runs(plant, model, min(task.starts, MOST_SHOWN), task.seed)
+    runs = some_runs(plant, model, estimator, min(task.starts, MOST_SHOWN), task.seed)
     unit, limits = UNITS[task.name], (lab.lower, lab.upper)
     energy = passive_energy(without_friction(model), parts_of(plant.scene.needs.actuation), np.zeros(2))
     of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
@@ -161,8 +166,8 @@ def draw(task: SwingUpTask, model: Dynamics, folder: Path) -> None:
     )  # fmt: skip
 
 
-def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> ClosedLoopRun:
+def some_runs(plant: DesktopPlant, model: Dynamics, estimator: Estimator, count: int, seed: int) -> ClosedLoopRun:
     """The first `count` of the runs that were tried, [count, N]."""
-    run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0)))
+    run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0, estimator=estimator)))
     runs = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))
     return jax.tree.map(np.asarray, runs)

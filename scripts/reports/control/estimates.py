@@ -15,30 +15,28 @@ import numpy as np
 
 from dln_jax.control.closed_loop import Controller, Hardware, hanging_starts, outcomes, simulate
 from dln_jax.control.desktop_plants import (
-    CUTOFF,
     SECONDS,
     DesktopPlant,
     desktop_plant,
-    differences,
-    estimated,
     law_of,
     model_of_plant,
     nominal_model,
 )
 from dln_jax.control.estimate import belief, extended, filtered, from_log, moving_horizon, unscented
 from dln_jax.control.estimate.process import Process
-from dln_jax.control.exploration import explore
-from dln_jax.control.observers import with_differences
+from dln_jax.control.plants.estimators import by_differences, by_filter
 from dln_jax.control.state_space import Law, field_of, integrated, saturated
 from dln_jax.mechanics.dynamics import Dynamics
-from dln_jax.training.swing_ups.learned import obtain
+from dln_jax.training.swing_ups.learned import obtain, recorded
 from scripts.reports.case import Findings
 from scripts.reports.rows import Row
 
 HELD = 2.0
 """s: last part of a run, in which the torque is judged."""
 STARTS = 1000
-QUICK_STARTS = 50
+"""Starts with the default filter and with differences, by the known model."""
+FEWER_STARTS, QUICK_STARTS = 100, 30
+"""Starts with other estimators and models, which are compared by medians, and of a quick run."""
 QUIETER = 0.2
 """Largest rms of the torque at the goal, as a share of that by differences."""
 CLOSER = 0.5
@@ -120,18 +118,20 @@ def commands(controller: Controller, plant: DesktopPlant, t: Any, y: Any) -> tup
 def chatter(name: str, model: str, quick: bool) -> Findings:
     """Swing-ups and the torque at the goal, by differences, by two filters and by the exact state."""
     plant = desktop_plant(name)
-    recording, _ = explore(plant, plant.numbers.gains, seed=0)
+    recording = recorded(plant, seconds=30.0, seed=0)
     dynamics = models(plant, recording)[model]()
     B, unit = np.asarray(plant.scene.needs.actuation), "N" if name == "cart-pole" else "N m"
     process = from_log(dynamics, recording, actuation=B, delay=plant.hardware.delay).process
     estimators = {
-        "differences": differences(plant),
-        "extended": estimated(plant, process),
-        "unscented": estimated(plant, process, unscented),
+        "differences": by_differences(plant.layout),
+        "extended": by_filter(plant.layout, process, delay=plant.hardware.delay),
+        "unscented": by_filter(plant.layout, process, delay=plant.hardware.delay, make=unscented),
         "exact-state": exact(plant),
     }
-    starts, rows, before = QUICK_STARTS if quick else STARTS, [], np.nan
+    rows, before = [], np.nan
     for key, make in estimators.items():
+        whole = model == "known" and key in ("differences", "extended")
+        starts = QUICK_STARTS if quick else STARTS if whole else FEWER_STARTS
         result = held(plant, dynamics, make, starts, sees=key == "exact-state")
         case, rms = f"estimates/{name}/{model}/{key}", float(np.median(result.rms))
         judged = key in ("extended", "unscented")
@@ -150,7 +150,7 @@ def chatter(name: str, model: str, quick: bool) -> Findings:
 def rates(plant: DesktopPlant, model: Dynamics, process: Process, case: str) -> list[Row]:
     """Errors of the rates along one swing-up that differences drive; each coordinate relative to differences'."""
     law = law_of(plant, model).law
-    controller, B = with_differences(law, 2, rate=plant.rate, cutoff=CUTOFF), np.asarray(plant.scene.needs.actuation)
+    controller, B = by_differences(plant.layout)(law), np.asarray(plant.scene.needs.actuation)
     hardware: Hardware = plant.hardware
     start = hanging_starts(1, 7, position=plant.position)[0]
     prior = belief([0.0, np.pi, 0.0, 0.0], [1.0, np.pi, 1.0, 1.0])
@@ -165,9 +165,9 @@ def rates(plant: DesktopPlant, model: Dynamics, process: Process, case: str) -> 
         # Controls act a sample after they are commanded.
         return run.x[:-1, 2:], memories[0][2], run.y, jnp.concatenate([jnp.zeros((1, 1)), asked[:-1]])
 
-    true, by_differences, y, u = log()
+    true, by_difference, y, u = log()
     rms = lambda qd: np.sqrt(np.mean((np.asarray(qd) - np.asarray(true)) ** 2, axis=0))  # noqa: E731
-    before, rows = rms(by_differences), []
+    before, rows = rms(by_difference), []
     filters = {
         "extended": extended,
         "unscented": unscented,

@@ -21,6 +21,8 @@ from scripts.reports.rows import Row
 
 TURN = 2 * np.pi / 4096
 STARTS, TO_REACH = 100, 0.99
+DRAWS = (0, 1, 2)
+"""Seeds of the sizes."""
 SOLID = 'contype="0" conaffinity="0"'
 
 
@@ -95,7 +97,7 @@ PLANTS: dict[str, Callable[[int, int], Plant]] = {
 
 def measured(name: str, sizes: int, quick: bool = False, *, say: Callable[[str], None] = lambda _: None) -> Findings:
     """Explores, learns, tunes and tries one plant."""
-    make, case = partial(PLANTS[name], sizes), f"foreign/{name}"
+    make, case = partial(PLANTS[name], sizes), f"foreign/{name}/{sizes}"
     starts = 10 if quick else STARTS
     try:
         learned = learn_to_swing_up(make(0), seed=sizes, say=say)
@@ -119,5 +121,7 @@ def measured(name: str, sizes: int, quick: bool = False, *, say: Callable[[str],
     )
 
 
-CASES: dict[str, Callable[[bool], Findings]] = {f"foreign/{name}": partial(measured, name, 0) for name in PLANTS}
-"""Cases of the control report by name; sizes by seed 0."""
+CASES: dict[str, Callable[[bool], Findings]] = {
+    f"foreign/{name}-{sizes}": partial(measured, name, sizes) for sizes in DRAWS for name in PLANTS
+}
+"""Cases of the control report by name and draw of the sizes."""

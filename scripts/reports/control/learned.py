@@ -8,8 +8,7 @@ import numpy as np
 
 from dln_jax.control.closed_loop import Outcomes
 from dln_jax.control.desktop_plants import PLANTS, DesktopPlant, Tried, desktop_plant, law_of, nominal_model, try_starts
-from dln_jax.control.exploration import Excitation, explore
-from dln_jax.training.swing_ups.learned import Errors, Obtained, errors_along, obtain, test_motions
+from dln_jax.training.swing_ups.learned import Errors, Obtained, errors_along, obtain, recorded, test_motions
 from dln_jax.types import InputError
 from scripts.reports.case import Findings, spread
 from scripts.reports.rows import Row
@@ -63,7 +62,7 @@ def _starts(quick: bool) -> int:
 
 
 def _of_seed(plant: DesktopPlant, model: str, seed: int, quick: bool) -> Outcome:
-    recording, _ = explore(plant, plant.numbers.gains, Excitation(seconds=SECONDS_OF_DATA), seed=seed)
+    recording = recorded(plant, seconds=SECONDS_OF_DATA, seed=seed)
     learned, starts = obtain(plant, model, recording, seed=seed), _starts(quick)
     errors = errors_along(plant, learned.dynamics, test_motions(plant, seed=seed))
     try:

@@ -11,7 +11,7 @@ from dln_jax.cli.commands import swing_up
 @pytest.mark.slow
 def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("dln_jax.training.swing_ups.run.MOST_SHOWN", 2)
-    few = ("--seconds-of-data", 4, "--starts", 2)
+    few = ("--seconds-of-data", 12, "--starts", 2, "--estimator", "differences")
     command(swing_up, "--plant", "furuta", "--model", "known", *few, "--out", tmp_path / "run")
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["success_share"] == 1 and found["not_finite"] == 0 and found["torque_nmse"] < 1e-20
@@ -31,7 +31,8 @@ def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
         (("--plant", "none.xml", "--actuated", "1"), "none.xml"),
         (("--plant", "furuta", "--actuated", "1"), "belong to a file"),
         (("--model", "feed-forward"), "choose from"),
-        (("--seconds-of-data", 1), "expected at least 4 s"),
+        (("--seconds-of-data", 1), "expected at least 12 s"),
+        (("--estimator", "luenberger"), "choose from"),
         (("--starts", 0), "starts is 0"),
         (("--seed", -1), "seed is -1"),
     ],

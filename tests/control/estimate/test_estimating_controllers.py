@@ -7,8 +7,9 @@ import pytest
 
 import dln_jax
 from dln_jax.control import Hardware, simulate, stateless
-from dln_jax.control.desktop_plants import desktop_rotary_pendulum, estimated, model_of_plant, try_starts
+from dln_jax.control.desktop_plants import desktop_rotary_pendulum, model_of_plant, try_starts
 from dln_jax.control.estimate import belief, extended, filtered, mechanical, with_estimate
+from dln_jax.control.plants.estimators import by_filter
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.scenes import cart_pole
@@ -106,12 +107,12 @@ def test_swing_ups_with_a_filter_succeed_and_hold_with_less_torque():
         model, plant.scene.needs.actuation, rate=plant.rate, band=[2.5e-4, 1e-5],
         encoder_step=plant.hardware.encoder_step,
     )  # fmt: skip
-    by_differences, by_filter = (
+    different, filtering = (
         try_starts(plant, model, starts=6, seconds=4.0, estimator=estimator)
-        for estimator in (None, estimated(plant, process))
+        for estimator in (None, by_filter(plant.layout, process, delay=1))
     )
-    assert by_differences.outcomes.share == by_filter.outcomes.share == 1
-    assert np.median(by_filter.effort) < 0.3 * np.median(by_differences.effort)
+    assert different.outcomes.share == filtering.outcomes.share == 1
+    assert np.median(filtering.effort) < 0.3 * np.median(different.effort)
 
 
 @pytest.mark.slow

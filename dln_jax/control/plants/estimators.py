@@ -1,0 +1,68 @@
+"""From controllers of states to controllers of measurements, for the plants of a layout."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from dln_jax.control.closed_loop import Controller
+from dln_jax.control.estimate import Filter, Process, belief, extended, unscented, with_estimate
+from dln_jax.control.observers import with_differences
+from dln_jax.control.plants.plant import Layout
+from dln_jax.control.state_space import Law
+from dln_jax.types import InputError
+
+Estimator = Callable[[Law | Controller], Controller]
+"""Law or controller of (q, qd) -> controller of measurements of q."""
+FASTEST_FILTER = 50.0
+"""Cut-off frequency of differences, Hz, and at most a quarter of the samples' rate."""
+FILTERS: Mapping[str, Callable[[Process], Filter]] = {"extended": extended, "unscented": unscented}
+ESTIMATORS = (*FILTERS, "differences")
+"""Names of `estimator_of`."""
+UNSURE = 1.0
+"""Standard deviation of the first estimate: coordinates, and rates in 1/s or m/s."""
+
+
+def by_differences(layout: Layout) -> Estimator:
+    """Rates by differences of the measurements and a low-pass."""
+    cutoff = min(FASTEST_FILTER, layout.rate / 4)
+    return lambda law: with_differences(law, len(layout.joints), rate=layout.rate, cutoff=cutoff)
+
+
+def by_filter(
+    layout: Layout, process: Process, *, delay: int = 0, make: Callable[[Process], Filter] = extended
+) -> Estimator:
+    """States by a filter of the measurements.
+
+    Args:
+        layout: of the plant.
+        process: such as that of `estimate.from_log`.
+        delay: samples after which a control begins to act.
+        make: process -> filter, such as `estimate.unscented`.
+    """
+    lower, upper = layout.limits.control.T
+    d, m = layout.actuation.shape
+    start = belief(np.concatenate([layout.hanging, np.zeros(d)]), np.full(2 * d, UNSURE))
+    settings: Any = {"controls": m, "measurements": d, "lower": lower, "upper": upper, "delay": delay}
+    return lambda law: with_estimate(law, make(process), start, **settings)
+
+
+def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: int) -> Estimator:
+    """Returns the estimator with a name.
+
+    Args:
+        name: one of `ESTIMATORS`.
+        layout: of the plant.
+        process: for the filters.
+        delay: samples after which a control begins to act.
+
+    Raises:
+        InputError: another name, or a filter without a process.
+    """
+    if name not in ESTIMATORS:
+        raise InputError(f"estimator is {name!r:.40}; choose from {', '.join(ESTIMATORS)}")
+    if name == "differences":
+        return by_differences(layout)
+    if process is None:
+        raise InputError(f"the filter {name!r} needs a process, such as that of estimate.from_log")
+    return by_filter(layout, process, delay=delay, make=FILTERS[name])

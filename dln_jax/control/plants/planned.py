@@ -1,0 +1,203 @@
+"""Swing-ups by a plan: an optimal trajectory from hanging to the goal, feedback along it, and a regulator at its end.
+
+    min  |error_N|² weight + integral lambda (effort |u / u_max|² + rates²) dt,   |u| <= `SHARE` u_max
+
+in the units of `scales`. Guesses of the controls are drawn, and solved together by iterative linear-quadratic
+regulators. Plans with the smallest feedback gains come first, because gains are large where the motors hardly reach the
+passive joints, and an error of phase turns their sign. The feedback is the time-varying regulator of the samples; its
+cost to go at the end is that of the goal's. A regulator about hanging brings the plant to rest first, and again if the
+goal is lost.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.control.closed_loop import Controller
+from dln_jax.control.plants.plant import Layout
+from dln_jax.control.plants.scales import Scales, swing_up_numbers
+from dln_jax.control.real_time import improve
+from dln_jax.control.regulators import Regulator, lqr, regulated, time_varying_lqr, value
+from dln_jax.control.state_space import Field, error, field_of, integrated, linearise
+from dln_jax.control.swing_up import SwingUpNumbers, Upright
+from dln_jax.control.tracking import friction_compensation, without_friction
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan
+from dln_jax.types import InputError
+
+DURATIONS = (8.0, 14.0, 20.0)
+"""Durations of plans, in units of 1 / lambda; a longer one is tried if no shorter one arrives."""
+FINENESS = 15.0
+"""Steps of a plan per 1 / lambda."""
+SHARE = 0.7
+"""Largest share of the motors' limits in a plan; feedback has the rest."""
+INSIDE = 0.8
+"""Share of the limits of the coordinates in which a plan stays."""
+GUESSES, ITERATIONS, LENGTHS = 16, 100, 0.5 ** np.arange(6)
+CLOSE = 0.1
+"""Largest error of a plan's end, in units of the coordinates."""
+EFFORTS = (1.0, 0.1)
+"""Weights of the controls in plans by turns: gentle plans, and firm ones."""
+AT_END, RATES, POSTURE, BEYOND = 300.0, 0.003, 0.02, 100.0
+"""Weights of the errors at the end, of the rates, of active coordinates away from the goal, where an acrobot's motor
+hardly reaches its passive joint, and of coordinates outside their share of the limits."""
+LOST = 1.0
+"""Distance from the plan or the goal in an angle, rad, beyond which the plant hangs and starts again."""
+
+
+class Followed(NamedTuple):
+    """A plan at the samples of a controller, with its regulators."""
+
+    x: Float[Array, "N n"]
+    u: Float[Array, "N m"]
+    K: Float[Array, "N m n"]
+    S: Float[Array, "n n"]
+    """Cost to go at the start."""
+    level: Any
+    """Cost to go from hanging below which the plan starts."""
+    goal: Regulator
+    hanging: Regulator
+
+
+def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0) -> list[Plan]:
+    """Plans from hanging to the goal that arrive, the least sensitive first; raises `InputError` if none does."""
+    d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
+    every = steps_of(layout, scales)
+    dt, goal, units = every / layout.rate, np.asarray(upright.at.x), _units(scales)
+    step = integrated(_compensated(upright), dt, substeps=2)
+    low, high = INSIDE * layout.limits.position.T
+
+    def end(x: Array) -> Array:
+        return AT_END * jnp.sum(((x - goal) / units) ** 2)
+
+    start = np.concatenate([layout.hanging, np.zeros(d)])
+
+    @jax.jit
+    @jax.vmap
+    def solved(u: Array, weight: Array) -> Plan:
+        def cost(x: Array, u: Array) -> Array:
+            away = ((x - goal) / units)[np.array(upright.parts.active)]
+            beyond = jnp.maximum(x[:d] - high, 0.0) + jnp.maximum(low - x[:d], 0.0)
+            running = weight * jnp.sum((u / size) ** 2) + RATES * jnp.sum((x[d:] / units[d:]) ** 2)
+            running += POSTURE * jnp.sum(away**2)
+            return dt * scales.fall * running + BEYOND * jnp.sum((beyond / units[:d]) ** 2)
+
+        problem = TrajectoryProblem(step, cost, end, lower=-SHARE * size, upper=SHARE * size)
+        again = lambda _, plan: improve(problem, plan, step_lengths=LENGTHS)  # noqa: E731
+        return jax.lax.fori_loop(0, ITERATIONS, again, first_plan(problem, start, u))
+
+    random = np.random.default_rng([seed, 41])
+    sizes = np.geomspace(0.03, 0.5, GUESSES)[:, None, None]
+    nearest = np.inf
+    for duration in DURATIONS:
+        guesses = sizes * size * random.normal(size=(GUESSES, round(duration / scales.fall / dt), len(size)))
+        plans = jax.tree.map(np.asarray, solved(guesses, np.resize(EFFORTS, GUESSES)))
+        off = np.abs((plans.x[:, -1] - goal) / units).max(axis=1)
+        largest = np.abs(plans.K * units / size[:, None]).max(axis=(1, 2, 3))
+        if good := [k for k in np.argsort(largest) if off[k] <= CLOSE]:
+            return [jax.tree.map(lambda leaf: leaf[k], plans) for k in good]  # noqa: B023
+        nearest = np.nanmin([nearest, *off])
+    raise InputError(
+        f"no plan of {DURATIONS[-1] / scales.fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} "
+        "of a coordinate's size away; a stronger motor or wider limits may"
+    )
+
+
+def steps_of(layout: Layout, scales: Scales) -> int:
+    """Samples in a step of a plan."""
+    return max(1, round(layout.rate / (FINENESS * scales.fall)))
+
+
+def followed(
+    chosen: Sequence[Plan],
+    upright: Upright,
+    layout: Layout,
+    scales: Scales,
+    numbers: Sequence[Mapping[str, float]],
+    spread: Any,
+) -> list[Followed]:
+    """Feedback about plans, from numbers without units.
+
+    Args:
+        chosen: plans from hanging, one for each set of numbers.
+        upright: the model.
+        layout: of the plant.
+        scales: of the model.
+        numbers: as for `swing_up_numbers`.
+        spread: standard deviations of the coordinates at a start [d].
+
+    Raises:
+        InputError: as for `lqr`.
+    """
+    every, d = steps_of(layout, scales), len(layout.joints)
+    step, dt = integrated(_compensated(upright), 1 / layout.rate), 1 / layout.rate
+    rest = jnp.concatenate([jnp.asarray(layout.hanging), jnp.zeros(d)])
+    field = field_of(without_friction(upright.model), upright.B)
+    below = linearise(jax.jit(field), rest, jnp.zeros(upright.B.shape[1]), tolerance=np.inf)
+
+    @jax.jit
+    @jax.vmap
+    def along(u: Array, Q: Array, R: Array, S: Array) -> tuple[Array, ...]:
+        u = jnp.repeat(u, every, axis=0)
+        x = jax.lax.scan(lambda x, u: (step(x, u), x), rest, u)[1]
+        F, G = jax.vmap(jax.jacfwd(step, argnums=(0, 1)))(x, u)
+        regulators = time_varying_lqr(F, G, dt * Q, dt * R, S)
+        level = 9 * jnp.sum(jnp.diagonal(regulators.S[0])[:d] * jnp.asarray(spread) ** 2)
+        return x, u, regulators.K, regulators.S[0], level
+
+    settings, goals = zip(*(swing_up_numbers(upright, layout, scales, one) for one in numbers), strict=True)
+    costs = [(one.state_cost, one.control_cost) for one in settings]
+    Q, R = map(np.stack, zip(*costs, strict=True))
+    rows = along(np.stack([plan.u for plan in chosen]), Q, R, np.stack([goal.S for goal in goals]))
+    x, u, K, S, level = map(np.asarray, rows)
+    return [
+        Followed(x[k], u[k], K[k], S[k], level[k], goal, lqr(below.A, below.B, *costs[k]))
+        for k, goal in enumerate(goals)
+    ]
+
+
+def follower(upright: Upright, layout: Layout, settings: SwingUpNumbers, plan: Followed) -> Controller:
+    """The controller of states x that swings up by a plan, whose arrays may be traced."""
+    joints, angles = layout.joints, np.array([kind == "revolute" for kind in layout.joints])
+    plan = jax.tree.map(jnp.asarray, plan)
+    rest = jnp.concatenate([jnp.asarray(layout.hanging), jnp.zeros(len(joints))])
+    hold, wait = regulated(plan.goal, upright.at.x, upright.at.u, joints), regulated(plan.hanging, rest, 0.0, joints)
+    begins, last = value(Regulator(plan.K[0], plan.S), rest, joints), len(plan.u)
+    to_controls = jnp.linalg.pinv(upright.B[np.array(upright.parts.active)])
+    friction = friction_compensation(
+        upright.model, upright.parts.active, smoothing=settings.smoothing, gain=settings.compensation
+    )  # fmt: skip
+
+    def act(number: Array, t: Array, x: Array) -> tuple[Array, Array]:
+        number = jnp.where((number < 0) & (begins(x) <= plan.level), 0, number)
+        k = jnp.clip(number, 0, last - 1)
+        off = error(x, jnp.where(number < last, plan.x[k], upright.at.x), joints)
+        lost = jnp.max(jnp.abs(off[: len(joints)])[angles]) > LOST
+        number = jnp.where(lost, -1, number)
+        u = jnp.where(number < last, plan.u[k] - plan.K[k] @ off, hold(x))
+        u = jnp.where(number < 0, wait(x), u)
+        if settings.compensation:
+            u = u + to_controls @ friction(*jnp.split(x, 2))
+        return jnp.where(number < 0, number, jnp.minimum(number + 1, last)), u
+
+    return Controller(jnp.asarray(-1), act)
+
+
+def _units(scales: Scales) -> np.ndarray:
+    return np.concatenate([scales.sizes, scales.sizes * scales.fall])
+
+
+def _compensated(upright: Upright) -> Field:
+    """The field of a plant whose active joints' friction is compensated; that of the others is there."""
+    driven = (upright.B != 0).any(axis=1)
+
+    def field(x: Array, u: Array) -> Array:
+        q, qd = jnp.split(x, 2)
+        tau = upright.B @ u + jnp.where(driven, upright.model.friction(q, qd), 0.0)
+        return jnp.concatenate([qd, upright.model.forward_dynamics(q, qd, tau)])
+
+    return field

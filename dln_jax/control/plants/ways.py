@@ -1,0 +1,77 @@
+"""Ways of swinging up whose settings trials choose: by plans with feedback, and by energy laws."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from dln_jax.control.closed_loop import Controller, stateless
+from dln_jax.control.plants.planned import followed, follower, plans_of
+from dln_jax.control.plants.plant import Layout
+from dln_jax.control.plants.scales import RANGES, Scales, swing_up_numbers
+from dln_jax.control.plants.simulated import spread_of
+from dln_jax.control.regulators import Regulator
+from dln_jax.control.swing_up import Upright, law_at
+
+PLANS = 8
+"""Number of plans, at most, that are tried with feedback."""
+
+
+class Way(NamedTuple):
+    """A way of swinging up, whose settings trials choose."""
+
+    name: str
+    draw: Callable[[np.random.Generator, int], list[Any]]
+    """(random, count) -> settings, trees of arrays of equal shapes."""
+    controller: Callable[[Any], Controller]
+    """Settings, perhaps traced -> controller of states."""
+    numbers: Callable[[Any], tuple[Mapping[str, float], Regulator]]
+    """Settings -> their numbers, and the regulator at the goal."""
+    errors: tuple[float, ...]
+    """Errors in the first round, one trial each."""
+
+
+def by_energy(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
+    """Energy laws and a regulator."""
+    # One set of smoothing and compensation for all: they are no arrays of the trial.
+    plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
+
+    def draw(random: np.random.Generator, count: int) -> list[Any]:
+        settings = [swing_up_numbers(upright, layout, scales, one) for one in _draws(random, count)]
+        arrays = [((one.gains, one.level, one.kick, one.surplus), regulator) for one, regulator in settings]
+        return [jax.tree.map(lambda leaf: np.asarray(leaf, float), one) for one in arrays]
+
+    def controller(settings: Any) -> Controller:
+        (gains, level, kick, surplus), regulator = settings
+        numbers = plain._replace(gains=gains, level=level, kick=kick, surplus=surplus)
+        return stateless(law_at(upright, layout.joints, numbers, regulator))
+
+    def numbers(settings: Any) -> tuple[dict[str, float], Regulator]:
+        (gains, level, kick, surplus), regulator = settings
+        named = {**gains._asdict(), "level": level, "kick": kick, "surplus": surplus}
+        return {name: float(value) for name, value in named.items()}, regulator
+
+    return Way("energy", draw, controller, numbers, (0.0, 0.0))
+
+
+def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
+    """Plans with feedback; raises as `plans_of`."""
+    plans = plans_of(upright, layout, scales, seed=seed)[:PLANS]
+    plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
+
+    def draw(random: np.random.Generator, count: int) -> list[Any]:
+        chosen = [plans[k % len(plans)] for k in range(count)]
+        return followed(chosen, upright, layout, scales, _draws(random, count), spread_of(layout))
+
+    def numbers(settings: Any) -> tuple[dict[str, float], Regulator]:
+        return {"seconds": len(settings.u) / layout.rate, "level": float(settings.level)}, settings.goal
+
+    return Way("plan", draw, lambda settings: follower(upright, layout, plain, settings), numbers, (0.15, -0.15))
+
+
+def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:
+    """Sets of numbers, alternately with the energy of the passive part and of the whole plant."""
+    low, high = np.log(np.array(list(RANGES.values()))).T
+    rows = np.exp(random.uniform(low, high, size=(count, len(RANGES))))
+    return [{**dict(zip(RANGES, row, strict=True)), "total": float(k % 2)} for k, row in enumerate(rows)]

@@ -1,0 +1,47 @@
+"""Explorations of the desktop plants keep to the limits, record what the hardware has, and are the same as for any."""
+
+import numpy as np
+import pytest
+
+from dln_jax.control.desktop_plants import desktop_plant, simulated_plant
+from dln_jax.control.plants.exploring import Exploration, explore, smooth_noise
+from dln_jax.data import schema
+from dln_jax.types import InputError
+
+PLANT = desktop_plant("furuta")
+BLIND = Exploration(seconds=3.0, blind=(0.3, 0.6), surplus=())
+
+
+def unused(recording):
+    raise AssertionError("blind episodes need no model")
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return explore(simulated_plant(PLANT, seed=1), unused, BLIND, seed=1).recording
+
+
+def test_a_desktop_plant_moves_within_the_share_of_its_limits(recording):
+    assert np.abs(recording.tau[:, 0]).max() <= BLIND.share * PLANT.hardware.upper + 1e-12
+    assert np.ptp(recording.q[:, 0]) > 0.1 and (recording.tau[:, 1] == 0).all()
+
+
+def test_a_recording_is_a_file_of_encoder_readings(recording, tmp_path):
+    steps = recording.q / PLANT.hardware.encoder_step
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    schema.save(tmp_path / "data.npz", recording)
+    read = schema.load(tmp_path / "data.npz")
+    assert read.estimated == ("qd", "qdd") and read.needs == PLANT.layout.needs and len(read.t) == 1500
+
+
+def test_noise_is_smooth():
+    noise = smooth_noise((4000, 2), rate=500.0, bandwidth=3.0, random=np.random.default_rng(0))
+    power = np.abs(np.fft.rfft(noise, axis=0)) ** 2
+    assert noise.std() == pytest.approx(1.0, rel=0.01) and power[100:].sum() < 0.02 * power.sum()
+
+
+def test_settings_out_of_range_are_one_line():
+    with pytest.raises(InputError, match="seconds is -1"):
+        explore(simulated_plant(PLANT), unused, BLIND._replace(seconds=-1.0))
+    with pytest.raises(InputError, match="choose from cart-pole, rotary-pendulum, furuta"):
+        desktop_plant("dance")
