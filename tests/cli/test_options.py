@@ -52,7 +52,7 @@ def test_names_in_options_are_those_of_the_library():
     assert set(FITS) - {AUTO} <= set(CATALOGUE)
     assert set(phase_spaces.GENERATED) == set(PROTOCOLS)
     assert set(functions.NAMES) == set(NAMED)
-    assert set(identification.IDENTIFIED) == set(LAWS) - {"load"}
+    assert set(identification.IDENTIFIED) == set(LAWS)
     choices = get_type_hints(train_value.TrainingOptions, include_extras=True)["plant"].__metadata__[0].metavar
     assert set(choices.strip("{}").split(",")) == {*PLANTS, "FILE"}
     activations = get_type_hints(functions.Learned, include_extras=True)["activation"].__metadata__[0].metavar

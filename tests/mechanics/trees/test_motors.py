@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import (
     armature_matrix,
@@ -13,7 +12,6 @@ from dln_jax.mechanics.trees import (
     dh_frames,
     inertial_parameters,
     kinetic_energy,
-    make_tree,
     newton_euler,
     serial,
     tree_energies,
@@ -54,7 +52,6 @@ def test_recursions_agree_with_derivatives_of_the_lagrangian():
         np.testing.assert_allclose(fast.inverse_dynamics(*STATE), slow.inverse_dynamics(*STATE), atol=1e-11)
         tau = fast.inverse_dynamics(*STATE)
         np.testing.assert_allclose(fast.forward_dynamics(*STATE[:2], tau), STATE[2], atol=1e-10)
-    assert lagrangian is not None
 
 
 def test_friction_of_coupled_motors_acts_at_their_rates():
@@ -90,4 +87,3 @@ def test_invalid_motors_are_refused():
     ):
         with pytest.raises(InputError, match=message):
             make()
-    assert make_tree is not None
