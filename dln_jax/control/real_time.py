@@ -40,6 +40,8 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e9
 TO_BOUNDARY, CLOSEST = 0.99, 1e-5
 """Share of the distance to a limit that a control may go in an iteration, and its least distance from finite limits
 relative to their distance."""
+ROUNDING = 1e-12
+"""Relative difference of costs that counts as rounding."""
 VIOLATED = 5.0
 """Excess in units of δ that counts as a violation: the multiplier is then above nine tenths of the price."""
 
@@ -108,7 +110,7 @@ def mpc(
 def improve(
     problem: TrajectoryProblem, plan: Plan, *, barrier: Any = BARRIER, step_lengths: Any = STEP_LENGTHS
 ) -> Plan:
-    """Runs one iteration from the plan's first state; the cost, which includes barriers and prices, never rises.
+    """Runs one iteration from the plan's first state; the cost, which includes barriers and prices, rises by rounding at most.
 
     Limits of the states have prices too: the problem's `soft` or 1e3, like all its constraints but the limits of the
     controls. The plan's `ending` is `VIOLATED` if the plan violates a constraint (`worst_violation` says which),
@@ -156,7 +158,8 @@ def improve(
     states, controls, (costs, excesses) = jax.vmap(trial)(jnp.asarray(step_lengths, u.dtype))
     costs, (now, excess) = jnp.where(jnp.isfinite(costs), costs, jnp.inf), total(plan.x, u)
     best = jnp.argmin(costs)
-    better = (costs[best] < now) | (jnp.isfinite(costs[best]) & ~jnp.isfinite(now))
+    # Equal within rounding counts as better: at the optimum the damping must not grow, nor the gains vanish.
+    better = (costs[best] <= now + ROUNDING * jnp.abs(now)) | (jnp.isfinite(costs[best]) & ~jnp.isfinite(now))
     x, u, cost, excess = (
         jnp.where(better, new[best], old)
         for new, old in ((states, plan.x), (controls, u), (costs, now), (excesses, excess))

@@ -42,7 +42,7 @@ NOISE, TURN, TICK = np.array([1e-4, 1e-3]), 2 * np.pi / 4096, 2.5e-5
 CORRECTIONS = 0.5, 0.15
 """Shares of an innovation that correct the coordinates, and their rates within a sample."""
 WALL, ROOM, RESERVED = 0.03, 0.1, 0.7
-"""Distance that receding plans and one plan with its gains keep from the ends of the rail, m, and the share of the
+"""Distance that predictive control and one plan with its gains keep from the ends of the rail, m, and the share of the
 force that the latter plans with."""
 LONG = 180
 """Steps of these plans."""
@@ -130,7 +130,7 @@ def along(plan: Plan, top: Plan) -> Callable[[np.ndarray], tuple[np.ndarray, flo
 
 
 def on_a_rail(quick: bool) -> Findings:
-    """Shares of swing-ups that succeed within the rail, by receding plans and by one plan with its gains."""
+    """Shares of swing-ups that succeed within the rail, by predictive control and by one plan with its gains."""
     planned, plant = cart_pole(known(), WALL), model()
     problem = in_jax(planned)
     solve, settle = starting(problem)
@@ -145,7 +145,7 @@ def on_a_rail(quick: bool) -> Findings:
     solve_carefully, regulate = starting(careful, LONG)[0], with_gains(careful)
     top = regulate(first_plan(careful, jnp.zeros(4), np.zeros((LONG, 1))))
     ways = {
-        "receding-plans": lambda x: of_c(functions, settle(solve(x))),
+        "predictive-control": lambda x: of_c(functions, settle(solve(x))),
         "plan-and-gains": lambda x: along(regulate(solve_carefully(x)), top),
     }
     rows: list[Row] = []
@@ -156,14 +156,14 @@ def on_a_rail(quick: bool) -> Findings:
 
 
 def _rows(case: str, runs: list[Run]) -> list[Row]:
-    found = outcomes(np.stack([run.x[:, 1] for run in runs]), rate=1 / DT)
+    scores = outcomes(np.stack([run.x[:, 1] for run in runs]), rate=1 / DT)
     farthest = np.array([np.abs(run.x[:, 0]).max() for run in runs])
-    good, words = np.isfinite(found.seconds) & (farthest <= RAIL), f"of {len(runs)} starts"
+    good, words = np.isfinite(scores.seconds) & (farthest <= RAIL), f"of {len(runs)} starts"
     return [
         expect(case, "success_share", f"{words}, up and never beyond the rail", np.mean(good), 1.0, at_least=True),
         expect(case, "farthest_m", words, farthest.max(), RAIL, "m"),
-        Row(case, "seconds_median", found.median, "s"),
-        Row(case, "seconds_worst", found.worst, "s"),
+        Row(case, "seconds_median", scores.median, "s"),
+        Row(case, "seconds_worst", scores.worst, "s"),
         Row(
             case,
             "p99_ms",

@@ -196,8 +196,8 @@ def cart_pole_report(quick: bool) -> Findings:
         rows.append(Row(case, "stack_bytes", effort.stack_bytes, "B"))
     for name in ("ipopt", "fatrop", "hpipm"):
         make = hpipm(planned, roots) if name == "hpipm" else to_the_end(name, planned, roots)
-        found = [closed(make(unknowns(solve(x))), x) for x in drawn[: 1 if quick else RIVAL_LOOPS]]
-        rows += _rows(f"realtime/cart-pole/{name}", found, None)
+        loops_of_rival = [closed(make(unknowns(solve(x))), x) for x in drawn[: 1 if quick else RIVAL_LOOPS]]
+        rows += _rows(f"realtime/cart-pole/{name}", loops_of_rival, None)
     return Findings(rows)
 
 

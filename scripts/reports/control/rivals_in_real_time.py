@@ -87,12 +87,12 @@ def to_the_end(name: str, problem: Planned, residuals: Callable[..., list[Any]])
         guess[:n] = x
         duals = {key: memory[key] for key in ("lam_x0", "lam_g0") if key in memory}
         began = time.process_time()
-        found = solver(x0=guess, lbx=lower, ubx=upper, lbg=of.lower_g, ubg=of.upper_g, **duals)
+        result = solver(x0=guess, lbx=lower, ubx=upper, lbg=of.lower_g, ubg=of.upper_g, **duals)
         seconds = time.process_time() - began
-        w = np.asarray(found["x"]).ravel()
+        w = np.asarray(result["x"]).ravel()
         memory["x0"], u = shifted(w, n, m), w[n : n + m]
-        memory["lam_x0"] = shifted(np.asarray(found["lam_x"]).ravel(), n, m)
-        g = np.asarray(found["lam_g"]).ravel()
+        memory["lam_x0"] = shifted(np.asarray(result["lam_x"]).ravel(), n, m)
+        g = np.asarray(result["lam_g"]).ravel()
         memory["lam_g0"] = np.append(g[n:], g[-n:])
         return u, seconds
 
@@ -115,9 +115,9 @@ def hpipm(problem: Planned, residuals: Callable[..., list[Any]]) -> Make:
         h, g, a, gaps = expand(w)
         lower, upper = of.lower - w, of.upper - w
         lower[:n] = upper[:n] = x - w[:n]
-        found = solver(h=h, g=g, a=a, lba=-gaps, uba=-gaps, lbx=lower, ubx=upper)
+        result = solver(h=h, g=g, a=a, lba=-gaps, uba=-gaps, lbx=lower, ubx=upper)
         seconds = time.process_time() - began
-        w += np.asarray(found["x"]).ravel()
+        w += np.asarray(result["x"]).ravel()
         memory["w"] = shifted(w, n, m)
         return w[n : n + m], seconds
 
