@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.desktop_plants import desktop_plant, model_of_plant
+from dln_jax.control.desktop_plants import desktop_plant, model_of_plant, simulated_plant
+from dln_jax.control.plants import Exploration, explore
 from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
 from dln_jax.learning.recordings import identified, learned, prepare
 from dln_jax.models.trigonometric import make_trigonometric
-from dln_jax.training.swing_ups.learned import recorded
 from dln_jax.types import InputError
 
 PLANT = desktop_plant("rotary-pendulum")
@@ -19,7 +19,7 @@ MODEL = make_trigonometric(PLANT.scene.needs)
 
 @pytest.fixture(scope="module")
 def recording():
-    return recorded(PLANT, seconds=12.0, seed=0)
+    return explore(simulated_plant(PLANT), lambda _: TRUTH, Exploration(seconds=12.0)).recording
 
 
 @pytest.fixture(scope="module")
