@@ -110,7 +110,7 @@ def mpc(
 def improve(
     problem: TrajectoryProblem, plan: Plan, *, barrier: Any = BARRIER, step_lengths: Any = STEP_LENGTHS
 ) -> Plan:
-    """Runs one iteration from the plan's first state; the cost, which includes barriers and prices, rises by rounding at most.
+    """Runs one iteration from the plan's first state; the cost with barriers and prices rises by rounding at most.
 
     Limits of the states have prices too: the problem's `soft` or 1e3, like all its constraints but the limits of the
     controls. The plan's `ending` is `VIOLATED` if the plan violates a constraint (`worst_violation` says which),

@@ -27,9 +27,9 @@ KNOTS, DT, FINE, SECONDS, TO_REACH_MS = 10, 0.02, 20, 8.0, 1.0
 """Steps of the horizon, their duration, s, torques per step, and the run, s."""
 RANGE, MARGIN, SPEED, ACCELERATION = 1.0, 0.03, 2.5, 100.0
 """Limits of joints about the middle, what plans keep of them, rad, speeds and accelerations."""
-SHARE = 0.75
+SHARE = 0.95
 """Share of the motors' torques that may be used."""
-BARRIER, PRICES = 1e-4, (20.0, 20.0)
+BARRIER, PRICES = 1e-3, (20.0, 20.0)
 AMPLITUDES = np.array([0.9, 1.15, 0.9, 0.9, 1.2, 0.9, 0.9])
 FREQUENCIES = np.array([1.5, 1.2, 1.6, 1.4, 1.8, 2.0, 2.1])
 
