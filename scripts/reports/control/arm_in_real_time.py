@@ -29,7 +29,10 @@ RANGE, MARGIN, SPEED, ACCELERATION = 1.0, 0.03, 2.5, 100.0
 """Limits of joints about the middle, what plans keep of them, rad, speeds and accelerations."""
 SHARE = 0.95
 """Share of the motors' torques that may be used."""
-BARRIER, PRICES = 1e-3, (20.0, 20.0)
+BARRIER, PRICES, ITERATIONS = 3e-3, (100.0, 1000.0), 2
+STOPPING = 0.2
+"""Time ahead for which the rates at the end of a plan must not lead out of the joints' limits, s: without it, a plan of
+0.2 s drives up to a limit at a speed that cannot be braked."""
 AMPLITUDES = np.array([0.9, 1.15, 0.9, 0.9, 1.2, 0.9, 0.9])
 FREQUENCIES = np.array([1.5, 1.2, 1.6, 1.4, 1.8, 2.0, 2.1])
 
@@ -55,10 +58,14 @@ def problem_of(torque: Any) -> TrajectoryProblem:
         share = torque(x, u) / (SHARE * LIMITS)
         return jnp.concatenate([share - 1, -share - 1])
 
+    def stopping(x: Array, wanted: Array) -> Array:
+        ahead = x[:D] + STOPPING * x[D:] - MIDDLE
+        return jnp.concatenate([ahead, -ahead]) - (RANGE - MARGIN)
+
     low, high = (np.append(MIDDLE + side * (RANGE - MARGIN), np.full(D, side * SPEED)) for side in (-1, 1))
     return TrajectoryProblem(
         step, lambda x, u, wanted: DT * (off(x, wanted) + 1e-4 * u @ u), lambda x, wanted: 0.2 * off(x, wanted),
-        -ACCELERATION, ACCELERATION, low, high, path=beyond, soft=PRICES,
+        -ACCELERATION, ACCELERATION, low, high, path=beyond, end_below=stopping, soft=PRICES,
     )  # fmt: skip
 
 
@@ -85,7 +92,8 @@ def seven_axis_report(quick: bool) -> Findings:
     for _ in range(SETTLING):
         plan = settle(plan)
     with tempfile.TemporaryDirectory() as place:
-        functions, efforts = in_c(problem._replace(knots=window(0)), plan, Path(place) / "arm", barrier=BARRIER)
+        functions, efforts = in_c(problem._replace(knots=window(0)), plan, Path(place) / "arm", barrier=BARRIER,
+                                    iterations=ITERATIONS)  # fmt: skip
     act, states, shares, times = of_c(functions, plan), [x], [], []
     for k in range(round((1.0 if quick else SECONDS) / DT)):
         u, seconds = act(x, window(k))
