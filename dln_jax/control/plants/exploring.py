@@ -20,7 +20,7 @@ from jaxtyping import Float
 from dln_jax.control.closed_loop import Controller
 from dln_jax.control.energy_shaping import energy_shaping
 from dln_jax.control.plants.estimators import by_differences
-from dln_jax.control.plants.planned import followed, follower, plans_of
+from dln_jax.control.plants.planned import READY, followed, follower, plans_of
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, compiled, distances, run
 from dln_jax.control.plants.scales import USUAL, Scales, circle, gains_of, scales_of, swing_up_numbers
@@ -117,7 +117,7 @@ def explore(
         signal = smooth_noise((samples, layout.actuation.shape[1]), rate=layout.rate, bandwidth=exploration.bandwidth,
                               random=random)  # fmt: skip
         size = weaker * noise * used.control[:, 1]
-        memory = (_start(inner, -1 if by_plan else stage), jnp.asarray(size * signal))
+        memory = (_start(inner, READY if by_plan else stage), jnp.asarray(size * signal))
         (one,) = run([plant], act, jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], memory), seconds=seconds)
         if one.stopped:
             weaker /= 2
