@@ -48,14 +48,17 @@ def test_an_episode_along_a_plan_comes_near_the_goal_within_the_limits():
 def test_a_lost_plan_starts_again_nearer_to_rest_or_after_a_while():
     upright = upright_of(MODEL, RAIL.actuation, RAIL.goal, postures=circle(RAIL))
     settings, goal = swing_up_numbers(upright, RAIL, scales_of(upright, RAIL), USUAL)
-    rest, samples = np.array([0.0, np.pi, 0.0, 0.0]), 10
-    none = np.zeros((1, 4))
+    rest, samples = jnp.array([0.0, np.pi, 0.0, 0.0]), 10
+    none = jnp.zeros((1, 4))
     plan = Followed(
-        np.tile(rest, (samples, 1)), np.zeros((samples, 1)), np.zeros((samples, 1, 4)), np.eye(4), 0.09, goal,
-        Regulator(none, np.eye(4)),
+        jnp.tile(rest, (samples, 1)), jnp.zeros((samples, 1)), jnp.zeros((samples, 1, 4)), jnp.eye(4), 0.09, goal,
+        Regulator(none, jnp.eye(4)),
     )  # fmt: skip
     act = follower(upright, RAIL, settings, plan).act
-    start = lambda number, off: int(act(jnp.asarray(number), jnp.zeros(()), jnp.asarray(rest + [0, off, 0, 0]))[0])  # noqa: E731
+
+    def start(number, off):
+        return int(act(jnp.asarray(number), jnp.zeros(()), rest.at[1].add(off))[0])
+
     assert start(READY, 0.29) == 1 and start(READY, 0.31) == READY
     lost = start(5, 1.1)
     assert lost == READY - PATIENCE * samples + 1
