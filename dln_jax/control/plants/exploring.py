@@ -4,6 +4,8 @@
    episode that `guarded` stops halves the noise of the next.
 2. A model is fitted. The others are episodes of its energy law, some to below and some to above the energy of the goal,
    with noise; it is fitted again on the way.
+3. If none of these came near the goal, as with an acrobot, whose motor hardly reaches its passive joint, the model does
+   not know the weight there. The remaining episodes follow a plan of the model to the goal, with less noise.
 """
 
 from collections.abc import Callable
@@ -18,10 +20,12 @@ from jaxtyping import Float
 from dln_jax.control.closed_loop import Controller
 from dln_jax.control.energy_shaping import energy_shaping
 from dln_jax.control.plants.estimators import by_differences
+from dln_jax.control.plants.planned import READY, followed, follower, plans_of
 from dln_jax.control.plants.plant import Layout, Plant
-from dln_jax.control.plants.runs import PlantRun, compiled, run
-from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of
-from dln_jax.control.swing_up import upright_of
+from dln_jax.control.plants.runs import PlantRun, compiled, distances, run
+from dln_jax.control.plants.scales import USUAL, Scales, circle, gains_of, scales_of, swing_up_numbers
+from dln_jax.control.plants.simulated import spread_of
+from dln_jax.control.swing_up import Upright, upright_of
 from dln_jax.data.encoders import low_pass
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics
@@ -31,6 +35,8 @@ DAMPING = 0.15
 """Damping of the blind episodes' spring over its stiffness, s."""
 FITTED_EVERY = 2
 """Number of later episodes after which the model is fitted again."""
+NEAR = 0.5
+"""Largest distance of every angle from the goal that counts as near, rad."""
 SHORTEST = 1.0
 """Shortest episode that is kept, s."""
 
@@ -47,6 +53,8 @@ class Exploration(NamedTuple):
     from hanging to the goal."""
     noise: float = 0.3
     """Standard deviation of their noise, as a share of the limits."""
+    along_plans: float = 0.1
+    """The same of episodes that follow plans, whose feedback has less to spare."""
     bandwidth: float = 3.0
     """Bandwidth of the noise, Hz."""
     share: float = 0.8
@@ -89,20 +97,27 @@ def explore(
     seconds = exploration.seconds / len(stages)
     runs: list[PlantRun] = []
     stopped: list[str] = []
-    weaker, blind, shaped = 1.0, compiled(_blind(inner), inner), None
+    weaker, blind, law, by_plan = 1.0, _blind(inner), None, False
     for number, stage in enumerate(stages):
         later = number - len(exploration.blind)
-        if later >= 0 and later % FITTED_EVERY == 0:
-            shaped = _energy_law(inner, fit, runs) or shaped
-        if later >= 0 and shaped is not None:
-            act, noise = shaped, exploration.noise
+        if later >= 0 and (by_plan or later % FITTED_EVERY == 0):
+            upright = _upright(inner, fit, runs)
+            planned = None
+            if upright and later and (by_plan or not any((distances(one.y, inner) < NEAR).any() for one in runs)):
+                planned = _plan_law(inner, *upright, seed=seed)
+            if planned:
+                law, by_plan = planned, True
+            elif upright and not by_plan:
+                law = _energy_law(inner, *upright)
+        if later >= 0 and law is not None:
+            act, noise = law, exploration.along_plans if by_plan else exploration.noise
         else:
             act, noise = blind, exploration.blind[min(number, len(exploration.blind) - 1)]
         samples = round(seconds * layout.rate)
         signal = smooth_noise((samples, layout.actuation.shape[1]), rate=layout.rate, bandwidth=exploration.bandwidth,
                               random=random)  # fmt: skip
         size = weaker * noise * used.control[:, 1]
-        memory = (_rates(inner).start, jnp.asarray(size * signal), jnp.asarray(stage))
+        memory = (_start(inner, READY if by_plan else stage), jnp.asarray(size * signal))
         (one,) = run([plant], act, jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], memory), seconds=seconds)
         if one.stopped:
             weaker /= 2
@@ -142,22 +157,22 @@ def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
     )
 
 
-def _rates(layout: Layout) -> Controller:
-    """Passes on measurements and their rates."""
-    return by_differences(layout)(lambda x: x)
+def _start(layout: Layout, number: float) -> Any:
+    """Memory of `by_differences` before the first sample, for a controller whose memory is a number."""
+    return by_differences(layout)(Controller(jnp.asarray(number), lambda memory, t, x: (memory, x))).start
 
 
-def _with(law: Callable[[Array, Array], Array], layout: Layout) -> Controller:
-    """(x, number of the stage) -> u, plus the noise of the memory (rates, noise [N, m], number)."""
-    rates = _rates(layout)
+def _with_noise(states: Controller, layout: Layout) -> Any:
+    """Compiles a controller of states for measurements, with noise: its memory is (that of `_start`, noise [N, m])."""
+    controller = by_differences(layout)(states)
 
     def act(memory: Any, t: Array, y: Array) -> tuple[Any, Array]:
-        inner, noise, number = memory
-        inner, x = rates.act(inner, t, y)
+        inner, noise = memory
+        inner, u = controller.act(inner, t, y)
         place = jnp.clip(jnp.round(t * layout.rate).astype(int), 0, len(noise) - 1)
-        return (inner, noise, number), law(x, number) + noise[place]
+        return (inner, noise), u + noise[place]
 
-    return Controller(None, act)
+    return compiled(Controller(None, act), layout)
 
 
 def _spring(layout: Layout, centre: np.ndarray) -> Callable[[Array], Array]:
@@ -172,33 +187,49 @@ def _spring(layout: Layout, centre: np.ndarray) -> Callable[[Array], Array]:
     return spring
 
 
-def _blind(layout: Layout) -> Controller:
+def _blind(layout: Layout) -> Any:
     spring, size = _spring(layout, layout.hanging), layout.limits.control[:, 1]
-    return _with(lambda x, _: jnp.asarray(-size * spring(x)), layout)
+    return _with_noise(Controller(None, lambda stage, t, x: (stage, jnp.asarray(-size * spring(x)))), layout)
 
 
-def _energy_law(layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun]) -> Any:
-    """The compiled energy law of a model of the runs so far, whose number is its surplus; `None` without a model."""
+def _upright(layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun]) -> Any:
+    """A model of the runs so far with its scales; `None` without one."""
     if len(runs) < 2:
         return None
     lower, upper = layout.limits.control.T
     try:
         model = fit(recording_of(runs, layout))
         upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
-        scales = scales_of(upright, layout)
+        return upright, scales_of(upright, layout)
     except InputError:
         return None
+
+
+def _plan_law(layout: Layout, upright: Upright, scales: Scales, *, seed: int) -> Any:
+    """The compiled follower of the least sensitive plan of a model; `None` without a plan."""
+    try:
+        plan = plans_of(upright, layout, scales, seed=seed)[0]
+        (chosen,) = followed([plan], upright, layout, scales, [USUAL], spread_of(layout))
+    except InputError:
+        return None
+    settings, _ = swing_up_numbers(upright, layout, scales, USUAL)
+    return _with_noise(follower(upright, layout, settings, chosen), layout)
+
+
+def _energy_law(layout: Layout, upright: Upright, scales: Scales) -> Any:
+    """The compiled energy law of a model, whose number is its surplus."""
+    lower, upper = layout.limits.control.T
     home = jnp.split(upright.at.x, 2)[0]
     gains, size = gains_of(scales, USUAL), layout.limits.control[:, 1]
     to_controls = jnp.linalg.pinv(layout.actuation[np.array(upright.parts.active)])
     spring = _spring(layout, layout.goal)
 
-    def law(x: Array, surplus: Array) -> Array:
+    def law(surplus: Array, t: Array, x: Array) -> tuple[Array, Array]:
         shaped = energy_shaping(upright.model, upright.parts, home, gains, surplus=surplus * scales.energy)
         q, qd = jnp.split(x, 2)
         # Beyond half of the reach the spring pushes back, whatever the model says.
         pull = spring(x)
         u = jnp.clip(to_controls @ shaped(q, qd), lower, upper)
-        return u - 2 * size * (pull - jnp.clip(pull, -1.0, 1.0))
+        return surplus, u - 2 * size * (pull - jnp.clip(pull, -1.0, 1.0))
 
-    return compiled(_with(law, layout), layout)
+    return _with_noise(Controller(None, law), layout)

@@ -45,6 +45,12 @@ EFFORTS = (1.0, 0.1)
 AT_END, RATES, POSTURE, BEYOND = 300.0, 0.003, 0.02, 100.0
 """Weights of the errors at the end, of the rates, of active coordinates away from the goal, where an acrobot's motor
 hardly reaches its passive joint, and of coordinates outside their share of the limits."""
+READY = -1
+"""Number of a plan's sample while the plant hangs and waits for its start."""
+CALM, PATIENCE = 1 / 36, 4
+"""Share of the level below which a lost plan starts again: half a standard deviation of the starts in place of three,
+as it may have been lost because it began too far away. After this number of a plan's durations the whole level counts,
+in case friction keeps the plant off."""
 LOST = 1.0
 """Distance from the plan or the goal in an angle, rad, beyond which the plant hangs and starts again."""
 
@@ -173,18 +179,19 @@ def follower(upright: Upright, layout: Layout, settings: SwingUpNumbers, plan: F
     )  # fmt: skip
 
     def act(number: Array, t: Array, x: Array) -> tuple[Array, Array]:
-        number = jnp.where((number < 0) & (begins(x) <= plan.level), 0, number)
+        level = plan.level * jnp.where(number < READY, CALM, 1.0)
+        number = jnp.where((number < 0) & (begins(x) <= level), 0, number)
         k = jnp.clip(number, 0, last - 1)
         off = error(x, jnp.where(number < last, plan.x[k], upright.at.x), joints)
         lost = jnp.max(jnp.abs(off[: len(joints)])[angles]) > LOST
-        number = jnp.where(lost, -1, number)
+        number = jnp.where(lost & (number >= 0), READY - PATIENCE * last, number)
         u = jnp.where(number < last, plan.u[k] - plan.K[k] @ off, hold(x))
         u = jnp.where(number < 0, wait(x), u)
         if settings.compensation:
             u = u + to_controls @ friction(*jnp.split(x, 2))
-        return jnp.where(number < 0, number, jnp.minimum(number + 1, last)), u
+        return jnp.where(number == READY, number, jnp.minimum(number + 1, last)), u
 
-    return Controller(jnp.asarray(-1), act)
+    return Controller(jnp.asarray(READY), act)
 
 
 def _units(scales: Scales) -> np.ndarray:

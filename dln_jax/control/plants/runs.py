@@ -109,15 +109,19 @@ class Trials(NamedTuple):
         return np.isfinite(self.seconds)
 
 
+def distances(y: Float[np.ndarray, "N d"], layout: Layout) -> Float[np.ndarray, " N"]:
+    """Largest distance of an angle from the goal, rad."""
+    angles = np.array([kind == "revolute" for kind in layout.joints])
+    return np.abs(np.remainder(y - layout.goal + np.pi, 2 * np.pi) - np.pi)[:, angles].max(axis=1)
+
+
 def judged_runs(runs: Sequence[PlantRun], layout: Layout, *, seconds: float) -> Trials:
     """Judges runs: every angle within `TOLERANCE` of the goal for the last `HELD` seconds, and never stopped."""
-    angles = np.array([kind == "revolute" for kind in layout.joints])
 
     def time_up(one: PlantRun) -> float:
         if one.stopped:
             return np.inf
-        off = np.abs(np.remainder(one.y - layout.goal + np.pi, 2 * np.pi) - np.pi)[:, angles].max(axis=1)
-        away = np.flatnonzero(~(off <= TOLERANCE))
+        away = np.flatnonzero(~(distances(one.y, layout) <= TOLERANCE))
         last = 0.0 if not len(away) else (away[-1] + 1) / layout.rate
         return last if last <= seconds - HELD else np.inf
 
