@@ -34,7 +34,7 @@ class Called(NamedTuple):
     text: str
     operations: Counter[str]
     unbounded: int
-    bytes: int
+    stack: int
     calls: set[Any]
     """Keys, in the source, of the functions that it calls directly or indirectly."""
 
@@ -96,7 +96,7 @@ class Body:
     """Largest number of operations on real numbers, by their names in `operations.OPERATIONS`."""
     unbounded: int = 0
     """Loops without a bound on their iterations, of which one is counted."""
-    bytes: int = _FRAME
+    stack: int = _FRAME
     """Largest stack: variables, and what a compiler adds to them."""
     calls: set[Any] = field(default_factory=set)
     """Keys, in the source, of the functions that it calls directly or indirectly."""
@@ -143,7 +143,7 @@ class Body:
     def declared(self, name: str, dtype: str, size: int, value: str = "") -> None:
         """Declares an array, or a scalar if the size is 0; a scalar with a value is constant."""
         width = 4 if self.source.precision == "f32" and dtype == "real" else 8
-        self.bytes += -(-size * width // _ALIGNMENT) * _ALIGNMENT or width
+        self.stack += -(-size * width // _ALIGNMENT) * _ALIGNMENT or width
         array, start, constant = (
             f"[{size}]" * bool(size),
             f" = {value}" * bool(value),
@@ -246,7 +246,7 @@ class Body:
         functions = sum(count[name] for name in OPERATIONS if OPERATIONS[name].function and name != "sqrt")
         return Cost(
             total(count), count["add"] + count["sub"] + fused, count["mul"] + fused, count["div"], count["sqrt"],
-            functions, self.bytes, self.unbounded,
+            functions, self.stack, self.unbounded,
         )  # fmt: skip
 
     def uses(self, node: Node) -> bool:

@@ -210,7 +210,7 @@ def _function(
         except (TypeError, ValueError, NotImplementedError) as error:  # JAX cannot differentiate it, or it has no C
             failure = error
             continue
-        if body.bytes <= stack:
+        if body.stack <= stack:
             blocks = [*inputs, *outputs]
             return body.source, CASADI_FUNCTION.format(
                 symbol=symbol,
@@ -220,7 +220,7 @@ def _function(
                 cost=stated(body.cost), inputs=len(inputs), outputs=len(outputs),
                 lines="\n".join(body.lines),
             )  # fmt: skip
-        kib = body.bytes / 1024
+        kib = body.stack / 1024
         failure = InputError(f"it would take {kib:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB")
     reason = str(failure).strip().partition("\n")[0]
     raise InputError(f"{symbol}: {reason}; export it without casadi") from failure

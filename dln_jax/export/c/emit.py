@@ -1,5 +1,6 @@
 """Writes a planned program as the body of a C function, region by region."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -47,8 +48,20 @@ def body_of(
                 _from_array(body, f"r{k}_", results[k].size, target)
             else:
                 copied(body, results[k], target)
-    body.bytes += max((source.parts[key].bytes for key in body.calls), default=0)
+    body.lines = _without_unread(body.lines)
+    body.stack += max((source.parts[key].stack for key in body.calls), default=0)
     return body
+
+
+def _without_unread(lines: list[str]) -> list[str]:
+    """Returns the lines without scalars that no later line reads, as where a zero has taken the place of a product."""
+    kept, read = [], set()
+    for line in reversed(lines):
+        scalar = re.match(r"\s*const \w+ (v\d+) = ", line)
+        if scalar is None or scalar[1] in read:
+            kept.append(line)
+            read |= set(re.findall(r"\bv\d+\b", line[scalar.end() if scalar else 0 :]))
+    return kept[::-1]
 
 
 def _is_moved(body: Body, node: Node) -> bool:
@@ -135,7 +148,7 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
     text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
     name = source.names.setdefault(text, f"part_{len(source.names)}")
     written = f"\nstatic void {name}{text}"
-    return Called(name, results, written, body.operations, body.unbounded, body.bytes, body.calls)
+    return Called(name, results, written, body.operations, body.unbounded, body.stack, body.calls)
 
 
 def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> list[str]:

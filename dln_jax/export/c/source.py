@@ -200,9 +200,9 @@ def _function(
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
-    if body.bytes > stack:
+    if body.stack > stack:
         raise TooLargeError(
-            f"{key} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
+            f"{key} would take {body.stack / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
         )
     words = set(re.findall(r"\w+", "\n".join(body.lines)))
     leaves = [*signature.arguments, *(() if signature.returns else signature.results)]

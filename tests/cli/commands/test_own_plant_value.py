@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -32,6 +33,8 @@ def rod(tmp_path):
 @pytest.fixture
 def brief(monkeypatch):
     """Iterations of a moment."""
+    # What earlier tests of the process have traced in float64 may hold indices of 64 bits.
+    jax.clear_caches()
     monkeypatch.setattr(
         "dln_jax.control.optimal.own_plants.Iteration",
         lambda **numbers: Iteration(**{**numbers, "starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}),
