@@ -1,6 +1,5 @@
 """Writes a planned program as the body of a C function, region by region."""
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -48,20 +47,8 @@ def body_of(
                 _from_array(body, f"r{k}_", results[k].size, target)
             else:
                 copied(body, results[k], target)
-    body.lines = _without_unread(body.lines)
     body.stack += max((source.parts[key].stack for key in body.calls), default=0)
     return body
-
-
-def _without_unread(lines: list[str]) -> list[str]:
-    """Returns the lines without scalars that no later line reads, as where a zero has taken the place of a product."""
-    kept, read = [], set()
-    for line in reversed(lines):
-        scalar = re.match(r"\s*const \w+ (v\d+) = ", line)
-        if scalar is None or scalar[1] in read:
-            kept.append(line)
-            read |= set(re.findall(r"\bv\d+\b", line[scalar.end() if scalar else 0 :]))
-    return kept[::-1]
 
 
 def _is_moved(body: Body, node: Node) -> bool:

@@ -67,7 +67,8 @@ class Program:
     finite: bool = False
     """Whether arguments and intermediate results are finite, so that 0 x = 0."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)
-    _scalars: dict[Node, list[Node]] = field(default_factory=dict)
+    _scalars: dict[tuple[Node, Region], list[Node]] = field(default_factory=dict)
+    """By node and `floor`: scalars that a branch makes exist in that branch alone."""
 
     def make(
         self,
@@ -206,16 +207,17 @@ class Program:
 
     def scalars(self, node: Node) -> list[Node]:
         """Returns the elements of a node as scalars."""
-        if node not in self._scalars:
+        key = node, self.floor
+        if key not in self._scalars:
             if node.op == "gather":
                 owner, starts = owners(node.args, np.asarray(node.value).ravel())
                 places = np.asarray(node.value).ravel() - starts[owner]
-                self._scalars[node] = [
+                self._scalars[key] = [
                     self._element(node.args[k], place) for k, place in zip(owner, places, strict=True)
                 ]
             else:
-                self._scalars[node] = [self._element(node, np.int64(place)) for place in range(node.size)]
-        return self._scalars[node]
+                self._scalars[key] = [self._element(node, np.int64(place)) for place in range(node.size)]
+        return self._scalars[key]
 
     def _element(self, node: Node, place: np.int64) -> Node:
         if node.op == "const":

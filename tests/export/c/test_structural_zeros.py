@@ -151,3 +151,18 @@ def test_nan_reaches_every_result_unless_arguments_are_finite(tmp_path):
         export_c(functions, tmp_path / str(finite), finite=finite)
         result = load_c(tmp_path / str(finite), flags=("-O1",)).product(x)
         assert np.isnan(result).all(1).tolist() == [not finite, not finite, True, not finite]
+
+
+@needs_compiler
+def test_scalars_of_a_branch_are_not_read_behind_it(tmp_path):
+    """Both branches, and what follows them, need the elements of one array."""
+
+    def f(x):
+        inside = lax.cond(x[0] > 0, lambda x: jnp.sin(2 * x), lambda x: -jnp.sin(2 * x), x)
+        return inside + jnp.sin(2 * x), 2 * x
+
+    x = np.array([0.3, -0.7, 1.1])
+    functions, states = {"f": (f, (x,))}, {"f": [(x,), (-x,)]}
+    ours, theirs = in_c(functions, states, tmp_path), in_jax(functions, states)
+    for found, expected in zip(ours["f"], theirs["f"], strict=True):
+        np.testing.assert_allclose(found, expected, atol=BOUND)
