@@ -272,7 +272,7 @@ def described(numbers: OwnProblem) -> list[str]:
 
     def listed(values: Sequence[float], units: Mapping[str, str]) -> str:
         pairs = zip(numbers.names, numbers.joints, values, strict=True)
-        return ", ".join(f"{name} {value:.3g} {units[kind]}" for name, kind, value in pairs)
+        return ", ".join(f"{name} {value:.3g} {units[kind]}".rstrip() for name, kind, value in pairs)
 
     d = len(numbers.joints)
     motors = ", ".join(

@@ -157,7 +157,7 @@ def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
     )
 
 
-def _start(layout: Layout, number: float) -> Any:
+def _start(layout: Layout, number: float | int) -> Any:
     """Memory of `by_differences` before the first sample, for a controller whose memory is a number."""
     return by_differences(layout)(Controller(jnp.asarray(number), lambda memory, t, x: (memory, x))).start
 
