@@ -23,9 +23,9 @@ from dln_jax.control.optimal.residual import ResidualStage, discounts_down_to, f
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.optimal.worst_case import Bounds, Disturbance, worst_disturbance
 from dln_jax.control.state_space import Law
-from dln_jax.files import as_type, finite, is_file
-from dln_jax.learning.engine.checkpoint import stored_rows
+from dln_jax.files import as_type
 from dln_jax.nn.activations import activation
+from dln_jax.training.value_checkpoints import Kept
 from dln_jax.training.value_plants import OTHER_NAMES, Chosen, OwnModel, plant_named, rebuilt, with_factors
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
@@ -34,8 +34,6 @@ from dln_jax.zoo.run import read_description, save
 
 VALUE = "value"
 """Stem of the pair of files in a run folder that holds the value function."""
-CHECKPOINT = "checkpoint_seed_{}"
-"""Stem of the pair of files that holds the state of a seed's iterations."""
 METHODS = ("fitted", "residual")
 ROUNDS = 6
 """Number of resamplings at the problem's own discount."""
@@ -131,40 +129,6 @@ def worst_of(chosen: Chosen, share: float) -> Disturbance | None:
         return None
     ones = np.ones(len(chosen.uncertain))
     return worst_disturbance(lambda x, u, p: chosen.altered(p)(x, u), ones, Bounds(parameters=share))
-
-
-class Kept(NamedTuple):
-    """Where the states of a training are stored."""
-
-    folder: Path
-    settings: Any
-    """JSON values that decide the result; a run with others is not continued."""
-    resume: bool
-
-    def store(self, seed: int, state: IterationState) -> None:
-        """Writes the state of a seed, for `restore`."""
-        tree = {"parameters": state.parameters, "optimiser": state.optimiser, "best": state.best}
-        facts = {"settings": finite(self.settings), "history": finite([list(at) for at in state.history])}
-        save_tree(self.folder, CHECKPOINT.format(seed), tree, facts, number=len(state.history))
-
-    def restore(self, seed: int, state: IterationState) -> IterationState:
-        """The stored state of a seed, or the one that it would start with.
-
-        Raises:
-            InputError: the stored run had other settings, or its files are damaged.
-        """
-        name = CHECKPOINT.format(seed)
-        if not (self.resume and is_file(self.folder / f"{name}.json")):
-            return state
-        manifest = load_manifest(self.folder, name)
-        if manifest.get("settings") != finite(self.settings):
-            raise InputError(f"{self.folder}: the run had another plant or other settings; start a new one")
-        like = {"parameters": state.parameters, "optimiser": state.optimiser, "best": state.best}
-        kind = tuple[int, float | None, float | None, float]
-        rows = stored_rows(self.folder / f"{name}.json", manifest, "history", kind)
-        numbers = [[np.nan if number is None else number for number in row] for row in rows]
-        history = [ValueProgress(int(k), loss, score, seconds) for k, loss, score, seconds in numbers]
-        return IterationState(**load_tree(self.folder, name, like), history=history)
 
 
 def by_iteration(

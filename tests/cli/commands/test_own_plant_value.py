@@ -11,9 +11,10 @@ from calls import command, refused
 from dln_jax.cli.commands import train_value
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.problem import rates
+from dln_jax.training.value_checkpoints import Kept
 from dln_jax.training.value_plants import Wishes, of_file, of_run, with_factors
 from dln_jax.training.value_training import verdict_of
-from dln_jax.training.values import Kept, load_value
+from dln_jax.training.values import load_value
 from dln_jax.types import InputError
 from dln_jax.zoo.run import save
 
