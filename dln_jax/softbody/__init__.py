@@ -1,6 +1,6 @@
-"""Soft bodies: meshes, energy terms, and implicit time steps that minimise an incremental potential.
+"""Soft bodies: meshes, energy terms and implicit time steps that minimise an incremental potential.
 
-`mesh` builds bodies and `terms` their energies; a scene holds both, and `make_step` returns its time step.
+`mesh` builds bodies and `terms` their energies. A scene holds both, and `make_step` returns its time step.
 """
 
 from dln_jax.rollout import rollout

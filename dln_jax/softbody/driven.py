@@ -1,7 +1,7 @@
 """Driven motions: actuated muscles, and held vertices that follow a path.
 
-A path is followed exactly: in every step a held vertex has the velocity (p(t + dt) - p(t)) / dt. With the path's
-velocity at t, a rotation would spiral outwards.
+Paths are followed exactly: in every step a held vertex has the velocity (p(t + dt) - p(t)) / dt. With the path's
+velocity at t instead, a rotation would spiral outwards.
 """
 
 import functools
@@ -24,21 +24,21 @@ class Example(NamedTuple):
 
     scene: SoftScene
     dt: float
-    """Suitable time step, in s."""
+    """Suitable time step in s."""
     seconds: float
-    """Duration of an illustrative motion, in s."""
+    """Duration of an illustrative motion in s."""
     v: Any = 0.0
-    """Initial velocities in m/s, [n, dim] or one for all; initial positions are the rest shape's."""
+    """Initial velocities in m/s, [n, dim] or one for all; the body starts in its rest shape."""
     ground: float | None = None
-    """Slope of the ground, rise over run; it passes through the origin. `None` without ground."""
+    """Slope of the ground (rise over run), which passes through the origin; `None` without ground."""
     control: Callable[[np.ndarray], Any] | None = None
     """Times [T] in s -> actuation [T, k], or a dict of such arrays by actuator."""
     held_path: Callable[[np.ndarray], np.ndarray] | None = None
     """Times [T] in s -> positions of the held vertices [T, k, dim]; by default they stay."""
     muscles: np.ndarray | None = None
-    """Pairs of vertices [k, 2], for images."""
+    """Pairs of vertices [k, 2], for figures."""
     moments: tuple[float, ...] = (0.0,)
-    """Times in s for images."""
+    """Times in s that figures show."""
 
 
 class Drive(NamedTuple):
@@ -53,10 +53,9 @@ class Drive(NamedTuple):
 
 
 def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
-    """Returns the inputs of a number of steps of dt in s, from step number `first` on.
+    """Returns the inputs of `steps` steps of dt in s, starting at step number `first`.
 
-    Held vertices get the velocities that take them from one point of their path to the next, so that they stay on it
-    exactly.
+    Held vertices get the velocities that keep them exactly on their path.
     """
     t = dt * np.arange(first, first + steps + 1)
     dtype = example.scene.params.rest.dtype
@@ -68,7 +67,7 @@ def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
 
 
 def driven_step(example: Example, dt: float, integrator: Integrator = BACKWARD_EULER, *, halvings: int = 0) -> Stepper:
-    """(init, step) of an example: init() is its initial state, and step(params, state, Drive) -> (state, Info)."""
+    """Returns (init, step): init() is the example's initial state, and step(params, state, Drive) -> (state, Info)."""
     init, step = make_step(example.scene, dt, integrator, halvings=halvings)
 
     def advance(params: Params, state: State, driven: Drive) -> tuple[State, Info]:

@@ -1,4 +1,4 @@
-"""Static equilibria: minima of the potential alone."""
+"""Static equilibria: minima of the potential without inertia."""
 
 from functools import partial
 from typing import Any
@@ -38,12 +38,12 @@ def static_solve(
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
 ) -> tuple[Float[Array, "n dim"], Info]:
-    """Positions [n, dim] of an equilibrium: a minimum of the potential alone, near the start x (default: rest shape).
+    """Returns positions [n, dim] of an equilibrium, a minimum of the potential near x (default: rest shape), and Info.
 
     Args:
-        scene: the body; without held vertices or springs to the world there is no unique minimum.
-        params: of the scene.
-        control: actuation, for scenes that have one.
+        scene: the body; without held vertices or springs to the world the minimum is not unique.
+        params: parameters of the scene.
+        control: actuation, for scenes with actuators.
         x: initial positions; held vertices stay there.
         tolerance, iterations, linear_solver, definite: as for `make_step`.
     """

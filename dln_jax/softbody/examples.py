@@ -1,15 +1,15 @@
-"""Examples: bodies with their loads, ready to be stepped.
+"""Examples: bodies with loads, ready to be stepped.
 
 | scene | body | motion |
 |---|---|---|
 | beam | cantilever of 4 m, in the plane or in space | falls under its weight and swings |
-| twist | bar of 8 m in space | its ends are turned against each other, twice or more |
-| slope | block in the plane | slides down a plane of tan 0.5, or sticks, by Coulomb friction |
+| twist | bar of 8 m in space | its ends are twisted against each other, twice or more |
+| slope | block in the plane | slides down a plane of slope 0.5, or sticks, by Coulomb friction |
 | drop | disc, or box in space | falls on the ground and bounces |
-| creature | crawler with muscles | crawls, by a wave that runs from its head to its tail |
+| creature | crawler with muscles | crawls by a wave that runs from its head to its tail |
 
 The last axis points up. Materials are elastic (E in Pa, Poisson's ratio, a density of `strain_energies`); densities are
-1000 kg/m³. Elements are linear (`order` 1) or quadratic (2), and those are `mixed` on request, for nu near 1/2. The
+1000 kg/m³. Elements are linear (`order` 1) or quadratic (2); quadratic ones can be `mixed`, for nu near 1/2. The
 creature is the published preset of `terms.creature`.
 """
 
@@ -48,7 +48,7 @@ CONTACT_FRICTION = 0.3
 DROP_SPEED = 2.0
 """Initial velocity of the falling body to the right, in m/s."""
 TURNING = 4.0
-"""Time in s in which the bar's ends are turned."""
+"""Time in s over which the bar's ends turn."""
 WAVE_PERIOD = 0.33
 """Period of the creature's muscles, in s."""
 WAVE_LENGTH = 2.0
@@ -63,7 +63,7 @@ Loads = Callable[[Mesh], Sequence[Term]]
 
 
 def no_loads(_: Mesh) -> Sequence[Term]:
-    """No further terms."""
+    """Adds no terms."""
     return ()
 
 
@@ -112,9 +112,9 @@ def twist(
     mixed: bool = False,
     contact: bool = False,
 ) -> Example:
-    """A bar of 1 m x 8 m x 1 m whose ends are turned against each other about its axis, half of the turns each.
+    """A bar of 1 m x 8 m x 1 m whose ends are twisted about its axis, each by half of `turns`, in opposite directions.
 
-    The turns take 4 s, then the ends are held for 1 s. There is no gravity. Beyond two turns the bar buckles, and
+    Twisting takes 4 s; then the ends are held for 1 s. There is no gravity. Beyond two turns the bar buckles, and
     without `contact` it can pass through itself.
     """
     mesh = _of_order(box((1.0, 8.0, 1.0), (cells, 8 * cells, cells)), order)
@@ -141,7 +141,7 @@ def slope(
     order: int = 1,
     mixed: bool = False,
 ) -> Example:
-    """A block of 1 m x 0.5 m on a plane of tan 0.5 that rises to the right: it slides if friction < 0.5."""
+    """A block of 1 m x 0.5 m on a plane of slope 0.5 that rises to the right: it slides if friction < 0.5."""
     mesh = _of_order(beam_mesh(1.0, 0.5, 2 * cells, cells), order)
     along = np.array([1.0, SLOPE]) / math.hypot(1.0, SLOPE)
     normal = np.array([-along[1], along[0]])
@@ -166,10 +166,10 @@ def drop(
     contact: bool = False,
     seed: int = 0,
 ) -> Example:
-    """A body that falls from its own height with 2 m/s to the right and a random rate of rotation (±1 rad/s).
+    """A body that falls from its own height, at 2 m/s to the right and with a random rate of rotation (±1 rad/s).
 
-    The body is a disc of radius 0.5 m with `cells` rings, a box of 1 m in space with a random tilt, or a custom mesh,
-    lifted or lowered to that height. The seed decides rate and tilt. `loads` returns further terms for the mesh.
+    The body is a disc of radius 0.5 m with `cells` rings, in space a box of 1 m with a random tilt, or a custom mesh,
+    moved to that height. The seed sets rate and tilt. `loads` returns further terms for the mesh.
     """
     random = np.random.default_rng(seed)
     if mesh is None:
@@ -192,12 +192,12 @@ def drop(
 
 
 def creature_scene(creature: Creature, bumps: Bumps | None = None) -> SoftScene:
-    """Returns the scene of a creature of the preset above its ground, which is rough with `bumps`."""
+    """Returns the scene of a preset creature above its ground, which is rough with `bumps`."""
     return make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles, bumps=bumps), masses=MASS)
 
 
 def creature() -> Example:
-    """The crawler, whose muscles shorten in a wave from head to tail, which pushes it forwards."""
+    """The crawler, whose muscles shorten in a wave from head to tail that pushes it forwards."""
     body = crawler()
     scene = creature_scene(body)
     x, y = body.mesh.vertices[body.muscles].mean(axis=1).T
@@ -223,7 +223,7 @@ class _Law(NamedTuple):
     poisson_ratio: float
     mixed: bool
     contact: bool = False
-    """Between and within the bodies of the mesh."""
+    """Contact between and within the bodies of the mesh."""
 
 
 def _solid(mesh: Mesh, law: _Law, *others: Term, held: ArrayLike = ()) -> SoftScene:
@@ -242,7 +242,7 @@ def _contact(mesh: Mesh, youngs_modulus: float) -> Contact:
 
 
 def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:
-    """A plane so stiff that a single vertex with the whole body's weight sinks by a thousandth of the body's height."""
+    """A plane so stiff that one vertex carrying the whole weight sinks by a thousandth of the body's height."""
     stiffness = 1e3 * (GRAVITY * float(lumped_masses(mesh, DENSITY).sum())) / height
     every = np.arange(len(mesh.vertices))
     return plane_contact(every, normal=normal, stiffness=stiffness, width=1e-3 * height, friction=friction)

@@ -1,14 +1,14 @@
-"""Repeated solution of a time step, so that friction takes its normal forces from the end of the step.
+"""Repeated solution of a time step, so that friction uses the normal forces at the end of the step.
 
     x^(j+1) = argmin E(x; normal forces and directions of friction at x^(j)),    x^(0) = x_n
 
-are the friction iterations of Li et al. 2020 (Incremental Potential Contact). A fixed point obeys Coulomb's law with
-the normal forces at the end of the step. There is no guarantee of convergence, but the error usually falls by a
-constant factor in every iteration. Every solution starts the next search, which takes no Newton step once the forces
-have stopped changing.
+These are the friction iterations of Li et al. 2020 (Incremental Potential Contact). A fixed point obeys Coulomb's law
+with the normal forces at the end of the step. Convergence is not guaranteed, but the error usually falls by a constant
+factor per iteration. Every solution warm-starts the next search, which takes no Newton step once the forces have
+stopped changing.
 
-The iterations are one loop of fixed length. Its derivative is that of the iterations that were taken, through the
-minimum of each, and exact whether or not the forces have stopped changing.
+The iterations are one loop of fixed length. Its derivative goes through the minimum of every iteration taken and is
+exact whether or not the forces have stopped changing.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,13 +41,13 @@ def iterated(
     Args:
         solve: (start of the search, data) -> solution and its outcome.
         prepared: solution -> data with the normal forces there.
-        start: of the first search.
+        start: start of the first search.
         first: data with the normal forces at the start of the step.
         count: at least 1.
 
     Returns:
-        The last solution, the outcome of all (the sum of their iterations; converged if all are), the data of the last
-        solution, and the data with the normal forces there.
+        The last solution, the combined outcome (iterations are summed; converged if all solutions are), the data of
+        the last solution, and the data with the normal forces there.
     """
 
     def again(carry: tuple[Array, Any, Any], _: None) -> tuple[tuple[Array, Any, Any], SolverInfo]:
@@ -70,11 +70,11 @@ def friction_change(
     before: tuple[Sequence[Any], Sequence[Any]],
     after: tuple[Sequence[Any], Sequence[Any]],
 ) -> Float[Array, ""]:
-    """Largest change of the friction at x, as force per mass in m/s², between two sets of normal forces.
+    """Returns the largest change of friction at x between two sets of normal forces, as force per mass in m/s².
 
     Args:
         scene: its terms and contacts.
-        energies: of the terms.
+        energies: energies of the terms.
         touching: energies of the contacts.
         x: positions in m.
         before, after: data of the terms, and of the contacts' energies.

@@ -6,20 +6,20 @@
 |---|---|---|---|
 | backward-euler | dt | x_n + dt v_n | v_{n+1} = (x - x_n) / dt |
 | bdf2 | 2/3 dt | (4 x_n - x_{n-1} + h (4 v_n - v_{n-1})) / 3 | v_{n+1} = (3 x - 4 x_n + x_{n-1}) / (2 dt) |
-| midpoint | dt/2 | x_n + h v_n | x is half way: x_{n+1} = 2 x - x_n, v_{n+1} = 2 (x - x_n) / h - v_n |
+| midpoint | dt/2 | x_n + h v_n | x is at mid-step: x_{n+1} = 2 x - x_n, v_{n+1} = 2 (x - x_n) / h - v_n |
 | average-vector-field | dt/sqrt(2) | x_n + dt v_n | v_{n+1} = 2 (x - x_n) / dt - v_n |
 
 Backward Euler is of first order and damps; bdf2 is of second order and damps little. The midpoint rule is of second
-order and keeps momentum and angular momentum, but not energy: use it for smooth motions. The average-vector-field
-method (Quispel and McLaren 2008) is of second order and keeps momentum and energy, but not angular momentum. Its
+order and conserves momentum and angular momentum, but not energy: use it for smooth motions. The average-vector-field
+method (Quispel and McLaren 2008) is of second order and conserves momentum and energy, but not angular momentum. Its
 force is the average along the step,
 
     F = -∫ grad V(x_n + s (x - x_n)) ds over 0 <= s <= 1,    so that    F·(x - x_n) = V(x_n) - V(x),
 
 and V is replaced by W(x) = ∫ V(x_n + s (x - x_n)) / s ds, whose gradient is -F. Gauss-Legendre quadrature with 2
 points in the plane and 3 in space is exact for the polynomials `stable_neo_hookean` and `st_venant_kirchhoff`; with
-`CONTACT_POINTS` it is nearly so for contact, friction and springs. Barriers of bodies need the pairs that are near
-anywhere between x_n and x, and are not averaged; those of obstacles are.
+`CONTACT_POINTS` it is nearly exact for contact, friction and springs. Barriers of obstacles are averaged; those of
+bodies are not, because they would need the pairs that are near anywhere between x_n and x.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ from dln_jax.types import InputError
 
 
 class Integrator(NamedTuple):
-    """An integrator: one line of the table."""
+    """An integrator: one row of the table."""
 
     span: float
     """Time from the state to the minimum, in units of dt."""
@@ -52,8 +52,8 @@ class Integrator(NamedTuple):
 
 
 CONTACT_POINTS = 8
-"""Quadrature points of elements with fewer vertices than a simplex (contact, springs), which are cheap and have kinks:
-in the example scenes a step creates up to 2 % of the energy at hand with 4 points, 0.2 % with 8 and 0.01 % with 16."""
+"""Quadrature points of elements with fewer vertices than a simplex (contact, springs), which are cheap and have kinks.
+In the example scenes a step creates up to 2 % of the current energy with 4 points, 0.2 % with 8 and 0.01 % with 16."""
 
 
 def _previous(state: State) -> Previous:
@@ -98,7 +98,7 @@ INTEGRATORS = {
     "midpoint": MIDPOINT,
     "average-vector-field": AVERAGE_VECTOR_FIELD,
 }
-"""Integrators by the names in command lines and tables."""
+"""Integrators by their names in command lines and tables."""
 
 
 def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
@@ -117,7 +117,7 @@ def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
             return of_one(between, data)
 
         if solid:
-            # Written out: the few points fuse with the arithmetic of the element.
+            # Written out, so that the few points fuse with the arithmetic of the element.
             return jnp.asarray(sum(w / s * at(s) for s, w in zip(nodes.tolist(), weights.tolist(), strict=True)))
         return jnp.sum(weights / nodes * jax.vmap(at)(jnp.asarray(nodes, x[0][0].dtype)))
 
@@ -130,7 +130,7 @@ def averaged_data(element: ElementEnergy, start: Float[Array, "n dim"], data: An
 
 
 def averaged_moving(energy: MovingEnergy) -> MovingEnergy:
-    """Returns the energy W of elements that are always the same; its data are (start of the step, its own data)."""
+    """Returns the energy W of a fixed set of elements; its data are (start of the step, the energy's own data)."""
     nodes, weights = np.polynomial.legendre.leggauss(CONTACT_POINTS)
     nodes, weights = (1 + nodes) / 2, weights / 2
 

@@ -1,6 +1,6 @@
-"""Scene of a soft body: a mesh, its energy terms, the held vertices, and all parameters.
+"""Scene of a soft body: a mesh, its energy terms, the held vertices and all parameters.
 
-Terms that a scene does not list are never traced. Everything in `Params` is differentiable and can be mapped over.
+Terms that a scene does not list are never traced. Everything in `Params` is differentiable and can be vmapped.
 """
 
 import reprlib
@@ -27,7 +27,7 @@ class Params(NamedTuple):
     rest: Float[Array, "n dim"]
     """Rest shape in m."""
     masses: Float[Array, " n"]
-    """In kg."""
+    """Masses of the vertices in kg."""
     terms: dict[str, Any]
     """Parameters of the terms, by name."""
 
@@ -38,11 +38,11 @@ class SoftScene(NamedTuple):
     mesh: Mesh
     terms: tuple[Term, ...]
     held: Int[np.ndarray, " k"]
-    """Vertices that are not solved for: they move with their own velocity in `State.v`."""
+    """Vertices that are not solved for: they move with their prescribed velocity in `State.v`."""
     params: Params
     """Default parameters."""
     contacts: tuple[Contact, ...] = ()
-    """Contacts by barriers, between bodies or with obstacles, if any."""
+    """Barrier contacts, between bodies or with obstacles."""
 
     @property
     def free(self) -> Bool[np.ndarray, "n dim"]:
@@ -53,7 +53,7 @@ class SoftScene(NamedTuple):
 
 
 class Previous(NamedTuple):
-    """The previous state, for methods of two steps."""
+    """The previous state, for two-step methods."""
 
     x: Float[Array, "n dim"]
     v: Float[Array, "n dim"]
@@ -65,22 +65,22 @@ class Growth(NamedTuple):
     """Energy that the steps of a motion have created, in J."""
 
     created: Float[Array, ""]
-    """Since the energy was lowest: max(created + energy_growth, 0), step by step."""
+    """Energy created since its minimum: max(created + energy_growth, 0), step by step."""
     at_hand: Float[Array, ""]
-    """Largest energy at hand in a step so far, without that."""
+    """Largest energy available to a step so far, without the created energy."""
 
 
 class State(NamedTuple):
-    """Positions and velocities."""
+    """Positions and velocities of the vertices."""
 
     x: Float[Array, "n dim"]
     """In m."""
     v: Float[Array, "n dim"]
     """In m/s; for held vertices the prescribed velocity."""
     previous: Previous | None = None
-    """Previous state, for methods of two steps."""
+    """Previous state, for two-step methods."""
     growth: Growth | None = None
-    """Energy created so far, by which `Info.converged` judges slow divergence; `None` judges single steps only."""
+    """Energy created so far, from which `Info.converged` detects slow divergence; `None` judges single steps only."""
 
 
 def make_scene(
@@ -98,13 +98,13 @@ def make_scene(
         mesh: its vertices are the rest shape.
         terms: energy terms of the body.
         density: in kg/m³ (kg/m² in the plane), for the masses of the vertices.
-        masses: of the vertices in kg, one for all or [n], instead of a density.
+        masses: masses of the vertices in kg, one for all or [n], instead of a density.
         held: indices of vertices that are not solved for.
-        contacts: contacts by barriers, of bodies (without which they pass through each other) and with obstacles.
+        contacts: barrier contacts with obstacles and between bodies, which otherwise pass through each other.
 
     Raises:
-        InputError: two terms of one name, an index or a mass out of range, no free vertex, or surfaces in contact that
-            cross in the rest shape.
+        InputError: two terms have the same name, an index or a mass is out of range, no vertex is free, or surfaces in
+            contact cross in the rest shape.
     """
     n = len(mesh.vertices)
     terms = tuple(terms)
@@ -141,14 +141,14 @@ def require_apart(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> None:
 
 
 def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
-    """Returns the parameters with some replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
+    """Returns the parameters with some values replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
 
     Args:
-        params: of a scene.
-        terms: new values by the name of the term and of its parameter; numbers or arrays, traced or not.
+        params: parameters of a scene.
+        terms: new values by term and parameter name; numbers or arrays, traced or not.
 
     Raises:
-        InputError: a term or a parameter that the scene does not have.
+        InputError: the scene does not have such a term or parameter.
     """
     replaced = dict(params.terms)
     for name, values in terms.items():
@@ -167,7 +167,7 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
 
 
 def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any:
-    """Converts new values of a parameter to the precision of the scene."""
+    """Converts a new parameter value to the precision of the scene; refuses a shape that does not fit."""
     if not isinstance(before, Array | np.ndarray | float | int):
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, params.rest.dtype), value)
     what = f"term '{name}': {field}"
@@ -176,14 +176,14 @@ def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any
     except (TypeError, ValueError):
         raise InputError(f"{what} is {reprlib.repr(value)}; expected numbers") from None
     shape, elements = np.shape(before), np.shape(array)
-    # A number may become one per element, and the reverse; vectors keep their length.
+    # A number may replace one value per element, and vice versa; vectors keep their length.
     if elements != shape and not (() in (shape, elements) and len(shape) + len(elements) == 1):
         raise InputError(f"{what} has shape {elements}; expected {shape}")
     return array
 
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
-    """Returns the terms in the form of the solver."""
+    """Returns the terms in the form that the solver takes."""
     return tuple(ElementEnergy(term.energy, term.indices, term.unrolled, term.weights) for term in scene.terms)
 
 
@@ -196,7 +196,7 @@ def prepare(
     control: Any = None,
     lag: Float[Array, "n dim"] | None = None,
 ) -> tuple[Any, ...]:
-    """Returns the data of all terms' elements for a step of dt in s that starts at x; by default for bodies at rest.
+    """Returns the data of all terms' elements for a step of dt in s that starts at x; dt = inf is a static solve.
 
     Friction takes its normal forces at `lag`, by default at x.
     """
@@ -208,7 +208,7 @@ def prepare(
 
 
 def _by_term(scene: SoftScene, control: Any) -> Callable[[str], Any]:
-    """Returns the function from a term's name to its control: one array for the only actuator, or a dict by names."""
+    """Returns a function from a term's name to its control: the array of the only actuator, or an entry of a dict."""
     driven = [term.name for term in scene.terms if term.control is not None]
     if not isinstance(control, Mapping):
         if control is not None and len(driven) > 1:
@@ -231,20 +231,20 @@ def prepare_contacts(
     dt: Any = jnp.inf,
     lag: Float[Array, "n dim"] | None = None,
 ) -> tuple[Any, ...]:
-    """Returns the data of the contacts' energies for a step of dt in s that starts at x, as `prepare`."""
+    """Returns the data of the contacts' energies for a step of dt in s that starts at x, like `prepare`."""
     context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), lag=lag)
     return tuple(data for contact in scene.contacts for data in contact.prepare(params.terms[contact.name], context))
 
 
 def contact_energies(scene: SoftScene) -> tuple[MovingEnergy, ...]:
-    """Returns the contacts in the form of the solver."""
+    """Returns the contacts in the form that the solver takes."""
     return tuple(energy for contact in scene.contacts for energy in contact.energies)
 
 
 def least_distance(
     scene: SoftScene, x: Float[Array, "n dim"], lists: Lists, data: Sequence[Any]
 ) -> Float[Array, ""] | None:
-    """Smallest distance in m in a contact; `None` for a scene without."""
+    """Returns the smallest distance in m over all contacts; `None` for a scene without contacts."""
     if not scene.contacts:
         return None
     starts = np.cumsum([0, *(len(contact.energies) for contact in scene.contacts)]).tolist()
@@ -256,7 +256,7 @@ def least_distance(
 
 
 def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Any = None) -> Array:
-    """V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as from rest at x."""
+    """Returns V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as if at rest at x."""
     stored = value(element_energies(scene), x, prepare(scene, params, x, control=control))
     energies, data = contact_energies(scene), prepare_contacts(scene, params, x)
     return stored + moving_gradient(energies, x, lists_between(energies, x, jnp.zeros_like(x), data), data)[0]

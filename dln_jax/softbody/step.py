@@ -1,6 +1,6 @@
-"""Implicit time steps as minimisations of an incremental potential (Rojas, Sifakis, Kavan 2021; Martin et al. 2011).
+"""Implicit time steps that minimise an incremental potential (Rojas, Sifakis, Kavan 2021; Martin et al. 2011).
 
-The potential is that of `integrators`.
+`integrators` states the potential.
 """
 
 from collections.abc import Callable
@@ -24,11 +24,11 @@ Step = Callable[[Params, State, Any], tuple[State, Info]]
 
 
 class Stepper(NamedTuple):
-    """A time step, and its initial state."""
+    """A time step and its initial state."""
 
     init: Callable[..., State]
-    """init(x=None, v=None): the rest shape at rest, or positions in m and velocities in m/s, [n, dim] or one [dim]
-    for all vertices. `InputError` for a known value that is not finite."""
+    """init(x=None, v=None): by default the rest shape at rest; positions in m and velocities in m/s are [n, dim] or one
+    [dim] for all vertices. Raises `InputError` for a known value that is not finite."""
     step: Step
     """step(params, state, control=None) -> (state after dt, Info): differentiable in all of its arguments. The control
     is an array for the scene's only actuator, or a dict of arrays by the names of the actuated terms."""
@@ -50,23 +50,22 @@ def make_step(
 
     Args:
         scene: the body; only its own terms are compiled.
-        dt: in s; a traced value, whose sign is not checked, serves several steps with one program.
-        integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, or a custom one.
-        tolerance: largest residual force per mass, in m/s², of a converged step; rounding errors always count as
-            converged.
+        dt: in s; a traced value, whose sign is not checked, lets one program serve several step lengths.
+        integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, `AVERAGE_VECTOR_FIELD` or a custom one.
+        tolerance: largest residual force per mass, in m/s², of a converged step; residuals at the level of rounding
+            always count as converged.
         iterations: largest number of Newton steps per time step; `Info.converged` reports whether they sufficed.
-        linear_solver: solver of the linear systems; by default the one with the least work for the stiffness in
-            `scene.params` and this time step (`by_size` if either is traced, or the preparation of a term needs a
-            control). Other parameters passed to the step later do not change the choice.
+        linear_solver: solver of the linear systems; by default the cheapest for the stiffness in `scene.params` and
+            this time step (`by_size` if either is traced, or if a term's preparation needs a control). Parameters
+            passed to the step later do not change the choice.
         definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
-        halvings: take a step that does not converge again in parts, of dt/2^halvings at the shortest; `Info.substeps`
-            reports their number. The step is compiled a second time for them.
-        friction_iterations: solve the step again this many times, with the normal forces and directions of friction of
-            the previous solution instead of those at the start of the step (`friction_iterations`).
-            `Info.friction_change` says how much another one would change.
-
+        halvings: repeat a step that does not converge in parts, the shortest of dt/2^halvings; `Info.substeps` reports
+            their number. This compiles the step a second time.
+        friction_iterations: number of times to solve the step again with the normal forces and directions of friction
+            at the previous solution instead of those at the start (`friction_iterations`). `Info.friction_change`
+            reports how much one more would change.
     Raises:
-        InputError: a number that is not positive, or halvings of a method of two steps.
+        InputError: a number is not positive, or halvings are used with a two-step method.
     """
     if halvings:
         require_positive(halvings=halvings)

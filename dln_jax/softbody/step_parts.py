@@ -1,4 +1,4 @@
-"""The parts of an implicit time step: where forces balance, the forces there, and the verdict."""
+"""The parts of an implicit time step: the minimum, the forces there, and the verdict."""
 
 from collections.abc import Callable
 from functools import partial
@@ -52,7 +52,7 @@ class Balanced(NamedTuple):
     at_start: tuple[Any, ...]
     """Data of the scene's terms."""
     data: tuple[Any, ...]
-    """Data of the step's energies: inertia, and the terms, averaged if the integrator is."""
+    """Data of the step's energies: of inertia, then of the terms, averaged if the integrator averages."""
     contact: tuple[Any, ...]
     """Data of the contacts."""
     friction_change: Float[Array, ""] | None = None
@@ -60,7 +60,7 @@ class Balanced(NamedTuple):
 
 
 class StepParts(NamedTuple):
-    """A time step in two parts, for steps around it that also decide where held vertices go."""
+    """A time step in two parts, for callers that also solve for the motion of held vertices."""
 
     init: Callable[..., State]
     balance: Callable[..., Balanced]
@@ -82,7 +82,7 @@ def step_parts(
     definite: bool = False,
     friction_iterations: int = 0,
 ) -> StepParts:
-    """Returns the parts of the step that `make_step` returns, which explains the arguments."""
+    """Returns the parts of the step that `make_step` returns; arguments are explained there."""
     if friction_iterations:
         require_positive(friction_iterations=friction_iterations)
     if not isinstance(dt, Tracer):
@@ -110,7 +110,7 @@ def step_parts(
     rest, masses = scene.params.rest, scene.params.masses
 
     def along(start: Array, data: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Data of the terms for forces that are averages along the step."""
+        """Returns the data of the terms, averaged along the step if the integrator averages."""
         if not integrator.averaged:
             return data
         return tuple(averaged_data(element, start, of) for element, of in zip(stored, data, strict=True))
@@ -144,7 +144,7 @@ def step_parts(
         h, target = integrator.target(state, dt)
         span = jnp.asarray(integrator.span * dt, state.x.dtype)
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
-        # Averaged along the step, a linear force of half of its time is that of the mean velocity.
+        # Averaging along the step halves a linear damping force; half the time makes it that of the mean velocity.
         elapsed = span / 2 if integrator.averaged else span
 
         def prepared(lag: Array | None) -> tuple[Any, Any, Any]:
@@ -159,7 +159,7 @@ def step_parts(
         if moving:
             start = state.x if x_after is None else x_after
         elif x_after is None:
-            # The better of two starts: the present positions, or those of motion without forces.
+            # The better of two starts: the current positions, or those of a motion without forces.
             stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
             of_coast, of_stay = jax.vmap(lambda x: value(energies, x, data))(jnp.stack([coast, stay]))
             start = jnp.where(of_coast < of_stay, coast, stay)
@@ -167,20 +167,20 @@ def step_parts(
             start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
 
         def from_start(outcome: SolverInfo, contact: Any) -> SolverInfo:
-            """With the lists at the start of the step, if the search began elsewhere."""
+            """Returns the outcome with the lists at the start of the step, if the search began elsewhere."""
             there = lists_between(moving, state.x, jnp.zeros_like(state.x), contact)
             return outcome._replace(lists=(there, outcome.lists[1]))
 
         def solved(x: Array, parts: tuple[Any, Any, Any]) -> tuple[Array, SolverInfo]:
             _, data, contact = parts
-            # Only known positions are known to be apart; held vertices approach their goals from there.
+            # Only known positions are known to be apart; held vertices approach their targets from there.
             start, feasible = jnp.where(free, x, carried), x if moving else None
             return solve(energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible)
 
         if not iterating:
             x, outcome = solved(start, first)
             return Balanced(x, outcome if x_after is None else from_start(outcome, first[2]), *first)
-        # Forces that are averages along the step take the normal forces of its middle.
+        # Forces averaged along the step take the normal forces at its middle.
         middle = 0.5 if integrator.averaged else 1.0
         x, outcome, (at_start, data, contact), (_, at_end, contact_at_end) = iterated(
             solved, lambda x: prepared(state.x + middle * (x - state.x)), start, first, friction_iterations
@@ -195,7 +195,7 @@ def step_parts(
 
     def conclude(params: Params, state: State, balanced: Balanced, dt: Any) -> tuple[State, Info]:
         x, v = integrator.finish(state, balanced.x, dt)
-        # Where a contact holds vertices back from their goals, going there would push them through it.
+        # If a contact keeps held vertices from their targets, moving them there would push them through it.
         x = jnp.where(free, x, balanced.x if moving else state.x + dt * state.v)
         v = jnp.where(free, v, state.v)
         info, growth = judged(params, state, x, v, balanced)

@@ -1,11 +1,11 @@
-"""Time steps that shorten themselves where they do not converge.
+"""Time steps that are divided where they do not converge.
 
-A step of dt that does not converge is taken again from its start in parts of dt/2, dt/4, ..., dt/2^halvings: a part
-that does not converge is halved, and those after it have the same length. The parts are a loop, which runs zero times
-for a step that converges.
+A step of dt that does not converge is repeated from its start in parts of dt/2, dt/4, ..., dt/2^halvings: a part that
+does not converge is halved, and later parts keep the shorter length. The parts are a loop, which runs zero times for a
+step that converges.
 
-The derivative of the step is the product of the derivatives of its parts: loops over the parts that were taken,
-forwards for tangents and backwards for cotangents, which evaluate every part again from its known solution.
+The derivative of the step is the product of the derivatives of its parts: loops over the parts taken, forwards for
+tangents and backwards for cotangents, which evaluate every part again from its known solution.
 """
 
 from collections.abc import Callable
@@ -25,17 +25,17 @@ Advance = Callable[..., tuple[State, Info]]
 
 
 class Parts(NamedTuple):
-    """Parts of a step that converged; those from `taken` on are empty."""
+    """The parts of a step that converged; entries from `taken` on are empty."""
 
     x: Float[Array, "parts n dim"]
-    """Positions at their starts, in m."""
+    """Positions at the starts of the parts, in m."""
     v: Float[Array, "parts n dim"]
     x_after: Float[Array, "parts n dim"]
-    """Positions at their ends, in m."""
+    """Positions at the ends of the parts, in m."""
     length: Int[Array, " parts"]
-    """In units of dt/2^halvings."""
+    """Lengths in units of dt/2^halvings."""
     taken: Int[Array, ""]
-    """Their number."""
+    """Number of parts."""
 
 
 class _Progress(NamedTuple):
@@ -47,12 +47,12 @@ class _Progress(NamedTuple):
 
 
 def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[..., tuple[State, Info]]:
-    """Returns the step (params, state, control=None) -> (state, Info) that shortens itself.
+    """Returns the step (params, state, control=None) -> (state, Info) that divides itself.
 
-    Where the shortest parts do not converge either, the result is that of the whole step, which did not converge.
+    If the shortest parts do not converge either, the result is that of the whole step, which did not converge.
 
     Args:
-        advance: a step of one-step integrators, of any length.
+        advance: step of a one-step integrator, of any length.
         dt: length of the whole step, in s.
         halvings: the shortest part is dt/2^halvings.
     """
@@ -135,10 +135,10 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
 
 
 def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inputs: Any) -> tuple[Array, Array]:
-    """Returns G (dots, start): the tangent after all parts, from those of their inputs and of the start.
+    """Returns G (dots, start): the tangent after all parts, from the tangents of their inputs and of the start.
 
-    It is the second half of the solution of [[1, 0], [-G, 1]] (inputs, out) = (inputs, 0), because JAX lets callers
-    define the transpose of a linear solve, and a loop of unknown length has no other.
+    Written as the second half of the solution of [[1, 0], [-G, 1]] (inputs, out) = (inputs, 0), because JAX lets
+    callers define the transpose of a linear solve, and a loop of unknown length has no other.
     """
 
     def forwards(inputs: Any) -> tuple[Array, Array]:
@@ -157,11 +157,11 @@ def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inpu
     right, parts = ravel_pytree((inputs, jax.tree.map(jnp.zeros_like, inputs[1])))
 
     def product(both: Array) -> Array:
-        # A loop of fixed length, which can be transposed and is evaluated for second derivatives only.
+        # A loop of fixed length, which can be transposed; it is evaluated for second derivatives only.
         inputs, out = parts(both)
 
         def one(moved: Any, number: Array) -> tuple[Any, None]:
-            # Empty parts would divide by their length.
+            # Empty parts would divide by their length, which is zero.
             return _where(number < count, tangent(jnp.minimum(number, count - 1), inputs[0], moved), moved), None
 
         moved, _ = jax.lax.scan(one, inputs[1], jnp.arange(most))
@@ -179,7 +179,7 @@ def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inpu
 
 
 def _with_part(parts: Parts, state: State, x_after: Array, length: Array, accepted: Array) -> Parts:
-    """Appends a part, if it is accepted."""
+    """Appends a part if it is accepted."""
     place = jnp.where(accepted, parts.taken, len(parts.length))
 
     def appended(column: Array, value: Array) -> Array:
@@ -195,7 +195,7 @@ def _with_part(parts: Parts, state: State, x_after: Array, length: Array, accept
 
 
 def _together(first: Info, second: Info) -> Info:
-    """Outcome of two parts, in order, the iterations apart."""
+    """Combines the outcomes of two successive parts, except their iterations."""
 
     def merged(combine: Callable[[Any, Any], Array], name: str) -> Any:
         values = getattr(first, name), getattr(second, name)

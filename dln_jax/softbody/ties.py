@@ -1,12 +1,12 @@
-"""Soft bodies carried by a robot: vertices tied to frames that move with the joints, and forces back to the joints.
+"""Soft bodies carried by a robot: vertices are tied to frames that move with the joints, which feel the forces.
 
     tau + sum over ties Jᵀ f = M(q) qdd + c(q, qd) + g(q),    x_tied = R(q) X + p(q),    f = -dE/dx_tied
 
 E is the incremental potential of the soft body's step (its energies and inertia), minimised over the free vertices, so
-that f includes the weight and the inertia of the tied vertices. Both equations hold at the end of the step: the
-joints' positions are the root of the first one, found by Newton's method around the minimisation. Its Jacobian, the
-added stiffness and mass of the soft body, comes from the implicit function theorem. Joints and body are therefore
-stable together, whichever is heavier or stiffer.
+f includes the weight and the inertia of the tied vertices. Both equations hold at the end of the step: the joint
+positions are the root of the first one, found by Newton's method around the minimisation. Its Jacobian, the added
+stiffness and mass of the soft body, comes from the implicit function theorem. The coupled step is therefore stable
+whichever is heavier or stiffer.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,12 +29,12 @@ from dln_jax.types import InputError, Vector, require_positive
 Pose = Callable[[Vector], tuple[Float[Array, "dim dim"], Float[Array, " dim"]]]
 """q [d] -> rotation R and origin p in m of a frame in the world."""
 REACHED = 1e-9
-"""Largest distance of a tied vertex from its place in the frame, relative to the extent of the body; one that contact
-holds back is farther away."""
+"""Largest distance of a tied vertex from its place in the frame, relative to the extent of the body. A vertex that
+contact holds back is farther away."""
 
 
 class Tie(NamedTuple):
-    """Vertices fixed in a frame; the rest shape states their coordinates in it."""
+    """Vertices fixed in a frame; the rest shape gives their coordinates in it."""
 
     pose: Pose
     vertices: Int[np.ndarray, " k"]
@@ -49,7 +49,7 @@ class TiedState(NamedTuple):
 
 
 class TiedStepper(NamedTuple):
-    """A time step of both, and their initial state."""
+    """A coupled time step and its initial state."""
 
     init: Callable[..., TiedState]
     step: Callable[[Params, TiedState, tuple[Any, Any]], tuple[TiedState, Info]]
@@ -69,24 +69,24 @@ def make_tied_step(
     """Returns (init, step) of a robot that carries the soft bodies of a scene.
 
     init(q, qd=0, x=None, v=None) -> TiedState. By default every component of the mesh with a tie is moved rigidly from
-    its rest shape into the frame of its first tie, and the others stay where the rest shape has them.
-    step(params, state, (tau, control)) -> (TiedState, Info of the soft bodies): differentiable in all of its arguments.
+    its rest shape into the frame of its first tie; the others stay in their rest shape.
+    step(params, state, (tau, control)) -> (TiedState, Info of the soft bodies) is differentiable in all its arguments.
     tau [d] are the generalised forces of the joints at the end of the step, and control is the scene's (or `None`).
     `Info.converged` also requires that the joints' equations hold and that no contact keeps a tied vertex from its
-    frame. Each step takes one minimisation for each iteration on q (2 or 3), and another one.
+    frame. Each step takes one minimisation per iteration on q (2 or 3) and a final one.
 
     Args:
         scene: its `held` must contain the tied vertices; other held vertices keep their velocity, as in `make_step`.
         dt: in s.
         ties: frames and their vertices.
-        inverse_dynamics: (q, qd, qdd) -> tau of the robot alone: of a known tree, or of a learned model.
-        integrator: `BACKWARD_EULER` or `BDF2`, for both.
+        inverse_dynamics: (q, qd, qdd) -> tau of the robot alone, from a known tree or a learned model.
+        integrator: `BACKWARD_EULER` or `BDF2`, for robot and bodies.
         torque_tolerance: largest residual of the joints' equations, in N m (or N).
         joint_iterations: largest number of Newton iterations on q.
         settings: tolerance, iterations, linear_solver and definite of `make_step`.
 
     Raises:
-        InputError: an integrator that does not end where forces balance, no tie, or vertices that are not held or are
+        InputError: the integrator does not end where forces balance, there is no tie, or a vertex is not held or is
             tied twice.
     """
     require_positive(dt=dt, torque_tolerance=torque_tolerance, joint_iterations=joint_iterations)
@@ -98,7 +98,7 @@ def make_tied_step(
     reached = REACHED * float(np.ptp(scene.mesh.vertices, axis=0).max())
 
     def positions(rest: Array, q: Vector) -> Float[Array, "k dim"]:
-        """Of the tied vertices."""
+        """Positions of the tied vertices."""
         return jnp.concatenate([_moved(tie.pose(q), rest[tie.vertices]) for tie in ties])
 
     def init(q: Any, qd: Any = 0.0, x: Any = None, v: Any = None) -> TiedState:
@@ -146,7 +146,7 @@ def make_tied_step(
         )
         body, info = conclude(params, *soft(params, state.body, q, control), dt)
         missed = jnp.max(jnp.abs(body.x[tied] - positions(params.rest, q)))
-        # Tied vertices move with the body: their velocity is the integrator's, not that of the straight way.
+        # Tied vertices move with the body: their velocity is the integrator's, not that of a straight line.
         v = integrator.finish(state.body, body.x, dt)[1][tied]
         body = body._replace(v=body.v.at[tied].set(v))
         if integrator.two_steps:
@@ -160,7 +160,7 @@ def make_tied_step(
 
 
 def _first_state(integrator: Integrator, x: Array, v: Array) -> State:
-    """Returns a first state with room for the state before, for methods of two steps."""
+    """Returns an initial state, with room for the previous one in two-step methods."""
     return State(x, v, Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None)
 
 

@@ -1,15 +1,15 @@
-"""Reliability of a time step: balanced forces are not sufficient.
+"""Reliability of a time step: balanced forces are not enough.
 
-A long step of a rule that does not damp can create energy without bound, and an impact can invert elements, while the
+A long step of an undamped method can create energy without bound, and an impact can invert elements, although the
 forces of every step are balanced. Over one step,
 
     growth = (T + V)' - (T + V) - W,    at hand = T + max(V - V', 0) + |W|
 
 with the kinetic energy T of the free vertices, the potential V (both values with the actuation and the lagged contact
 of this step) and the work W done by held vertices. The exact motion has growth <= 0. A step that creates more than
-`LARGEST_GROWTH` of the energy at hand has diverged. Slow growth, of a percent in every step, has no such step.
-Therefore the state carries the energy created since the energy was lowest, max(created + growth, 0), which may not
-exceed the same share of the largest energy at hand so far.
+`LARGEST_GROWTH` of the energy at hand has diverged. Slow growth, of a percent per step, contains no such step.
+Therefore the state also carries the energy created since its minimum, max(created + growth, 0), which may not exceed
+the same share of the largest energy at hand so far.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,11 +26,11 @@ from dln_jax.solvers.elements.energies import ElementEnergy, value
 from dln_jax.solvers.newton import SolverInfo
 
 TOLERANCE = 1e-6
-"""Default largest residual force per mass, in m/s²; Newton's last step usually reduces it far below."""
+"""Default largest residual force per mass, in m/s²; Newton's last step usually gets far below it."""
 LARGEST_GROWTH = 0.1
-"""Share of the energy at hand. In the example scenes, steps of backward Euler, BDF2 and the average-vector-field method
-stay below 0.012 and whole motions below 0.023, and smooth motions of the midpoint rule below 1e-3; contact that the
-midpoint rule does not resolve reaches 0.1 to 5 before it diverges."""
+"""Share of the energy at hand. In the example scenes, backward Euler, BDF2 and the average-vector-field method stay
+below 0.012 per step and 0.023 per motion, and smooth motions of the midpoint rule below 1e-3; contact that the midpoint
+rule does not resolve reaches 0.1 to 5 before it diverges."""
 
 
 class Info(NamedTuple):
@@ -41,34 +41,33 @@ class Info(NamedTuple):
     iterations: Int[Array, ""]
     """Newton iterations."""
     converged: Bool[Array, ""]
-    """Whether the result can be trusted: forces are balanced, the motion has not `diverged`, and no element is
-    inverted (`least_J` > 0). Otherwise derivatives are NaN."""
+    """Whether the result can be trusted: forces are balanced, the motion has not `diverged`, and no element is inverted
+    (`least_J` > 0). Otherwise derivatives are NaN."""
     definite: Bool[Array, ""] | None = None
     """Whether the Hessian at the minimum is positive definite; `None` unless requested."""
     energy_growth: Float[Array, ""] | None = None
     """Energy created by the step, in J; negative for damping. `None` for a static solve."""
     energy_at_hand: Float[Array, ""] | None = None
-    """Energy available to the step, in J, with the effect of rounding and tolerance. `None` for a static solve."""
+    """Energy available to the step, in J, including rounding and tolerance. `None` for a static solve."""
     diverged: Bool[Array, ""] | None = None
     """Whether the step, or the motion up to it, created more than `LARGEST_GROWTH` of the energy at hand. `None` for a
     static solve."""
     least_J: Float[Array, ""] | None = None
-    """Smallest ratio of volume to rest volume, over elements that resist deformation, if any; of quadratic elements at
-    their quadrature points."""
+    """Smallest ratio of volume to rest volume over elements that resist deformation, if any; quadratic elements are
+    evaluated at their quadrature points."""
     overlaps: Int[Array, ""] | None = None
-    """Number of pairs of overlapping mesh components: bodies have no contact with each other and pass through. `None`
-    for a mesh of one component and for a scene with contacts. It does not affect `converged`."""
+    """Number of pairs of overlapping mesh components, which pass through each other without contact. `None` for a mesh
+    of one component and for a scene with contacts. Does not affect `converged`."""
     substeps: Int[Array, ""] | None = None
     """Number of parts that the step was divided into, 1 for a whole step; `None` without `halvings`."""
     least_distance: Float[Array, ""] | None = None
-    """Smallest distance in m of two surfaces in contact, at most the distance within which contact acts."""
+    """Smallest distance in m between surfaces in contact, capped at the distance within which contact acts."""
     friction_change: Float[Array, ""] | None = None
-    """Largest change of the friction on a vertex, as force per mass in m/s², if it took its normal forces and
-    directions from the end of the step; `None` without friction or `friction_iterations`. It does not affect
-    `converged`."""
+    """Largest change of friction on a vertex, as force per mass in m/s², if normal forces and directions were taken
+    from the end of the step; `None` without friction or `friction_iterations`. Does not affect `converged`."""
     overflow: Bool[Array, ""] | None = None
-    """Whether the lists of pairs in contact were too short, which needs a larger `capacity`; such a step has not
-    converged."""
+    """Whether the lists of pairs in contact were too short, which needs a larger `capacity`; such a step does not
+    converge."""
 
 
 class Balance(NamedTuple):
@@ -77,7 +76,7 @@ class Balance(NamedTuple):
     growth: Float[Array, ""]
     at_hand: Float[Array, ""]
     unclear: Float[Array, ""]
-    """Part of the energy at hand that is rounding and work of the residual forces."""
+    """Part of the energy at hand due to rounding and to the work of the residual forces."""
 
 
 def energy_balance(
@@ -95,10 +94,10 @@ def energy_balance(
     Args:
         scene: its terms and free vertices.
         masses: in kg.
-        data: of the terms' elements in this step.
+        data: data of the terms' elements in this step.
         x, v: positions and velocities at the start and the end of the step.
-        work: of the held vertices, in J.
-        outcome: of the minimisation.
+        work: work of the held vertices, in J.
+        outcome: outcome of the minimisation.
         contact: energies in J of contacts at the start and at the end.
     """
     free = jnp.asarray(scene.free)
@@ -113,9 +112,9 @@ def energy_balance(
 
 
 def with_energies(info: Info, balance: Balance, before: Growth | None) -> tuple[Info, Growth | None]:
-    """Adds the judgement of the energies to that of the forces and positions.
+    """Adds the verdict on energies to that on forces and positions.
 
-    Returns the outcome, and the energy created so far, if the state before the step has one.
+    Returns the outcome, and the energy created so far if the state before the step carries it.
     """
     growth, at_hand, unclear = balance
     sound, so_far = growth <= LARGEST_GROWTH * at_hand, None
@@ -131,7 +130,7 @@ def with_energies(info: Info, balance: Balance, before: Growth | None) -> tuple[
 def work_of_held(
     held: Int[np.ndarray, " k"], energies: Sequence[ElementEnergy], data: Sequence[Any], x: Array, moved: Array
 ) -> Float[Array, ""]:
-    """Work of held vertices against the forces at x, in J, from the elements at these vertices."""
+    """Returns the work of held vertices against the forces at x, in J, from the elements at these vertices."""
     near, their_data = [], []
     for energy, of in zip(energies, data, strict=True):
         touched = np.flatnonzero(np.isin(energy.indices, held).any(axis=1))
@@ -145,8 +144,7 @@ def work_of_held(
 
 
 def least_J(scene: SoftScene, params: Params, x: Float[Array, "n dim"]) -> Float[Array, ""] | None:
-    """Smallest volume ratio J, of a quadratic element at its quadrature points; `None` if no term acts on the mesh's
-    elements."""
+    """Returns the smallest J (at quadrature points if quadratic); `None` if no term acts on the mesh's elements."""
     elements = scene.mesh.nodes
     if not len(elements) or not any(np.array_equal(term.indices, elements) for term in scene.terms):
         return None
@@ -161,7 +159,7 @@ def verdict_on_positions(
     overlaps: Callable[[Array], Array] | None,
     contact: Sequence[Any],
 ) -> Info:
-    """Combines the solver's verdict with that on the positions: no element is inverted."""
+    """Combines the solver's verdict with that on the positions: no element may be inverted."""
     least = least_J(scene, params, x)
     converged = outcome.converged if least is None else outcome.converged & (least > 0)
     pairs = None if overlaps is None else overlaps(x)

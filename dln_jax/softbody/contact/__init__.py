@@ -1,4 +1,4 @@
-"""Contact by barriers, between and within bodies and with rigid obstacles: surfaces never cross."""
+"""Barrier contact between and within bodies and with rigid obstacles: surfaces never cross."""
 
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.contact import Contact, ContactParameters

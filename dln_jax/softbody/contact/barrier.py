@@ -2,14 +2,14 @@
 
     E = kappa A m(c) b(D) / h³,    b(D) = -(D - h²)² ln(D / h²) for 0 < D < h², else 0
 
-with the squared distance D of the pair, the distance h within which it acts, the area A that the pair stands for, and
-the stiffness kappa in Pa. b is twice continuously differentiable at D = h² and grows without bound as D vanishes, so
-that bodies never touch. Nearly parallel edges are mollified, because the closest points of two edges jump there:
+with the squared distance D of the pair, the distance h within which it acts, the area A that the pair represents and
+the stiffness kappa in Pa. b is twice continuously differentiable at D = h² and grows without bound as D approaches
+zero, so bodies never touch. Nearly parallel edges are mollified, because the closest points of two edges jump there:
 
     m(c) = (2 - c/epsilon) c/epsilon for c < epsilon, else 1,    c = |u x v|²,    epsilon = 1e-3 |U|² |V|²
 
-for edges u, v, which are U, V in the rest shape. Derivatives are written out: those by automatic differentiation take
-several times as long to compile.
+for edges u, v, which are U, V in the rest shape. Derivatives are written by hand: automatic ones take several times as
+long to compile.
 """
 
 from typing import NamedTuple
@@ -20,15 +20,15 @@ from jaxtyping import Array, Float
 from dln_jax.softbody.contact.distances import Stencil, closest, summed
 
 MOLLIFIED = 1e-3
-"""Squared sine of the angle between edges below which their contact is mollified (Li et al. 2020, section 5)."""
+"""Contact of edges is mollified below this squared sine of the angle between them (Li et al. 2020, section 5)."""
 
 
 class Pair(NamedTuple):
-    """Data of the contact of one pair; [pairs, ...] for all."""
+    """Contact data of one pair, or [pairs, ...] of all of them."""
 
     stencil: Stencil
     strength: Float[Array, "*pairs"]
-    """kappa A / h³ in N/m³; zero for a place in the list that is not used."""
+    """kappa A / h³ in N/m³; zero for an unused slot of the list."""
     near: Float[Array, "*pairs"]
     """h² in m²."""
     parallel: Float[Array, "*pairs"]
@@ -52,7 +52,7 @@ def pair_gradient(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""
     if x.shape == (4, 3):
         m, m_slope, _ = _mollifier(x, pair.parallel)
         value, along = m * value, m * along + value * m_slope
-    # Places that are not used hold any vertices, even coinciding ones.
+    # Unused slots hold arbitrary vertices, even coinciding ones.
     used = pair.strength > 0
     return jnp.where(used, pair.strength * value, 0), jnp.where(used, pair.strength * along, 0)
 

@@ -1,10 +1,10 @@
 """Contact between and within bodies by barriers on the distances of their surfaces (Li et al. 2020).
 
-The energies sum over all pairs of a vertex and an edge in the plane, or of a vertex and a triangle and of two edges in
-space, that share no vertex. Which pairs are near is found anew in every Newton step, in lists of fixed capacity, and
-continuous collision detection bounds the steps, so that no pair ever crosses.
+The energies sum over all pairs without a common vertex: vertex and edge in the plane, vertex and triangle or two edges
+in space. Every Newton step searches for the near pairs again, in lists of fixed capacity, and continuous collision
+detection limits the steps, so that no pair ever crosses.
 
-Friction is lagged: normal forces and tangent planes are those at the start of the time step, or of the previous
+Friction is lagged: normal forces and tangent planes are those at the start of the time step, or at the previous
 solution of this step where `make_step` iterates,
 
     D = mu lambda f(|u|),    u = (1 - n nᵀ) sum_i w_i (x_i - x_i(start)),
@@ -33,29 +33,29 @@ from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import require_positive
 
 _AT_ONCE = 256
-"""Pairs whose distance is measured in one turn of a loop; no list is shorter."""
+"""Number of pairs whose distance is measured in one turn of a loop; no list is shorter."""
 
 
 class Kind(NamedTuple):
-    """Pairs of two kinds of primitives."""
+    """The pairs of two kinds of primitives."""
 
     one: Group
     other: Group
     number: int
-    """Of the kind, for its closest features."""
+    """Number of the kind in `distances`."""
     neighbours: tuple[int, int]
-    """Pairs of clusters, and of primitives, whose boxes meet in the rest shape."""
+    """Number of pairs of clusters, and of primitives, whose boxes meet in the rest shape."""
 
 
 class Listed(NamedTuple):
-    """Pairs in a list, without derivatives."""
+    """A list of pairs, without derivatives."""
 
     pairs: Int[Array, "capacity 2"]
-    """Numbers of the primitives."""
+    """Indices of the primitives."""
     kind: Int[Array, " capacity"]
-    """Number of the kind."""
+    """`POINT_TRIANGLE` or `EDGE_EDGE`."""
     used: Bool[Array, " capacity"]
-    """False for places that are not used."""
+    """False for unused slots."""
 
 
 def body_contact(
@@ -72,12 +72,12 @@ def body_contact(
 
     Args:
         mesh: its boundary is in contact.
-        distance: h in m, within which surfaces repel each other; well below the edges' length.
-        stiffness: kappa in Pa. The gap at which a pressure p is carried depends on p / kappa and h alone: kappa = p
-            keeps about half of h. It has no influence on whether bodies cross: they never do.
+        distance: h in m, within which surfaces repel each other; well below the edge length.
+        stiffness: kappa in Pa. The gap at which the contact carries a pressure p depends only on p / kappa and h: with
+            kappa = p about half of h remains. Bodies never cross, whatever the stiffness.
         friction: Coulomb's coefficient, reached at the threshold speed in m/s.
-        capacity: places in the list of near pairs, for every kind of pairs; by default two for every vertex of the
-            boundary, and at least 128. A step that needs more does not converge, and its `Info.overflow` is true.
+        capacity: slots in the list of near pairs, for every kind of pair; by default two per boundary vertex and at
+            least 128. A step that needs more does not converge, and its `Info.overflow` is true.
         name: key of its parameters in `Params.terms`.
 
     Raises:
@@ -138,7 +138,7 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
         margin = parameters.distance / 2
         of_one = boxes(kind.one, x, x + step, margin)
         of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
-        # Boxes of neighbours in one surface always meet, so that these lists are longer than those of near pairs.
+        # Boxes of neighbours in one surface always meet, so these lists are longer than those of near pairs.
         clusters, primitives = (count + count // 2 + 2 * capacity for count in kind.neighbours)
         lists.append(pairs_near(kind.one, kind.other, of_one, of_other, (clusters, primitives)))
     pairs, used = (jnp.concatenate(parts) for parts in zip(*(listed[:2] for listed in lists), strict=True))
@@ -152,9 +152,9 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
 
 
 def _within_reach(x: Array, step: Array, corners: Array, number: np.ndarray, used: Array, distance: Array) -> Array:
-    """Whether pairs can come within a distance in a step, by their distance and the bound of their speed.
+    """Whether pairs can come within a distance during a step, by their distance and the bound of their speed.
 
-    Only those of the listed pairs that are used are measured, which are a fraction of the list.
+    Measures only the used slots, which are a fraction of the list.
     """
     order = jnp.argsort(~used)
     kinds = jnp.asarray(number)
@@ -179,7 +179,7 @@ def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pai
     (one, other), number, used = elements.data.pairs.T, elements.data.kind, elements.data.used
     of_vertices, of_edges = areas(surface, rest)
     stencil = jax.vmap(stencil_of)(jax.lax.stop_gradient(x[elements.indices]), number)
-    # A pair of facets is counted from both sides, in space by vertices and by edges (Li et al. 2023, section 4).
+    # A pair of facets is counted from both sides: in space by vertices and by edges (Li et al. 2023, section 4).
     if surface.dimension == 2:
         area, parallel = of_vertices[one] / 2, jnp.zeros_like(rest, shape=one.shape)
     else:
@@ -205,7 +205,7 @@ def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
 def _lagged(
     barrier: MovingEnergy, friction: Array, data: Any, context: Context, threshold_speed: float
 ) -> tuple[Elements, tuple[Slip, Array]]:
-    """Returns the pairs that rub, with their normal forces at the start of the step or where the context says."""
+    """Returns the pairs in frictional contact, with normal forces at the start of the step or at `context.lag`."""
     x = context.x if context.lag is None else context.lag
     elements = jax.lax.stop_gradient(barrier.elements(x, jnp.zeros_like(x), data))
     corners = x[elements.indices]

@@ -1,8 +1,8 @@
-"""Broad phase: lists of primitives that may come near each other, of fixed capacity.
+"""Broad phase: lists, of fixed capacity, of primitives that may come near each other.
 
 Primitives are grouped once into clusters of neighbours in the rest shape, which stay neighbours while the body deforms.
-Bounding boxes of clusters are compared first, then those of primitives in clusters that meet. Lists that are too short
-are reported, never cut off silently.
+The bounding boxes of clusters are compared first, then those of the primitives in clusters that meet. A list that is
+too short is reported, never silently cut off.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 CLUSTER = 8
-"""Primitives that share one bounding box."""
+"""Number of primitives that share one bounding box."""
 
 
 class Group(NamedTuple):
@@ -22,7 +22,7 @@ class Group(NamedTuple):
     primitives: Int[np.ndarray, "m k"]
     """Vertices of the primitives."""
     clusters: Int[np.ndarray, "c 8"]
-    """Numbers of the primitives in every cluster; -1 for an empty place."""
+    """Indices of the primitives in every cluster; -1 for an empty slot."""
 
 
 class Boxes(NamedTuple):
@@ -36,15 +36,15 @@ class PairList(NamedTuple):
     """A list of pairs of primitives."""
 
     pairs: Int[Array, "capacity 2"]
-    """Numbers of the primitives."""
+    """Indices of the primitives."""
     used: Bool[Array, " capacity"]
-    """False for places that are not used."""
+    """False for unused slots."""
     overflow: Bool[Array, ""]
-    """Whether there are more pairs than places."""
+    """Whether there are more pairs than slots."""
 
 
 def group(primitives: Int[np.ndarray, "m k"], rest: Float[np.ndarray, "n dim"]) -> Group:
-    """Puts primitives into clusters of neighbours, by halving along the longest side."""
+    """Groups primitives into clusters of neighbours, by halving along the longest side."""
     centres = rest[primitives].mean(axis=1)
     clusters: list[np.ndarray] = []
 
@@ -68,7 +68,7 @@ def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margi
 
 
 def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: float) -> tuple[int, int]:
-    """Returns the numbers of pairs of clusters and of pairs of primitives whose boxes, enlarged by half, meet at x."""
+    """Counts the pairs of clusters and of primitives whose boxes, each enlarged by half the margin, meet at x."""
     counts = []
     for clusters in (True, False):
         sides = []
@@ -87,9 +87,9 @@ def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacit
     """Returns the pairs of primitives without a common vertex whose boxes meet.
 
     Args:
-        one, other: the primitives; a pair of one group with itself is listed once.
+        one, other: the primitives; pairs within one group are listed once.
         of_one, of_other: their boxes.
-        capacity: places for pairs of clusters and for pairs of primitives.
+        capacity: slots for pairs of clusters and for pairs of primitives.
     """
     same = one is other
     clusters, used, too_many_clusters = places(
@@ -117,7 +117,7 @@ def _of_clusters(of: Group, box: Boxes) -> Boxes:
 
 
 def _meet(one: Boxes, other: Boxes) -> Bool[Array, "*batch one other"]:
-    """Whether boxes meet, for all pairs along the last axis of boxes."""
+    """Whether boxes meet, for all pairs along their last batch axis."""
 
     def axis(i: int) -> Array:
         return (one.low[..., :, None, i] <= other.high[..., None, :, i]) & (
@@ -131,8 +131,8 @@ def _meet(one: Boxes, other: Boxes) -> Bool[Array, "*batch one other"]:
 
 
 def places(mask: Bool[Array, "..."], capacity: int) -> tuple[Int[Array, " capacity"], Bool[Array, " capacity"], Array]:
-    """Returns the flat places where the mask is true, which of them are used, and whether some had to be left out."""
-    # A binary search in the running counts of words of 32 places, then one in the word: `nonzero` scatters, which takes
+    """Returns the flat indices where the mask is true, which slots are used, and whether some had to be left out."""
+    # A binary search in the running counts of 32-bit words, then one in the word: `nonzero` scatters, which takes
     # several times as long.
     flat = mask.reshape(-1)
     rows = jnp.pad(flat, (0, -len(flat) % 32)).reshape(-1, 32)

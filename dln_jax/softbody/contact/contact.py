@@ -1,4 +1,4 @@
-"""What a scene knows of a contact by barriers, whatever touches."""
+"""The interface between a scene and a barrier contact, whatever touches."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 
 
 class ContactParameters(NamedTuple):
-    """Parameters of a contact by barriers."""
+    """Parameters of a barrier contact."""
 
     distance: Float[Array, ""]
     """h in m, within which surfaces repel each other."""
@@ -33,13 +33,13 @@ class Contact(NamedTuple):
     prepare: Callable[[Any, Context], tuple[Any, ...]]
     """(parameters, context) -> data of the energies in a step."""
     least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
-    """(positions, elements and data of the barrier) -> smallest distance in m, at most the distance h."""
+    """(positions, elements and data of the barrier) -> smallest distance in m, capped at h."""
     changing: bool = True
-    """Whether the elements of the energies change."""
+    """Whether the set of elements changes during a motion."""
 
     @property
     def friction(self) -> tuple[MovingEnergy, ...]:
-        """The friction, if there is any."""
+        """The friction energy, if the contact has one."""
         return self.energies[1:]
 
 

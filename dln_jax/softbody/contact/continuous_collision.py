@@ -1,9 +1,9 @@
 """Conservative continuous collision detection: how far vertices may move until a pair nearly touches.
 
 Additive advancement (Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, section 5): with the speed
-bound l = max |p_i| + max |p_j| over the vertices of the two primitives (relative to their mean motion), no point of one
-comes nearer to the other than d - t l. The time advances by such bounds until the distance has shrunk to a fraction of
-what it was. The result never overestimates, apart from rounding, which the remaining distance exceeds.
+bound l = max |p_i| + max |p_j| over the vertices of the two primitives (relative to their mean motion), the distance
+after a time t is at least d - t l. Time advances by such bounds until the distance has shrunk to a fraction of its
+initial value. The result never overestimates, apart from rounding, which is smaller than the remaining distance.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ _ITERATIONS = 200
 
 
 def speed_bound(p: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
-    """l in m per unit of time for one pair of a kind of `distances`, whose vertices move by p."""
+    """Returns l in m per unit of time for one pair whose vertices move by p; kinds are those of `distances`."""
     speed = jnp.sqrt(summed((p - summed(p, axis=0) / len(p)) ** 2))
     first = jnp.arange(len(p)) < jnp.where((kind == EDGE_EDGE) & (len(p) == 4), 2, 1)
     return jnp.max(jnp.where(first, speed, 0)) + jnp.max(jnp.where(first, 0, speed))
@@ -30,15 +30,15 @@ def speed_bound(p: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[A
 def longest_step(
     distance: Callable[[Float[Array, " lanes"]], Float[Array, " lanes"]], bound: Float[Array, " lanes"]
 ) -> Float[Array, ""]:
-    """Returns the largest t <= 1 such that no lane has lost more than 1 - `REMAINING` of its distance at any time.
+    """Returns the largest t <= 1 up to which no lane has lost more than 1 - `REMAINING` of its distance.
 
     Args:
-        distance: time of every lane -> distances in m.
-        bound: rates at which the distances shrink at most, in m per unit of time; zero for lanes to be ignored.
+        distance: one time per lane -> distances in m.
+        bound: upper bounds on the rates at which distances shrink, in m per unit of time; zero excludes a lane.
     """
     start = distance(jnp.zeros_like(bound))
     target = REMAINING * start
-    # Other lanes keep enough of their distance whatever they do.
+    # The other lanes keep enough distance however they move.
     moving = bound > start - target
     rate = jnp.where(moving, bound, 1.0)
 
@@ -57,6 +57,6 @@ def longest_step(
         return t, active & (t < limit), limit, count + 1
 
     one = jnp.ones((), start.dtype)
-    # A lane that is still active after all iterations is free up to its t, as is a lane that has stopped.
+    # A lane that is still active after all iterations is free up to its t, like a lane that has stopped.
     t, *_ = jax.lax.while_loop(more, advance, (jnp.zeros_like(bound), moving, one, jnp.asarray(0)))
     return jnp.min(jnp.where(moving, t, 1.0), initial=1.0)

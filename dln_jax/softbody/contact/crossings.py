@@ -1,6 +1,6 @@
-"""Exact test for crossing surfaces: edges that cross in the plane, and edges that cross triangles in space.
+"""Exact test for crossing surfaces: edges that cross in the plane, edges that cross triangles in space.
 
-Signs of determinants of float64 coordinates are decided in rational arithmetic wherever rounding could change them.
+Orientation determinants of float64 coordinates are evaluated in rational arithmetic where rounding could change a sign.
 """
 
 import itertools
@@ -16,14 +16,14 @@ from dln_jax.softbody.contact.surface import surface_of
 from dln_jax.softbody.mesh.mesh import Mesh
 
 _ROUNDING = 1e-14
-"""Rounding error of a determinant, relative to the sum of the absolute values of its products; 20 units of rounding."""
+"""Rounding error of a determinant relative to the sum of the absolute values of its products: 20 units of rounding."""
 
 
 def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Returns the pairs of primitives of the boundary that have a common point at positions x, by their vertices.
+    """Returns the pairs of boundary primitives that have a common point at positions x, by their vertices.
 
-    Pairs of edges in the plane, of an edge and a triangle in space; those that share a vertex are left out. Two
-    triangles in space that cross always have an edge of one that crosses the other.
+    Pairs are two edges in the plane, an edge and a triangle in space; pairs with a common vertex are left out. If two
+    triangles in space cross, an edge of one crosses the other.
     """
     surface = surface_of(mesh)
     x = np.asarray(x, float)
@@ -51,10 +51,10 @@ def _boxes_meet(one: Group, other: Group, x: np.ndarray) -> Int[np.ndarray, "m 2
 
 
 def _segments_meet(one: Float[np.ndarray, "m 2 2"], other: Float[np.ndarray, "m 2 2"]) -> Bool[np.ndarray, " m"]:
-    """Whether segments of the plane have a common point."""
+    """Whether segments in the plane have a common point."""
     (a, b), (c, d) = one.swapaxes(0, 1), other.swapaxes(0, 1)
     of_other, of_one = _sides(a, b, c) * _sides(a, b, d), _sides(c, d, a) * _sides(c, d, b)
-    # The boxes of segments in one line meet if they do; those of others do, if they have a common point.
+    # Collinear segments meet exactly if their boxes do; other segments with a common point have boxes that meet.
     boxes_meet = (one.min(axis=1) <= other.max(axis=1)) & (other.min(axis=1) <= one.max(axis=1))
     return (of_other <= 0) & (of_one <= 0) & boxes_meet.all(axis=1)
 
@@ -62,7 +62,7 @@ def _segments_meet(one: Float[np.ndarray, "m 2 2"], other: Float[np.ndarray, "m 
 def _segments_meet_triangles(
     edges: Float[np.ndarray, "m 2 3"], triangles: Float[np.ndarray, "m 3 3"]
 ) -> Bool[np.ndarray, " m"]:
-    """Whether segments of space have a common point with triangles."""
+    """Whether segments in space meet triangles."""
     (p, q), (a, b, c) = edges.swapaxes(0, 1), triangles.swapaxes(0, 1)
     start, end = _sides(a, b, c, p), _sides(a, b, c, q)
     flat = (start == 0) & (end == 0)
@@ -75,7 +75,7 @@ def _segments_meet_triangles(
 
 
 def _meet_in_plane(edges: np.ndarray, triangles: np.ndarray) -> Bool[np.ndarray, " m"]:
-    """Whether segments in the planes of triangles meet them, in the projections along the longest axes of normals."""
+    """Whether segments in the plane of a triangle meet it, projected along the largest component of its normal."""
     a, b, c = triangles.swapaxes(0, 1)
     axis = np.argmax(np.abs(np.cross(b - a, c - a)), axis=1)
     kept = np.array([[1, 2], [0, 2], [0, 1]])[axis][:, None, :]
@@ -92,7 +92,7 @@ def _sides(*points: Float[np.ndarray, "m dim"]) -> Int[np.ndarray, " m"]:
     rows = np.stack([point - points[0] for point in points[1:]], axis=1)
     value, size = _determinants(rows)
     signs = np.sign(value).astype(int)
-    # Differences of equal coordinates are exactly zero, and so is a determinant all of whose products are.
+    # Differences of equal coordinates are exactly zero, and so is a determinant whose products all vanish.
     for number in np.flatnonzero((np.abs(value) <= _ROUNDING * size) & (size > 0)):
         first, *others = ([Fraction(float(u)) for u in point[number]] for point in points)
         exact, _ = _determinants(np.array([[np.subtract(other, first) for other in others]], dtype=object))

@@ -1,12 +1,12 @@
-"""Distances between a point and an edge or a triangle, and between two edges, with one formula for all of them.
+"""Distances of a point to an edge or a triangle and between two edges, all by one formula.
 
     D = |delta|²,  delta = w - s_1 e_1 - s_2 e_2,  s = argmin D = G⁻¹ (e_i·w),  G_ij = e_i·e_j
 
 w joins a point of one primitive to a point of the other, and e_1, e_2 span the closest features: both for the interior
 of a triangle or of two edges, one for a point and an edge, none for two points. A `Stencil` states w and e as
-combinations of the vertices, so that one program serves all pairs. Which features are closest is decided by
-comparisons, without derivatives; D is once continuously differentiable where they change (Li et al. 2020, section 3.2).
-With beta the weights of the vertices in delta and c_i those in e_i, the derivatives are
+combinations of the vertices, so that one program serves all pairs. Comparisons, without derivatives, decide which
+features are closest; D is once continuously differentiable where they change (Li et al. 2020, section 3.2). With beta
+the weights of the vertices in delta and c_i those in e_i, the derivatives are
 
     dD/dx = 2 beta (x) delta,    d²D/dx² = 2 beta betaᵀ (x) I - 2 A G⁻¹ Aᵀ,    A_i = beta (x) e_i + c_i (x) delta.
 """
@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 POINT_TRIANGLE, EDGE_EDGE = 0, 1
-"""Kinds of pairs in space: (p, a, b, c), and (a, b, c, d) with edges from a to b and from c to d. In the plane there is
-one kind, a point and an edge: (p, a, b)."""
-# Two directions whose squared sine is below this are parallel, and the closest points are sought on the boundary.
+"""Kinds of pairs in space: (p, a, b, c), and (a, b, c, d) with edges from a to b and from c to d. The plane has one
+kind: a point and an edge, (p, a, b)."""
+# Two directions whose squared sine is below this count as parallel; their closest points are sought on the boundary.
 _PARALLEL = 1e-20
 
 
@@ -32,13 +32,13 @@ class Stencil(NamedTuple):
     offset: Float[Array, "*pairs k"]
     """w = offset @ x."""
     directions: Float[Array, "*pairs axes k"]
-    """e = directions @ x; zero for a direction that is not used."""
+    """e = directions @ x; zero for an unused direction."""
     unused: Float[Array, "*pairs axes"]
-    """1 for a direction that is not used, else 0."""
+    """1 for an unused direction, else 0."""
 
 
 class Closest(NamedTuple):
-    """Closest points of a pair."""
+    """The closest points of a pair."""
 
     delta: Float[Array, "*pairs dim"]
     """Vector between them in m, from the second primitive to the first."""
@@ -51,7 +51,7 @@ class Closest(NamedTuple):
 
 
 def closest(x: Float[Array, "k dim"], stencil: Stencil) -> Closest:
-    """Returns the closest points of the features of a pair with vertices x."""
+    """Returns the closest points of the given features of a pair with vertices x."""
     w, e = _combined(stencil.offset, x), _combined(stencil.directions, x)
     G = summed(e[:, None, :] * e[None, :, :]) + jnp.diag(stencil.unused)
     inverse = _inverse(G)
@@ -61,22 +61,19 @@ def closest(x: Float[Array, "k dim"], stencil: Stencil) -> Closest:
 
 
 def squared_distance(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
-    """D in m² of a pair of a kind."""
+    """Returns D in m² of a pair."""
     delta = closest(x, stencil_of(x, kind)).delta
     return summed(delta**2)
 
 
 def summed(values: Array, axis: int = -1) -> Array:
-    """Returns the sum over a short axis, written out.
-
-    It becomes part of the arithmetic around it, where a reduction is compiled as a program of its own.
-    """
+    """Returns the sum over a short axis, written out: XLA fuses it, but compiles a reduction as a separate loop."""
     parts = [jax.lax.index_in_dim(values, i, axis, keepdims=False) for i in range(values.shape[axis])]
     return functools.reduce(jnp.add, parts)
 
 
 def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
-    """Returns the closest features of a pair of a kind with vertices x."""
+    """Returns the closest features of a pair with vertices x."""
     tables = _SPACE if x.shape[1] == 3 else _PLANE
     p, a, b = jnp.moveaxis(_combined(jnp.asarray(tables.segments, x.dtype)[kind], x), 1, 0)
     e, w = b - a, p - a
@@ -105,7 +102,7 @@ def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
 
 
 def _combined(weights: Float[Array, "*rows k"], x: Float[Array, "k dim"]) -> Float[Array, "*rows dim"]:
-    # A sum and no matrix product, which would round to fewer digits on a GPU.
+    # A sum instead of a matrix product, which would round to fewer digits on a GPU.
     return summed(weights[..., None] * x, axis=-2)
 
 
@@ -124,13 +121,13 @@ class _Tables(NamedTuple):
     interior: np.ndarray | None
     """[3, k]: w, e_1, e_2 of the interior."""
     offset: np.ndarray
-    """[regions, k] of `Stencil`; three regions for every segment (at a, at b, between), then the interior."""
+    """[regions, k] of `Stencil`: three regions for every segment (at a, at b, between), then the interior."""
     directions: np.ndarray
     unused: np.ndarray
 
 
 def _tables(kinds: list[tuple[str, list[str], list[str]]], axes: int) -> _Tables:
-    """Builds tables from the names of vertices, segments as "pab", and the interior as differences: "pa" is p - a."""
+    """Builds tables from names of vertices, segments such as "pab", and the interior as differences: "pa" is p - a."""
     segments, interiors, offsets, directions = [], [], [], []
     for names, edges, interior in kinds:
         unit = dict(zip(names, np.eye(len(names)), strict=True))

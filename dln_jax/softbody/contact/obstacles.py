@@ -1,14 +1,14 @@
-"""Contact of vertices with rigid obstacles, by the barrier on their signed distance.
+"""Contact of vertices with rigid obstacles, by a barrier on their signed distance.
 
     E = kappa A b(d²) / h³
 
-with the signed distance d of a vertex to the obstacle, positive outside, and b of `barrier`. The distance bounds the
-steps of a minimisation, so that no vertex gets into an obstacle, however fast it is. Only vertices are in contact: an
-obstacle that is smaller than the triangles of a body can pass between them. Make it a body whose vertices are held, and
-use `body_contact` for that.
+with the signed distance d of a vertex to the obstacle, positive outside, and b of `barrier`. The distance limits the
+steps of the minimisation, so that no vertex enters an obstacle, however fast it is. Only vertices are in contact: an
+obstacle smaller than the triangles of a body can pass between them. Model such an obstacle as a body with held
+vertices, in a `body_contact`.
 
-A distance function must not overestimate the distance (its slope is at most 1), and must be twice differentiable almost
-everywhere outside the obstacle. An obstacle moves if its parameters do, from step to step, by less than the gap.
+A distance function must not overestimate the distance (its slope is at most 1) and must be twice differentiable almost
+everywhere outside the obstacle. To move an obstacle, change its parameters from step to step, by less than the gap.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ Distance = Callable[[Float[Array, " dim"], Any], Float[Array, ""]]
 
 
 class Obstacle(NamedTuple):
-    """A rigid shape: its distance function and its parameters."""
+    """A rigid shape: its distance function and parameters."""
 
     distance: Distance
     shape: Any
@@ -48,16 +48,16 @@ class ObstacleParameters(NamedTuple):
 
 
 class HalfSpace(NamedTuple):
-    """Points below a plane."""
+    """The points below a plane."""
 
     normal: Float[Array, " dim"]
-    """Normal out of the ground, of any length."""
+    """Outward normal, of any length."""
     offset: Float[Array, ""]
     """Distance of the plane from the origin along the normal, in m."""
 
 
 class Capsule(NamedTuple):
-    """Points within a radius of a segment; a sphere if both ends coincide."""
+    """The points within a radius of a segment; a sphere if both ends coincide."""
 
     start: Float[Array, " dim"]
     end: Float[Array, " dim"]
@@ -66,7 +66,7 @@ class Capsule(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A box with sides along the rows of a rotation."""
+    """A box whose sides point along the rows of a rotation."""
 
     centre: Float[Array, " dim"]
     half_lengths: Float[Array, " dim"]
@@ -76,18 +76,18 @@ class Box(NamedTuple):
 
 
 class Heightfield(NamedTuple):
-    """Ground below a smooth surface: the cubic B-spline of heights on a lattice along the horizontal axes."""
+    """Ground below a smooth surface: the cubic B-spline of heights on a lattice over the horizontal axes."""
 
     heights: Float[Array, "..."]
     """Control points in m, [k] in the plane or [k, l] in space; beyond the lattice the ground is level."""
     origin: Float[Array, " horizontal"]
     """Position of the first control point, in m."""
     spacing: Float[Array, ""]
-    """Of the lattice, in m."""
+    """Lattice spacing in m."""
 
 
 def half_space(normal: Numbers, offset: float = 0.0) -> Obstacle:
-    """The half-space n·x < offset, for the unit normal n."""
+    """Returns the half-space n·x < offset in m, for the unit normal n."""
 
     def distance(x: Array, shape: HalfSpace) -> Array:
         return jnp.sum(x * shape.normal) / jnp.linalg.norm(shape.normal) - shape.offset
@@ -97,7 +97,7 @@ def half_space(normal: Numbers, offset: float = 0.0) -> Obstacle:
 
 
 def capsule(start: Numbers, end: Numbers, radius: float) -> Obstacle:
-    """Points within a radius in m of the segment between two points."""
+    """Returns the points within a radius in m of the segment between two points."""
     require_positive(radius=radius)
 
     def distance(x: Array, shape: Capsule) -> Array:
@@ -111,12 +111,12 @@ def capsule(start: Numbers, end: Numbers, radius: float) -> Obstacle:
 
 
 def sphere(centre: Numbers, radius: float) -> Obstacle:
-    """Points within a radius in m of a centre."""
+    """Returns the points within a radius in m of a centre."""
     return capsule(centre, centre, radius)
 
 
 def box(centre: Numbers, half_lengths: Numbers, rotation: Any = None) -> Obstacle:
-    """A box of half lengths in m along the rows of a rotation (by default the axes)."""
+    """Returns a box of half lengths in m along the rows of a rotation (by default the axes)."""
     lengths = vector("the half lengths of a box", half_lengths, zero_allowed=False)
     rows = jnp.eye(len(lengths)) if rotation is None else jnp.asarray(rotation, float)
 
@@ -131,10 +131,10 @@ def box(centre: Numbers, half_lengths: Numbers, rotation: Any = None) -> Obstacl
 
 
 def heightfield(heights: Any, origin: Numbers, spacing: float) -> Obstacle:
-    """Ground below the cubic B-spline of heights in m, [k] or [k, l]; its slope scales the vertical distance.
+    """Returns the ground below the cubic B-spline of heights in m, [k] or [k, l].
 
-    The distance is at most the true one: the height above the ground, divided by sqrt(1 + s²) with the largest slope s
-    of the control points.
+    The distance never exceeds the true one: it is the height above the ground divided by sqrt(1 + s²), with s the
+    largest slope of the control points.
     """
     require_positive(spacing=spacing)
     heights = jnp.asarray(heights, float)
@@ -163,10 +163,10 @@ def obstacle_contact(
     threshold_speed: float = 1e-3,
     name: str = "obstacle",
 ) -> Contact:
-    """Contact of the boundary's vertices with an obstacle; the other arguments as for `body_contact`.
+    """Contact of the boundary's vertices with an obstacle; the other arguments are those of `body_contact`.
 
     Raises:
-        InputError: a number that is not positive, or a vertex that is inside the obstacle in the rest shape.
+        InputError: a number is not positive, or a vertex is inside the obstacle in the rest shape.
     """
     require_positive(distance=distance, threshold_speed=threshold_speed)
     surface = surface_of(mesh)
@@ -191,7 +191,7 @@ def obstacle_contact(
     def energy(x: Float[Array, "1 dim"], data: tuple[Any, Array, Array]) -> Float[Array, ""]:
         shape, strength, near = data
         d = obstacle.distance(x[0], shape)
-        # Inside the obstacle the energy is infinite, which no step accepts.
+        # Inside the obstacle the energy is infinite, so that no step is accepted there.
         return jnp.where(d > 0, strength * barrier(d**2, near)[0], jnp.inf)
 
     def distances(x: Array, shape: Any) -> Array:

@@ -1,7 +1,7 @@
-"""The surface of a body in contact: its vertices, edges and triangles, and the areas that they stand for.
+"""The contact surface of a body: its vertices, edges and triangles, and the areas that they represent.
 
-The facets of a quadratic mesh are divided at their mid-side nodes, into 2 edges in the plane and 4 triangles in space.
-All of its nodes are then in contact, on a surface that is linear between them.
+The facets of a quadratic mesh are divided at their mid-side nodes, into 2 edges in the plane and 4 triangles in space,
+so all nodes are in contact, on a surface that is linear between them.
 """
 
 import itertools
@@ -15,11 +15,11 @@ from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.softbody.mesh.surfaces import facet_nodes
 
 _PARTS = {3: ((0, 2), (2, 1)), 6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
-"""Parts of a quadratic facet by its number of nodes, oriented as the facet."""
+"""Parts of a quadratic facet by its number of nodes, with the facet's orientation."""
 
 
 class Surface(NamedTuple):
-    """Primitives of the boundary, by indices of vertices. A body in the plane has edges and no triangles."""
+    """Primitives of the boundary, as vertex indices. A body in the plane has no triangles."""
 
     vertices: Int[np.ndarray, " v"]
     edges: Int[np.ndarray, "e 2"]
@@ -44,9 +44,9 @@ def surface_of(mesh: Mesh) -> Surface:
 
 
 def areas(surface: Surface, rest: Float[Array, "n dim"]) -> tuple[Float[Array, " v"], Float[Array, " e"]]:
-    """Returns the areas of vertices and edges in m², a third of the areas of their triangles.
+    """Returns the areas of vertices and edges in m²: each gets a third of the areas of its triangles.
 
-    In the plane a vertex has half the lengths of its edges, for a thickness of 1 m, and edges have their length.
+    In the plane, for a thickness of 1 m, a vertex gets half the lengths of its edges and an edge its length.
     """
     if surface.dimension == 2:
         lengths = jnp.linalg.norm(rest[surface.edges[:, 1]] - rest[surface.edges[:, 0]], axis=1)
@@ -60,7 +60,7 @@ def areas(surface: Surface, rest: Float[Array, "n dim"]) -> tuple[Float[Array, "
 
 
 def _shared(primitives: np.ndarray, facets: np.ndarray, share: Float[Array, " facets"]) -> Float[Array, " primitives"]:
-    """Adds the shares of the facets that contain every primitive."""
+    """Adds up, for every primitive, the shares of the facets that contain it."""
     k = primitives.shape[1]
     parts = np.sort(facets[:, list(itertools.combinations(range(facets.shape[1]), k))], axis=2)
     _, number = np.unique(np.concatenate([primitives, parts.reshape(-1, k)]), axis=0, return_inverse=True)

@@ -1,8 +1,8 @@
-"""Mesh files: .msh of Gmsh by `mesh/gmsh.py`, .vtk, .vtu, .obj and TetGen's .ele and .node by meshio (extra `[mesh]`).
+"""Mesh files: .msh of Gmsh by `mesh/gmsh.py`; .vtk, .vtu, .obj and TetGen's .ele and .node by meshio (extra `[mesh]`).
 
-VTK has no sets. Integer arrays name them: 0 and 1 whether a vertex or an element belongs to the set of that name, which
-is what `write_mesh` writes; up to `MOST_REGIONS` different numbers as sets NAME-0, NAME-1, ...; and meshio's own
-conversion of its sets, whose names are joined by hyphens.
+VTK has no sets, so integer arrays name them. An array of 0 and 1, as `write_mesh` writes, marks the members of the set
+of that name. An array with up to `MOST_REGIONS` different numbers gives sets NAME-0, NAME-1, ... meshio's own
+conversion of its sets, with names joined by hyphens, is read as well.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ SUFFIXES = (".msh", ".vtk", ".vtu", ".obj", ".ele", ".node")
 QUADRATIC = {2: "triangle6", 3: "tetra10"}
 """Quadratic cells by dimension, in meshio's names; their nodes have VTK's order, as in `Mesh.nodes`."""
 MOST_REGIONS = 64
-"""Integer arrays with more different numbers are numberings, not regions."""
+"""An integer array with more different numbers is a numbering, not a set of regions."""
 INSTALL = "pip install 'dln-jax[mesh]'"
 
 
@@ -35,12 +35,12 @@ def read_mesh(path: str | Path, *, scale: float = 1.0, merge: float = MERGE) -> 
     """Reads the body in a mesh file, with its named sets, and states what was left out or repaired.
 
     Args:
-        path: of a .msh (2.2 or 4.1, ASCII or binary), .vtk, .vtu, .obj, .ele or .node file.
+        path: a .msh (2.2 or 4.1, ASCII or binary), .vtk, .vtu, .obj, .ele or .node file.
         scale: length of the file's unit in m, such as 0.001 for millimetres.
-        merge: vertices closer than this fraction of the largest extent become one; 0 merges nothing.
+        merge: vertices closer than this fraction of the largest extent are merged; 0 merges none.
 
     Raises:
-        InputError: the file is missing, of another format or damaged, meshio is needed and missing, or as `solid_mesh`.
+        InputError: the file is missing, damaged or of another format, meshio is needed and missing, or as `solid_mesh`.
     """
     path = Path(path)
     if not is_file(path):
@@ -62,10 +62,10 @@ def write_mesh(
     vertex_data: Mapping[str, np.ndarray] | None = None,
     element_data: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Writes a mesh with its named sets as .vtu; `read_mesh` returns the same sets, of quadratic meshes their corners.
+    """Writes a mesh with its named sets as .vtu. `read_mesh` returns the same sets (of quadratic meshes the corners).
 
     Args:
-        path: of the file.
+        path: the file to write.
         mesh: its elements and sets.
         x: positions in m (default: the rest shape).
         vertex_data: arrays [n] or [n, dim] by name.
@@ -79,7 +79,7 @@ def write_mesh(
     vertices = {
         name: _flags(n, part.vertices)
         for name, part in mesh.sets.items()
-        # The nodes of its elements follow from them.
+        # A set that has exactly the nodes of its elements needs no vertex array.
         if not len(part.elements) or not np.array_equal(part.vertices, np.unique(mesh.nodes[part.elements]))
     }
     elements = {name: _flags(m, part.elements) for name, part in mesh.sets.items() if len(part.elements)}
@@ -104,16 +104,16 @@ def write_motion(
     *,
     stride: int = 1,
 ) -> None:
-    """Writes a motion for ParaView: PATH.pvd with the times, and one .vtu for every moment in a folder beside it.
+    """Writes a motion for ParaView: PATH.pvd with the times, and one .vtu per saved moment in a folder beside it.
 
-    Every .vtu has the positions in m, displacement in m, velocity in m/s, J (volume over rest volume) of the elements,
-    and the named sets, in single precision.
+    Every .vtu has, in single precision, the positions in m, displacement in m, velocity in m/s, J (volume over rest
+    volume) of the elements, and the named sets.
 
     Args:
-        path: of the .pvd file.
+        path: the .pvd file to write.
         mesh: rest shape.
         t, x, v: times in s, positions in m and velocities in m/s.
-        stride: moments of the motion per file.
+        stride: write every `stride`-th moment.
     """
     require_positive(stride=stride)
     folder = path.with_suffix("")
@@ -138,7 +138,7 @@ def write_motion(
 
 
 def require_meshio(purpose: str) -> Any:
-    """Returns the module meshio; `InputError` with the install command if it is missing."""
+    """Returns the module meshio; raises `InputError` with the install command if it is missing."""
     try:
         return importlib.import_module("meshio")
     except ImportError:
@@ -158,7 +158,7 @@ def _read_by_meshio(path: Path) -> FileMesh:
     meshio = require_meshio(f"reading {path.suffix} files")
     printed = io.StringIO()
     try:
-        # meshio prints, and exits the process, where it cannot read a file.
+        # meshio prints, and exits the process, if it cannot read a file.
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             content = meshio.read(path)
         points = np.asarray(content.points, np.float64)
@@ -184,7 +184,7 @@ def _read_by_meshio(path: Path) -> FileMesh:
 
 
 def _sets(key: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and members of the sets in an array of a VTK file; none if it holds no integers."""
+    """Yields names and members of the sets in an array of a VTK file; none if it does not hold integers."""
     if values.dtype.kind not in "iu" or values.ndim != 1 or not len(values):
         return
     numbers, names = np.unique(values), _joined_names(key)
@@ -199,7 +199,7 @@ def _sets(key: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _joined_names(key: str) -> list[str]:
-    """Names of meshio's sets from the name of their array: joined by hyphens or, for points, by the joined names."""
+    """Splits an array's name into the names of meshio's sets: joined by hyphens or, for points, by the joined names."""
     parts = key.split("-")
     count = math.isqrt(len(parts) - 1) + 1
     names = [parts[0][: len(parts[0]) // 2], *parts[1 : count - 1], parts[-1][: len(parts[-1]) // 2]]
@@ -213,5 +213,5 @@ def _flags(count: int, members: np.ndarray) -> np.ndarray:
 
 
 def _in_space(values: np.ndarray) -> np.ndarray:
-    """Vectors of the plane with a third component of zero; numbers as they are."""
+    """Adds a third component of zero to vectors in the plane; leaves scalars unchanged."""
     return np.pad(values, ((0, 0), (0, 1))) if values.ndim == 2 and values.shape[1] == 2 else values

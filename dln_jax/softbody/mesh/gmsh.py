@@ -1,8 +1,8 @@
 """Reads .msh files of Gmsh, versions 2.2 and 4.1, ASCII and binary, with all their physical groups.
 
-The format is described in https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format. meshio 5 refuses files in which some
-elements belong to no physical group (`Mesh.SaveAll`) and nodes with parametric coordinates, and keeps one group of an
-element that is in several; this reader takes all of them.
+The format is described in https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format. meshio 5 refuses files with elements
+in no physical group (`Mesh.SaveAll`) or with parametric node coordinates, and keeps one group of an element that is in
+several; this reader accepts all of them.
 """
 
 import re
@@ -27,7 +27,7 @@ KINDS = {
 }
 """Kind of cell and number of nodes by Gmsh's number; corners come first in all of them."""
 GEOMETRY = ("point", "curve", "surface", "volume")
-"""Physical groups without a name are called by these and their number, such as surface-3."""
+"""Physical groups without a name get these names and their number, such as surface-3."""
 
 
 class _Block(NamedTuple):
@@ -42,7 +42,7 @@ def read_gmsh(data: bytes) -> FileMesh:
     """Reads the content of a .msh file.
 
     Raises:
-        InputError: another version, a partitioned mesh, an unknown kind of element, or a section that is cut off.
+        InputError: another version, a partitioned mesh, an unknown kind of element, or a truncated section.
         ValueError: the numbers of a section do not fit its header.
     """
     sections = dict(_sections(data))
@@ -75,7 +75,7 @@ def read_gmsh(data: bytes) -> FileMesh:
 
 
 def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block], names: list[str]) -> FileMesh:
-    """Joins the blocks of a kind, and numbers nodes by their place in the file instead of their tags.
+    """Joins the blocks of every kind, and numbers nodes by their position in the file instead of their tags.
 
     A named group without elements becomes an empty set: MSH 2.2 with `Mesh.SaveAll` keeps only the names.
     """
@@ -100,7 +100,7 @@ def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block], names:
 
 
 def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of the sections between $Name and $EndName."""
+    """Yields names and contents of the sections between $Name and $EndName."""
     at = 0
     while (start := data.find(b"$", at)) >= 0:
         content = data.find(b"\n", start) + 1 or len(data)
@@ -142,7 +142,7 @@ def _binary(section: bytes, types: dict[str, str]) -> Take:
 def _groups(
     reader: Callable[[str], Take], sections: dict[str, bytes], names: dict[tuple[int, int], str]
 ) -> dict[tuple[int, int], tuple[str, ...]]:
-    """Physical groups by dimension and tag of the entities; files without entities have no groups."""
+    """Returns physical groups by dimension and tag of the entities; files without entities have none."""
     groups: dict[tuple[int, int], tuple[str, ...]] = {}
     if "Entities" not in sections:
         return groups
@@ -159,7 +159,7 @@ def _groups(
 
 
 def _nodes(take: Take) -> tuple[np.ndarray, np.ndarray]:
-    """Tags and positions of the nodes, version 4.1."""
+    """Returns tags and positions of the nodes, version 4.1."""
     tags, points = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     for _ in range(take("n", 4)[0]):
         dimension, _, parametric = take("i", 3)
@@ -170,7 +170,7 @@ def _nodes(take: Take) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _elements(take: Take, groups: dict[tuple[int, int], tuple[str, ...]]) -> Iterator[_Block]:
-    """Elements of version 4.1, whose groups are those of their entity."""
+    """Yields elements of version 4.1, which have the groups of their entity."""
     for _ in range(take("n", 4)[0]):
         dimension, tag, number = take("i", 3)
         kind, nodes = _kind(number)
@@ -180,7 +180,7 @@ def _elements(take: Take, groups: dict[tuple[int, int], tuple[str, ...]]) -> Ite
 
 
 def _nodes_2(section: bytes, binary: bool, order: str) -> tuple[np.ndarray, np.ndarray]:
-    """Tags and positions of the nodes, version 2.2."""
+    """Returns tags and positions of the nodes, version 2.2."""
     count, _, content = section.partition(b"\n")
     if binary:
         rows = np.frombuffer(content, [("tag", f"{order}i4"), ("x", f"{order}f8", 3)], int(count))
@@ -192,13 +192,13 @@ def _nodes_2(section: bytes, binary: bool, order: str) -> tuple[np.ndarray, np.n
 def _elements_2(
     section: bytes, binary: bool, types: dict[str, str], names: dict[tuple[int, int], str]
 ) -> Iterator[_Block]:
-    """Elements of version 2.2: an element's first tag is its group, and it is listed once in every group."""
+    """Yields elements of version 2.2: the first tag of an element is its group, and every group lists it once."""
     count, _, content = section.partition(b"\n")
     take = _binary(content, types) if binary else _ascii(content)
     tables: dict[tuple[int, int], list[np.ndarray]] = {}
     read = 0
     while read < int(count):
-        # ASCII states kind and number of tags for every element (number, kind, tags), binary for a block of them.
+        # ASCII states kind and number of tags for every element (number, kind, tags), binary for a block of elements.
         number, block, tags = map(int, take("i", 3)[slice(None) if binary else [1, 0, 2]])
         columns, block = int(binary) + tags + _kind(number)[1], block if binary else 1
         tables.setdefault((number, tags), []).append(take("i", block * columns).reshape(block, columns))

@@ -1,7 +1,7 @@
-"""Counts overlapping components of a moving mesh: separating-axis tests of simplices, after bounding boxes.
+"""Counts overlapping components of a moving mesh by separating-axis tests of simplices, after bounding boxes.
 
 Two convex bodies have common interior points exactly if their projections overlap on every candidate axis (Gottschalk,
-Lin and Manocha 1996): the facet normals of both and, in space, the cross products of their edges.
+Lin and Manocha 1996): the facet normals of both bodies and, in space, the cross products of their edges.
 """
 
 import itertools
@@ -16,14 +16,14 @@ from dln_jax.softbody.mesh.mesh import Mesh, components
 from dln_jax.softbody.mesh.simplices import FACETS
 
 _CLUSTER = 16
-"""Elements that share one bounding box."""
+"""Number of elements that share one bounding box."""
 
 
 def count_overlaps(mesh: Mesh) -> Callable[[Float[Array, "n dim"]], Int[Array, ""]] | None:
-    """Positions -> number of pairs of components that overlap; `None` for a mesh of one component.
+    """Returns positions -> number of overlapping pairs of components; `None` for a mesh of one component.
 
-    Components that only touch, to a depth of sqrt(eps) of the larger element, do not overlap. Pairs of elements are
-    compared only if the bounding boxes of their clusters meet.
+    Components that only touch, to a depth of sqrt(eps) of the larger element, do not overlap. Elements are compared
+    only if the bounding boxes of their clusters meet.
     """
     labels = components(mesh)
     if labels.max(initial=0) == 0:
@@ -49,7 +49,7 @@ def count_overlaps(mesh: Mesh) -> Callable[[Float[Array, "n dim"]], Int[Array, "
                 of_one, of_other = x[corners[one[place]]], x[corners[other[place]]]
                 return jax.vmap(lambda a: jax.vmap(lambda b: simplices_overlap(a, b))(of_other))(of_one).any()
 
-            # One overlapping pair of elements decides its pair of components.
+            # One overlapping pair of elements is enough for its pair of components.
             hit = jax.lax.cond(hits[pair], lambda _: jnp.asarray(True), meet, None)
             return k + 1, hits.at[pair].max(hit)
 
@@ -64,10 +64,10 @@ def simplices_overlap(a: Float[Array, "corners dim"], b: Float[Array, "corners d
     axes = jnp.concatenate([_normals(a), _normals(b), *([_edge_products(a, b)] if a.shape[1] == 3 else [])])
     squared = jnp.sum(axes**2, axis=1)
     extent = jnp.maximum(*(jnp.max(corners.max(axis=0) - corners.min(axis=0)) for corners in (a, b)))
-    # The cross product of parallel edges is zero and no axis.
+    # The cross product of parallel edges is zero and gives no axis.
     scale = extent if a.shape[1] == 2 else extent**2
     usable = squared > (jnp.sqrt(jnp.finfo(a.dtype).eps) * scale) ** 2
-    # Relative to a nearby origin, so that distance from the world's origin costs no precision.
+    # Coordinates relative to a nearby origin, so that a large distance from the world's origin costs no precision.
     of_a, of_b = ((corners - a[0]) @ axes.T for corners in (a, b))
     depth = jnp.minimum(of_a.max(axis=0) - of_b.min(axis=0), of_b.max(axis=0) - of_a.min(axis=0))
     depth = jnp.where(usable, depth / jnp.sqrt(jnp.where(usable, squared, 1.0)), jnp.inf)
@@ -91,7 +91,7 @@ def _edge_products(a: Float[Array, "4 3"], b: Float[Array, "4 3"]) -> Float[Arra
 def _clusters(
     mesh: Mesh, labels: Int[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, "clusters size"], Int[np.ndarray, " clusters"]]:
-    """Clusters of neighbouring elements of one component, and their components; incomplete clusters repeat elements."""
+    """Returns clusters of neighbouring elements of one component, and their components; short ones repeat elements."""
     centres = mesh.vertices[mesh.elements].mean(axis=1)
     clusters, owners = [], []
 

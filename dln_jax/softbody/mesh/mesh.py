@@ -1,7 +1,7 @@
 """Meshes of simplices: triangles in the plane, tetrahedra in space.
 
-Static NumPy arrays in float64, which become constants of the compiled simulation. A body in the plane is 1 m thick: its
-areas in m² count as volumes in m³. `mesh/simplices.py` has volumes that are differentiable by the rest shape.
+Meshes are static NumPy arrays in float64, which become constants of the compiled simulation. A body in the plane is
+1 m thick: its areas in m² count as volumes in m³. `mesh/simplices.py` has volumes differentiable by the rest shape.
 """
 
 import itertools
@@ -19,20 +19,20 @@ from dln_jax.softbody.mesh.simplices import SIDES, facets, regularity, simplex_v
 from dln_jax.types import InputError
 
 FLAT = 1e-12
-"""Largest `regularity` of a degenerate element, whose volume is rounding error."""
+"""An element is degenerate up to this `regularity`: its volume is rounding error."""
 _CORNER_SHARES = {2: 1 / 19, 3: 1 / 36}
-"""Share of a quadratic element's mass at a corner, after Hinton, Rock and Zienkiewicz (1976): in proportion to the
-diagonal of the consistent mass matrix, which is 6 at a corner and 32 in the middle of a side. All are positive."""
+"""Share of a quadratic element's mass at one corner (Hinton, Rock and Zienkiewicz 1976): in proportion to the diagonal
+of the consistent mass matrix, which is 6 at a corner and 32 in the middle of a side. All shares are positive."""
 WORDS = {2: ("triangle", "area"), 3: ("tetrahedron", "volume")}
 
 
 class NamedSet(NamedTuple):
-    """Part of a body with a name, such as a physical group of Gmsh."""
+    """Named part of a body, such as a physical group of Gmsh."""
 
     vertices: Int[np.ndarray, " k"]
     """In ascending order."""
     elements: Int[np.ndarray, " j"]
-    """In ascending order; none if the set is a surface, a curve or points."""
+    """In ascending order; empty if the set is a surface, a curve or points."""
 
 
 class Mesh(NamedTuple):
@@ -43,11 +43,11 @@ class Mesh(NamedTuple):
     elements: Int[np.ndarray, "m corners"]
     """Corners of the triangles (dim 2) or tetrahedra (dim 3), positively oriented."""
     turned: int = 0
-    """Number of inverted elements (clockwise, in the plane) that `make_mesh` has reoriented."""
+    """Number of inverted elements (clockwise in the plane) that `make_mesh` has reoriented."""
     sets: Mapping[str, NamedSet] = MappingProxyType({})
-    """Named parts, from a mesh file."""
+    """Named parts from a mesh file."""
     midsides: Int[np.ndarray, "m edges"] | None = None
-    """Mid-side nodes of quadratic elements, vertices in the order of `simplices.SIDES`; `None` for linear elements."""
+    """Mid-side nodes of quadratic elements, in the order of `simplices.SIDES`; `None` for linear elements."""
 
     @property
     def dimension(self) -> int:
@@ -63,12 +63,12 @@ class Mesh(NamedTuple):
 def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
     """Builds a mesh of vertices [n, dim] in m and elements [m, dim + 1]; validates it and reorients inverted elements.
 
-    `Mesh.turned` counts those. Elements may overlap, because the energies of all add up; `overlaps` returns where.
+    `Mesh.turned` counts the reoriented elements. Elements may overlap: their energies add up; `overlaps` finds them.
 
     Raises:
         InputError: names the first invalid vertex or element: a position that is not finite, a corner out of range or
-            repeated, a duplicate or degenerate element, a vertex in no element. Or elements that share no vertex
-            although some of their corners coincide: a mesh whose vertices were never merged.
+            repeated, a duplicate or degenerate element, a vertex in no element. Also if elements share no vertices
+            although some of their corners coincide: the vertices of such a mesh were never merged.
     """
     positions = _as_vertices(vertices)
     corners = _as_elements(elements, positions.shape[1])
@@ -81,28 +81,28 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
 
 
 def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
-    """Areas in m² or volumes in m³ of the elements."""
+    """Returns areas in m² or volumes in m³ of the elements."""
     return simplex_volumes(mesh.vertices, mesh.nodes)
 
 
 def edges(mesh: Mesh) -> Int[np.ndarray, "e 2"]:
-    """Distinct edges, with the smaller vertex first, in lexicographic order."""
+    """Returns the distinct edges in lexicographic order, each with the smaller vertex first."""
     pairs = list(itertools.combinations(range(mesh.dimension + 1), 2))
     return np.unique(np.sort(mesh.elements[:, pairs].reshape(-1, 2), axis=1), axis=0)
 
 
 def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Facets with the body on one side only, oriented outwards.
+    """Returns the facets with the body on one side only, oriented outwards.
 
-    An edge [a, b] of the plane has the body on its left: its outward normal is (yb - ya, xa - xb). That of a triangle
-    [a, b, c] in space is (b - a) x (c - a).
+    An edge [a, b] in the plane has the body on its left and the outward normal (yb - ya, xa - xb). A triangle [a, b, c]
+    in space has the outward normal (b - a) x (c - a).
     """
     distinct, counts = _facet_sides(mesh)
     return distinct[(counts == 0).any(axis=1)]
 
 
 def overlaps(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Facets with two or more elements on one side. They overlap, with the sum of their masses and stiffnesses.
+    """Returns facets with two or more elements on one side, which overlap: their masses and stiffnesses add up.
 
     Overlaps of elements without a common facet are not detected.
     """
@@ -111,7 +111,7 @@ def overlaps(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
 
 
 def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
-    """Index, from 0, of every element's component; shared vertices connect elements."""
+    """Returns the component of every element, counted from 0; shared vertices connect elements."""
     n, m = len(mesh.vertices), len(mesh.elements)
     corners = mesh.elements.ravel()
     first = np.repeat(mesh.elements[:, 0], mesh.elements.shape[1])
@@ -120,7 +120,7 @@ def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
 
 
 def boundary_vertices(mesh: Mesh) -> Int[np.ndarray, " b"]:
-    """Vertices of the boundary, in ascending order."""
+    """Returns the vertices of the boundary, in ascending order."""
     outside = boundary(mesh)
     if mesh.midsides is None:
         return np.unique(outside)
@@ -131,7 +131,7 @@ def boundary_vertices(mesh: Mesh) -> Int[np.ndarray, " b"]:
 
 
 def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]], np.ndarray]) -> Int[np.ndarray, " k"]:
-    """Indices of the vertices whose rest positions [n, dim] satisfy a condition, such as `lambda x: x[:, 0] < 1e-9`.
+    """Returns the vertices whose rest positions [n, dim] satisfy a condition, such as `lambda x: x[:, 0] < 1e-9`.
 
     Raises:
         InputError: no vertex does, or the condition does not return one boolean per vertex.
@@ -149,17 +149,17 @@ def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]],
 
 
 def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndarray, " n"]:
-    """Masses of the vertices in kg: an element's corners get equal shares of its mass.
+    """Returns the masses of the vertices in kg: an element's corners get equal shares of its mass.
 
-    Of a quadratic element, each mid-side node gets 16/3 of a corner's share. These masses integrate linear functions
-    exactly, so that body forces by them converge with order 2, and not with the order 3 of the elements.
+    In a quadratic element, each mid-side node gets 16/3 of a corner's share. These masses integrate linear functions
+    exactly, so results with body forces converge with order 2 instead of the elements' order 3.
 
     Args:
-        mesh: in m.
+        mesh: positions in m.
         density: in kg/m³ (in the plane for 1 m of thickness), one for all elements or one per element, [m].
 
     Raises:
-        InputError: a density is not positive and finite, or their number differs from that of the elements.
+        InputError: a density is not positive and finite, or the number of densities differs from that of the elements.
     """
     densities = np.asarray(density, dtype=np.float64)
     m = len(mesh.elements)
@@ -180,10 +180,10 @@ def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndar
 
 
 def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, "f 2"]]:
-    """Distinct facets, in the orientation of their first element, and the numbers of elements on their two sides."""
+    """Returns the distinct facets, oriented as in their first element, and how many elements lie on their two sides."""
     every = facets(mesh.elements).reshape(-1, mesh.dimension)
     _, first, group = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_inverse=True)
-    # The sign of the permutation that sorts a facet's corners decides on which side its element lies.
+    # The sign of the permutation that sorts a facet's corners tells on which side its element lies.
     swaps = sum(every[:, i] > every[:, j] for i, j in itertools.combinations(range(mesh.dimension), 2))
     counts = np.bincount(2 * group.reshape(-1) + swaps % 2, minlength=2 * len(first)).reshape(-1, 2)
     order = np.argsort(first)
@@ -218,7 +218,7 @@ def _as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
 
 
 def _require_volumes(vertices: np.ndarray, elements: np.ndarray, shape: np.ndarray) -> None:
-    """Refuses flat elements, which have no strain, and vertices without a mass or a second element."""
+    """Refuses flat elements, which have no strain, and vertices without mass or without a second element."""
     kind, measure = WORDS[vertices.shape[1]]
     if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Points inside of bodies: the element that contains a point, and the point's shares in its nodes."""
+"""Points inside bodies: the element that contains a point, and the point's shape-function values."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,16 +9,16 @@ from dln_jax.softbody.mesh.simplices import SIDES
 from dln_jax.types import InputError
 
 _OUTSIDE = 1e-9
-"""Smallest barycentric coordinate of a point on the surface, as rounding leaves it."""
+"""Smallest barycentric coordinate accepted for a point on the surface, to allow for rounding."""
 
 
 def located(mesh: Mesh, points: ArrayLike) -> tuple[Int[np.ndarray, "p nodes"], Float[np.ndarray, "p nodes"]]:
-    """Nodes of the elements that contain points of the rest shape, in m, and the values of their shape functions there.
+    """Returns the nodes of the elements that contain points of the rest shape (in m), and the shape functions there.
 
-    A point moves with the body as the sum of its nodes' positions, weighted by these values.
+    A point moves with the body: its position is the sum of its nodes' positions, weighted by these values.
 
     Raises:
-        InputError: points of a wrong shape, or one that is outside of the body.
+        InputError: points of a wrong shape, or a point outside the body.
     """
     positions = np.asarray(points, dtype=float)
     if positions.ndim != 2 or positions.shape[1] != mesh.dimension or not np.isfinite(positions).all():

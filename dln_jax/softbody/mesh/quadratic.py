@@ -1,4 +1,4 @@
-"""Quadratic meshes: mid-side nodes on the edges of a linear mesh, and the split that keeps them from locking."""
+"""Quadratic meshes: mid-side nodes on the edges of a linear mesh, and the split that avoids locking."""
 
 from types import MappingProxyType
 
@@ -14,13 +14,13 @@ from dln_jax.types import InputError
 def quadratic(mesh: Mesh) -> Mesh:
     """Adds a node in the middle of every edge: triangles of 6 nodes and tetrahedra of 10.
 
-    The new vertices follow those of the mesh, whose corners and their numbers stay; named sets get them as by
+    The new vertices follow those of the mesh, whose corners keep their indices; named sets are extended by
     `with_midsides`. Edges are straight; for a curved rest shape, move vertices by `mesh._replace(vertices=...)`. With
-    curved edges, uniform strains stay exact in the plane, but not in space, where the quadrature is not exact: move
-    mid-side nodes of the boundary only.
+    curved edges, uniform strains stay exact in the plane but not in space, where the quadrature is not exact: move only
+    mid-side nodes on the boundary.
 
     Raises:
-        InputError: the mesh is quadratic already.
+        InputError: the mesh is already quadratic.
     """
     if mesh.midsides is not None:
         raise InputError("the mesh is quadratic already; pass the linear mesh")
@@ -37,8 +37,8 @@ def barycentric_split(mesh: Mesh) -> Mesh:
     """Splits each element of a linear mesh at its centre into 3 triangles or 4 tetrahedra (Alfeld split).
 
     In the plane, quadratic elements on a split mesh are the Scott-Vogelius pair of degree 2: it satisfies the inf-sup
-    condition (Arnold and Qin 1992) and converges with order 3 also as nu approaches 1/2. In space that is proved from
-    degree 3 on only (Zhang 2005).
+    condition (Arnold and Qin 1992) and converges with order 3 even as nu approaches 1/2. In space this is proved only
+    from degree 3 on (Zhang 2005).
 
     Raises:
         InputError: the mesh is quadratic.
@@ -62,6 +62,6 @@ def barycentric_split(mesh: Mesh) -> Mesh:
 
 
 def with_midsides(mesh: Mesh, vertices: ArrayLike) -> Int[np.ndarray, " k"]:
-    """Returns some corners of a quadratic mesh together with the mid-side nodes between any two of them, for `held`."""
+    """Returns corners of a quadratic mesh together with the mid-side nodes between any two of them, for `held`."""
     chosen = np.isin(mesh.elements, vertices)[:, np.array(SIDES[mesh.dimension])].all(axis=2)
     return np.union1d(vertices, mesh.nodes[:, mesh.dimension + 1 :][chosen]).astype(int)

@@ -10,10 +10,10 @@ from dln_jax.types import InputError
 
 
 def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
-    """Vertices that are in any of these sets, in ascending order, as for `held`.
+    """Returns the vertices that are in any of these sets, in ascending order, for example for `held`.
 
     Raises:
-        InputError: a set that does not exist, and the message lists those that do, or one without vertices.
+        InputError: a set does not exist (the message lists those that do), or has no vertices.
     """
     members = [np.zeros(0, np.int64)]
     for name in names:
@@ -26,12 +26,12 @@ def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
 
 
 def values_by_set(mesh: Mesh, default: float, values: Mapping[str, float]) -> Float[np.ndarray, " m"]:
-    """One value per element, such as Young's modulus: that of its set or, outside of these sets, the default.
+    """Returns one value per element, such as Young's modulus: that of its set, or the default outside these sets.
 
     An element in several of these sets gets the value of the last one.
 
     Raises:
-        InputError: a set that does not exist, or has no elements.
+        InputError: a set does not exist, or has no elements.
     """
     result = np.full(len(mesh.elements), float(default))
     for name, value in values.items():

@@ -1,9 +1,9 @@
-"""Meshes of simple shapes: beam, box, disc, any set of cells of a lattice, and creatures with muscles along their skin.
+"""Meshes of simple shapes: beam, box, disc, any set of lattice cells, and creatures with muscles along their skin.
 
-A creature stands on y = 0 and faces right. It is a drawing of square cells (`#`), with two triangles per cell, and
-pointed ends (`<`, `>`). All edges of the outline except those on the ground are muscles: both sides of the legs, to
-bend them, and the upper and lower side of the body. Sizes suit the material of the "creature" preset, whose energies
-count per triangle and not per area.
+A creature stands on y = 0 and faces right. It is drawn in square cells (`#`), with two triangles per cell, and pointed
+ends (`<`, `>`). All edges of the outline except those on the ground are muscles: on both sides of the legs, to bend
+them, and on the upper and lower side of the body. Sizes suit the material of the "creature" preset, whose energies are
+per triangle, not per area.
 """
 
 import itertools
@@ -19,9 +19,9 @@ from dln_jax.softbody.mesh.mesh import Mesh, boundary, make_mesh
 from dln_jax.types import InputError, require_positive
 
 # Lattice cells are cut so that every diagonal joins two vertices with an even sum of coordinates: neighbours are mirror
-# images, which makes them fit, and no direction is preferred. In space that is one regular tetrahedron between four
-# alternate corners and one tetrahedron in each of the other four. The alternative, six equal tetrahedra around a space
-# diagonal (Kuhn), costs a fifth more elements, has flatter ones, and a bent bar twists towards its diagonals.
+# images, so they fit, and no direction is preferred. In space a cell is one regular tetrahedron between four alternate
+# corners and one tetrahedron in each of the other four. The alternative, six equal tetrahedra around a space diagonal
+# (Kuhn), costs a fifth more elements, has flatter ones, and a bent bar twists towards its diagonals.
 PATTERNS = {
     2: (((0, 0), (1, 0), (1, 1)), ((0, 0), (1, 1), (0, 1))),
     3: (
@@ -32,7 +32,7 @@ PATTERNS = {
         ((1, 1, 1), (0, 1, 1), (1, 1, 0), (1, 0, 1)),
     ),
 }
-"""Corners of the simplices in a cell at even coordinates; in one at odd coordinates x is mirrored."""
+"""Corners of the simplices in a cell at even coordinates; at odd coordinates x is mirrored."""
 POINT = 0.8
 """Length of a pointed end, in cells."""
 
@@ -43,11 +43,11 @@ class Creature(NamedTuple):
     name: str
     mesh: Mesh
     muscles: Int[np.ndarray, "k 2"]
-    """Vertices at the two ends of the muscles, from left to right."""
+    """Vertices at the two ends of every muscle, from left to right."""
 
 
 def beam(length: float, height: float, cells_x: int, cells_y: int) -> Mesh:
-    """Triangles on [0, length] x [0, height], in m; (cells_x + 1)(cells_y + 1) vertices, ordered along x first.
+    """Returns triangles on [0, length] x [0, height], in m; (cells_x + 1)(cells_y + 1) vertices, ordered along x first.
 
     Diagonals alternate: with an even number of cells along an axis, the mesh is its own mirror image along it.
     """
@@ -55,12 +55,12 @@ def beam(length: float, height: float, cells_x: int, cells_y: int) -> Mesh:
 
 
 def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mesh:
-    """Five tetrahedra per cell on [0, lx] x [0, ly] x [0, lz], in m; as symmetric as `beam`."""
+    """Returns five tetrahedra per cell on [0, lx] x [0, ly] x [0, lz], in m; as symmetric as `beam`."""
     return _grid(lengths, cells)
 
 
 def disc(radius: float, rings: int) -> Mesh:
-    """Triangles on a disc around the origin, radius in m; 1 + 3 rings (rings + 1) vertices, 6 rings² triangles.
+    """Returns triangles on a disc around the origin, radius in m; 1 + 3 rings (rings + 1) vertices, 6 rings² triangles.
 
     Ring k has 6 k vertices; the boundary is a regular polygon inscribed in the circle.
     """
@@ -80,15 +80,15 @@ def disc(radius: float, rings: int) -> Mesh:
 
 
 def lattice(cells: ArrayLike) -> tuple[Int[np.ndarray, "n dim"], Int[np.ndarray, "m corners"]]:
-    """Integer positions and positively oriented elements of the unit cells with these lower corners [c, dim].
+    """Returns integer positions and positively oriented elements of the unit cells with these lower corners [c, dim].
 
-    Vertices are in lexicographic order. Cells may be any set; scale the positions and pass both to `make_mesh`.
+    Vertices are in lexicographic order. Any set of cells will do; scale the positions and pass both to `make_mesh`.
     """
     lower = np.asarray(cells, dtype=np.int64)
     pattern = np.array(PATTERNS[lower.shape[1]])
     mirrored = pattern.copy()
     mirrored[..., 0] = 1 - mirrored[..., 0]
-    mirrored[:, -2:] = mirrored[:, :-3:-1].copy()  # A mirror image is inverted; two corners swapped are so again.
+    mirrored[:, -2:] = mirrored[:, :-3:-1].copy()  # Mirroring inverts an element; swapping two corners restores it.
     odd = lower.sum(axis=1) % 2 == 1
     corners = lower[:, None, None] + np.where(odd[:, None, None, None], mirrored, pattern)
     positions, numbers = np.unique(corners.reshape(-1, lower.shape[1]), axis=0, return_inverse=True)
@@ -96,7 +96,7 @@ def lattice(cells: ArrayLike) -> tuple[Int[np.ndarray, "n dim"], Int[np.ndarray,
 
 
 def crawler() -> Creature:
-    """A long low body on four small feet, pointed in front and behind: 28 vertices, 24 muscles."""
+    """A long low body on four small feet, pointed at both ends: 28 vertices, 24 muscles."""
     return _drawn("crawler", 0.3, "<########>", " #.#..#.# ")
 
 
@@ -111,7 +111,7 @@ def quadruped() -> Creature:
 
 
 def box_quadruped() -> Creature:
-    """A body in space on four legs, of cubes of 0.4 m: 56 vertices, 48 muscles along legs, back and belly."""
+    """A body in space on four legs, made of cubes of 0.4 m: 56 vertices, 48 muscles along legs, back and belly."""
     body = itertools.product(range(4), range(3), (1,))
     legs = itertools.product((0, 3), (0, 2), (0,))
     positions, elements = lattice([*body, *legs])
@@ -129,7 +129,7 @@ def body_length(creature: Creature) -> float:
 
 
 def _drawn(name: str, size: float, *rows: str) -> Creature:
-    """Returns the creature of a drawing whose cells have sides of `size` m."""
+    """Builds the creature of a drawing whose cells have sides of `size` m."""
     drawing = {(x, y): mark for y, row in enumerate(reversed(rows)) for x, mark in enumerate(row)}
     positions, elements = lattice([cell for cell, mark in drawing.items() if mark == "#"])
     number = {tuple(position): index for index, position in enumerate(positions.tolist())}
@@ -159,7 +159,7 @@ def _grid(lengths: tuple[float, ...], cells: tuple[int, ...]) -> Mesh:
 
 
 def _on_ring(k: int, place: int) -> int:
-    """Index of a vertex by its position on ring k, modulo the ring."""
+    """Index of the vertex at a position on ring k, modulo the ring."""
     return 0 if k == 0 else 1 + 3 * k * (k - 1) + place % (6 * k)
 
 

@@ -1,4 +1,4 @@
-"""Volumes, shapes and facets of individual simplices, from positions and corners, whether they form a mesh or not.
+"""Volumes, shapes and facets of individual simplices, whether they form a mesh or not.
 
 Quadratic simplices have a mid-side node on each edge after their corners. With barycentric coordinates l, the shape
 functions are l_i (2 l_i - 1) at corner i and 4 l_i l_j between corners i and j. Their quadrature points (3 in a
@@ -15,20 +15,21 @@ from jaxtyping import Array, Float, Int
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
 FACETS = {2: ((0, 1), (1, 2), (2, 0)), 3: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))}
-"""Corners of the facets by dimension, oriented outwards: in the plane the body lies on the left of an edge; in space
-the right-hand normal of a triangle points away from the body."""
+"""Corners of the facets by dimension, oriented outwards: in the plane the body lies on the left of an edge, in space
+the
+ right-hand normal of a triangle points away from the body."""
 
 SIDES = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}
 """Corners of the edges by dimension, in the order of the mid-side nodes (that of VTK)."""
 _FRACTION = {2: 1 / 6, 3: (5 - math.sqrt(5)) / 20}
-"""The smallest barycentric coordinate of the quadrature points; the others are permutations."""
+"""Smallest barycentric coordinate of the quadrature points, which are its permutations."""
 
 
 def simplex_volumes(vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m nodes"]) -> Float[AnyArray, " m"]:
-    """Signed areas in m² or volumes in m³: det[x1 - x0, ..., xdim - x0] / dim!, negative for inverted elements.
+    """Returns signed areas in m² or volumes in m³: det[x1 - x0, ..., xdim - x0] / dim!, negative if inverted.
 
-    Takes NumPy and JAX arrays, so that it can be differentiated by the rest shape. The volume of a quadratic
-    tetrahedron with curved edges is that of the quadrature.
+    Takes NumPy arrays, and JAX arrays for derivatives by the rest shape. The volume of a quadratic tetrahedron with
+    curved edges is that of the quadrature.
     """
     if elements.shape[1] > vertices.shape[1] + 1:
         return jacobians(vertices, elements).mean(axis=1) / math.factorial(vertices.shape[1])
@@ -39,20 +40,20 @@ def simplex_volumes(vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray
 def volume_ratios(
     x: Float[AnyArray, "n dim"], rest: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m nodes"]
 ) -> Float[AnyArray, "m points"]:
-    """J = det dx/dX: one number for a linear element, one at each quadrature point of a quadratic element."""
+    """Returns J = det dx/dX: one per linear element, one per quadrature point of a quadratic element."""
     if elements.shape[1] > x.shape[1] + 1:
         return jacobians(x, elements) / jacobians(rest, elements)
     return (simplex_volumes(x, elements) / simplex_volumes(rest, elements))[:, None]
 
 
 def jacobians(vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m nodes"]) -> Float[AnyArray, "m points"]:
-    """Determinants of dx/dl of quadratic elements at their quadrature points, in m² or m³."""
+    """Returns the determinants of dx/dl of quadratic elements at their quadrature points, in m² or m³."""
     J = vertices[elements].swapaxes(1, 2)[:, None] @ reference_gradients(vertices.shape[1])
     return determinant(J.transpose(2, 3, 0, 1))
 
 
 def reference_gradients(dimension: int) -> Float[np.ndarray, "points nodes dim"]:
-    """Derivatives of a quadratic element's shape functions by the barycentric coordinates l1, ..., ldim."""
+    """Returns derivatives of a quadratic element's shape functions by the barycentric coordinates l1, ..., ldim."""
     fraction, count = _FRACTION[dimension], dimension + 1
     points = np.full((count, count), fraction) + (1 - count * fraction) * np.eye(count)
     slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])
@@ -64,10 +65,10 @@ def reference_gradients(dimension: int) -> Float[np.ndarray, "points nodes dim"]
 def facet_rule(
     dimension: int, quadratic: bool
 ) -> tuple[Float[np.ndarray, "points nodes"], Float[np.ndarray, "points nodes d"], Float[np.ndarray, " points"]]:
-    """Shape functions of a facet at its quadrature points, their derivatives by its coordinates, and the weights.
+    """Returns a facet's shape functions at its quadrature points, their derivatives by its coordinates, and weights.
 
     Nodes are the corners, then the mid-side nodes in the order of `SIDES`. The rules (centroid; Gauss with 2 points;
-    Strang and Fix 1973 with 6 points) integrate the volume that facets enclose exactly.
+    Strang and Fix 1973 with 6 points) are exact for the volume that the facets enclose.
     """
     slopes = np.concatenate([-np.ones((1, dimension - 1)), np.eye(dimension - 1)])
     if not quadratic:
@@ -88,7 +89,7 @@ def facet_rule(
 
 
 def determinant(F: Any) -> Any:
-    """Determinant of a 2 x 2 or 3 x 3 matrix from its rows; entries are scalars, or arrays over several matrices."""
+    """Returns the determinant of a 2 x 2 or 3 x 3 matrix; entries are scalars, or arrays over several matrices."""
     if len(F) == 2:
         return F[0][0] * F[1][1] - F[0][1] * F[1][0]
     cofactor = cofactors(F)
@@ -96,10 +97,10 @@ def determinant(F: Any) -> Any:
 
 
 def cofactors(F: Any) -> list[list[Any]]:
-    """Rows of cof F = det F F⁻ᵀ."""
+    """Returns the rows of cof F = det F F⁻ᵀ."""
     if len(F) == 2:
         return [[F[1][1], -F[1][0]], [-F[0][1], F[0][0]]]
-    # Cyclic indices give the signs.
+    # Cyclic indices take care of the signs.
     return [
         [
             F[(i + 1) % 3][(j + 1) % 3] * F[(i + 2) % 3][(j + 2) % 3]
@@ -111,7 +112,7 @@ def cofactors(F: Any) -> list[list[Any]]:
 
 
 def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]) -> Float[np.ndarray, " m"]:
-    """Shapes of the elements: the volume over that of the regular simplex with the same longest edge.
+    """Returns the volume of every element divided by that of the regular simplex with the same longest edge.
 
     1 for a regular simplex, 0 for a flat one, negative for an inverted one; also 0 if all corners coincide.
     """
@@ -125,5 +126,5 @@ def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "
 
 
 def facets(elements: Int[np.ndarray, "m corners"]) -> Int[np.ndarray, "m corners dim"]:
-    """Edges of the triangles or triangles of the tetrahedra, oriented outwards unless the element is inverted."""
+    """Returns the facets of all elements, oriented outwards unless the element is inverted."""
     return elements[:, np.array(FACETS[elements.shape[1] - 1])]

@@ -1,7 +1,7 @@
-"""From the content of a mesh file to a body: selects its triangles or tetrahedra, repairs them, and keeps named sets.
+"""Builds a body from the content of a mesh file: selects its triangles or tetrahedra, repairs them, keeps named sets.
 
-Every change is stated. A set of surfaces, curves or points becomes a set of vertices; one of the body's own elements
-becomes a set of elements and of their corners.
+Every change is reported. A set of surfaces, curves or points becomes a set of vertices; a set of the body's own
+elements becomes a set of elements and of their corners.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from dln_jax.types import InputError, require_positive
 MERGE = 1e-7
 """Vertices closer than this fraction of the largest extent are merged; single precision rounds to 6e-8."""
 CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
-"""Number of corners of cells that a body may have beside its elements; these nodes come first in all formats."""
+"""Number of corners of the cells that a file may contain; corners come first in all formats."""
 DIMENSIONS = {
     "vertex": 0,
     "line": 1,
@@ -36,7 +36,7 @@ ELEMENTS = {2: "triangle", 3: "tetra"}
 
 
 class FileMesh(NamedTuple):
-    """The content of a mesh file, before anything is selected or repaired."""
+    """Content of a mesh file, before anything is selected or repaired."""
 
     points: Float[np.ndarray, "n 3"]
     cells: dict[str, Int[np.ndarray, "m k"]]
@@ -51,24 +51,24 @@ class ReadMesh(NamedTuple):
 
     mesh: Mesh
     statements: tuple[str, ...]
-    """What was left out, simplified or repaired, in sentences. `Mesh.turned` counts reoriented elements."""
+    """Sentences on what was left out, simplified or repaired. `Mesh.turned` counts reoriented elements."""
 
 
 def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -> ReadMesh:
     """Builds the body in a mesh file.
 
-    The body is its tetrahedra or, without any, its triangles in a plane z = const. Cells of higher order are reduced to
-    their corners. Vertices closer than `merge` times the largest extent become one; loose vertices and repeated
-    elements are removed.
+    The body is the file's tetrahedra or, without any, its triangles in a plane z = const. Cells of higher order are
+    reduced to their corners. Vertices closer than `merge` times the largest extent are merged; loose vertices and
+    repeated elements are removed.
 
     Args:
-        content: of the file.
+        content: content of the file.
         scale: length of the file's unit in m, such as 0.001 for millimetres.
-        merge: fraction of the largest extent; 0 merges nothing.
+        merge: fraction of the largest extent; 0 merges none.
 
     Raises:
-        InputError: a surface without volume, hexahedra or other cells that are no simplices, an element without
-            volume, or positions that are not finite.
+        InputError: the file has a surface without volume, cells that are not simplices (such as hexahedra), an element
+            without volume, or positions that are not finite.
     """
     require_positive(scale=scale)
     of_dimension = {
@@ -105,7 +105,7 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
 
 
 def base(kind: str) -> str:
-    """The kind of cell of first order: triangle for triangle6."""
+    """Returns the first-order kind of a cell: triangle for triangle6."""
     return kind.rstrip("0123456789")
 
 
@@ -116,7 +116,7 @@ def _plural(kind: str) -> str:
 def _corners(
     content: FileMesh, element: str
 ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]], list[str]]:
-    """Corners of the cells by kind of first order, the sets of these cells, and a statement about curved elements."""
+    """Returns corners of the cells by first-order kind, the sets of these cells, and a statement on curved elements."""
     cells: dict[str, np.ndarray] = {}
     sets: dict[str, dict[str, np.ndarray]] = {name: {} for name in content.cell_sets}
     curved = 0
@@ -134,7 +134,7 @@ def _corners(
 
 
 def _in_plane(points: Float[np.ndarray, "n 3"], corners: Int[np.ndarray, " k"]) -> Float[np.ndarray, "n 2"]:
-    """The x and y of points if these corners lie in a plane z = const."""
+    """Returns x and y of the points if these corners lie in a plane z = const; refuses other surfaces."""
     extents = np.ptp(points[corners], axis=0)
     flat = np.flatnonzero(extents <= MERGE * extents.max())
     if 2 in flat:
@@ -191,7 +191,7 @@ def _repaired(
 
 
 def _first_of_same(points: Float[np.ndarray, "n dim"], distance: float) -> Int[np.ndarray, " n"]:
-    """The smallest index among the points that are closer than this to each other."""
+    """Returns for every point the smallest index among the points within this distance of it, and of those in turn."""
     if not distance > 0:
         return np.arange(len(points))
     pairs = KDTree(points).query_pairs(distance, output_type="ndarray")

@@ -1,7 +1,7 @@
-"""Facets of bodies: parts of the surface, facets by named sets, closed surfaces of chambers, and what they enclose.
+"""Facets of bodies: parts of the surface, facets of named sets, closed surfaces of chambers and enclosed volumes.
 
-Facets are edges of the plane or triangles of space, [f, dim] corners. A chamber is bounded by a closed surface of
-facets between any vertices: the wall of a cavity, and caps over its openings. Its facets are oriented out of the
+Facets [f, dim] are edges in the plane or triangles in space, by their corners. A chamber is bounded by a closed surface
+of facets between any vertices: the wall of a cavity, and caps over its openings. Its facets are oriented out of the
 chamber, into the material, so that the enclosed volume
 
     plane:  sum over edges of ½ (a x b)        space:  sum over triangles of 1/6 a·(b x c)
@@ -27,9 +27,9 @@ RIDGES = {2: "vertex", 3: "edge"}
 
 
 def surface_parts(mesh: Mesh) -> list[Int[np.ndarray, "f dim"]]:
-    """Connected parts of the boundary, oriented out of the body: outer surfaces first, then the walls of its cavities.
+    """Returns connected parts of the boundary, oriented out of the body: outer surfaces, then walls of cavities.
 
-    Parts are in the order of the signed volume that they enclose, which is negative for a cavity.
+    Parts are sorted by the signed volume that they enclose, which is negative for a cavity.
     """
     outside = boundary(mesh)
     ridges, _ = _ridges(outside)
@@ -43,7 +43,7 @@ def surface_parts(mesh: Mesh) -> list[Int[np.ndarray, "f dim"]]:
 
 
 def inner_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Walls of all closed cavities of a body, for `pressure`.
+    """Returns the walls of all closed cavities of a body, for `pressure`.
 
     Raises:
         InputError: the body has no closed cavity.
@@ -55,15 +55,15 @@ def inner_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
 
 
 def outer_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Outer surface of all bodies of a mesh, without the walls of cavities."""
+    """Returns the outer surface of all bodies of a mesh, without the walls of cavities."""
     return np.concatenate([part for part in surface_parts(mesh) if enclosed_volume(mesh.vertices, part) > 0])
 
 
 def facets_in(mesh: Mesh, name: str) -> Int[np.ndarray, "f dim"]:
-    """Facets of the boundary whose corners are all in a named set.
+    """Returns the facets of the boundary whose corners are all in a named set.
 
     Raises:
-        InputError: a set that does not exist, or that contains no facet of the boundary.
+        InputError: the set does not exist, or contains no facet of the boundary.
     """
     outside = boundary(mesh)
     chosen = outside[np.isin(outside, vertices_in(mesh, [name])).all(axis=1)]
@@ -74,18 +74,18 @@ def facets_in(mesh: Mesh, name: str) -> Int[np.ndarray, "f dim"]:
 
 
 def closed_surface(mesh: Mesh, facets: ArrayLike, *, cap: bool = False) -> Int[np.ndarray, "f dim"]:
-    """Facets of a chamber, oriented out of it.
+    """Returns the facets of a chamber, oriented out of it.
 
-    Facets of the body's boundary are turned into its material. Others, such as caps, are turned like their neighbours;
-    a part without any facet of the boundary is turned so that it encloses a positive volume.
+    Facets of the body's boundary are turned to point into its material, others, such as caps, like their neighbours. A
+    part without any boundary facet is turned so that it encloses a positive volume.
 
     Args:
         mesh: the body.
         facets: [f, dim] vertices, in any orientation and order.
-        cap: close openings by flat facets between the vertices of their rims. In the plane there may be one opening.
+        cap: close openings with flat facets between the vertices of their rims; in the plane, one opening at most.
 
     Raises:
-        InputError: facets that are repeated or do not fit the mesh, or a surface that is open; the message names where.
+        InputError: facets are repeated or do not fit the mesh, or the surface is open; the message says where.
     """
     chosen = _oriented(mesh, checked_facets(mesh, facets))
     if cap:
@@ -103,7 +103,7 @@ def closed_surface(mesh: Mesh, facets: ArrayLike, *, cap: bool = False) -> Int[n
 
 
 def checked_facets(mesh: Mesh, facets: ArrayLike) -> Int[np.ndarray, "f dim"]:
-    """Facets as integers [f, dim]; refuses ones that are repeated or do not fit the mesh."""
+    """Returns facets as integers [f, dim]; refuses facets that are repeated or do not fit the mesh."""
     chosen = np.asarray(facets)
     if chosen.ndim != 2 or chosen.shape[1] != mesh.dimension or not len(chosen) or chosen.dtype.kind not in "iu":
         raise InputError(
@@ -124,10 +124,10 @@ def checked_facets(mesh: Mesh, facets: ArrayLike) -> Int[np.ndarray, "f dim"]:
 
 
 def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "f nodes"]:
-    """Corners of facets, followed by their mid-side nodes in a quadratic mesh, in the order of `facet_rule`.
+    """Returns the corners of facets, followed in a quadratic mesh by mid-side nodes in the order of `facet_rule`.
 
     Raises:
-        InputError: a facet of a quadratic mesh with an edge that has no mid-side node, such as a cap.
+        InputError: a facet of a quadratic mesh has an edge without a mid-side node; caps do.
     """
     if mesh.midsides is None:
         return facets
@@ -144,7 +144,7 @@ def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray,
 
 
 def enclosed_volume(x: Float[AnyArray, "n dim"], nodes: Int[np.ndarray, "f nodes"]) -> Any:
-    """Volume in m³ (area in m²) enclosed by facets with these nodes at positions x in m; takes NumPy and JAX arrays."""
+    """Returns the volume in m³ (area in m²) that facets with these nodes enclose at x in m (NumPy or JAX array)."""
     dimension = x.shape[1]
     if nodes.shape[1] == dimension:
         return determinant(x[nodes].transpose(1, 2, 0)).sum() / math.factorial(dimension)
@@ -155,7 +155,7 @@ def enclosed_volume(x: Float[AnyArray, "n dim"], nodes: Int[np.ndarray, "f nodes
 def facet_points(
     nodes: Float[AnyArray, "f nodes dim"],
 ) -> tuple[Float[AnyArray, "f points dim"], Float[AnyArray, "f points dim"]]:
-    """Quadrature points of facets in m, and their normals, as long as the points' shares of the area in m²."""
+    """Returns quadrature points of facets in m, and normals whose lengths are the points' shares of the area in m²."""
     values, slopes, weights = facet_rule(nodes.shape[2], nodes.shape[1] > nodes.shape[2])
     points = (nodes.swapaxes(1, 2)[:, None] @ values[:, :, None])[..., 0]
     tangents = nodes.swapaxes(1, 2)[:, None] @ slopes
@@ -168,7 +168,7 @@ def facet_points(
 
 
 def _ridges(facets: Int[np.ndarray, "f dim"]) -> tuple[Int[np.ndarray, "f dim d"], Int[np.ndarray, "f dim"]]:
-    """Ends of edges, or edges of triangles, with sorted vertices, and the direction in which the facet passes them."""
+    """Returns the facets' ends or edges, with sorted vertices, and the direction (±1) in which facets pass them."""
     if facets.shape[1] == 2:
         return facets[:, :, None], np.broadcast_to([-1, 1], facets.shape)
     ends = facets[:, np.array(SIDES[2])]
@@ -176,19 +176,19 @@ def _ridges(facets: Int[np.ndarray, "f dim"]) -> tuple[Int[np.ndarray, "f dim d"
 
 
 def _open_ridges(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "g d"]:
-    """Ridges that the facets do not pass equally often in both directions, in the direction of the surplus."""
+    """Returns the ridges that facets do not pass equally often both ways, in the direction of the surplus."""
     ridges, signs = _ridges(facets)
     distinct, number = np.unique(ridges.reshape(-1, ridges.shape[2]), axis=0, return_inverse=True)
     net = np.bincount(number.reshape(-1), weights=signs.ravel()).astype(int)
     gaps = distinct[net != 0]
     if gaps.shape[1] == 2:
         return np.where(net[net != 0, None] < 0, gaps[:, ::-1], gaps)
-    # Starts come first.
+    # Start points come first.
     return gaps[np.argsort(net[net != 0], kind="stable")]
 
 
 def _oriented(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "f dim"]:
-    """Turns facets of the boundary into the body, and others like their neighbours."""
+    """Turns facets of the boundary to point into the body, and others like their neighbours."""
     outside = {frozenset(facet): facet for facet in boundary(mesh).tolist()}
     ridges, _ = _ridges(facets)
     owners: dict[tuple, list[int]] = {}
@@ -211,7 +211,7 @@ def _oriented(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "
 
 
 def _spread(turned: dict[int, list[int]], front: list[int], facets: np.ndarray, owners: dict) -> list[int]:
-    """Turns the neighbours of facets like these, and theirs; returns the facets and all that were turned."""
+    """Turns neighbours like these facets, and theirs in turn; returns the given facets and all that were turned."""
     reached = list(front)
     while front:
         facet = front.pop()
@@ -228,7 +228,7 @@ def _spread(turned: dict[int, list[int]], front: list[int], facets: np.ndarray, 
 
 
 def _caps(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "c dim"]:
-    """Facets that close all openings: an edge of the plane, or fans of triangles over the rims in space."""
+    """Returns facets that close all openings: an edge in the plane, fans of triangles over the rims in space."""
     gaps = _open_ridges(facets)
     if facets.shape[1] == 2:
         if len(gaps) > 2:

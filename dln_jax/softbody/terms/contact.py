@@ -1,19 +1,19 @@
-"""Contact of vertices with rigid surfaces by a smooth penalty, with smooth and lagged Coulomb friction.
+"""Contact of vertices with rigid surfaces by a smooth penalty, with smooth, lagged Coulomb friction.
 
     V = k phi(d),   phi = 0 for d >= 0,  -d³/(6 w) for -w <= d < 0,  d²/2 + w d/2 + w²/6 for d < -w
 
-with the signed distance d to the surface. phi is twice continuously differentiable for w > 0; a vertex at rest lies
-at the depth where k |phi'(d)| carries its weight. Contact and friction are one term with shared parameters: the normal
-force of the friction comes from the same k, so that it is differentiable by k. A contact without a friction coefficient
-computes no friction.
+with the signed distance d to the surface. phi is twice continuously differentiable for w > 0; a vertex rests at the
+depth where k |phi'(d)| carries its weight. Contact and friction are one term with shared parameters: the normal force
+of the friction comes from the same k and is differentiable by it. Without a friction coefficient no friction is
+computed.
 
     D = mu lambda_n f(|u|),   u = (1 - n nᵀ)(x - x_n),   f(u) = u²/e - u³/(3 e²) for u < e,  u - e/3 beyond,
 
 after Li et al. 2020 (Incremental Potential Contact, section 5), with their constant chosen such that f(0) = 0, and
-normals n and normal forces lambda_n at the start of the step (or at the previous of several solutions of the step,
-`make_step`). The force is mu lambda_n against the slip from the threshold speed e/dt on, and falls smoothly to zero
-below it: a block that "sticks" on a slope creeps at less than the threshold. f is twice continuously differentiable.
-The slip e must be well above the rounding of the positions: in float32, 1e-4 m for a body of a metre.
+normals n and normal forces lambda_n at the start of the step (or at the previous solution of a repeated step, see
+`make_step`). The force mu lambda_n opposes slip above the threshold speed e/dt and falls smoothly to zero below it: a
+block that "sticks" on a slope creeps more slowly than the threshold. f is twice continuously differentiable. The slip e
+must be well above the rounding of the positions: in float32, 1e-4 m for a body of a metre.
 
 Contact damping adds the force c lambda (-d') to the normal force lambda = -k phi'(d), with c in s/m (Hunt and Crossley
 1975). It comes from the dissipation
@@ -48,15 +48,15 @@ from dln_jax.softbody.terms.term import (
 )
 from dln_jax.types import Scalar, require_positive
 
-# Ratio of squared slip to squared threshold below which the cubic part of f is rounding and its derivatives overflow.
+# Below this ratio of squared slip to squared threshold, the cubic part of f is rounding and its derivatives overflow.
 _NO_SLIP = 1e-16
 
 
 class PlaneContact(NamedTuple):
-    """Parameters of a plane; stiffness and friction are for all vertices [] or per vertex [m]."""
+    """Parameters of a plane; stiffness and friction are one for all vertices [] or one per vertex [m]."""
 
     normal: Float[Array, " dim"]
-    """Normal out of the ground, of any length."""
+    """Outward normal of the ground, of any length."""
     offset: Float[Array, ""]
     """Distance of the plane from the origin along the normal, in m."""
     stiffness: Float[Array, "..."]
@@ -68,7 +68,7 @@ class PlaneContact(NamedTuple):
 
 
 class DistanceContact(NamedTuple):
-    """Parameters of a surface with a signed distance, for all vertices [] or per vertex [m]."""
+    """Parameters of a surface with a signed distance, one for all vertices [] or one per vertex [m]."""
 
     stiffness: Float[Array, "..."]
     """k in N/m."""
@@ -79,16 +79,16 @@ class DistanceContact(NamedTuple):
 
 
 class Slip(NamedTuple):
-    """Data of the friction of one vertex; [m, ...] for all."""
+    """Friction data of one vertex, or [m, ...] of all."""
 
     start: Float[Array, "*m dim"]
     """Position x_n at the start of the step, in m."""
     normal: Float[Array, "*m dim"]
     """Unit normal n there."""
     force: Float[Array, "*m"]
-    """Largest friction mu lambda_n, in N."""
+    """Largest friction force mu lambda_n, in N."""
     threshold: Float[Array, "*m"]
-    """Slip e per step at which friction reaches its largest value, in m."""
+    """Slip e per step, in m, at which friction reaches its largest force."""
 
 
 def plane_contact(
@@ -105,7 +105,7 @@ def plane_contact(
 ) -> Term:
     """Contact with the half-space n·x < offset, for the unit normal n.
 
-    Stiffness k in N/m; width w in m. A width of 0 means ½ k d² below the plane, which is only once continuously
+    Stiffness k is in N/m and width w in m. Width 0 gives ½ k d² below the plane, which is only once continuously
     differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s. `damping` c in s/m
     dissipates in the normal direction (`damping_of_restitution`).
     """
@@ -142,7 +142,7 @@ def distance_contact(
     threshold_speed: float = 1e-3,
     name: str = "obstacle",
 ) -> Term:
-    """Contact with the body where `distance(x [dim])`, in m, is negative; the other arguments as for a plane.
+    """Contact with a body inside which `distance(x [dim])`, in m, is negative; other arguments as for a plane.
 
     The function must be twice differentiable wherever it is negative at a vertex. Friction takes the normal from its
     gradient at the start of the step; where the gradient vanishes (the centre of a ball), there is no friction.
@@ -180,7 +180,7 @@ def _contact(
     width: float,
     threshold_speed: float,
 ) -> Term:
-    """Builds the term of a surface from its data per vertex, the distance, and (distance, normal, steepness) of all."""
+    """Builds a surface's term from its data per vertex, the distance, and (distance, normal, steepness) of all."""
     require_positive(threshold_speed=threshold_speed)
     if width != 0.0:
         require_positive(width=width)
@@ -215,7 +215,7 @@ def _contact(
 
 
 def friction_energy(x: Any, slip: Slip) -> Scalar:
-    """D in J of one vertex."""
+    """Returns D in J of one vertex."""
     axes = range(len(x))
     moved = [x[i] - slip.start[i] for i in axes]
     along = sum(moved[i] * slip.normal[i] for i in axes)

@@ -1,6 +1,6 @@
-"""Terms of the published soft creatures: a preset for comparison with their simulator (J. Rojas, algovivo).
+"""Terms of the published soft creatures, a preset for comparison with their simulator (J. Rojas, algovivo).
 
-There a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here the same divided by h², so that V is unscaled:
+There, a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here, the same divided by h², so that V is unscaled:
 
     element    ½ mu (I1 - dim) - mu s(J) + ½ lambda s(J)²,   s(J) = -1.5 + 2 J - 0.5 J²
     muscle     ½ k_m ((l - a l0)/(a l0))²,   l = sqrt(d² + 1e-6)
@@ -8,12 +8,12 @@ There a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here the same di
     ground     k y² for y < 0, plus friction k_f ((x - x_n)/h)² (0.01 - y_n) for y_n < 0.01
 
 s is the second-order expansion of ln J, and the weight of an element is 1 for any size, so mu and lambda are in J.
-The friction is viscous and lagged. k_f is in kg/m, because its part of V is an energy although it is friction: with
+Friction is viscous and lagged. k_f is in kg/m, because its part of V is an energy although it models friction: with
 vx = (x - x_n)/h the force is -2 k_f (0.01 - y_n) vx / h, which depends on the time step, and h² V does not contain h.
 A static solve (h infinite) has no friction.
 
-The published creatures are plane and their ground is flat. In space y is the last coordinate, x stands for the others,
-and elements are tetrahedra. Above rough ground, y is the height over sum_i A_i sin(k_i·x + phi_i).
+The published creatures are planar and their ground is flat. In space y is the last coordinate, x stands for the others,
+and elements are tetrahedra. Above rough ground, y is the height above sum_i A_i sin(k_i·x + phi_i).
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ FRICTION_HEIGHT = 0.01
 
 
 class CreatureMaterial(NamedTuple):
-    """Parameters of the triangles, for all [] or per triangle [m]."""
+    """Parameters of the triangles, one for all [] or one per triangle [m]."""
 
     mu: Float[Array, "..."]
     """In J."""
@@ -62,18 +62,18 @@ class Bumps(NamedTuple):
 
 
 class CreatureGround(NamedTuple):
-    """Parameters of the ground, for all vertices [] or per vertex [n]."""
+    """Parameters of the ground, one for all vertices [] or one per vertex [n]."""
 
     stiffness: Float[Array, "..."]
     """k in J/m²: half of the stiffness in N/m."""
     friction: Float[Array, "..."]
     """k_f in kg/m."""
     bumps: Bumps | None = None
-    """Shape of rough ground; `None` for flat ground, which computes none."""
+    """Shape of rough ground; `None` for flat ground."""
 
 
 def ground_height(bumps: Bumps, horizontal: Sequence[Array] | Array) -> Array:
-    """Height of rough ground in m at a point with these horizontal coordinates."""
+    """Returns the height of rough ground in m at a point with these horizontal coordinates."""
     phase = bumps.phase + sum(bumps.wave_vector[:, i] * coordinate for i, coordinate in enumerate(horizontal))
     return jnp.sum(bumps.amplitude * jnp.sin(phase))
 
@@ -84,10 +84,10 @@ def creature_terms(
     *,
     bumps: Bumps | None = None,
 ) -> tuple[Term, ...]:
-    """Terms "elastic", "muscles", "gravity" and "ground" of a creature above y = 0; muscles are pairs [k, 2].
+    """Returns the terms "elastic", "muscles", "gravity" and "ground" of a creature above y = 0.
 
-    The control of a step is the actuation of the muscles, 0.25 to 1 in the published creatures. With `bumps` the ground
-    is rough.
+    Muscles are pairs of vertices [k, 2]. Their actuation is the control of a step, 0.25 to 1 in the published
+    creatures. With `bumps` the ground is rough.
     """
     if bumps is not None and np.shape(bumps.wave_vector)[-1] != mesh.dimension - 1:
         got, expected = np.shape(bumps.wave_vector)[-1], mesh.dimension - 1

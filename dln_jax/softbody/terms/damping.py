@@ -8,7 +8,8 @@ A step of length dt from x_n minimises the dissipation
 with the velocity v = (x - x_n)/dt. The second is a Kelvin-Voigt material whose viscosities are beta times the Lamé
 parameters: rotations do not dissipate, and for small strains its force is -beta K v with the stiffness K of linear
 elasticity. A vibration of frequency omega decays as exp(-(alpha + beta omega²) t / 2). A static solve has no damping.
-Backward Euler and bdf2 take these forces with an error of first order in dt, the other integrators of second order.
+Backward Euler and bdf2 integrate these forces with a first-order error in dt, the other integrators with a second-order
+error.
 """
 
 from typing import Any, NamedTuple
@@ -45,7 +46,7 @@ class StiffnessDamping(NamedTuple):
 
 
 def mass_damping(mesh: Mesh, *, rate: Numbers, name: str = "mass_damping") -> Term:
-    """Damps all velocities of a mesh's vertices, also those of rigid motions, with the rate alpha in 1/s."""
+    """Damps all velocities of a mesh's vertices, including rigid motions, at the rate alpha in 1/s."""
     count = len(mesh.vertices)
     parameters = MassDamping(material("rate", rate, count, "vertex", NOT_NEGATIVE))
 
@@ -67,9 +68,9 @@ def stiffness_damping(
     poisson_ratio: Numbers,
     name: str = "stiffness_damping",
 ) -> Term:
-    """Damps strain rates of all elements of a mesh, with the time beta in s and the moduli of the elastic material.
+    """Damps the strain rates of all elements of a mesh, with the time beta in s and the moduli of the elastic material.
 
-    The moduli are parameters of this term: replacing those of the elastic term does not change them.
+    The moduli belong to this term: replacing those of the elastic term does not change them.
     """
     count = len(mesh.elements)
     parameters = StiffnessDamping(

@@ -12,13 +12,13 @@ bending; their displacements converge with order 3 for smooth solutions. As nu a
 
 Mixed elements are quadratic in displacement with one pressure per element, p = lambda (J - 1), eliminated from
 sum of w_q W(F_q, mu, 0) + volume (p (J - 1) - p²/(2 lambda)) (P2/P0, a perturbed Lagrangian; at small strains the
-selective reduced integration of Malkus and Hughes 1978). What remains is an energy of the positions alone, so that a
-step stays a minimisation. In the plane the pair satisfies the inf-sup condition (Boffi, Brezzi and Fortin 2013, chapter
-8), so that it does not lock. In space there is no such proof, because no node lies inside a face to control its flux;
-clamped cubes of unordered tetrahedra converge without locking (tests/softbody/test_quadratic_elements.py). A constant
-pressure limits displacements to order 2, and it cannot vary through the thickness of a beam: with one element, the
-pressure that bending needs is missing and the beam is up to 1.6 times too soft. There use quadratic elements, split by
-`mesh.barycentric_split` if nu is close to 1/2.
+selective reduced integration of Malkus and Hughes 1978). The result is an energy of the positions alone, so that a step
+stays a minimisation. In the plane the pair satisfies the inf-sup condition (Boffi, Brezzi and Fortin 2013, chapter 8)
+and does not lock. In space there is no such proof, because no node lies inside a face to control its flux; clamped
+cubes of unordered tetrahedra converge without locking (tests/softbody/test_quadratic_elements.py). A constant pressure
+limits displacements to order 2, and it cannot vary through the thickness of a beam: with one element across, the
+pressure that bending needs is missing and the beam is up to 1.6 times too soft. For such beams use quadratic elements,
+split by `mesh.barycentric_split` if nu is close to 1/2.
 """
 
 from typing import Any, NamedTuple
@@ -60,17 +60,16 @@ def elastic(
 ) -> Term:
     """Elastic energy of all elements of a mesh, linear or quadratic; parameters are a `Material`.
 
-    Young's modulus in Pa must be positive and Poisson's ratio between -1 and 0.5 (excluded), one for all elements or
-    one per element; otherwise `InputError` names the element. In 2-D the strain is plane, so that mu and lambda are
-    those of the solid.
+    Young's modulus in Pa must be positive and Poisson's ratio between -1 and 0.5 (exclusive), one for all elements or
+    one per element. In 2-D the strain is plane, so mu and lambda are those of the solid.
 
     Mixed elements, for nu near 1/2, need a quadratic mesh. Their volumetric energy is lambda/2 (J - 1)² of the mean J,
-    that of the stable neo-Hookean density; other densities differ from their own by third order in J - 1, and those of
-    St. Venant-Kirchhoff and the corotated solid, whose lambda multiplies a trace of strains, by third order in strain.
+    as in the stable neo-Hookean density. Other densities differ from their own by third order in J - 1; those whose
+    lambda multiplies a trace of strains (St. Venant-Kirchhoff, corotated) by third order in strain.
 
     Raises:
-        InputError: a parameter is out of range, `mixed` with a linear mesh, or a quadratic element that its mid-side
-            nodes turn inside out.
+        InputError: a parameter is out of range (the message names the element), `mixed` with a linear mesh, or a
+            quadratic element that its mid-side nodes turn inside out.
     """
     count = len(mesh.elements)
     if mesh.midsides is None and mixed:
@@ -113,15 +112,15 @@ def elastic(
 
 
 def lame_parameters(youngs_modulus: Array, poisson_ratio: Array) -> tuple[Array, Array]:
-    """(mu, lambda) in Pa from E in Pa and nu."""
+    """Returns (mu, lambda) in Pa from E in Pa and nu."""
     mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
     return mu, 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
 
 
 def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "corners dim"], Scalar]:
-    """Gradients of a simplex's linear shape functions, 1/m, F = sum over corners of x_k (grad N_k)ᵀ, and signed volume.
+    """Returns the gradients of a simplex's linear shape functions in 1/m, and its signed volume in m³ (m² in 2-D).
 
-    The volume is in m³, or m² in 2-D. The formulas are written out and differentiable.
+    F = sum over corners of x_k (grad N_k)ᵀ. The formulas are written out and differentiable.
     """
     axes = range(corners.shape[1])
     edges = [[corners[k + 1, i] - corners[0, i] for k in axes] for i in axes]
@@ -135,7 +134,7 @@ def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "c
 def quadratic_geometry(
     nodes: Float[Array, "nodes dim"],
 ) -> tuple[Float[Array, "points nodes dim"], Float[Array, " points"]]:
-    """Gradients of a quadratic simplex's shape functions at its quadrature points, 1/m, and the points' weights.
+    """Returns the gradients of a quadratic simplex's shape functions at its quadrature points in 1/m, and weights.
 
     The weights are the points' shares of the volume, in m³, or m² in 2-D.
     """
@@ -149,5 +148,5 @@ def quadratic_geometry(
 
 
 def shape_gradients(element: tuple[Any, ...]) -> Float[Array, "corners dim"]:
-    """Returns the gradients of the shape functions, the first of an element's data: F combines positions by them."""
+    """Returns the shape function gradients, the first of an element's data; they combine positions to F."""
     return element[0]

@@ -1,9 +1,9 @@
-"""Contractile fibres in the material, with a direction in every element.
+"""Contractile fibres in the material, with one direction per element.
 
     W = a s |F d| + ½ k (|F d| - 1)²
 
 per volume, with the unit direction d, the stretch |F d| along it, the strength s in Pa (force per area of the rest
-shape at full activation), the activation a, and the passive stiffness k in Pa of the fibres, if they have one.
+shape at full activation), the activation a, and the passive stiffness k in Pa of the fibres, if any.
 """
 
 from typing import Any, NamedTuple
@@ -25,14 +25,14 @@ from dln_jax.types import InputError, Scalar
 
 
 class Fibres(NamedTuple):
-    """Parameters of fibres, for all elements [] or per element [m]."""
+    """Parameters of fibres, one for all elements [] or one per element [m]."""
 
     direction: Float[Array, "*m dim"]
-    """Of any length, in the rest shape; one or per element."""
+    """Direction in the rest shape, of any length; one, or one per element."""
     strength: Float[Array, "..."]
     """s in Pa."""
     activation: Float[Array, " groups"] | None
-    """a of every group, from 0 to 1, or `None` if it is the control."""
+    """Activation a of every group, from 0 to 1, or `None` if it is the control."""
     stiffness: Float[Array, "..."] | None
     """k in Pa, or `None`."""
 
@@ -54,14 +54,14 @@ def fibres(
         mesh: linear or quadratic.
         direction: one [dim], or one per element [m, dim], of any length but zero.
         strength: s in Pa, one or per element.
-        activation: a, one or one per group; without it, a is the control of the step, one number per group.
-        stiffness: k in Pa, one or per element; without it the fibres have no passive stiffness.
-        elements: those with fibres, such as `mesh.sets["muscle"].elements`; by default all. There are m of them.
-        groups: number of every element's group [m], from 0 on; by default all are in group 0.
-        name: of the term.
+        activation: a, one or one per group; by default a is the control of the step, one number per group.
+        stiffness: k in Pa, one or per element; by default the fibres have no passive stiffness.
+        elements: the m elements with fibres, such as `mesh.sets["muscle"].elements`; by default all.
+        groups: group of every such element [m], counted from 0; by default all are in group 0.
+        name: name of the term.
 
     Raises:
-        InputError: a number out of range, or shapes that do not fit.
+        InputError: a number is out of range, or shapes do not fit.
     """
     chosen = np.arange(len(mesh.elements)) if elements is None else np.asarray(elements, dtype=int).reshape(-1)
     wrong = (chosen < 0) | (chosen >= len(mesh.elements))

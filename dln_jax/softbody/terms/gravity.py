@@ -19,7 +19,7 @@ class Gravity(NamedTuple):
 
 
 def gravity(vertices: Mesh | int, acceleration: Numbers | None = None, *, name: str = "gravity") -> Term:
-    """-m g·x for all vertices of a mesh, or for the first `vertices` ones; g is the acceleration in m/s².
+    """-m g·x for all vertices of a mesh, or for the first `vertices` of them; g is the acceleration in m/s².
 
     With a mesh, g defaults to 9.81 m/s² against the last axis, which points up: y in the plane, z in space.
     """

@@ -1,9 +1,9 @@
-"""Dead loads: forces on vertices, on parts of the surface and on the volume, that do not turn with the body.
+"""Dead loads on vertices, facets and volume: forces that do not turn with the body.
 
     V = -sum over vertices of f·x,    f = F,    f = t ∫ N dA over facets,    f = b ∫ N dV over elements
 
-with the shape functions N of the rest shape, for a force F in N, a traction t in N per m² of the rest shape (per m of
-an edge of the plane, 1 m thick), and a body force b in N/m³. A pressure, which follows the surface, is in `pressure`.
+with the shape functions N of the rest shape, a force F in N, a traction t in N per m² of the rest shape (per m of an
+edge in the plane, 1 m thick) and a body force b in N/m³. For a pressure, which follows the surface, see `pressure`.
 """
 
 from collections.abc import Callable
@@ -31,31 +31,31 @@ from dln_jax.softbody.terms.term import (
 from dln_jax.types import InputError, Scalar
 
 _NODES = {2: (0.0, 1 / 3), 3: (-1 / 20, 1 / 5)}
-"""Shares of a quadratic element's volume at its corners and its mid-side nodes: integrals of the shape functions."""
+"""Shares of a quadratic element's volume at a corner and at a mid-side node: integrals of the shape functions."""
 
 
 class Load(NamedTuple):
     """Parameters of a load."""
 
     force: Float[Array, "*m dim"] | None
-    """In N, N/m² or N/m³, or `None` if it is the control."""
+    """Load in N, N/m² or N/m³, or `None` if it is the control."""
 
 
 def point_force(mesh: Mesh, vertices: Indices, force: Numbers | None = None, *, name: str = "force") -> Term:
-    """A force in N on each of these vertices: one [dim], or one per vertex [m, dim]; without it, it is the control.
+    """A force in N on each of these vertices, one [dim] or one per vertex [m, dim]; by default the control of the step.
 
     Raises:
-        InputError: vertices or a force that do not fit the mesh.
+        InputError: the vertices or the force do not fit the mesh.
     """
     indices = vertex_list("vertices with a force", vertices)
     return _load(name, mesh, indices[:, 0], force, lambda _: jnp.ones(len(indices)), per_vertex=True)
 
 
 def traction(mesh: Mesh, facets: ArrayLike, force: Numbers | None = None, *, name: str = "traction") -> Term:
-    """A force [dim] per area of the rest shape on facets, such as `facets_in(mesh, name)`; without it, the control.
+    """A force [dim] per rest area on facets, such as `facets_in(mesh, name)`; by default the control of the step.
 
     Raises:
-        InputError: facets or a force that do not fit the mesh.
+        InputError: the facets or the force do not fit the mesh.
     """
     nodes = facet_nodes(mesh, checked_facets(mesh, facets))
     values, _, _ = facet_rule(mesh.dimension, mesh.midsides is not None)
@@ -69,7 +69,7 @@ def traction(mesh: Mesh, facets: ArrayLike, force: Numbers | None = None, *, nam
 
 
 def body_force(mesh: Mesh, force: Numbers | None = None, *, name: str = "body_force") -> Term:
-    """A force [dim] per volume of the rest shape, in N/m³, on all elements; without it, it is the control."""
+    """A force [dim] per rest volume on all elements, in N/m³; by default the control of the step."""
     corner, middle = (1 / (mesh.dimension + 1), 0.0) if mesh.midsides is None else _NODES[mesh.dimension]
     shares = np.where(np.arange(mesh.nodes.shape[1]) <= mesh.dimension, corner, middle)
 
@@ -88,7 +88,7 @@ def _load(
     *,
     per_vertex: bool = False,
 ) -> Term:
-    """A force on vertices that is the product of weights, a function of the rest shape, and the parameter."""
+    """Builds the term of forces on vertices: weights, a function of the rest shape, times the parameter."""
     count, dimension = len(vertices), mesh.dimension
     if force is not None:
         force = jnp.asarray(force, dtype=float)

@@ -10,7 +10,7 @@ from dln_jax.types import InputError, require_positive
 
 
 def penalty(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
-    """phi(d) in m²."""
+    """Returns phi(d) in m²."""
     if width == 0.0:
         return jnp.where(distance < 0, 0.5 * distance**2, 0.0)
     ramp = jnp.where(distance < 0, -(distance**3) / (6.0 * width), 0.0)
@@ -18,7 +18,7 @@ def penalty(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
 
 
 def penalty_force(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
-    """-phi'(d) in m, the normal force divided by k."""
+    """Returns -phi'(d) in m, the normal force divided by k."""
     if width == 0.0:
         return jnp.where(distance < 0, -distance, 0.0)
     ramp = jnp.where(distance < 0, distance**2 / (2.0 * width), 0.0)
@@ -26,7 +26,7 @@ def penalty_force(distance: Float[Array, "*m"], width: float) -> Float[Array, "*
 
 
 def penalty_integral(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
-    """Phi(d) in m³, the integral of phi from 0."""
+    """Returns Phi(d) in m³, the integral of phi from 0."""
     if width == 0.0:
         return jnp.where(distance < 0, distance**3 / 6.0, 0.0)
     ramp = jnp.where(distance < 0, -(distance**4) / (24.0 * width), 0.0)
@@ -37,11 +37,11 @@ def penalty_integral(distance: Float[Array, "*m"], width: float) -> Float[Array,
 def damping_of_restitution(restitution: float, speed: float) -> float:
     """Returns the damping c in s/m with which a point mass rebounds at `restitution` times its speed, in m/s.
 
-    c is that of one speed: slower impacts rebound better, at 1 - 2/3 c u for small c u. A body also turns some of the
-    energy into its own vibrations, which is no loss of the contact.
+    c suits this speed only: slower impacts rebound faster, at 1 - 2/3 c u for small c u. A body also turns some of the
+    energy into its own vibrations, which is not a loss of the contact.
 
     Raises:
-        InputError: a speed that is not positive, or a coefficient that is not between 0.05 and 1.
+        InputError: the speed is not positive, or the coefficient is not between 0.05 and 1.
     """
     require_positive(speed=speed)
     if not 0.05 <= restitution <= 1.0:

@@ -1,10 +1,10 @@
 """Pressure in chambers: a gauge pressure, or a sealed amount of gas.
 
-    pressure:  -p V(x)                                         force of every facet:  p times its area, along its normal
+    pressure:  -p V(x)                                         force on every facet:  p times its area, along its normal
     gas:       -n R T ln(V(x)/V0) + p_a (V(x) - V0)             p = n R T / V - p_a
 
 with the volume V that a closed surface of facets encloses (`mesh.surfaces`), in m³, or m² for 1 m of thickness. The
-pressure follows the surface as it moves. A gauge pressure is a sum over facets; the gas couples all vertices of its
+pressure follows the surface as it moves. A gauge pressure is a sum over facets. A gas couples all vertices of its
 chamber, because its pressure falls as the chamber grows: it is one element, whose Hessian is dense.
 """
 
@@ -24,14 +24,14 @@ from dln_jax.softbody.terms.term import Bound, Context, Corners, Term, control_o
 from dln_jax.types import InputError, Scalar, require_positive
 
 MOST_VERTICES = 800
-"""Largest chamber of a sealed gas: its Hessian has the square of this number times the dimension, twice."""
+"""Largest chamber of a sealed gas: its dense Hessian has (vertices times dimension)² entries, stored twice."""
 ATMOSPHERE = 101325.0
-"""Standard pressure of the surroundings, in Pa."""
+"""Standard ambient pressure, in Pa."""
 FINITE = Bound(np.isfinite, "a finite number")
 
 
 class Pressure(NamedTuple):
-    """Parameters of a pressure."""
+    """Parameters of a gauge pressure."""
 
     pressure: Float[Array, ""] | None
     """Gauge pressure p in Pa, or `None` if it is the control."""
@@ -43,7 +43,7 @@ class Gas(NamedTuple):
     amount: Float[Array, ""] | None
     """n R T in J, or `None` if it is the control."""
     ambient: Float[Array, ""]
-    """Pressure p_a of the surroundings in Pa."""
+    """Ambient pressure p_a in Pa."""
 
 
 def pressure(
@@ -51,12 +51,12 @@ def pressure(
 ) -> Term:
     """Gauge pressure in Pa in a chamber with these facets, such as `inner_surface(mesh)` or `facets_in(mesh, name)`.
 
-    It pushes against the material. On an outer surface, a positive pressure compresses the body. Without a value, the
-    pressure is the control of the step, one number. Openings must have caps, of your own or by `cap=True`; the force on
-    a cap acts on its rim.
+    It pushes against the material; a positive pressure on an outer surface compresses the body. By default the pressure
+    is the control of the step, one number. Openings need caps, your own or those of `cap=True`; the force on a cap acts
+    on its rim.
 
     Raises:
-        InputError: as for `closed_surface`, or a pressure that is not finite.
+        InputError: as for `closed_surface`, or the pressure is not finite.
     """
     surface = closed_surface(mesh, facets, cap=cap)
     nodes = facet_nodes(mesh, surface)
@@ -67,7 +67,7 @@ def pressure(
         value = parameters.pressure
         if value is None:
             value = control_of(name, context, (), "the gauge pressure in Pa")
-        # The sum does not depend on the origin; near the chamber, its rounding is smallest.
+        # The sum does not depend on the origin; its rounding is smallest near the chamber.
         centre = jax.lax.stop_gradient(context.x[vertices].mean(axis=0))
         return jnp.broadcast_to(value, len(nodes)), jnp.broadcast_to(centre, (len(nodes), dimension))
 
@@ -97,15 +97,15 @@ def gas(
 
     Args:
         mesh: the body.
-        facets: of the chamber.
-        pressure: gauge pressure in Pa that the gas has in the rest shape; it sets the amount n R T = (p + p_a) V0.
-            `None`: the amount in J is the control of the step, as for a pump.
-        ambient: pressure of the surroundings in Pa.
+        facets: facets of the chamber.
+        pressure: gauge pressure in Pa of the gas in the rest shape; it sets the amount n R T = (p + p_a) V0. With
+            `None`, the amount in J is the control of the step, as for a pump.
+        ambient: ambient pressure in Pa.
         cap: close openings.
-        name: of the term.
+        name: name of the term.
 
     Raises:
-        InputError: as for `closed_surface`; no amount of gas; or a chamber with more than `MOST_VERTICES`.
+        InputError: as for `closed_surface`, no gas, or a chamber with more than `MOST_VERTICES` vertices.
     """
     nodes = facet_nodes(mesh, closed_surface(mesh, facets, cap=cap))
     vertices, local = np.unique(nodes, return_inverse=True)
@@ -134,7 +134,7 @@ def gas(
     def energy(x: Corners, chamber: tuple[Any, ...]) -> Scalar:
         amount, ambient, centre = chamber
         now = enclosed_volume(jnp.asarray(x) - centre, local)
-        # A volume that is not positive has no energy, and no step accepts it.
+        # The energy of a volume that is not positive is NaN, so that no step accepts it.
         return -amount * jnp.log(now / volume) + ambient * (now - volume)
 
     control = () if pressure is None else None

@@ -26,7 +26,7 @@ class Springs(NamedTuple):
     stiffness: Float[Array, "..."]
     """In N/m."""
     rest_length: Float[Array, "..."] | None
-    """In m; `None` takes it from the rest shape."""
+    """In m; `None` means the length in the rest shape."""
 
 
 class Muscles(NamedTuple):
@@ -46,10 +46,9 @@ def springs(
 ) -> Term:
     """½ k (l - l0)² for pairs of vertices, with l = sqrt(d² + softening²) and the distance d.
 
-    The rest length l0 in m is that of the rest shape (with the same softening, so that it carries no force), or the
-    parameter `rest_length`. Without softening, the force of a compressed spring has no direction at d = 0 and its
-    stiffness no bound. Exactly there, only the well-defined parts are kept (zero force, stiffness k), which is exact
-    for l0 = 0.
+    The rest length l0 in m is `rest_length`, by default that of the rest shape (with the same softening, so that it
+    carries no force). Without softening, the force of a compressed spring has no direction at d = 0 and its stiffness
+    no bound. Exactly there, only the well-defined parts are kept (zero force, stiffness k), which is exact for l0 = 0.
     """
     indices = vertex_pairs("pairs of springs", pairs)
     count = len(indices)
@@ -69,8 +68,8 @@ def springs(
 def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name: str = "muscles") -> Term:
     """½ k ((l - a l0)/(a l0))² for pairs of vertices, with l = sqrt(d² + softening²) and the distance d.
 
-    l0 is the distance in the rest shape, which must not be zero, and a > 0 the actuation: `control` [m] of the step,
-    in the order of the pairs. k is in J, and softening in m.
+    l0 is the distance in the rest shape, which must not be zero, and a > 0 the actuation: the `control` [m] of the
+    step, in the order of the pairs. k is in J and softening in m.
     """
     indices = vertex_pairs("pairs of muscles", pairs)
     count = len(indices)
@@ -100,12 +99,12 @@ def _energy(softening: float):
 
 
 def _ends(_: Any) -> list[list[float]]:
-    """Weights of a spring's ends in its edge."""
+    """Weights of the two vertices in a spring's edge."""
     return [[-1.0], [1.0]]
 
 
 def length_of(squared_distance: Float[Array, "*m"], softening: float) -> Float[Array, "*m"]:
-    """sqrt(d² + softening²); without softening its derivative at zero is zero."""
+    """Returns sqrt(d² + softening²); without softening its derivative at zero is zero."""
     if softening > 0.0:
         return jnp.sqrt(squared_distance + softening**2)
     apart = squared_distance > 0

@@ -1,8 +1,8 @@
 """Energy densities of isotropic elastic materials, in J per m² or m³ of the rest shape, as functions of F = dx/dX.
 
-With I1 = |F|² and J = det F, all have W = 0 and no stress at rest, and for small strains e = sym(F - I) the energy
-mu |e|² + lambda/2 tr(e)² of linear elasticity, in 2-D (plane strain) and in 3-D. F is a sequence of rows, so that all
-operations are on scalars, which fuse under `vmap`.
+With I1 = |F|² and J = det F, all densities have W = 0 and no stress at rest and, for small strains e = sym(F - I), the
+energy mu |e|² + lambda/2 tr(e)² of linear elasticity, in 2-D (plane strain) and in 3-D. F is a sequence of rows, so
+that all operations are on scalars, which fuse under `vmap`.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,14 +21,14 @@ StrainEnergy = Callable[[DeformationGradient, Scalar, Scalar], Scalar]
 """(F, mu, lambda) -> W in J/m^dim; the Lamé parameters are in Pa."""
 
 _LAGUERRE_STEPS = 20
-"""Enough for double roots, where convergence is linear; elsewhere 1 to 4 suffice."""
+"""Enough for double roots, where convergence is linear; otherwise 1 to 4 suffice."""
 
 
 def neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu/2 (I1 - dim) - mu ln J + lambda/2 (ln J)² (Bonet and Wood 2008, eq. 6.28).
 
-    An inverted or collapsed element (J <= 0) has infinite energy, which every line search refuses, and derivatives of
-    zero, which do not affect those of other elements.
+    An inverted or collapsed element (J <= 0) has infinite energy, which every line search refuses, and zero
+    derivatives, which do not affect those of other elements.
     """
     J = determinant(F)
     valid = J > 0
@@ -40,9 +40,9 @@ def neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
 def stable_neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu/2 (I1 - dim) - mu (J - 1) + (lambda + mu)/2 (J - 1)² (Smith, de Goes and Kim 2018).
 
-    A polynomial: finite and smooth for every F, inverted or collapsed. The paper's lambda is lambda + mu of linear
-    elasticity, because -mu (J - 1) alone contributes -mu/2 tr(e)² to second order. Without the paper's further term
-    -mu/2 ln(I1 + 1) the point F = 0 is stationary; at rest nothing changes.
+    The density is a polynomial: finite and smooth for every F, even inverted or collapsed. The paper's lambda is
+    lambda + mu of linear elasticity, because -mu (J - 1) alone contributes -mu/2 tr(e)² to second order. The paper's
+    term -mu/2 ln(I1 + 1) is left out, so that the point F = 0 is stationary; at rest nothing changes.
     """
     change = determinant(F) - 1.0
     return 0.5 * mu * (squared_norm(F) - len(F)) - mu * change + 0.5 * (lam + mu) * change**2
@@ -51,13 +51,13 @@ def stable_neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scala
 def st_venant_kirchhoff(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu |E|² + lambda/2 tr(E)² with the Green strain E = (FᵀF - I)/2.
 
-    Smooth everywhere, but softens under compression: uniaxial stress vanishes again as the element collapses.
+    Smooth everywhere, but it softens under compression: uniaxial stress vanishes as the element collapses.
     """
     return linear_energy(green_strain(F), mu, lam)
 
 
 def green_strain(F: DeformationGradient) -> list[list[Any]]:
-    """Rows of the lower triangle of E = (FᵀF - I)/2."""
+    """Returns the rows of the lower triangle of E = (FᵀF - I)/2."""
     axes = range(len(F))
     return [
         [0.5 * (sum(F[k][i] * F[k][j] for k in axes) - (1.0 if i == j else 0.0)) for j in axes if j <= i] for i in axes
@@ -65,7 +65,7 @@ def green_strain(F: DeformationGradient) -> list[list[Any]]:
 
 
 def linear_energy(strain: Sequence[Sequence[Array]], mu: Scalar, lam: Scalar) -> Scalar:
-    """mu |E|² + lambda/2 tr(E)² of a symmetric E, from the rows of its lower triangle."""
+    """Returns mu |E|² + lambda/2 tr(E)² of a symmetric E, from the rows of its lower triangle."""
     axes = range(len(strain))
     trace = sum(strain[i][i] for i in axes)
     squared = sum((1.0 if i == j else 2.0) * strain[i][j] ** 2 for i in axes for j in range(i + 1))
@@ -75,26 +75,27 @@ def linear_energy(strain: Sequence[Sequence[Array]], mu: Scalar, lam: Scalar) ->
 def corotated(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu |F - R|² + lambda/2 tr(RᵀF - I)² with the rotation R closest to F (McAdams et al. 2011).
 
-    By invariants, W = mu (I1 - 2 s + dim) + lambda/2 (s - dim)², where s = tr(RᵀF) is the sum of the singular values,
-    the smallest with the sign of J. Where the two smallest cancel, R is not unique and W has a crease: mirror images
-    in 2-D, and in 3-D elements collapsed to a line or mirrored in the plane of equal stretches. See `rotation_trace`.
+    In invariants, W = mu (I1 - 2 s + dim) + lambda/2 (s - dim)², where s = tr(RᵀF) is the sum of the singular values,
+    the smallest with the sign of J. Where the two smallest cancel, R is not unique and W has a crease: at mirror images
+    in 2-D, and in 3-D at elements collapsed to a line or mirrored in the plane of equal stretches. See
+    `rotation_trace`.
     """
     s, dimension = rotation_trace(F), len(F)
     return mu * (squared_norm(F) - 2.0 * s + dimension) + 0.5 * lam * (s - dimension) ** 2
 
 
 def squared_norm(F: DeformationGradient) -> Scalar:
-    """I1 = |F|²."""
+    """Returns I1 = |F|²."""
     return jnp.asarray(sum(entry * entry for row in F for entry in row))
 
 
 def rotation_trace(F: DeformationGradient) -> Scalar:
-    """s = max over rotations R of tr(RᵀF), with correct first and second derivatives and without singular values.
+    """Returns s = max over rotations R of tr(RᵀF), with correct first and second derivatives, without an SVD.
 
     In 2-D s² = (F11 + F22)² + (F21 - F12)². In 3-D s is the largest root of (s² - I1)² - 8 J s - 4 |cof F|² (the
     characteristic polynomial of Davenport's 4x4 matrix, whose roots are all real). On the crease this root is double or
-    triple, so s is exact to 1e-8 or 1e-6 (in float64). The derivative there is F s/|F|², correct for a change of size;
-    it is zero at F = 0 and on the crease in 2-D, where s = 0.
+    triple, so s is accurate to 1e-8 or 1e-6 (in float64). The derivative there is F s/|F|², correct for a change of
+    size; it is zero at F = 0 and on the crease in 2-D, where s = 0.
     """
     if len(F) == 2:
         squared = (F[0][0] + F[1][1]) ** 2 + (F[1][0] - F[0][1]) ** 2
@@ -129,7 +130,7 @@ def _largest_root(I1: Scalar, J: Scalar, minors: Scalar) -> Scalar:
     precision = jnp.finfo(start.dtype).eps
     s, _, _ = jax.lax.while_loop(unfinished, improve, (start, start, jnp.asarray(0)))
 
-    # Every Newton step from the constant root doubles the correct order of derivatives: 1, then 3.
+    # From the constant root, one Newton step makes derivatives correct to order 1, two steps to order 3.
     simple = slope(s, *constants[:2]) > 32.0 * jnp.sqrt(precision) * s**3
     root = s
     for _ in range(2):

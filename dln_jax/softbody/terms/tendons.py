@@ -1,9 +1,9 @@
-"""Tendons: cords along a path through a body, without friction, that pull and never push.
+"""Tendons: frictionless cords along a path through a body, which pull and never push.
 
-    of a length:   ½ k max(0, L(x) - l)²          of a tension:   T L(x),          L = sum over segments |p_{i+1} - p_i|
+    of given length:  ½ k max(0, L(x) - l)²      of given tension:  T L(x),      L = sum over segments |p_{i+1} - p_i|
 
-A point p of the path is a vertex, or a point inside of an element that moves with it. The total length couples all
-points, because the cord slides through them with the same tension everywhere: a tendon is one element.
+A point p of the path is a vertex, or a point inside an element that moves with it. The total length couples all points,
+because the cord slides through them with the same tension everywhere: a tendon is one element.
 """
 
 from collections.abc import Callable
@@ -40,17 +40,17 @@ class TendonOfTension(NamedTuple):
 def tendon_of_length(
     mesh: Mesh, path: ArrayLike, *, stiffness: float, length: float | None = None, name: str = "tendon"
 ) -> Term:
-    """A tendon that pulls with the stiffness k in N/m beyond the length l in m, and is slack below.
+    """A tendon that pulls with stiffness k in N/m when longer than l in m, and is slack when shorter.
 
     Args:
         mesh: the body.
         path: vertices [p], or points [p, dim] of the rest shape in m.
         stiffness: k.
-        length: l; without it, l is the control of the step, one number. `path_length` is that of the rest shape.
-        name: of the term.
+        length: l; by default l is the control of the step, one number. `path_length` returns that of the rest shape.
+        name: name of the term.
 
     Raises:
-        InputError: a path of fewer than two points, or one that is outside of the body or stays in place; or a number
+        InputError: the path has fewer than two points, leaves the body or has a segment of zero length; or a number is
             out of range.
     """
     parameters = TendonOfLength(
@@ -72,9 +72,9 @@ def tendon_of_length(
 
 
 def tendon_of_tension(mesh: Mesh, path: ArrayLike, *, tension: float | None = None, name: str = "tendon") -> Term:
-    """A tendon with the tension T in N, whatever its length; without it, T is the control of the step, one number.
+    """A tendon with the tension T in N at any length; by default T is the control of the step, one number.
 
-    The path and the errors are those of `tendon_of_length`.
+    Path and errors are those of `tendon_of_length`.
     """
     parameters = TendonOfTension(None if tension is None else material("tension", tension, 1, "tendon", NOT_NEGATIVE))
 
@@ -88,7 +88,7 @@ def tendon_of_tension(mesh: Mesh, path: ArrayLike, *, tension: float | None = No
 
 
 def path_length(mesh: Mesh, path: ArrayLike, x: Any = None) -> Float[Array, ""]:
-    """Length in m of a tendon's path at positions x [n, dim], by default those of the rest shape."""
+    """Returns the length in m of a tendon's path at positions x [n, dim], by default the rest shape."""
     nodes, weights = _path(mesh, path)
     return _length(jnp.asarray(weights) @ jnp.asarray(mesh.vertices if x is None else x)[nodes])
 
@@ -112,7 +112,7 @@ def _tendon(
 
 
 def _path(mesh: Mesh, path: ArrayLike) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "p k"]]:
-    """Distinct nodes of all points, and the points' shares in them."""
+    """Returns the distinct nodes of all points, and the points' weights on them."""
     points = np.asarray(path)
     if points.ndim == 1 and points.dtype.kind in "iu":
         if ((points < 0) | (points >= len(mesh.vertices))).any():

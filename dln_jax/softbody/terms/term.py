@@ -6,8 +6,8 @@ An element is whatever the energy couples: the corners of a triangle, the two en
 ground. `prepare` turns a term's parameters into the data of its elements once per time step, so that everything an
 element needs (rest shape, material, actuation, lagged contact forces) is differentiable.
 
-Values that users pass to the factories of terms are checked when the scene is built. Inside a transformation (a scene
-built under `jit` or `grad`) they are traced and pass unchecked, like those that later replace the defaults.
+Values passed to the factories of terms are checked when the scene is built. Traced values (a scene built under `jit` or
+`grad`) pass unchecked, like those that later replace the defaults.
 """
 
 import math
@@ -29,7 +29,7 @@ Indices = ArrayLike | Sequence[int | np.integer] | Sequence[Sequence[int | np.in
 
 
 class Context(NamedTuple):
-    """Data of a time step for the preparation of a term, shared by all terms."""
+    """Data of a time step from which terms prepare their elements."""
 
     rest: Float[Array, "n dim"]
     """Rest shape in m."""
@@ -40,7 +40,7 @@ class Context(NamedTuple):
     dt: Float[Array, ""]
     """Length of the step in s; infinite for a static solve."""
     control: Any = None
-    """Control of the step for this term, if there is one: an array, in the scene's only actuator the whole control."""
+    """Control of the step for this term, if any: an array; for the scene's only actuator the whole control."""
     lag: Float[Array, "n dim"] | None = None
     """Positions in m at which friction takes its normal forces and directions; by default those at the start."""
 
@@ -53,8 +53,9 @@ class Term(NamedTuple):
     indices: Int[np.ndarray, "m k"]
     """Vertices of the elements."""
     energy: Callable[[Corners, Any], Float[Array, ""]]
-    """(positions x[k][i] of one element's vertices, its data) -> J. The positions are `Corners`, scalars: arithmetic of
-    scalars fuses over all elements, while slices and stacks of arrays do not. With weights, combinations instead."""
+    """(positions x[k][i] of one element's vertices, its data) -> J. The positions are scalars (`Corners`), whose
+    arithmetic fuses over all elements, unlike slices and stacks of arrays. With `weights` it takes combinations of
+    positions."""
     parameters: Any
     """Default parameters: a NamedTuple of arrays, SI units."""
     prepare: Callable[[Any, Context], Any]
@@ -62,19 +63,19 @@ class Term(NamedTuple):
     unrolled: bool = True
     """False if the energy takes an array [k, dim] instead of scalars: compiles faster beyond a dozen unknowns."""
     control: tuple[int, ...] | None = None
-    """Shape of the control that the preparation reads from its context; `None` for a term without."""
+    """Shape of the control that the preparation reads from its context; `None` for a term without control."""
     lagged: bool = False
-    """Whether the preparation reads the lag of its context."""
+    """Whether the preparation reads `Context.lag`."""
     weights: Callable[[Any], Any] | None = None
     """Data of one element -> w[k][j], if the energy takes y[i][j] = sum over vertices k of x[k][i] w[k][j] (rows of a
-    deformation gradient, an edge) in place of the positions. Its Hessian compiles and runs faster."""
+    deformation gradient, an edge) instead of positions. The Hessian then compiles and runs faster."""
 
 
 class Bound(NamedTuple):
     """Range of accepted values."""
 
     holds: Callable[[np.ndarray], np.ndarray]
-    """Elementwise; false for NaN."""
+    """Elementwise test; false for NaN."""
     expected: str
     """The range in words."""
 
@@ -86,7 +87,7 @@ NOT_NEGATIVE = Bound(lambda values: (values >= 0) & np.isfinite(values), "zero o
 def material(
     name: str, value: Numbers, count: int, element: str, bound: Bound = POSITIVE
 ) -> Float[Array, ""] | Float[Array, " m"]:
-    """Validates a value for all elements [] or one per element [m]; `InputError` names the first element at fault."""
+    """Validates a value for all elements [] or one per element [m]; `InputError` names the first invalid element."""
     result = jnp.asarray(value, dtype=float)
     if result.shape not in ((), (count,)):
         raise InputError(f"{name} has shape {result.shape}; expected one number, or {count}: one per {element}")
@@ -98,7 +99,7 @@ def material(
 
 
 def control_of(name: str, context: Context, shape: tuple[int, ...], meaning: str) -> Float[Array, "..."]:
-    """Returns the control of a driven term in its shape; `InputError` says what it means if it is missing.
+    """Returns the control of a driven term in its shape; if it is missing, `InputError` says what it means.
 
     A single number may have the shape [] or [1].
     """
@@ -110,7 +111,7 @@ def control_of(name: str, context: Context, shape: tuple[int, ...], meaning: str
 
 
 def vector(name: str, value: Numbers, *, zero_allowed: bool = True) -> Float[Array, " dim"]:
-    """Validates a finite vector of the plane or of space."""
+    """Validates a finite vector in the plane or in space."""
     result = jnp.asarray(value, dtype=float)
     if result.shape not in ((2,), (3,)):
         raise InputError(f"{name} has shape {result.shape}; expected 2 or 3 components")
@@ -124,13 +125,13 @@ def vector(name: str, value: Numbers, *, zero_allowed: bool = True) -> Float[Arr
 
 
 def require_dimension(name: str, components: int, dimension: int) -> None:
-    """Raises `InputError` if a vector does not have the scene's dimension."""
+    """Raises `InputError` unless a vector has the scene's dimension."""
     if components != dimension:
         raise InputError(f"{name} has {components} components in a scene of dimension {dimension}")
 
 
 def vertex_list(name: str, vertices: Indices) -> Int[np.ndarray, "m 1"]:
-    """Distinct vertices as elements of one corner."""
+    """Returns distinct vertices as elements of one corner."""
     indices = _indices(name, vertices, 1)
     if len(np.unique(indices)) < len(indices):
         raise InputError(f"{name} names a vertex twice; expected each vertex once")
@@ -138,7 +139,7 @@ def vertex_list(name: str, vertices: Indices) -> Int[np.ndarray, "m 1"]:
 
 
 def vertex_pairs(name: str, pairs: Indices) -> Int[np.ndarray, "m 2"]:
-    """Pairs of distinct vertices."""
+    """Returns validated pairs of distinct vertices."""
     indices = _indices(name, pairs, 2)
     if (loops := np.flatnonzero(indices[:, 0] == indices[:, 1])).size:
         raise InputError(f"{name}: pair {loops[0]} joins vertex {indices[loops[0], 0]} to itself")
