@@ -1,8 +1,8 @@
 """Writes and reads the files of an export as a unit, and never overwrites a run.
 
-A description, a JSON file beside the others, holds the SHA-256 of all files and its own. All new files are complete
-before the first is renamed into place, and descriptions come last. An interruption therefore leaves the old files, the
-new files, or a description whose digests do not fit, which readers refuse. Digests detect accidents, not forgery.
+A description, a JSON file beside the others, holds the SHA-256 of all files and of itself. All new files are complete
+before the first is renamed into place, and descriptions come last. After an interruption there are the old files, the
+new files, or a description with wrong digests, which readers refuse. Digests detect accidents, not forgery.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ def write_exports(directory: Path, files: Mapping[str, bytes], *, overwrite: boo
     Args:
         directory: folder of the export, not of a run.
         files: name -> bytes, descriptions included.
-        overwrite: replace existing files, but a .json only if it describes files of the same names.
+        overwrite: replace existing files; a .json only if it describes files of the same names.
 
     Raises:
         InputError: the folder belongs to a run, a file may not be replaced, or the folder cannot be written to.
@@ -85,7 +85,7 @@ def read_export(path: Path, names: Iterable[str]) -> tuple[dict[str, Any], dict[
 
 
 def _values(path: Path) -> dict[str, Any]:
-    """Returns the object in a JSON file, empty if there is none."""
+    """Returns the object in a JSON file, or an empty dictionary."""
     with suppress(InputError):
         return read_json(path, remedy="")
     return {}

@@ -1,9 +1,9 @@
 """Low-latency calls on the CPU, for control loops.
 
-By default JAX hands a computation on the CPU to another thread and returns at once. A loop that waits for the result
+By default JAX hands a computation on the CPU to another thread and returns at once, so a loop that waits for the result
 pays for two thread switches. `enable_low_latency` makes JAX compute in the calling thread. JAX reads the setting when
-its backend starts and silently ignores it afterwards, so a late call is refused. Single calls gain; large batches,
-whose preparation overlaps with the computation, may become slower.
+its backend starts and silently ignores it afterwards, so a late call is refused. Single calls become faster; large
+batches, whose preparation overlaps with the computation, may become slower.
 
 A jitted function with its parameters closed over is 1 to 2 us faster than the result of `lower().compile()`, whose call
 passes through more Python; `low_latency` therefore returns a jitted function.
@@ -25,7 +25,7 @@ _SETTING = "jax_cpu_enable_async_dispatch"
 
 
 def enable_low_latency() -> None:
-    """Makes JAX compute on the CPU in the calling thread, in the whole process from now on.
+    """Makes JAX compute on the CPU in the calling thread, for the whole process from now on.
 
     Raises:
         InputError: a backend has already started (any array, or a list of devices, starts it), or JAX computes on a
@@ -43,20 +43,20 @@ def enable_low_latency() -> None:
 
 
 def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = False) -> Callable[..., Any]:
-    """Returns the function compiled for arguments like the examples, after one call.
+    """Compiles a function for arguments like the examples, calls it once, and returns it.
 
     Args:
         function: a function of arrays with its parameters closed over, such as
             `load(folder).dynamics.inverse_dynamics`.
         examples: one example per argument, with the shape and dtype of later calls.
         numpy: copy all arguments into one buffer, for a single transfer, and return NumPy arrays. Arguments are
-            converted to one common dtype. The callable serves one thread at a time, because of the buffer. By default
+            converted to one common dtype, and because of the buffer only one thread may call at a time. By default
             arguments are NumPy or device arrays (a device array saves 2 us) and results are device arrays; another
-            shape or dtype compiles again.
+            shape or dtype recompiles.
 
     Raises:
-        InputError: there are no examples, or with `numpy` they have several dtypes, or the default device is not a CPU;
-            with `numpy`, the callable raises it for an argument whose shape differs from its example.
+        InputError: there are no examples, `numpy` examples have several dtypes, or the default device is not a CPU;
+            later calls with `numpy` raise it for an argument whose shape differs from its example.
     """
     if (platform := jax.default_backend()) != "cpu":
         raise InputError(_only_on_cpu(platform))
@@ -64,7 +64,7 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
         raise InputError("low_latency got no example; give one argument of each kind that calls will have")
     if not numpy:
         compiled = jax.jit(function)
-        # JAX caches a fast path of the dispatch for NumPy and for device arrays, at the first call with such arrays.
+        # JAX caches a fast dispatch path for NumPy and for device arrays, each at the first call with such arrays.
         for convert in (np.asarray, jnp.asarray):
             jax.block_until_ready(compiled(*map(convert, examples)))
         return compiled
@@ -85,7 +85,7 @@ def _only_on_cpu(platform: str) -> str:
 def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:
     """Returns the argument as a real array of this shape, without a copy if it already is one.
 
-    The check is needed because the assignment to a buffer would broadcast silently.
+    The check is needed because assignment to a buffer would broadcast silently.
 
     Raises:
         InputError: the argument has another shape, or is not an array of real numbers.

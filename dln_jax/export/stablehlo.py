@@ -1,7 +1,7 @@
 """Exports functions as `jax.export` artefacts: StableHLO that any JAX runs without this package.
 
-An artefact is what `jax.export` serialises (its platforms and shapes included), followed by the SHA-256 of these bytes.
-`jax.export.deserialize` ignores what follows; `load_stablehlo` checks it. JAX promises to read artefacts for six months
+An artefact is the output of `jax.export` (including platforms and shapes), followed by its SHA-256.
+`jax.export.deserialize` ignores the digest; `load_stablehlo` checks it. JAX promises to read artefacts for six months
 after the release that wrote them; export older ones again from the run folder. Artefacts are compiled where they are
 loaded, for the platforms that they were lowered for. Writing and reading need the package `flatbuffers`.
 """
@@ -65,7 +65,7 @@ def export_dynamics(
     platforms: Sequence[str] = ("cpu",),
     overwrite: bool = False,
 ) -> list[Path]:
-    """Writes the inverse_dynamics, forward_dynamics, energy and mass_matrix that a model has, and returns the paths.
+    """Writes those of inverse_dynamics, forward_dynamics, energy and mass_matrix that a model has; returns the paths.
 
     Args:
         dynamics: functions of one state, such as `load(folder).dynamics`.
@@ -107,7 +107,7 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
         exported = export.deserialize(bytearray(data[:-DIGEST]))
     except Exception as error:  # flatbuffers and struct raise exceptions without a common class
         raise InputError(f"{path}: no artefact that JAX {jax.__version__} can read; {AGAIN}") from error
-    # A GPU is "gpu" as a backend, and "cuda" or "rocm" as a platform.
+    # A GPU is called "gpu" as a backend, and "cuda" or "rocm" as a platform.
     platform, platforms = export.default_export_platform(), ", ".join(exported.platforms)
     if platform not in exported.platforms:
         raise InputError(f"{path} is for {platforms}, and JAX runs on {platform}; export it with that platform")
@@ -115,7 +115,7 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
     if any(argument.dtype == "float64" for argument in expected):
         require_double_precision(str(path))
 
-    # The checks run while JAX traces, so once for every shape and dtype.
+    # The checks run while JAX traces, and so once per shape and dtype.
     @jax.jit
     def call(*arguments):
         if len(arguments) != len(expected):
@@ -148,9 +148,9 @@ def _artefact(function: Callable[..., Any], examples: Sequence[Any], platforms: 
 
 
 def _shape_of(number: int, example: Any) -> jax.ShapeDtypeStruct:
-    """Shape of an example, and the dtype in which JAX computes."""
+    """Returns the shape of an example, and the dtype in which JAX computes."""
     with contextlib.suppress(TypeError):
-        # A list or tuple, which JAX would treat as several arguments, stays one.
+        # A list or tuple stays one argument, although JAX would treat it as several.
         if isinstance(shape := jax.eval_shape(lambda x: x, example), jax.ShapeDtypeStruct):
             if isinstance(example, jax.ShapeDtypeStruct) and example.dtype != shape.dtype:
                 raise InputError(

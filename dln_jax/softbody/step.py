@@ -64,6 +64,7 @@ def make_step(
         friction_iterations: number of times to solve the step again with the normal forces and directions of friction
             at the previous solution instead of those at the start (`friction_iterations`). `Info.friction_change`
             reports how much one more would change.
+
     Raises:
         InputError: a number is not positive, or halvings are used with a two-step method.
     """

@@ -1,7 +1,7 @@
 """A generated C source that makes exported functions callable from Python.
 
-It replaces ctypes, whose calls take longer than the dynamics of a small arm. It declares the few functions of Python
-(3.11 and later) that it calls, so that no Python headers are needed.
+It replaces ctypes, whose calls take longer than the dynamics of a small arm. It declares the few Python functions that
+it calls (Python 3.11 and later), so no Python headers are needed.
 """
 
 import collections
@@ -134,7 +134,7 @@ static PyObject *called(
 
 
 def binding(name: str, functions: Mapping[str, Signature], precision: str) -> str:
-    """Returns the source of the binding, to be compiled together with the export."""
+    """Returns the source of the binding, which is compiled together with the export."""
     leaves = [leaf for function in functions.values() for leaf in (*function.arguments, *function.results)]
     text = _START.substitute(
         name=name,
@@ -155,7 +155,7 @@ def binding(name: str, functions: Mapping[str, Signature], precision: str) -> st
 
 
 def bound(library: ctypes.PyDLL, name: str, functions: Mapping[str, Signature], precision: str) -> Any:
-    """Returns a named tuple of the functions of a library that was built with the binding."""
+    """Returns a named tuple of the functions in a library that was built with the binding."""
     make = library[f"{name}_python"]
     make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
     made: dict[str, Callable[..., Any]] = {}
@@ -171,7 +171,7 @@ def bound(library: ctypes.PyDLL, name: str, functions: Mapping[str, Signature], 
 def _converting(
     name: str, leaves: tuple[Leaf, ...], precision: str, made: Mapping[str, Callable[..., Any]]
 ) -> Callable[..., Any]:
-    """Returns a function that converts arguments to arrays and calls a function in `made` with them."""
+    """Returns a function that converts arguments to arrays and passes them to a function in `made`."""
     parameters = [inspect.Parameter(leaf.name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for leaf in leaves]
     expected = inspect.Signature(parameters)
 
@@ -198,7 +198,7 @@ def _type(kind: str, precision: str) -> Any:
 
 
 def _format(kind: str, precision: str) -> str:
-    """Returns the format character of the buffer of an array."""
+    """Returns the format character of an array's buffer."""
     return np.zeros(1, _type(kind, precision)).data.format
 
 
@@ -217,7 +217,7 @@ static PyObject *call_$number(PyObject *self, PyObject *const *arguments, Py_ssi
 
 
 def _function(number: int, name: str, signature: Signature, precision: str) -> str:
-    """Returns a C function that passes pointers to an exported function, and one that Python calls."""
+    """Returns two C functions: one passes pointers to an exported function, the other is called by Python."""
     results = () if signature.returns else signature.results
     leaves = [*signature.arguments, *results]
     passed = [

@@ -1,7 +1,8 @@
 """The text of one C function under construction: lines, variables that hold nodes, and expressions that read them.
 
-A reading takes an integer array of positions, with one axis for each loop around it (a scalar outside loops). Slices,
-transposes and gathers become indexing of that integer array, and constants are stored in the order of their reading.
+A read takes an integer array of positions with one axis per surrounding loop (a scalar outside loops). Slices,
+transposes and gathers become indexing of that integer array, and constants are stored in the order in which they are
+read.
 """
 
 from collections import Counter
@@ -21,9 +22,9 @@ from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import C_TYPES, PRECISIONS, literal
 
 _FRAME = 512
-"""Bytes for saved registers, spilled vectors and helper functions."""
+"""Bytes allowed for saved registers, spilled vectors and helper functions."""
 _ALIGNMENT = 32
-"""Bytes; gcc aligns arrays for vectors."""
+"""Bytes to which gcc aligns arrays for vectors."""
 
 
 class Called(NamedTuple):
@@ -36,29 +37,29 @@ class Called(NamedTuple):
     unbounded: int
     stack: int
     calls: set[Any]
-    """Keys, in the source, of the functions that it calls directly or indirectly."""
+    """Keys (in the source) of the functions that it calls, directly or indirectly."""
 
 
 @dataclass
 class Source:
-    """Tables and helper functions that the functions of one source file share."""
+    """Tables and helper functions shared by the functions of one source file."""
 
     precision: str
     libm: bool
     finite: bool = False
-    """Arguments and intermediate results are finite."""
+    """Whether arguments and intermediate results are finite."""
     loop_bound: int | None = None
-    """Iterations after which loops without a bound end, with NaN."""
+    """Number of iterations after which a loop without a known bound ends with NaN."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
     functions: set[str] = field(default_factory=set)
     """Elementary functions called on scalars."""
     arrays: set[str] = field(default_factory=set)
     """Elementary functions called on arrays."""
     integers: set[str] = field(default_factory=set)
-    """Integer functions that are called."""
+    """Integer functions called."""
     kernels: set[str] = field(default_factory=set)
     orders: set[tuple[str, ...]] = field(default_factory=set)
-    """Kinds of the sort keys of every sort."""
+    """Kinds of the keys of every sort."""
     parts: dict[bytes, "Called"] = field(default_factory=dict)
     """Functions that others call, by the digest of their program."""
     names: dict[str, str] = field(default_factory=dict)
@@ -70,7 +71,7 @@ class Source:
         return PRECISIONS[self.precision][2]
 
     def copy(self) -> "Source":
-        """Returns a copy that shares no containers, to discard if a function is refused."""
+        """Returns a copy that shares no containers, so that it can be discarded if a function is refused."""
         return Source(**{attribute.name: copy(getattr(self, attribute.name)) for attribute in fields(self)})
 
     def table(self, numbers: np.ndarray, dtype: str) -> str:
@@ -93,13 +94,13 @@ class Body:
     """Name of every argument, and whether it is passed by value."""
     lines: list[str] = field(default_factory=list)
     operations: Counter[str] = field(default_factory=Counter)
-    """Largest number of operations on real numbers, by their names in `operations.OPERATIONS`."""
+    """Upper bound on the operations on real numbers, by their names in `operations.OPERATIONS`."""
     unbounded: int = 0
-    """Loops without a bound on their iterations, of which one is counted."""
+    """Number of loops without a bound on their iterations; one iteration of each is counted."""
     stack: int = _FRAME
-    """Largest stack: variables, and what a compiler adds to them."""
+    """Upper bound on the stack in bytes: variables, and what a compiler adds to them."""
     calls: set[Any] = field(default_factory=set)
-    """Keys, in the source, of the functions that it calls directly or indirectly."""
+    """Keys (in the source) of the functions that it calls, directly or indirectly."""
     names: dict[Node, str] = field(default_factory=dict)
     """Names of the arrays that hold nodes."""
     _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)
@@ -108,7 +109,7 @@ class Body:
     _turns: int = 1
 
     def line(self, text: str) -> None:
-        """Appends a line at the current depth."""
+        """Appends a line at the current indentation."""
         self.lines.append("    " * self._depth + text)
 
     @contextmanager
@@ -141,7 +142,7 @@ class Body:
         self.operations.update({name: count * self._turns for name, count in operations.items()})
 
     def declared(self, name: str, dtype: str, size: int, value: str = "") -> None:
-        """Declares an array, or a scalar if the size is 0; a scalar with a value is constant."""
+        """Declares an array, or a scalar if size is 0; a scalar with a value is constant."""
         width = 4 if self.source.precision == "f32" and dtype == "real" else 8
         self.stack += -(-size * width // _ALIGNMENT) * _ALIGNMENT or width
         array, start, constant = (
@@ -152,7 +153,7 @@ class Body:
         self.line(f"{constant}{C_TYPES[dtype]} {name}{array}{start};")
 
     def kept(self, node: Node) -> str:
-        """Returns the name of an array for a node: one that is free again, or a new one."""
+        """Returns the name of an array for a node, reusing a free one if possible."""
         free = self._free.get((node.region, node.dtype, node.size))
         self.names[node] = free.pop() if free else f"v{node.number}"
         if self.names[node] == f"v{node.number}":
@@ -183,7 +184,7 @@ class Body:
         return f"i_{node.attribute}" if node.op == "counter" else self.names.get(node, f"v{node.number}")
 
     def read(self, node: Node, positions: np.ndarray, names: Sequence[str] = ()) -> str:
-        """Returns the C expression of the elements at these positions, inside loops over these variables."""
+        """Returns the C expression for the elements at these positions, inside loops over these variables."""
         if is_constant(node) and node not in self.plan.arrays:
             return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
         if node.op == "gather" and node not in self.plan.arrays:
@@ -196,11 +197,11 @@ class Body:
         return name
 
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
-        """Returns the C expression of an index, from a table unless it is linear in the loop variables."""
+        """Returns the C expression of an index, using a table unless it is linear in the loop variables."""
         terms, first = [], 0
         linear = strides(positions)
         if linear is None:
-            # The table leaves out axes along which the index moves by equal steps.
+            # The table omits axes along which the index moves by equal steps.
             even = {axis: step for axis in range(positions.ndim) if (step := _step(positions, axis)) is not None}
             kept = positions[tuple(0 if axis in even else slice(None) for axis in range(positions.ndim))]
             table, names_kept = self.source.table(kept.astype(np.int32), "int"), []
@@ -220,7 +221,7 @@ class Body:
         """Returns the C expression of constants, inside loops over these variables."""
         if numbers.size and ((numbers == numbers.flat[0]).all() or (numbers != numbers).all()):
             return literal(numbers.flat[0], self.source.precision, dtype)
-        # The table leaves out axes along which the numbers are equal.
+        # The table omits axes along which the numbers are equal.
         kept = [axis for axis in range(numbers.ndim) if not (numbers == numbers.take([0], axis=axis)).all()]
         stored = numbers[tuple(slice(None) if axis in kept else 0 for axis in range(numbers.ndim))]
         index = self.index(np.arange(stored.size).reshape(stored.shape), [names[axis] for axis in kept])
@@ -232,7 +233,7 @@ class Body:
         return f"{'&' if by_value else ''}{self.name(node)}"
 
     def projected(self, loop: Node) -> set[int]:
-        """Returns the indices of the results of a loop that something reads."""
+        """Returns the indices of a loop's results that something reads."""
         return {
             node.attribute
             for node, mask in self.plan.needed.items()
@@ -241,7 +242,7 @@ class Body:
 
     @property
     def cost(self) -> Cost:
-        """The most that a call takes."""
+        """Upper bound on the cost of a call."""
         count, fused = self.operations, self.operations["multiply_add"]
         functions = sum(count[name] for name in OPERATIONS if OPERATIONS[name].function and name != "sqrt")
         return Cost(

@@ -1,6 +1,6 @@
-"""Exports JAX functions with exact derivatives as C for CasADi's `external`, and so for acados.
+"""Exports JAX functions with exact derivatives as C for CasADi's `external`, and hence for acados.
 
-CasADi (3.6 and later) takes the derivatives of a function f from these functions of the same library:
+CasADi (3.6 and later) takes the derivatives of a function f from these symbols of the same library:
 
 | symbol | inputs | outputs |
 |---|---|---|
@@ -10,12 +10,12 @@ CasADi (3.6 and later) takes the derivatives of a function f from these function
 | `adj1_f` | x, y, seeds of y | (dy/dx)ᵀ seeds |
 | `jac_adj1_f` | x, y, seeds of y, outputs of `adj1_f` | derivatives of these outputs with respect to all inputs |
 
-Outputs among the inputs are declared without elements, and so are derivatives with respect to them. All other matrices
-are dense and column-major, vectors are n x 1. A null pointer stands for an input of zeros or an unwanted output.
+Outputs among the inputs, and derivatives with respect to them, are declared without elements. All other matrices are
+dense and column-major; vectors are n x 1. A null pointer stands for an input of zeros or an unwanted output.
 
 The C loops over the directions of derivatives. Unrolled, it would be at most a third faster at two and four degrees of
-freedom, but the Hessian of forward dynamics would compile in 18 s instead of 2 s at four, and exceed the stack at
-seven, with seven times as much.
+freedom, but the Hessian of forward dynamics would compile in 18 s instead of 2 s at four, and at seven it would exceed
+the stack sevenfold.
 """
 
 import re
@@ -57,7 +57,7 @@ class Block(NamedTuple):
 def external_functions(
     name: str, functions: Mapping[str, Any], source: Source, *, stack: int, leave_out: bool = False
 ) -> tuple[Source, str, list[str]]:
-    """Returns the source of tables, the C text of `casadi_NAME_F` and its derivatives for every F, and refusals.
+    """Returns the source of tables, the C of `casadi_NAME_F` and its derivatives for every F, and reasons for refusals.
 
     Args:
         name: name of the export.
@@ -68,7 +68,7 @@ def external_functions(
 
     Raises:
         InputError: CasADi cannot take a function: its arrays are not real or have more than two axes, a name is
-            reserved, or it has no arguments or no derivatives, or needs more stack.
+            reserved, it has no arguments or derivatives, or it needs more stack.
     """
     text, largest, left_out = "", 1, []
     for key, (function, examples) in functions.items():
@@ -92,7 +92,7 @@ def external_functions(
 def _flat(
     symbol: str, function: Callable[..., Any], examples: Sequence[Any]
 ) -> tuple[list[Block], list[Block], Function]:
-    """Returns inputs, outputs, and the function between the vectors of all inputs and of all outputs, column-major."""
+    """Returns inputs, outputs, and the function from all inputs to all outputs as column-major vectors."""
     leaves, tree = jax.tree.flatten(tuple(examples))
     shapes = [np.shape(leaf) for leaf in leaves]
     try:
@@ -140,7 +140,7 @@ def _reverse(function: Function, x: Array) -> Array:
 
 
 def _unit(k: Array, like: Array) -> Array:
-    # A comparison, because rows of an identity matrix would be kept in an array.
+    # A comparison, because rows of an identity matrix would be stored in an array.
     return (jnp.arange(like.size) == k).astype(like.dtype)
 
 
@@ -160,7 +160,7 @@ def _pull_forward(function: Function, x: Array, seeds: Array) -> Array:
 
 
 def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterable[tuple[str, Any, Any, Any]]:
-    """Yields prefix, inputs and outputs of all derivatives, and functions that compute them, the cheapest first."""
+    """Yields prefix, inputs and outputs of every derivative, and functions that compute it, cheapest first."""
     x_parts, y_parts = (
         [slice(*ends) for ends in pairwise([0, *accumulate(block.size for block in blocks)])]
         for blocks in (inputs, outputs)
@@ -202,7 +202,7 @@ def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterab
 def _function(
     source: Source, symbol: str, inputs: list[Block], outputs: list[Block], ways: Sequence[Any], stack: int
 ) -> tuple[Source, str]:
-    """Returns the source and the C text by the first method that can be compiled."""
+    """Returns the source and the C text from the first method that can be compiled."""
     failure: Exception | None = None
     for way in ways:
         try:

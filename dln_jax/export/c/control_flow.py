@@ -1,7 +1,7 @@
-"""Rules for loops and branches, which stay loops and branches of the program.
+"""Lowering rules for loops and branches, which stay loops and branches in the program.
 
 With finite arguments (`Program.finite`), elements of a loop's arrays that keep a known value are constants inside the
-loop and after it, so that the zeros of a derivative's structure cost nothing there.
+loop and after it, so that structural zeros of a derivative cost nothing there.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,9 +48,9 @@ def _with_known(program: Program, node: Node, mask: np.ndarray, numbers: np.ndar
 def _steady(
     program: Program, start: Sequence[Node], carries: Sequence[Node], body: Callable[[list[Node]], list[Node]]
 ) -> tuple[list[Node], list[Node], list[tuple[np.ndarray, np.ndarray]]]:
-    """Returns the carries inside a loop, the results of its body, and which elements keep a known value, with values.
+    """Returns a loop's inner carries, the results of its body, and masks and values of elements that never change.
 
-    They are assumed to be all that are known at the start; those that the body changes are dropped until none is.
+    All elements known at the start are assumed constant; those that the body changes are dropped until none is left.
     """
     steady = [known(node) for node in start]
     steady = [(mask & (program.finite and mask.size > 1), numbers) for mask, numbers in steady]
@@ -87,7 +87,7 @@ def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
     def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
         return sum(a.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
 
-    # Counted, because releases of JAX store these numbers differently; stacked arrays differ in shape inside.
+    # Counted, because JAX releases store these numbers differently; stacked arrays have another shape inside.
     count = alike(parameters["results"], inner.outvars)
     constants = alike(args, inner.invars) - count
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
@@ -109,13 +109,13 @@ def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
 
 
 def _slice_of(program: Program, array: Node, turn: Node, length: int) -> Node:
-    """Returns the part of a stacked array in an iteration; elements that are the same in all of them are constants."""
+    """Returns the slice of a stacked array in an iteration; elements that are equal in all slices are constants."""
     size, shape, index = array.size // length, array.shape[1:], np.arange(array.size)
     mask, numbers = (part.reshape(length, size) for part in known(array))
     same = mask.all(0) & (numbers == numbers[0]).all(0) & program.finite
     whole = array
     if same.any() and array.op == "gather" and array.args[0].shape == array.shape and array.args[0].op != "const":
-        # The array whose elements these constants replace lies in memory; this one would have to be copied.
+        # The array whose elements these constants replace is in memory; this one would have to be copied.
         whole = array.args[0] if ((np.ravel(array.value) == index) | np.tile(same, length)).all() else array
     first = program.elementwise("mul", turn, size)
     offsets = program.constant(np.arange(size).reshape(shape), "index")
@@ -143,4 +143,4 @@ def _cond(program: Program, parameters: Parameters, which: Node, *operands: Node
 
 
 RULES = {"while": _while, "scan": _scan, "cond": _cond}
-"""Rules by the name of the primitive."""
+"""Rules by name of the primitive."""

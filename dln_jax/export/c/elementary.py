@@ -1,16 +1,17 @@
 """Elementary functions in exported C: plain C99 without branches or tables, which compilers vectorise.
 
-Each is right to two units in the last place over its range, with the usual values at zeros, infinities and NaN; only
-`exp` rounds results below the smallest normal number to zero. The ideas are standard (Cody and Waite, Software Manual
-for the Elementary Functions, 1980; Muller, Elementary Functions, 2016):
+Each is accurate to two units in the last place over its range and has the usual values at zeros, infinities and NaN;
+only `exp` flushes results below the smallest normal number to zero. The methods are standard (Cody and Waite, Software
+Manual for the Elementary Functions, 1980; Muller, Elementary Functions, 2016):
 
     exp, expm1  x = n ln 2 + r, a polynomial in r, 2ⁿ by its bits
-    tanh        1 - 2 e / (1 + e) with e = exp(-2|x|), near 0 a rational function; one division for both
-    sin, cos    |x| = n pi/2 + r with pi/2 in parts whose products with n are exact; two polynomials, n chooses one
+        tanh        1 - 2 e / (1 + e) with e = exp(-2|x|); near 0 a rational function; one division serves both
+        sin, cos    |x| = n pi/2 + r, with pi/2 in parts whose products with n are exact; n selects one of two
+        polynomials
     log, log1p  x = 2ᵏ (1 + s), log(1 + s) = 2 artanh(s / (2 + s))
 
-A number is rounded to an integer n by adding 1.5 2⁵² (float: 1.5 2²³), which leaves n in the low bits of the sum: this
-needs IEEE arithmetic rounded to the nearest, so no -ffast-math.
+A number is rounded to an integer n by adding 1.5 2⁵² (float: 1.5 2²³), which leaves n in the low bits of the sum. This
+needs IEEE round-to-nearest arithmetic, so no -ffast-math.
 """
 
 import math
@@ -22,7 +23,7 @@ import numpy as np
 
 from dln_jax.export.c.text import PRECISIONS, fill, number
 
-# From the constant term up: interpolation at Chebyshev nodes in 60 digits (mpmath), then rounded. In r or in r²,
+# From the constant term up: interpolated at Chebyshev nodes in 60 digits (mpmath), then rounded. In r or in r²,
 #   exp  (e^r - 1 - r) / r², |r| <= ln(2)/2           sin, cos  (sin(r)/r - 1) / r², ((cos(r) - 1) / r² + 1/2) / r²
 #   log  (2 artanh(r)/r - 2) / r², r <= 3 - 2 sqrt(2) tanh      (tanh(r)/r - 1) / r² = tanh / tanh_below, r <= 0.56
 _POLYNOMIALS = {
@@ -48,7 +49,7 @@ _POLYNOMIALS = {
         "log": (0.66666687, 0.39988735, 0.29582024),
     },
 }  # fmt: skip
-# ln 2 and pi/2 in parts: all but the last are short enough for exact products with the n that occur.
+# ln 2 and pi/2 in parts: all but the last are short enough for exact products with any n that occurs.
 _LN2 = {"f64": (0.6931471805598903, 5.497923018708371e-14), "f32": (0.69314575, 1.4286068e-06)}
 _HALF_PI = {
     "f64": (1.5707963267923333, 2.5633441515839558e-12, 1.0562999066987428e-23),
@@ -58,9 +59,9 @@ _HALF_PI = {
 _EXP_RANGE = {"f64": (-708.3964185322641, 709.782712893384), "f32": (-87.33654, 88.72283)}
 
 BOUNDS: Mapping[str, Mapping[str, float]] = {name: {"f64": 2e5, "f32": 1e4} for name in ("sin", "cos")}
-"""Largest |x| for which the digits of pi suffice; beyond it C calls <math.h>. Other functions have no bound."""
+"""Largest |x| for which the stored digits of pi suffice; beyond it C calls <math.h>. Other functions have no bound."""
 
-# A choice is made by bits: gcc moves code that only one side of ?: needs into a branch, and then cannot vectorise.
+# Selections use bits: gcc moves code that only one side of ?: needs into a branch, and then cannot vectorise.
 _COMMON = """
 /* Elementary functions: the bits of a number and back, and condition ? x : y without a branch */
 typedef $word elementary_word;
@@ -78,7 +79,7 @@ _EVALUATION = """
 #error "FLT_EVAL_METHOD: extended precision makes exp and others wrong; give -mfpmath=sse -msse2, or export with --libm"
 #endif
 """
-# The nearest number with fewer bits, ties to even, as XLA rounds it: small ones to zero, large ones to infinity.
+# The nearest number with fewer bits, ties to even, as XLA rounds it: underflow to zero, overflow to infinity.
 _ROUNDED = """static inline real elementary_rounded(real x, int exponent_bits, int mantissa_bits)
 {
     const elementary_word bits = elementary_word_of(x), sign = bits & $sign, unit = 1;
@@ -92,7 +93,7 @@ _ROUNDED = """static inline real elementary_rounded(real x, int exponent_bits, i
     return elementary_number_of(sign | kept);
 }
 """
-# Whole numbers in the total order of the real ones: -0 before 0, NaN of either sign outside the infinities.
+# Integers in the total order of the real numbers: -0 before 0, NaN of either sign outside the infinities.
 _ORDERED = """static inline elementary_word elementary_ordered(real x)
 {
     const elementary_word bits = elementary_word_of(x);
@@ -166,7 +167,7 @@ const real not_zero = elementary_choice(y == 0, -(real)INFINITY, value);
 const real not_negative = elementary_choice(y < 0, (real)NAN, not_zero);
 const real result = elementary_choice(y < (real)INFINITY, not_negative, x);
 """
-# What is computed with integers stands in lines of `elementary_word`: `OPERATIONS` counts the others.
+# Integer arithmetic stands in lines of `elementary_word`: `OPERATIONS` counts the others.
 _BODIES = {
     "exp": f"""const real t = x, above = x + (real)INFINITY;{_REDUCED}
 const real power = 1 + MULTIPLY_ADD(r2, $exp, r);
@@ -197,7 +198,7 @@ const real bias = elementary_choice(x < $smallest, $grown_bias, $bias), k = elem
 const real s = f - 1;{_LOGARITHM}
 return result;
 """,
-    # What rounding 1 + x lost joins s, times 2⁻ᵏ: by halves, since 2⁻ᵏ may be subnormal.
+    # The rounding error of 1 + x joins s, times 2⁻ᵏ: by halves, since 2⁻ᵏ may be subnormal.
     "log1p": f"""const real y = 1 + x, lost = x - (y - 1);{_SCALED}
 const elementary_word twice_inverse_power = ($exponent_mask - exponent) << $mantissa;
 const real k = elementary_number_of(counted) - $bias, scale = elementary_number_of(twice_inverse_power);
@@ -207,27 +208,26 @@ return copysign${{f}}(result, x);
 }
 _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="        ", break_on_hyphens=False)
 VECTORISED: tuple[str, ...] = tuple(_BODIES)
-"""Names of the functions, which vectorise."""
+"""Names of the functions that vectorise."""
 
 
 def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] = ()) -> str:
     """Returns the C of `elementary_NAME(x)` for names, of `elementary_NAME_each(n, x, y)` for arrays, and of helpers.
 
-    The name `choice` stands for the choice between two numbers, which the others need too, `rounded` for rounding to
-    fewer bits, `ordered` for comparisons in the total order, and `sin_cos` for both functions of one argument, in the
-    time of one.
+    Special names: `choice` selects one of two numbers, which the others need too; `rounded` rounds to fewer bits;
+    `ordered` compares in the total order; `sin_cos` computes both functions in the time of one.
 
     The source must first include <float.h>, <math.h> and <stdint.h> and define the type `real` and
-    `MULTIPLY_ADD(a, b, c)`, which is a b + c, fused or not. Arrays have separate functions because gcc vectorises the
-    loop around a call only if it inlines the call, and it inlines about sixty calls in a source.
+    `MULTIPLY_ADD(a, b, c)`, which is a b + c, fused or not. Arrays have functions of their own because gcc vectorises
+    the loop around a call only if it inlines the call, and it inlines about sixty calls per source.
     """
     arrays = set(arrays)
     needed = set(names) | arrays
     chosen = needed & {*VECTORISED, "sin_cos"}
     if not chosen and not needed & {"choice", "rounded", "ordered"}:
-        return ""  # clang warns of unused functions
+        return ""  # clang warns about unused functions
     facts = _values(precision)
-    # By method 1 float is computed in double, which is wrong for the functions of float alone.
+    # With method 1, float is computed in double, which breaks only the functions of float.
     text = [fill(_EVALUATION, precision, or_double=" && FLT_EVAL_METHOD != 1" * (precision == "f64"))] * bool(chosen)
     text.append(fill(_COMMON, precision, **facts))
     text += [fill(_ROUNDED, precision, **facts)] * ("rounded" in needed)
@@ -293,7 +293,7 @@ def _values(precision: str) -> dict[str, str]:
 
 
 def _polynomial(x: str, coefficients: list[str]) -> str:
-    """Estrin's scheme: the halves are independent; x2, x4, ... are the powers of x."""
+    """Estrin's scheme, whose halves are independent; x2, x4, ... are the powers of x."""
     if len(coefficients) == 1:
         return coefficients[0]
     power = 2 ** ((len(coefficients) - 1).bit_length() - 1)
@@ -307,4 +307,4 @@ def _operations(name: str) -> int:
 
 
 OPERATIONS: Mapping[str, int] = {name: _operations(name) for name in VECTORISED}
-"""Floating-point operations of one evaluation, a multiply-add as 2 (float: fewer; comparisons are none)."""
+"""Floating-point operations of one evaluation; a multiply-add counts 2, comparisons 0 (float needs fewer)."""

@@ -17,14 +17,14 @@ _CHOICES = {
     "max": "elementary_choice(({0} > {1}) | ({0} != {0}), {0}, {1})",
     "min": "elementary_choice(({0} < {1}) | ({0} != {0}), {0}, {1})",
 }
-"""C without a branch, for loops, since a branch would prevent vectorisation."""
+"""Branch-free C for loops, because a branch would prevent vectorisation."""
 _FIRST = np.array(0)
 _BOXES = 6
-"""Largest number of boxes that become separate loops; more boxes are read through tables of positions."""
+"""Largest number of boxes that become separate loops; more are read through tables of positions."""
 
 
 def unrolled(body: Body, node: Node) -> set[Node]:
-    """Writes a scalar: an expression of the scalars that are fused into it, and of variables; returns what it wrote."""
+    """Writes a scalar as an expression of variables and of the scalars fused into it; returns the nodes written."""
     if node in body.plan.beside and not body.source.libm:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
         body.source.functions.add("sin_cos")
@@ -42,7 +42,7 @@ def unrolled(body: Body, node: Node) -> set[Node]:
 
 
 def _scalar(body: Body, node: Node, root: Node) -> str:
-    """Returns the C expression of a scalar, which contains the scalars that are fused into the same root."""
+    """Returns the C expression of a scalar, including the scalars fused into the same root."""
     if node is not root and body.plan.root.get(node) is not root:
         return body.read(node, _FIRST)
     if node.op == "take":
@@ -51,7 +51,7 @@ def _scalar(body: Body, node: Node, root: Node) -> str:
 
 
 def combination(node: Node) -> Callable[..., str]:
-    """Returns a function that gives the C of two combined terms."""
+    """Returns a function that writes the C of two combined terms."""
     return partial(expression, node.op.partition("_")[2], node.dtype)
 
 
@@ -71,7 +71,7 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
     if name := _guarded(node):
         body.source.integers.add(name)
         return f"elementary_{name}({', '.join(args)})"
-    # The kind of the operands decides: that of a comparison's result is bool.
+    # The kind of the operands decides; the result of a comparison is bool.
     return expression(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
 
 
@@ -129,7 +129,7 @@ def _variables(shape: Sequence[int]) -> list[str]:
 
 
 def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | None:
-    """Returns the strides of a reading, or None if it needs a table."""
+    """Returns the strides of a read, or None if it needs a table."""
     if node.op == "gather" and node not in body.plan.arrays:
         positions = np.asarray(np.asarray(node.value).ravel()[positions])
     linear = strides(positions)
@@ -137,7 +137,7 @@ def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | N
 
 
 def _merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
-    """Returns the shape with neighbouring axes merged where all readings allow it; at least one axis remains."""
+    """Returns the shape with adjacent axes merged where all reads allow it; at least one axis remains."""
     result: list[int] = []
     kept: list[int] = []
     for axis, extent in enumerate(shape):
@@ -153,9 +153,9 @@ def _merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[i
 
 
 def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
-    """Writes a copy of a node to an array; with `own`, the array that is to hold a gather.
+    """Copies a node to an array; `own` means the array that is to hold a gather.
 
-    Large gathers are split into boxes, each of which one loop nest reads from one source.
+    Large gathers are split into boxes, each read from one source by one loop nest.
     """
     index = np.arange(node.size).reshape(node.shape)
     stored = node in body.plan.arrays and not own
@@ -180,7 +180,7 @@ def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequ
 
 
 def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
-    """Splits the elements into boxes, such that one loop nest reads a box from one source."""
+    """Splits the elements into boxes that one loop nest can read from one source."""
     if node.op != "gather" or node.value is None:
         return [index]
     owner = owners(node.args, node.value)[0].ravel()
@@ -204,7 +204,7 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
 
 def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
-    """Returns the elements of every source, as [axes along which the source does not change, the rest as one axis]."""
+    """Returns the elements of every source, as [axes along which the source is constant, the rest as one axis]."""
     owner, _ = owners(node.args, np.asarray(node.value))
     leading = []
     while len(leading) < index.ndim - 1 and (owner == owner[:1]).all():
@@ -215,7 +215,7 @@ def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
 
 def _runs(at: np.ndarray, owner: np.ndarray) -> list[int]:
-    """Returns the starts, and the end, of the runs of rows with the same sources and equal steps."""
+    """Returns the starts, and the end, of the runs of rows with equal sources and equal steps."""
     steps, cuts = np.diff(at, axis=0), [0]
     for row in range(1, len(at)):
         first = cuts[-1]

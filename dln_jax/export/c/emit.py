@@ -20,22 +20,22 @@ def body_of(
     source: Source, program: Program, results: Sequence[Node], inputs: dict[int, tuple[str, bool]],
     targets: Sequence[str], *, apart: bool = False, optional: bool = False,
 ) -> Body:  # fmt: skip
-    """Returns the body of a function that writes its results to targets; without targets, that returns its only result.
+    """Returns the body of a function that writes its results to targets or, without targets, returns its only result.
 
     Args:
         source: tables and helper functions of the file.
         program: the program.
-        results: its results.
+        results: results of the program.
         inputs: name of every argument, and whether it is passed by value.
         targets: names of the arrays for the results.
-        apart: results do not overlap arguments.
-        optional: a target may be a null pointer.
+        apart: whether results never overlap arguments.
+        optional: whether a target may be a null pointer.
     """
     body = Body(source, program, plan_of(program, results), inputs)
     region(body, ())
     if results and not targets:
         body.line(f"return {body.read(results[0], np.array(0))};")
-    # Targets that may overlap arguments must not be written before all arguments are read: results that only move
+    # Targets that may overlap arguments must not be written before all arguments are read. Results that only move
     # elements of arguments are therefore copied to arrays first.
     moved = {k for k, _ in enumerate(targets) if not apart and results[k].size and _is_moved(body, results[k])}
     for k in sorted(moved):
@@ -63,7 +63,7 @@ def _from_array(body: Body, source: str, size: int, target: str) -> None:
 
 
 def region(body: Body, region: tuple[int, ...], done: set[Node] | None = None, only: set[Node] | None = None) -> None:
-    """Writes the nodes of a region that are not done yet; with `only`, those of them in this set."""
+    """Writes the nodes of a region that are not done yet; `only` restricts them to a set."""
     done = set() if done is None else done
     for node in body.plan.order.get(region, []):
         if node not in done and (only is None or node in only):
@@ -110,7 +110,7 @@ def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -
 
 
 def _call(body: Body, node: Node) -> None:
-    """Writes a call of the C function of another program, and on first use that function."""
+    """Writes a call of another program's C function and, on first use, that function."""
     source, key = body.source, node.attribute
     if key not in source.parts:
         source.parts[key] = _part(source, *body.program.parts[key])
@@ -139,9 +139,9 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
 
 
 def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> list[str]:
-    """Declares the arrays of a control flow's results, read or not, and returns their names.
+    """Declares arrays for the results of a loop or branch, read or not, and returns their names.
 
-    Those of a loop are the carries, which start as its arguments, then the outputs of all its `turns`.
+    A loop has its carries, initialised with its arguments, then the outputs of all `turns` iterations.
     """
     number = np.ravel(node.attribute)[0]
     carried = len(node.args) if node.op != "branch" else len(results)
@@ -157,7 +157,7 @@ def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> 
 
 
 def _carry_over(body: Body, loop: Loop, names: list[str], number: int) -> None:
-    """Writes the new carries, through temporaries: results of an iteration may be the old carries in another order."""
+    """Writes the new carries, through temporaries: they may be the old carries in another order."""
     moved = loop.results[: len(names)]
     temporary = [f"n{number}_{index}" for index in range(len(moved))]
     for name, node in zip(temporary, moved, strict=True):
@@ -193,7 +193,7 @@ def _while(body: Body, node: Node) -> None:
 
 
 def _bound(node: Node, loop: Loop) -> int | None:
-    """Returns the largest number of iterations of a `while`, by a counter that its condition compares, or None."""
+    """Returns the largest number of iterations of a `while` whose condition compares a counter, or None."""
     waiting, bounds = [*loop.conditions], []
     while waiting:
         test = waiting.pop()

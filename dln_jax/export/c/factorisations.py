@@ -7,7 +7,7 @@ from dln_jax.export.c.body import Body
 from dln_jax.export.c.nodes import Node
 
 _SWEEPS = 16
-"""Most Jacobi sweeps; random matrices of 6 rows need 5 to 7, of 40 rows 8 to 10."""
+"""Maximum number of Jacobi sweeps; random matrices of 6 rows need 5 to 7, of 40 rows 8 to 10."""
 
 FUNCTIONS = {
     "cholesky": """
@@ -182,7 +182,7 @@ FUNCTIONS = {
     }
     """,
 }
-"""C functions by the name of their node; a source contains the functions that it calls."""
+"""C functions by the name of their node; a source contains those that it calls."""
 
 
 def definitions(names: Collection[str], suffix: str) -> str:
@@ -223,11 +223,11 @@ _SIZES = {
         for name, count in {"mul": 8 * a[0] + 4, "add": 4 * a[0] + 9, "div": 5, "sqrt": 2}.items()
     }),
 }  # fmt: skip
-"""The sizes that a C function takes, and at most its operations, from the shapes of arguments and result."""
+"""Sizes passed to a C function, and an upper bound on its operations, by the shapes of arguments and result."""
 
 
 def _call(body: Body, node: Node) -> None:
-    """Writes a call of a node's C function: with sizes, pointers to the arguments, and arrays for the results."""
+    """Calls a node's C function with sizes, pointers to the arguments, and arrays for the results."""
     body.source.kernels.add(node.op)
     *sizes, operations = _SIZES[node.op](*(arg.shape for arg in node.args), node.shape)
     a, arrays = node.args[0], []

@@ -1,4 +1,4 @@
-"""The functions that are exported from a run or a system: pure functions of one state, with example arguments.
+"""The functions exported from a run or a system: pure functions of one state, with example arguments.
 
 For a system with forces, in coordinates and velocities, x = (q, qd):
 
@@ -12,14 +12,14 @@ For a system with forces, in coordinates and velocities, x = (q, qd):
 | `torque_std`, `out_of_distribution` | q, qd, qdd | tau_std; out_of_distribution |
 | `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
 
-For a phase space without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p, and `phase_step_rk4`,
-`phase_step_implicit_midpoint` (q_next, p_next) of q, p, dt. For a differential network: `value`, `value_and_jacobian`,
-`value_jacobian_hessian` (y, jacobian, hessian) of x. For a model of images: the functions of its latent phase space,
-`encode` (q, p) of two images, and `decode` (frames) of q, p.
+For a phase space without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p; `phase_step_rk4` and
+`phase_step_implicit_midpoint` (q_next, p_next) of q, p, dt. For a differential network: `value`, `value_and_jacobian`
+and `value_jacobian_hessian` (y, jacobian, hessian) of x. For a model of images: the functions of its latent phase
+space, `encode` (q, p) of two images, and `decode` (frames) of q, p.
 
 NAME_jacobian returns the derivatives of all results with respect to all arguments, such as tau_q [d, d], with the
-argument's axes last; for a step of x it returns x_next, A and B; for a scalar it is called NAME_gradient. A function
-that a system lacks is missing.
+argument's axes last. A step of x returns x_next, A and B. The derivative of a scalar is called NAME_gradient. Functions
+that a system lacks are missing.
 """
 
 import functools
@@ -63,7 +63,7 @@ Named = dict[str, Function]
 DERIVATIVES = ("_jacobian", "_gradient", "_hessian")
 """Endings of the names of derivatives."""
 LARGEST_FACTOR = 250_000
-"""Largest number of entries of a covariance factor that is exported, at some 24 bytes of C per entry."""
+"""Largest number of entries of a covariance factor that is exported; an entry takes about 24 bytes of C."""
 SCALARS = ("energy", "hamiltonian")
 """Functions with a scalar result, whose derivative is a gradient."""
 
@@ -80,8 +80,8 @@ def functions_of_run(
         iterations: as for `functions_of_system`.
 
     Raises:
-        InputError: the model has no function of a name, the precision cannot hold a parameter, or a user-defined model
-            is exported without needs or in another precision than that of its training.
+        InputError: the model lacks a named function, the precision cannot hold a parameter, or a user-defined model has
+            no needs or is exported in another precision than it was trained in.
     """
     functions = _of_run(run, precision, iterations)
     chosen = list(functions) if names is None else list(names)
@@ -110,7 +110,7 @@ def functions_of_system(
         iterations: Newton steps of the implicit midpoint rule, as for `mechanics.discrete.implicit_midpoint`.
     """
     d = degrees_of_freedom
-    # Networks take long to trace: jitted, they are traced once and not for every function that contains them.
+    # Networks take long to trace; jitted, they are traced once instead of once per function that contains them.
     traced = _traced_once(system)
     functions: Named = {}
     if not isinstance(system, PhaseRates):
@@ -168,7 +168,7 @@ def _converted(dtype: Any, leaf: Array) -> Array:
 
 
 def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tuple[int, ...]) -> Functions:
-    """Pairs functions with examples: vectors of this size, except the arguments with other shapes."""
+    """Pairs functions with example vectors of this size, except for arguments with other shapes."""
     shapes["dt"] = ()
 
     def examples(function: Function) -> tuple[np.ndarray, ...]:
@@ -274,7 +274,7 @@ def _steps(
 
 
 def _with_derivatives(name: str, function: Function) -> Named:
-    """Returns the function, and a function of the derivatives of its results with respect to its arguments."""
+    """Returns the function, and one that returns the derivatives of its results with respect to its arguments."""
     arguments = list(inspect.signature(function).parameters)
     places = range(len(arguments))
 

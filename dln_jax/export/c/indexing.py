@@ -1,4 +1,4 @@
-"""Rules for gather, scatter, dynamic slices and sort, by flat positions, which are constants if the indices are."""
+"""Rules for gather, scatter, dynamic slices and sort by flat positions, constant where the indices are."""
 
 from collections.abc import Sequence
 from math import prod
@@ -16,7 +16,7 @@ _COMBINED = ("add", "sub", "mul", "min", "max")
 
 
 def _gather(program: Program, parameters: Parameters, operand: Node, indices: Node) -> Node:
-    """Applies `lax.gather`; windows that reach outside the operand are moved inside, or filled."""
+    """Applies `lax.gather`; windows that reach outside the operand are moved inside or filled."""
     numbers, sizes = parameters["dimension_numbers"], parameters["slice_sizes"]
     rank = len(indices.shape) - 1 + len(numbers.offset_dims)
     outer = [axis for axis in range(rank) if axis not in numbers.offset_dims]
@@ -60,18 +60,18 @@ def _scatter(op: str) -> Rule:
 def _windows(
     program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped, batched, order
 ) -> tuple[Node, Node | None]:
-    """Returns the flat positions of windows, and, if windows outside are dropped, which positions are inside.
+    """Returns the flat positions of windows and, if windows outside are dropped, which positions are inside.
 
     Args:
-        program: in which they are computed.
+        program: program in which they are computed.
         indices: corners of the windows [batch, axes].
-        shape: of the operand.
-        sizes: of a window along each axis of the operand.
-        mode: of `lax.gather` or `lax.scatter`, for windows outside.
-        axes: of the operand, to which the indices refer.
+        shape: shape of the operand.
+        sizes: size of a window along each axis of the operand.
+        mode: mode of `lax.gather` or `lax.scatter`, for windows outside.
+        axes: axes of the operand to which the indices refer.
         dropped: axes of the operand that a window lacks.
-        batched: axes of the operand and of the indices that go together.
-        order: of the axes of the result, among those of the batch followed by those of a window.
+        batched: corresponding axes of the operand and of the indices.
+        order: order of the result's axes, among those of the batch followed by those of a window.
     """
     batch, index = indices.shape[:-1], np.arange(indices.size).reshape(indices.shape)
     flat = np.zeros(batch, np.int64)
@@ -97,7 +97,7 @@ def _windows(
 def _corners(program: Program, starts: dict[int, Node], shape, sizes, first, *, fills=False) -> tuple[Node, Any]:
     """Returns the flat positions of windows' corners, clamped into the operand; with `fills`, also which were inside.
 
-    `starts` are the indices of the corners by axis of the operand, to which flat positions `first` are added.
+    `starts` are the corner indices by axis of the operand; they are added to the flat positions `first`.
     """
     flat, inside = program.constant(first, "index"), None
     for axis, start in starts.items():
@@ -134,7 +134,7 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
     if op == "set":
         index[flat[left]] = operand.size + left
         return program.gather([operand, updates], index.reshape(operand.shape))
-    while left.size:  # a pass handles one update of every target
+    while left.size:  # a pass handles one update per target
         _, first = np.unique(flat[left], return_index=True)
         now = left[first]
         combined = program.elementwise(op, program.gather([operand], flat[now]), program.gather([updates], now))
@@ -146,18 +146,16 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
 
 
 def _dynamic_slice(program: Program, parameters: Parameters, operand: Node, *starts: Node) -> Node:
-    """Applies `lax.dynamic_slice`."""
     sizes = parameters["slice_sizes"]
     return take(program, operand, _window(program, operand.shape, sizes, starts[: len(sizes)]))
 
 
 def _dynamic_update_slice(program: Program, _, operand: Node, update: Node, *starts: Node) -> Node:
-    """Applies `lax.dynamic_update_slice`."""
     return _put(program, "set", operand, _window(program, operand.shape, update.shape, starts), update)
 
 
 def _sort(program: Program, parameters: Parameters, *nodes: Node) -> list[Node]:
-    """Applies `lax.sort` along an axis by the first `num_keys` arrays: stable, NaN last."""
+    """Applies `lax.sort` along an axis with the first `num_keys` arrays as keys: stable, NaN last."""
     axis, shape = parameters["dimension"], nodes[0].shape
     if shape[axis] < 2 or nodes[0].size == 0:
         return list(nodes)
@@ -175,7 +173,7 @@ def _window(program: Program, shape, sizes, starts: Sequence[Node]) -> Node:
 
 
 def _index(program: Program, start: Node, upper: int) -> Node:
-    """Returns an index, clamped before the conversion if it is unsigned with 64 bits, which an index cannot hold."""
+    """Returns an index; unsigned 64-bit indices are clamped before conversion, because an index cannot hold them."""
     if start.dtype == "unsigned_long":
         start = program.elementwise("min", start, max(upper, 0))
     return convert(program, start, "index")
@@ -199,4 +197,4 @@ RULES = {
     "scatter": _scatter("set"),
     **{f"scatter-{op}": _scatter(op) for op in _COMBINED},
 }
-"""Rules by the name of the primitive."""
+"""Rules by name of the primitive."""

@@ -1,4 +1,4 @@
-"""Interface of an exported source: signatures of its functions, their C declarations, and the JSON description."""
+"""Interface of an exported source: signatures of its functions, their C declarations and the JSON description."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -27,21 +27,21 @@ class Leaf(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """The most that one call of a C function takes."""
+    """Upper bounds on what one call of a C function takes."""
 
     operations: int = 0
-    """Floating-point operations, those of the source's own elementary functions included."""
+    """Floating-point operations, including those of the source's own elementary functions."""
     additions: int = 0
-    """Additions and subtractions outside elementary functions; a multiply-add is one, and a multiplication."""
+    """Additions and subtractions outside elementary functions; a multiply-add counts here and as a multiplication."""
     multiplications: int = 0
     divisions: int = 0
     square_roots: int = 0
     functions: int = 0
     """Calls of elementary functions; sine and cosine of one number are one call."""
     stack_bytes: int = 0
-    """Stack of an optimised build, called functions included."""
+    """Stack of an optimised build, including called functions."""
     unbounded_loops: int = 0
-    """Loops without a bound on their iterations; the numbers count one iteration of each."""
+    """Loops without a bound on their iterations; the other numbers count one iteration of each."""
 
 
 class Signature(NamedTuple):
@@ -118,7 +118,7 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
 
 def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
     """Returns the JSON description of an export, without digests."""
-    # JSON makes lists of leaves and shapes, which are tuples.
+    # JSON turns leaves and shapes, which are tuples, into lists.
     stated = {
         key: {"arguments": function.arguments, "results": function.results, **function.cost._asdict()}
         for key, function in functions.items()
@@ -127,7 +127,7 @@ def description(name: str, precision: str, version: str, functions: Mapping[str,
 
 
 def stated_costs(directory: str | Path, *, name: str = "model") -> dict[str, Cost]:
-    """Returns the most that one call of each function of an export takes.
+    """Returns the cost of one call of each function of an export.
 
     Raises:
         InputError: as for `load_c`.

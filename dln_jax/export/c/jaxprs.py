@@ -1,4 +1,4 @@
-"""Jaxprs: how to make them, which calls they repeat, and which line of Python an equation comes from."""
+"""Jaxprs: how to make them, which calls they repeat, and which line of Python made an equation."""
 
 import hashlib
 from collections import Counter
@@ -12,7 +12,7 @@ from jax.extend import core
 from dln_jax.types import InputError
 
 _LARGE_CALL = 600
-"""Smallest number of equations at which a jitted function that is called several times becomes a C function."""
+"""A jitted function with at least this many equations that is called several times becomes a C function."""
 
 
 def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
@@ -31,15 +31,15 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
 
 
 def repeated_calls(every: Sequence[Any]) -> set[int]:
-    """Returns the `id` values of the large jaxprs that these closed jaxprs seem to call several times.
+    """Returns the `id` values of large jaxprs that these closed jaxprs seem to call several times.
 
-    Calls that look alike here become one function only if their programs are identical (`Program.identity`).
+    Such calls become one function only if their programs are identical (`Program.identity`).
     """
     known: dict[int, tuple[int, bytes]] = {}
     counts: Counter[bytes] = Counter()
 
     def visit(jaxpr: Any) -> tuple[int, bytes]:
-        """Returns the number of equations, calls included, and a digest of primitives, types and constants."""
+        """Returns the number of equations, including calls, and a digest of primitives, types and constants."""
         if id(jaxpr) in known:
             return known[id(jaxpr)]
         closed, size, digest = closed_jaxpr(jaxpr), 0, hashlib.sha256()
@@ -70,7 +70,7 @@ def _jaxprs(value: Any) -> list[Any]:
 
 
 def expanded(primitive: Any) -> Any:
-    """Returns the jaxpr of a high-level primitive of JAX 0.11, such as `custom_root`, in ordinary primitives."""
+    """Returns a high-level primitive of JAX 0.11, such as `custom_root`, as a jaxpr of ordinary primitives."""
 
     def expand(*leaves: Any) -> list[Any]:
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
@@ -80,11 +80,11 @@ def expanded(primitive: Any) -> Any:
 
 
 def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
-    """Returns the jaxpr of the `impl` of a primitive of another library, such as Equinox; None for JAX's primitives.
+    """Returns the jaxpr of the `impl` of another library's primitive, such as Equinox's; None for JAX's primitives.
 
     Args:
-        equation: that applies the primitive.
-        known: values of the constant arguments, None for the others, which become the arguments of the jaxpr.
+        equation: equation that applies the primitive.
+        known: values of constant arguments; None for the others, which become arguments of the jaxpr.
     """
     primitive = equation.primitive
     if _of_jax(primitive):
@@ -100,7 +100,6 @@ def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
 
 
 def _of_jax(primitive: Any) -> bool:
-    """Returns whether JAX itself defines a primitive."""
     return getattr(primitive.impl, "func", primitive.impl).__module__.partition(".")[0] == "jax"
 
 
@@ -113,7 +112,7 @@ def is_error_of_equinox(equation: Any) -> bool:
 
 
 def closed_jaxpr(jaxpr: Any) -> Any:
-    """Returns a jaxpr as a closed one; an open jaxpr has no constants."""
+    """Returns a jaxpr in closed form; an open jaxpr has no constants."""
     return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
 
 

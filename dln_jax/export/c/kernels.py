@@ -1,4 +1,4 @@
-"""C of reductions, scattered updates and sorts; `factorisations` has the functions on matrices."""
+"""C of reductions, scattered updates and sorts; functions on matrices are in `factorisations`."""
 
 from collections.abc import Collection, Sequence
 from string import Template
@@ -46,7 +46,7 @@ def _name(kinds: Sequence[str]) -> str:
 
 
 def orderings(orders: Collection[tuple[str, ...]]) -> str:
-    """Returns the C functions that sort by keys of these kinds, the first key first."""
+    """Returns the C functions that sort by keys of these kinds, the first key taking precedence."""
     text = ""
     for kinds in sorted(orders):
         comparisons = ""
@@ -80,7 +80,7 @@ def _reduction(body: Body, node: Node) -> None:
 
 
 def _arg(body: Body, node: Node) -> None:
-    """Writes argmax or argmin: the first extreme, or the first NaN if there is one."""
+    """Writes argmax or argmin: the first extremum, or the first NaN if there is one."""
     (a,) = node.args
     rows, count = a.shape
     at, kind, better = np.arange(a.size).reshape(a.shape), C_TYPES[a.dtype], ">" if node.op == "argmax" else "<"

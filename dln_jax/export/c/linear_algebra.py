@@ -13,7 +13,7 @@ from dln_jax.types import InputError
 
 
 def _items(program: Program, node: Node, rank: int = 2) -> list[Node]:
-    """Returns the matrices of a batch; for rank 1, the vectors."""
+    """Returns the matrices of a batch (vectors for rank 1)."""
     index = np.arange(node.size).reshape(-1, *node.shape[len(node.shape) - rank :])
     return [program.gather([node], positions) for positions in index]
 
@@ -22,7 +22,7 @@ def _applied(
     program: Program, op: str, *arrays: Node, shapes: Sequence[Sequence[int]], ranks: Sequence[int] = (2, 2),
     kind: str = "real", attribute: Any = None,
 ) -> list[Node]:  # fmt: skip
-    """Returns the results of an operation on every item of a batch; the results of one item lie end to end."""
+    """Applies an operation to every item of a batch; the results of one item lie end to end."""
     batch, sizes = arrays[0].shape[: len(arrays[0].shape) - ranks[0]], [prod(shape) for shape in shapes]
     items = zip(*(_items(program, array, rank) for array, rank in zip(arrays, ranks, strict=False)), strict=True)
     nodes = [program.make(op, (sum(sizes),), kind, item, attribute) for item in items]
@@ -98,4 +98,4 @@ RULES = {
         program, "permutation", pivots, shapes=[(parameters["permutation_size"],)], ranks=(1,), kind="int"
     ),
 }
-"""Rules by the name of the primitive."""
+"""Rules by name of the primitive."""

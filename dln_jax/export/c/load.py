@@ -16,7 +16,7 @@ from dln_jax.export.c.text import check_name
 from dln_jax.types import InputError
 
 FLAGS = ("-O3", "-march=native")
-"""Optimises for the compiling machine, without reordering sums."""
+"""Optimises for the compiling machine without reordering sums."""
 STANDARD = ("-std=c99", "-pedantic")
 # On macOS the linker must be told that Python's symbols resolve when the library is loaded.
 _UNDEFINED = ("-undefined", "dynamic_lookup") if sys.platform == "darwin" else ()
@@ -28,11 +28,11 @@ def load_c(
     """Compiles an export in a temporary folder and returns a named tuple of its functions.
 
     The functions take NumPy arrays (or lists of numbers) by position or name, raise `InputError` for shapes that differ
-    from the exported ones, and return their result, or a named tuple of several. Contiguous arrays of the exported
-    type, passed by position, are fastest; other arguments are converted first.
+    from the exported ones, and return their result, or a named tuple of several. Contiguous arrays of the exported type
+    passed by position are fastest; other arguments are converted first.
 
-    The C code is compiled and run, so load only folders that you trust. The digests in the description detect files
-    that were altered or mixed up; they do not prove who wrote them.
+    The C code is compiled and run, so load only folders that you trust. The digests in the description detect altered
+    or mixed-up files; they do not prove who wrote them.
 
     Args:
         directory: folder with the files that `export_c` wrote.
@@ -49,12 +49,13 @@ def load_c(
             # The checked bytes are compiled, even if the folder changes meanwhile.
             for file_name, content in sources.items():
                 (Path(folder) / file_name).write_bytes(content)
-            # No file of an export has a minus in its name.
+            # No file of an export has a hyphen in its name.
             between, built = Path(folder) / "for-python.c", Path(folder) / f"lib{name}.so"
             between.write_text(binding(name, signatures, precision))
             texts = [str(Path(folder) / f"{name}.c"), str(between)]
             compile_c([*STANDARD, *flags, "-fPIC", "-shared", *_UNDEFINED, *texts, "-lm", "-o", str(built)], compiler)
-            # PyDLL keeps the interpreter's lock: releasing it would take longer than the functions, microseconds.
+            # PyDLL keeps the interpreter's lock: releasing it takes longer than the functions, which run for
+            # microseconds.
             library = ctypes.PyDLL(str(built))
     except OSError as error:
         raise InputError(f"{directory}: not to be built in a temporary folder ({error}); set TMPDIR") from error
@@ -62,7 +63,7 @@ def load_c(
 
 
 def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
-    """Runs a C compiler, and raises InputError if there is none or if it fails."""
+    """Runs a C compiler; raises InputError if there is none or if it fails."""
     names = [compiler] if compiler else [os.environ.get("CC", "cc"), "cc", "gcc", "clang"]
     chosen = next((path for candidate in names if candidate and (path := shutil.which(candidate))), None)
     if chosen is None:

@@ -41,8 +41,8 @@ def program_of(
         finite: arguments and intermediate results are finite numbers.
 
     Raises:
-        InputError: the jaxpr has no C: an unsupported primitive (the message names the line that made it), random
-            numbers, an unsupported dtype, or a shape that is unknown at compile time.
+        InputError: the jaxpr cannot be written in C: it has an unsupported primitive (the message names the line that
+            made it), random numbers, an unsupported dtype, or a shape unknown at compile time.
     """
     program = Program(real=PRECISIONS[precision][0], repeated=repeated, finite=finite, inline=_inline)
     inputs = [
@@ -53,7 +53,6 @@ def program_of(
 
 
 def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
-    """Returns the results of a closed jaxpr."""
     jaxpr = closed.jaxpr
     nodes: dict[Any, Node] = dict(zip(jaxpr.invars, args, strict=True))
 
@@ -110,7 +109,7 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
 
 
 def _failed(program: Program, aval: Any) -> Node:
-    """Returns the value for an error that C cannot raise: NaN, the largest integer or true (EQX_ON_ERROR=nan)."""
+    """Returns the value that stands for an error, which C cannot raise: NaN, the largest integer or true."""
     kind = kind_of(aval.dtype)
     return program.broadcast(program.constant(failure(kind), kind), aval.shape)
 
@@ -144,7 +143,7 @@ def _custom_linear_solve(program: Program, parameters: Parameters, *args: Node) 
 
 
 def _platform(program: Program, parameters: Parameters) -> Node:
-    """Returns the index of the branch for the CPU: its own, or the default."""
+    """Returns the index of the CPU's branch, or of the default branch."""
     places = [k for k, parameter in enumerate(parameters["platforms"]) if parameter is None or "cpu" in parameter]
     return program.constant(np.int32(places[0]), "int")
 

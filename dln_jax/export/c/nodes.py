@@ -1,4 +1,4 @@
-"""Nodes of a program of small arrays, and their values where they are constant."""
+"""Nodes of a program of small arrays, and the values of constant ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Node:
     number: int
 
     def __hash__(self) -> int:
-        """Returns the number, because an address would order sets of nodes, and so the text, anew in each process."""
+        """Returns the number: with addresses, the order of sets, and so the text, would vary between processes."""
         return self.number
 
     @property
@@ -76,7 +76,7 @@ def is_uniform(node: Node) -> bool:
 
 
 def known(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Returns which elements [size] are constants, and their values, zero for the others."""
+    """Returns which elements [size] are constant, and their values (zero for the others)."""
     if node.op == "const":
         return np.ones(node.size, bool), np.asarray(node.value).ravel()
     if node.op == "gather":
@@ -98,7 +98,7 @@ def is_direct(node: Node) -> bool:
 
 
 def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
-    """Returns (first, steps) with positions = first + sum_a steps_a i_a, or None if there are none."""
+    """Returns (first, steps) such that positions = first + sum_a steps_a i_a, or None if there are none."""
     if positions.size == 0:
         return 0, (0,) * positions.ndim
     first = int(positions.flat[0])
@@ -112,13 +112,13 @@ def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
 
 
 def owners(sources: Sequence[Node], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the index of the source at every position of the sources laid end to end, and their first positions."""
+    """Returns the index of the source at every position in the sources laid end to end, and their first positions."""
     starts = np.cumsum([0, *(source.size for source in sources)])
     return np.searchsorted(starts, positions, side="right") - 1, starts
 
 
 def read_source(node: Node, positions: np.ndarray) -> tuple[Node, np.ndarray]:
-    """Returns the one source that a `gather` reads at these positions, and the positions in it."""
+    """Returns the single source that a `gather` reads at these positions, and the positions in it."""
     positions = np.asarray(np.asarray(node.value).ravel()[positions])
     owner, starts = owners(node.args, positions)
     first = int(owner.flat[0])

@@ -1,9 +1,9 @@
-"""Elementwise operations: their C, their NumPy function for constants, and their cost.
+"""Elementwise operations: their C code, their NumPy function for constants, and their cost.
 
-Integer arithmetic in C has XLA's results: sums wrap around, divisions never trap, conversions saturate. C leaves
-undefined: signed overflow, division by zero, the lowest number over -1, the conversion of a real number that does not
-fit, and shifts by at least the number of bits. XLA defines them all (x / 0 is -1, or the largest unsigned number;
-x % 0 is x; NaN becomes 0; all bits are shifted out), and so does this C.
+Integer arithmetic in C gives XLA's results: sums wrap around, divisions never trap, conversions saturate. C leaves
+signed overflow, division by zero, the lowest number divided by -1, conversion of a real number that does not fit, and
+shifts by at least the number of bits undefined. XLA defines them all (x / 0 is -1, or the largest unsigned number; x %
+0 is x; NaN becomes 0; all bits are shifted out), and so does this C.
 """
 
 import functools
@@ -47,7 +47,7 @@ def _converted(x, kind: str):
 def _shifted_right(a, b, *, kind: str):
     """Returns `a >> b` for arrays, with zeros (kind "u") or copies of the sign bit (kind "i") shifted in.
 
-    NumPy shifts as XLA does: a negative amount, or one of at least the number of bits, shifts all bits out.
+    NumPy shifts like XLA: a negative amount, or one of at least the number of bits, shifts all bits out.
     """
     typed = np.dtype(f"{kind}{a.dtype.itemsize}")
     return np.right_shift(a.view(typed), b.view(typed)).view(a.dtype)
@@ -63,7 +63,7 @@ class Operation(NamedTuple):
     cost: int = 1
     """Floating-point operations; comparisons and selections cost 0."""
     dtype: str | None = None
-    """Kind of the result; None for the kind of the arguments."""
+    """Kind of the result; None for that of the arguments."""
     function: str | None = None
     """Function of <math.h> that it calls, if any."""
 
@@ -86,7 +86,7 @@ _AS_IN_NUMPY = (
     "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh",
     "cosh", "tanh", "asinh", "acosh", "atanh", "floor", "ceil", "rint", "trunc",
 )  # fmt: skip
-"""Functions of <math.h> that NumPy has by the same name."""
+"""Functions of <math.h> that have the same name in NumPy."""
 OPERATIONS = {
     "add": Operation("({0} + {1})", np.add),
     "sub": Operation("({0} - {1})", np.subtract),
@@ -143,21 +143,21 @@ OPERATIONS = {
 
 
 def total(operations: Mapping[str, int]) -> int:
-    """Returns the floating-point operations of numbers of operations by name."""
+    """Returns the number of floating-point operations in counts of operations by name."""
     return sum(OPERATIONS[name].cost * count for name, count in operations.items())
 
 
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
 """Operations that commute bit for bit, also in floating point."""
 TRANSCENDENTAL = frozenset(name for name, operation in OPERATIONS.items() if operation.function and name != "sqrt")
-"""Operations that call a function of <math.h>, but for sqrt."""
+"""Operations that call a function of <math.h>, except sqrt."""
 VECTORISED = frozenset(_VECTORISED)
 """Operations whose C vectorises in loops."""
 _ON_BOOL = {"add": "or", "mul": "and", "max": "or", "min": "and", "ne": "xor"}
 
 
 def on_kind(op: str, kind: str) -> str:
-    """Returns the name of an operation for numbers of a kind: some differ for integers and booleans."""
+    """Returns the name of an operation for a kind; some differ for integers and booleans."""
     if kind == "bool":
         return _ON_BOOL.get(op, op)
     return f"integer_{op}" if kind != "real" and f"integer_{op}" in OPERATIONS else op
@@ -184,7 +184,7 @@ def _pattern(op: str, kind: str) -> str:
 
 def expression(op: str, dtype: str, *args: str, suffix: str = "") -> str:
     """Returns the C of an operation on numbers of a kind; `suffix` ends the names of functions of <math.h>."""
-    alike = len(args) == 2 and args[0] == args[1]  # compilers warn of comparing a number with itself
+    alike = len(args) == 2 and args[0] == args[1]  # compilers warn about comparing a number with itself
     if alike and (op in ("lt", "gt") or (dtype != "real" and op in ("eq", "ne", "le", "ge"))):
         return str(int(op in ("eq", "le", "ge")))
     if alike and op in ("max", "min"):
@@ -195,7 +195,7 @@ def expression(op: str, dtype: str, *args: str, suffix: str = "") -> str:
 
 
 def _beside_zero(op: str, args: Sequence[str]) -> str | None:
-    """Returns C for an unsigned number against a literal 0, where compilers warn of the plain comparison, or None."""
+    """Returns C that compares an unsigned number with a literal 0 without compiler warnings, or None."""
     zeros = ("0U", "0ULL")
     if op in ("max", "min") and not {*zeros}.isdisjoint(args):
         other = args[0] if args[1] in zeros else args[1]
@@ -218,7 +218,7 @@ _GUARDED = {
     ),
     "{kind}_of(real x)": ("x != x", "0", "x <= {low} ? {lower} : x >= {high} ? {upper} : ({c})x"),
 }
-"""Prototype, condition, result if the condition holds, and result otherwise, of the C functions on integers."""
+"""Prototype, condition, result if the condition holds and result otherwise, of the C functions on integers."""
 
 
 def definitions(names: Collection[str], precision: str) -> str:

@@ -1,7 +1,7 @@
-"""Decides which nodes of a program become scalars or loops, which get arrays, and in which order they are computed.
+"""Decides which nodes of a program become scalars or loops, which get arrays, and the order of computation.
 
 Small arrays are unrolled into scalars, so that moving elements costs nothing and a compiler keeps them in registers.
-Others are loops over arrays; an elementwise operation with one reader is fused into the loop of its reader.
+Others become loops over arrays; an elementwise operation with one reader is fused into its reader's loop.
 """
 
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ from dln_jax.export.c.program import Program
 from dln_jax.export.c.simplify import UNROLL_LIMIT
 
 _DEPTH = 16
-"""Largest depth of a scalar expression; compilers limit the depth of parentheses."""
+"""Largest depth of a scalar expression; compilers limit the nesting of parentheses."""
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """Operations that read arguments through a pointer."""
@@ -25,7 +25,7 @@ class Plan(NamedTuple):
     """Decisions about the nodes that the results need."""
 
     order: dict[Region, list[Node]]
-    """Nodes of a region in the order of their computation."""
+    """Nodes of a region in order of computation."""
     unrolled: set[Node]
     """Nodes that are computed element by element."""
     arrays: set[Node]
@@ -33,7 +33,7 @@ class Plan(NamedTuple):
     root: dict[Node, Node]
     """Last node of the loop that computes an elementwise node."""
     needed: dict[Node, np.ndarray]
-    """Elements that something reads, of every node."""
+    """Which elements of every node are read."""
     levels: dict[Node, int]
     """Length of the longest chain of products before a node."""
     reads: dict[Node | None, set[Node]]
@@ -41,7 +41,7 @@ class Plan(NamedTuple):
     readers: dict[Node, set[Node | None]]
     """Steps that read an array."""
     beside: dict[Node, Node]
-    """The cosine of a sine, and the reverse: scalars of the same argument."""
+    """Pairs of a sine and a cosine of the same scalar, in both directions."""
 
 
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
@@ -50,7 +50,7 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     nodes, readers, whole, contiguous = _reached(program, results)
     unrolled = {node for node in nodes if _is_unrolled(node)}
     arrays, followed = set(contiguous), set()
-    # Loops read arrays. A gather that a loop cannot index linearly is copied to an array first.
+    # Loops read arrays. A gather that a loop cannot index linearly is first copied to an array.
     for node in reversed(nodes):
         looped = any(
             reader in followed if reader.op == "gather" else reader not in unrolled for reader in readers[node]
@@ -96,7 +96,7 @@ def _bodies(program: Program, node: Node) -> list[Loop]:
 
 
 def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
-    """Returns the needed nodes in order, their readers, the nodes that are read whole, and those read by pointer."""
+    """Returns the needed nodes in order, their readers, the nodes read whole, and those read by pointer."""
     reached, waiting = set(), list(results)
     while waiting:
         node = waiting.pop()
@@ -123,12 +123,12 @@ def _is_unrolled(node: Node) -> bool:
 
 
 def _is_scalar(node: Node) -> bool:
-    """Returns whether a node can be a variable without an array."""
+    """Returns whether a node can be a variable instead of an array."""
     return node.size == 1 and node.op not in ("dot_general", *_FACTORED) and node.op[:4] != "put_"
 
 
 def _fused(nodes: list[Node], readers: dict[Node, list[Node]], whole, unrolled, arrays) -> dict[Node, Node]:
-    """Returns the last node of the loop, or of the expression of scalars, that an elementwise node is fused into."""
+    """Returns the last node of the loop or scalar expression into which each elementwise node is fused."""
     root: dict[Node, Node] = {}
     depths = {node: 0 for node in nodes if node.op == "gather" and node in arrays and node in unrolled}
     for node in reversed(nodes):
@@ -167,7 +167,7 @@ def _levels(nodes: list[Node]) -> dict[Node, int]:
 
 
 def _sources(node: Node, arrays: set[Node]) -> set[Node]:
-    """Returns the arrays that a reading of a node reads."""
+    """Returns the arrays that are read to evaluate a node."""
     if node.op == "gather" and node not in arrays:
         return {source for arg in node.args for source in _sources(arg, arrays)}
     return {node} & arrays
@@ -184,7 +184,7 @@ def _reads(program: Program, nodes, arrays, root, results) -> dict[Node | None, 
             read += [*loop.results, *loop.conditions]
         for argument in read:
             for source in _sources(argument, arrays):
-                # A reading in a nested loop counts as a reading by that loop.
+                # A read in a nested loop counts as a read by that loop.
                 depth = len(source.region)
                 step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
                 reads.setdefault(step, set()).add(source)
@@ -192,7 +192,7 @@ def _reads(program: Program, nodes, arrays, root, results) -> dict[Node | None, 
 
 
 def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np.ndarray]:
-    """Returns which elements of every node something reads."""
+    """Returns which elements of every node are read."""
     needed = {node: np.zeros(node.size, bool) for node in nodes}
     projected: dict[Node, set[int]] = {}
     for node in results:

@@ -1,6 +1,6 @@
-"""Rules that turn JAX's elementwise and shape primitives, products and reductions into nodes of a program.
+"""Rules that lower JAX's elementwise and shape primitives, products and reductions to nodes of a program.
 
-A rule takes the program, the equation's parameters and its arguments, and returns the result or a list of results. The
+A rule takes the program, the equation's parameters and its arguments, and returns one or several results. The
 parameters include `kind`, the kind of the first result.
 """
 
@@ -33,7 +33,7 @@ def convert(program: Program, node: Node, kind: str) -> Node:
 
 
 def rows_of(program: Program, node: Node, axes: tuple[int, ...]) -> Node:
-    """Returns the node as a matrix [o, r], its columns the elements along `axes`."""
+    """Returns the node as a matrix [o, r] whose columns are the elements along `axes`."""
     kept = [axis for axis in range(len(node.shape)) if axis not in axes]
     index = np.arange(node.size).reshape(node.shape).transpose([*kept, *axes])
     return program.gather([node], index.reshape(prod(node.shape[axis] for axis in kept), -1))
@@ -46,8 +46,8 @@ def _elementwise(name: str) -> Rule:
 def _moved(move: Callable[..., Any]) -> Rule:
     """Returns the rule of a primitive that only moves elements.
 
-    `move` takes arrays of the indices of all elements, one array for each argument, and the parameters, and returns the
-    array of a result or a list of arrays.
+    `move` takes one array of element indices per argument, and the parameters; it returns the index array of the
+    result, or a list of them.
     """
 
     def rule(program: Program, parameters: Parameters, *nodes: Node) -> Any:
@@ -90,7 +90,7 @@ def _split(index, parameters):
 
 
 def _comparison(name: str) -> Rule:
-    """Returns the rule of a comparison; booleans are compared by logic, since compilers warn of comparing them."""
+    """Returns the rule of a comparison; booleans use logic, because compilers warn about comparing them."""
 
     def rule(program: Program, _, a: Node, b: Node) -> Node:
         if a.dtype != "bool" or name == "ne":
@@ -105,7 +105,7 @@ def _comparison(name: str) -> Rule:
 
 
 def _total_order(name: str) -> Rule:
-    """Returns the rule of a comparison in the total order of IEEE 754, which for other kinds is the usual one."""
+    """Returns the rule of a comparison in the total order of IEEE 754; other kinds are compared as usual."""
     usual = _comparison(name)
 
     def rule(program: Program, parameters, a: Node, b: Node) -> Node:
@@ -137,7 +137,7 @@ def _sign(program: Program, _, x: Node) -> Node:
         return program.elementwise("min", x, 1)
     minus, one = (program.constant(number, x.dtype) for number in (-1, 1))
     positive, negative = (program.elementwise(name, x, 0) for name in ("gt", "lt"))
-    # 0 and NaN are their own sign.
+    # 0 and NaN are returned as they are.
     return program.select(positive, program.select(negative, x, minus), one)
 
 
@@ -273,4 +273,4 @@ RULES: dict[str, Rule] = {
     **{name: _arg(name) for name in ("argmax", "argmin")},
     **{f"cum{name}": _cumulative(_OF_REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
 }
-"""Rules by the name of the primitive."""
+"""Rules by name of the primitive."""

@@ -1,8 +1,8 @@
 """Products of matrices as C loops.
 
 Every loop keeps a block of sums in registers, side by side along the contiguous axis of the second matrix. Products
-with the same constant share one loop, so that a value and its tangents pass through a network's layer together, and
-the constant is stored in the order of that loop. A product with one column splits its sums into parts.
+with the same constant share one loop, so that a value and its tangents pass through a network layer together, and the
+constant is stored in the order of that loop. A product with one column splits its sums into parts.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,9 @@ from dln_jax.export.c.text import C_TYPES
 
 _LANES = {"f64": 4, "f32": 8}
 _TILE = 64
-"""Columns whose sums are kept at once; gcc allocates registers better for wide blocks."""
+"""Number of columns summed at once; gcc allocates registers better for wide blocks."""
 _ROWS = 16
-"""Largest number of rows with separate sums; a product with more rows is a loop over rows."""
+"""Largest number of rows with separate sums; more rows are a loop over rows."""
 
 
 def _multiply_add(a: str, b: str, total: str, dtype: str = "real") -> str:
@@ -29,7 +29,7 @@ def _multiply_add(a: str, b: str, total: str, dtype: str = "real") -> str:
 
 
 def summed(body: Body, count: int, parts: int, add: Callable[[str, str], str]) -> None:
-    """Writes the declaration of a real `sum_` of `count` terms, in a number of partial sums that vectorise.
+    """Declares a real `sum_` of `count` terms, computed in partial sums that vectorise.
 
     `add(k, total)` returns the C of the total and term k; `parts` is a power of 2.
     """
@@ -68,7 +68,7 @@ def dot_general(body: Body, members: list[Node]) -> None:
 
 
 def _parts(rows: int, columns: int, count: int) -> int:
-    """Returns how many partial sums a column has: with few columns, several hide the latency of an addition."""
+    """Returns the number of partial sums per column: with few columns, several hide the latency of an addition."""
     parts = {1: 4 if columns <= 32 else 1, 2: 2 if columns <= 16 else 1}.get(rows, 1)
     while count % parts:
         parts //= 2

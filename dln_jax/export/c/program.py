@@ -1,14 +1,14 @@
 """A program of small arrays: a graph of interned nodes, simplified as it is built.
 
 There are few kinds of nodes, because everything that only moves numbers (slices, transposes, concatenations, padding,
-gathers and selections at constant indices) is a `gather`: it states for every element which element of which source it
-is. A gather of gathers is one gather.
+gathers and selections at constant indices) is a `gather`: it states the source element of every element. A gather of
+gathers is one gather.
 
 | op | value |
 |---|---|
 | `input`, `const` | a leaf of an argument; numbers |
 | `gather` | elements of the sources, laid end to end, at the positions `value` |
-| a name in `operations.OPERATIONS` | elementwise, for arguments of one shape or scalars; small results are scalars |
+| a name in `operations.OPERATIONS` | elementwise, on arguments of one shape or scalars; small results are scalars |
 | `dot_general` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
 | `reduce_*`, `arg*` | reduction over the last axis of the argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
@@ -21,7 +21,7 @@ is. A gather of gathers is one gather.
 | `call` | a call of another program |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, an iteration reads `carry` and `counter` |
 
-`simplify` states which operations become others, and which are written as scalars.
+`simplify` decides which operations are replaced by simpler ones and which are written as scalars.
 """
 
 import hashlib
@@ -59,7 +59,7 @@ class Program:
     repeated: Collection[int] = ()
     """`id` values of jaxprs whose calls stay calls."""
     parts: dict[bytes, Part] = field(default_factory=dict)
-    """Called programs by their `identity`, the attribute of a `call`."""
+    """Called programs by their `identity`, which is the attribute of a `call`."""
     lowered: dict[Any, bytes] = field(default_factory=dict)
     """Identities of called programs, by the `id` of the jaxpr and the constant arguments."""
     inline: Any = None
@@ -68,7 +68,7 @@ class Program:
     """Whether arguments and intermediate results are finite, so that 0 x = 0."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)
     _scalars: dict[tuple[Node, Region], list[Node]] = field(default_factory=dict)
-    """By node and `floor`: scalars that a branch makes exist in that branch alone."""
+    """Scalars by node and `floor`: scalars made in a branch exist only there."""
 
     def make(
         self,
@@ -80,7 +80,7 @@ class Program:
         value: np.ndarray | None = None,
         region: Region = (),
     ) -> Node:
-        """Returns the interned node, placed in the innermost region of its arguments, so outside loops if possible."""
+        """Returns the interned node in the innermost region of its arguments, and so outside loops if possible."""
         shape, args = tuple(map(int, shape)), tuple(args)
         if prod(shape) > LARGEST:
             raise InputError(
@@ -98,7 +98,7 @@ class Program:
         return node
 
     def identity(self, results: Sequence[Node]) -> bytes:
-        """Returns a digest of everything that the results depend on, constants bit for bit."""
+        """Returns a digest of everything that the results depend on, with constants bit for bit."""
         digest = hashlib.sha256()
         for node in self.nodes:
             value_type = None if node.value is None else node.value.dtype.str
@@ -146,11 +146,11 @@ class Program:
         return self.gather([node], np.arange(node.size).reshape(shape))
 
     def broadcast(self, node: Node, shape: Sequence[int]) -> Node:
-        """Returns the node broadcast as by NumPy."""
+        """Returns the node broadcast as in NumPy."""
         return self.gather([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
 
     def elementwise(self, op: str, *operands: Node | float) -> Node:
-        """Returns an operation of `OPERATIONS` on nodes of one kind and numbers, broadcast as by NumPy."""
+        """Returns an operation of `OPERATIONS` on nodes of one kind and numbers, broadcast as in NumPy."""
         kinds = {arg.dtype for arg in (operands[1:] if op == "select" else operands) if isinstance(arg, Node)}
         assert len(kinds) == 1, f"{op} of {', '.join(sorted(kinds))}"
         (kind,) = kinds
@@ -159,7 +159,7 @@ class Program:
         args = tuple(arg if arg.shape in ((), shape) else self.broadcast(arg, shape) for arg in args)
         operation = OPERATIONS[op := on_kind(op, kind)]
         dtype = operation.dtype or kind
-        # Repeated real numbers are not folded: a table of them would be read from memory.
+        # Repeated real numbers are not folded: the result would be a table, read from memory.
         known = all(arg.op == "const" or (dtype != "real" and is_constant(arg)) for arg in args)
         if known and operation.fold is not None:
             with np.errstate(all="ignore"):
@@ -177,7 +177,7 @@ class Program:
         return self.make(op, shape, dtype, args)
 
     def dot_general(self, a: Node, b: Node) -> Node:
-        """Returns sum_k a[b, m, k] b[b, k, n]; a constant comes second, by transposition."""
+        """Returns sum_k a[b, m, k] b[b, k, n]; products with a constant are transposed so that it comes second."""
         (batch, m, k), n = a.shape, b.shape[2]
         if a.op == b.op == "const" and a.value is not None and b.value is not None:
             return self.constant(np.matmul(a.value, b.value), a.dtype)
@@ -233,7 +233,7 @@ class Program:
         return self.gather([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
 
     def select(self, chosen: Node, if_false: Node, if_true: Node) -> Node:
-        """Returns an elementwise selection; one with a constant condition is a gather."""
+        """Returns an elementwise selection; with a constant condition it is a gather."""
         shape = np.broadcast_shapes(chosen.shape, if_false.shape, if_true.shape)
         if is_constant(chosen):
             chosen_value = np.broadcast_to(values(chosen), shape)

@@ -29,23 +29,23 @@ def export_run(
     finite: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Exports the model in a run's folder by `export_c`, and returns the paths of the files.
+    """Exports the model of a run with `export_c`, and returns the paths of the files.
 
     Args:
         run: folder of the run.
         directory: folder of the export.
-        functions: names from `families.functions_of_run`; default: all functions that are not too large for C, and
-            for CasADi all functions that are not derivatives.
+        functions: names from `families.functions_of_run`; default: all that are not too large for C, and for CasADi all
+            that are not derivatives.
         name: name of the export.
         precision: f32 or f64; default: the precision of the training.
         iterations: Newton steps of the implicit midpoint rule.
-        temperature: temperature of the C functions, °C, for a robot whose friction depends on it; default: the
-            reference of its identification.
+        temperature: temperature of the C functions in °C, for a robot whose friction depends on it; default: the
+            reference temperature of its identification.
         libm, casadi, finite, overwrite: as for `export_c`.
 
     Raises:
-        InputError: the folder holds no run, a function does not exist, a temperature that the model does not depend
-            on, or `export_c` refuses a function.
+        InputError: the folder holds no run, a function does not exist, the model does not depend on the temperature, or
+            `export_c` refuses a function.
     """
     trained = load(run)
     if temperature is not None:

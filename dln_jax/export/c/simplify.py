@@ -1,8 +1,8 @@
-"""Simplifications of elementwise operations, and the choice of operations that are written element by element.
+"""Simplifies elementwise operations, and decides which are written element by element.
 
 Simplifications keep the results of IEEE arithmetic, except the sign of zero in 0 + x = x, which XLA simplifies too.
-There is 1 x = x, but 0 x = 0, 0 / x = 0 and 0 - x = -x hold only for finite numbers: a program that states finite
-arguments (`Program.finite`) has them, so that zeros of a derivative's structure cost nothing.
+1 x = x always holds, but 0 x = 0, 0 / x = 0 and 0 - x = -x hold only for finite numbers: they are applied in programs
+that assume finite arguments (`Program.finite`), so that structural zeros of a derivative cost nothing.
 """
 
 from math import prod
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from dln_jax.export.c.program import Program
 
 UNROLL_LIMIT = 64
-"""Largest number of elements of a result, or of products of a sum, that may be unrolled; structural zeros are free."""
+"""Largest number of elements of a result, or of products in a sum, that are unrolled; structural zeros are free."""
 VECTOR = 8
 VECTOR_OF_FUNCTIONS = 4
-"""Results with fewer elements are unrolled wherever their arguments lie; of functions of <math.h>, fewer than these."""
+"""Results with fewer elements are always unrolled; the second limit is for functions of <math.h>."""
 _MOST_ZEROS = 16 * UNROLL_LIMIT
-"""Largest number of elements, structural zeros included, of a result that is unrolled."""
+"""Largest number of elements, including structural zeros, of a result that is unrolled."""
 _MOST_SCALARS = 36
 """Largest number of elements of an operation on scalars alone that is unrolled; larger ones are faster as loops."""
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "integer_div": 1, "or": 0, "xor": 0, "and": ...}
@@ -33,7 +33,7 @@ _TRIVIAL = {
     "mul": np.logical_or, "add": np.logical_or, "sub": np.logical_or, "div": lambda a, b: a, "neg": lambda a: a,
     "select": lambda condition, a, b: a & b,
 }  # fmt: skip
-"""Where an operation on finite numbers costs nothing, from where its arguments are zero."""
+"""Where an operation on finite numbers costs nothing, given where its arguments are zero."""
 
 
 def neutral(op: str, dtype: str) -> Any:
@@ -46,7 +46,7 @@ def neutral(op: str, dtype: str) -> Any:
 def unrolls(program: "Program", op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> bool:
     """Returns whether an elementwise operation is written element by element.
 
-    Small results are, so that moving their elements costs nothing and a compiler keeps them in registers.
+    Small ones are, so that moving their elements costs nothing and a compiler keeps them in registers.
     """
     size, functions = prod(shape), op in TRANSCENDENTAL
     if size < (VECTOR_OF_FUNCTIONS if functions else VECTOR):
@@ -63,14 +63,14 @@ def unrolls(program: "Program", op: str, args: tuple[Node, ...], shape: tuple[in
 
 
 def _is_mixed(gather: Node) -> bool:
-    """Returns whether a gather reads arrays, which no loop can read without copying them."""
+    """Returns whether a gather reads arrays, which a loop cannot read without copying them."""
     return any(arg.size > 1 or arg.op == "const" for arg in gather.args)
 
 
 def unrolls_product(program: "Program", a: Node, b: Node) -> bool:
     """Returns whether a product of matrices [b, m, k] and [b, k, n] is written element by element.
 
-    A constant with several columns is not: other products with it share its loop.
+    Constants with several columns stay whole: other products with the same constant share its loop.
     """
     (batch, m, k), n = a.shape, b.shape[2]
     if batch * m * k * n <= UNROLL_LIMIT and not (is_constant(b) and n >= VECTOR_OF_FUNCTIONS):
@@ -141,7 +141,7 @@ def below_broadcast(program: "Program", op: str, args: tuple[Node, ...], shape: 
 
 
 def _comparison_known(op: str, args: tuple[Node, ...]) -> bool | None:
-    """Returns the result of a comparison that does not depend on its operands; compilers warn of those."""
+    """Returns the result of a comparison that does not depend on its operands, about which compilers warn; or None."""
     if op in ("lt", "gt") and args[0] is args[1]:
         return False
     if op in ("eq", "ne", "le", "ge") and args[0] is args[1] and args[0].dtype != "real":

@@ -1,7 +1,7 @@
 """Exports JAX functions as C99 source without dependencies, with a demo program and a CMake file.
 
-The source holds constant tables and functions of one state: no allocation, no mutable state outside the stack, no
-library but <math.h>. The same functions, name and precision give the same files, byte for byte.
+The source holds constant tables and functions of one state, with no allocation, no mutable state outside the stack and
+no library but <math.h>. The same functions, name and precision give the same files, byte for byte.
 """
 
 import importlib.metadata
@@ -36,15 +36,15 @@ from dln_jax.types import InputError, require_positive
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
 """Functions of arrays by name, with example arguments."""
 STACK = 256 * 1024
-"""Default limit of the stack that a function may use, in bytes."""
+"""Default limit in bytes of the stack that a function may use."""
 LENGTH = 10_000_000
-"""Largest length of a source in bytes."""
+"""Largest size of a source in bytes."""
 LINES = 4000
-"""Largest size in lines, including callees, at which a function is exported by default."""
+"""A function of more lines, including callees, is not exported by default."""
 
 
 class TooLargeError(InputError):
-    """A function needs more stack, or more lines, than generated C suits."""
+    """A function needs more stack, or more lines, than suits generated C."""
 
 
 def export_c(
@@ -74,17 +74,17 @@ def export_c(
         casadi: also write NAME_casadi.c, the functions with exact derivatives for CasADi's `external`; a collection
             names the functions to include.
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
-            NAME_casadi.c functions that CasADi cannot take; the files list the missing functions.
+            NAME_casadi.c functions that CasADi cannot take; the files list the omitted functions.
         stack: bytes of stack that a function may use; a plan over many steps may need more than the default.
-        finite: arguments and intermediate results are finite numbers. Then 0 x = 0, and the zeros and ones of a
-            derivative's structure cost nothing; a NaN or an infinity may not reach all results that it reaches in JAX.
+        finite: assume finite arguments and intermediate results. Then 0 x = 0, so that the zeros and ones of a
+            derivative's structure cost nothing; NaN or infinity may reach fewer results than in JAX.
         loop_bound: bound on the iterations of a `while_loop` whose condition does not compare a counter with a
-            constant. A loop that needs more ends with NaN (integers: the largest; truth values: true).
+            constant. A loop that needs more ends with NaN (integers: the largest; booleans: true).
         overwrite: replace existing files.
 
     Raises:
-        InputError: a function has no C or needs more stack, a name is invalid in C, the source exceeds 10 MB, files
-            exist, or the folder belongs to a run, whose files are never replaced.
+        InputError: a function cannot be written in C or needs more stack, a name is invalid in C, the source exceeds 10
+            MB, files exist, or the folder belongs to a run, whose files are never replaced.
     """
     texts = source_files(
         functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi,
@@ -150,7 +150,7 @@ def _precision(functions: Functions) -> str:
 def _exported(
     functions: Functions, source: Source, name: str, leave_out_large: bool, stack: int
 ) -> tuple[Source, dict[str, Signature], list[str], list[str]]:
-    """Returns the source, signatures and texts of the functions, and why functions were left out."""
+    """Returns the source, signatures and texts of the functions, and reasons for those left out."""
     signatures, texts, left_out = {}, [], []
     every = {
         check_name(key, "the name of a function"): _traced(key, *pair, source.precision)
@@ -174,7 +174,7 @@ def _exported(
 
 
 def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], precision: str) -> tuple[Signature, Any]:
-    """Returns the signature, still without costs, and the closed jaxpr of a function."""
+    """Returns the signature, without costs, and the closed jaxpr of a function."""
 
     def cast(leaf: Any) -> np.ndarray:
         array = array_of(leaf)
@@ -192,7 +192,7 @@ def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], pre
 def _function(
     source: Source, name: str, key: str, signature: Signature, closed: Any, repeated: Collection[int], stack: int
 ) -> tuple[Signature, str, int]:
-    """Returns the signature with costs, the C text, and the number of lines, callees included, of a function."""
+    """Returns the signature with costs, the C text, and the number of lines of a function, including callees."""
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(signature.arguments)}
     targets = [] if signature.returns else [leaf.name for leaf in signature.results]
     try:

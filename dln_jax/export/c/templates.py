@@ -1,4 +1,4 @@
-"""Texts of the files of an export: header, preamble, demo program, CasADi interface and CMake file."""
+"""Texts of the exported files: header, preamble, demo program, CasADi interface and CMake file."""
 
 from collections.abc import Mapping, Sequence
 from math import prod
@@ -140,7 +140,7 @@ _TIMED = """        if (calls_ > 0) {{
 def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
     """Returns NAME_demo.c, which prints every function at one state and, with an argument N, times N calls.
 
-    Real arguments are random, but a time step `dt` is a millisecond.
+    Real arguments are random, except that a time step `dt` is a millisecond.
     """
     real = PRECISIONS[precision][1]
     kinds = {**KINDS, "real": real}
@@ -224,7 +224,7 @@ def header(
 
 
 def stated(cost: Cost) -> str:
-    """Returns the words for the most that a call takes."""
+    """Returns the cost of a call in words."""
     names = ("additions", "multiplications", "divisions", "square_roots", "functions")
     kinds = [f"{name.replace('_', ' ')} {getattr(cost, name)}" for name in names if getattr(cost, name)]
     kinds += [f"unbounded loops, of which one iteration is counted {cost.unbounded_loops}"] * bool(cost.unbounded_loops)
@@ -233,6 +233,6 @@ def stated(cost: Cost) -> str:
 
 
 def about(*paragraphs: str, left_out: Sequence[str]) -> str:
-    """Returns a comment that also lists the functions left out, and why."""
+    """Returns a comment that also lists the functions left out, with reasons."""
     absent = "\n".join(f"Left out: {reason}" for reason in left_out)
     return comment(*paragraphs, *[absent] * bool(absent))

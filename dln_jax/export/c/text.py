@@ -29,12 +29,12 @@ NUMPY_TYPES: Mapping[str, Any] = {
     "unsigned_long": np.uint64,
     "index": np.int64,
 }
-"""NumPy type of each kind but `real`, which has the precision of the export."""
+"""NumPy type of each kind except `real`, which has the precision of the export."""
 SIGNED = ("int", "long")
 """Integer kinds whose overflow C leaves undefined."""
 UNSIGNED = ("unsigned", "unsigned_long")
 _KINDS = {np.dtype(numpy_type).name: kind for kind, numpy_type in NUMPY_TYPES.items() if kind != "index"}
-# JAX gives tangents of integers the type float0; no program computes with them.
+# JAX gives integers tangents of the type float0; no program computes with them.
 _KINDS |= {"float32": "real", "float64": "real", str(jax.dtypes.float0): "bool"}
 PRECISIONS = {"f32": (np.float32, "float", "f"), "f64": (np.float64, "double", "")}
 """NumPy type, C type, and the suffix of its literals and of the functions of <math.h>."""
@@ -46,8 +46,8 @@ acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc exp 
 fmod frexp hypot ilogb ldexp lgamma llrint llround log log10 log1p log2 logb lrint lround modf nan nearbyint nextafter
 nexttoward pow remainder remquo rint round scalbln scalbn sin sinh sqrt tan tanh tgamma trunc
 """
-# Keywords of C99 and C++, headers and functions of their libraries, targets of make, and names that a source defines:
-# a function, library or header with such a name would not build, or would hide the original.
+# Keywords of C99 and C++, headers and functions of their libraries, targets of make, and names that a source defines: a
+# function, library or header with such a name would not build, or would hide the original.
 _RESERVED = frozenset(
     re.findall(
         r"\w+",
@@ -68,7 +68,7 @@ _RESERVED = frozenset(
 
 
 def kind_of(dtype: Any) -> str:
-    """Returns the kind of a JAX dtype, and raises InputError if C has none."""
+    """Returns the kind of a JAX dtype; raises InputError if C has none."""
     if str(dtype) not in _KINDS:
         hint = "draw random numbers beforehand" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
         raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")
@@ -76,7 +76,7 @@ def kind_of(dtype: Any) -> str:
 
 
 def limit(kind: str, *, upper: bool) -> Any:
-    """Returns the lower or upper limit of the numbers of a kind."""
+    """Returns the lower or upper limit of a kind."""
     if kind in ("real", "bool"):
         return upper if kind == "bool" else np.inf if upper else -np.inf
     limits = np.iinfo(NUMPY_TYPES[kind])
@@ -84,12 +84,12 @@ def limit(kind: str, *, upper: bool) -> Any:
 
 
 def failure(kind: str) -> Any:
-    """Returns the value for a result that does not exist: NaN, the largest integer or true."""
+    """Returns the value that stands for a missing result: NaN, the largest integer or true."""
     return np.nan if kind == "real" else limit(kind, upper=True)
 
 
 def check_name(name: str, what: str = "name") -> str:
-    """Returns a valid name in C, and raises InputError for any other."""
+    """Returns a valid C name; raises InputError for any other."""
     taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|i|table|part)_?\d\w*|elementary_.*|.*_", name)
     if not _NAME.fullmatch(name) or taken or len(name) > 40:
         raise InputError(
@@ -105,9 +105,9 @@ def fill(text: str, precision: str, **values) -> str:
 
 
 def number(value, precision: str, kind: str = "real") -> str:
-    """Returns the shortest literal of the same number; raises InputError if the precision cannot hold it.
+    """Returns the shortest literal that gives the same number; raises InputError if the precision cannot hold it.
 
-    C has no literal for the lowest number of 32 and 64 bits, which have names.
+    The lowest 32- and 64-bit integers have no literal in C and are written by name.
     """
     if kind != "real":
         lowest = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
@@ -140,5 +140,5 @@ def table(name: str, array: np.ndarray, precision: str) -> str:
 
 
 def comment(*paragraphs: str) -> str:
-    """Returns a block comment with the lines unchanged."""
+    """Returns a block comment with its lines unchanged."""
     return "/*\n" + "".join(f" * {line}".rstrip() + "\n" for line in "\n\n".join(paragraphs).splitlines()) + " */\n"

@@ -53,7 +53,7 @@ class Listed(NamedTuple):
     pairs: Int[Array, "capacity 2"]
     """Indices of the primitives."""
     kind: Int[Array, " capacity"]
-    """`POINT_TRIANGLE` or `EDGE_EDGE`."""
+    """Number of the kind in `distances`."""
     used: Bool[Array, " capacity"]
     """False for unused slots."""
 
