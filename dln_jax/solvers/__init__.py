@@ -1,4 +1,4 @@
-"""Linear and nonlinear solvers that know no physics."""
+"""Linear and nonlinear solvers without any physics."""
 
 from dln_jax.solvers import elimination, least_squares, levenberg_marquardt, normal_equations
 from dln_jax.solvers.newton import SolverInfo, find_root

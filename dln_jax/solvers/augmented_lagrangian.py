@@ -7,12 +7,12 @@ With multipliers mu >= 0 and a penalty rho, a round minimises
     f(x) + sum over i of (max(0, mu_i + rho g_i(x))² - mu_i²) / (2 rho)
 
 without constraints by L-BFGS (SciPy), then sets mu <- max(0, mu + rho g) (Powell, Hestenes, Rockafellar; Nocedal and
-Wright 2006, "Numerical Optimization", section 17.4). The penalty grows after a round that has not divided the violation
-by four. The solution may violate a constraint by about `tolerance`, which the caller must check.
+Wright 2006, "Numerical Optimization", section 17.4). The penalty grows after every round that has not reduced the
+violation to a quarter. The solution may violate a constraint by about `tolerance`; the caller must check.
 
-SciPy has constrained methods of its own. On the excitation problems of two arms (10 and 14 unknowns, 480 and 720
-constraints) SLSQP takes a tenth of the time, but it ended in poorer minima from four of seven starts: once at a
-condition of 25 in place of 9. `trust-constr` took more than a hundred times as long and ended in poorer minima still.
+SciPy's own constrained methods were compared on the excitation problems of two arms (10 and 14 unknowns, 480 and 720
+constraints). SLSQP takes a tenth of the time, but ended in poorer minima from four of seven starts: once at a condition
+number of 25 instead of 9. `trust-constr` took more than a hundred times as long and ended in even poorer minima.
 """
 
 from collections.abc import Callable
@@ -59,11 +59,11 @@ def make_minimiser(
 
     Args:
         function: returns f and g.
-        rounds: largest number of rounds; the last is earlier if x satisfies the constraints within `tolerance` and f
-            has changed by at most 1e-3 of its size.
-        iterations: largest number of L-BFGS iterations in a round.
+        rounds: largest number of rounds; the search ends earlier once x satisfies the constraints within `tolerance`
+            and f has changed by at most 1e-3 of its size.
+        iterations: largest number of L-BFGS iterations per round.
         penalty: rho of the first round; f and g should be of order one.
-        growth: factor on rho.
+        growth: factor by which rho grows.
         tolerance: largest accepted g.
 
     Raises:

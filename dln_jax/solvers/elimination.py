@@ -1,7 +1,7 @@
 """Small linear systems, unrolled row by row: Gaussian elimination, and substitution with triangular matrices.
 
-The Hessians of learned energies need not be definite, so that Cholesky does not apply. The matrices of mechanics have a
-few rows and come in batches. Unrolled, they fuse with the surrounding code, which is faster than one library call per
+The Hessians of learned energies need not be definite, so Cholesky does not apply. The matrices of mechanics have a few
+rows and come in batches. Unrolled, they fuse with the surrounding code, which is faster than one library call per
 matrix up to a dozen rows.
 """
 
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.solvers import lapack
 
-# For more rows the library call is faster, and the unrolled program slow to compile.
+# With more rows the library call is faster, and the unrolled program is slow to compile.
 _UNROLLED_ROWS = 16
 
 

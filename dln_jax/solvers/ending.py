@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Ending(IntEnum):
-    """The outcomes of an iteration; an array of their values may be traced, and `reason` gives the words."""
+    """Outcomes of an iteration; arrays of them may be traced, and `reason` puts them into words."""
 
     CONVERGED = 0
     OUT_OF_ITERATIONS = 1
@@ -29,5 +29,5 @@ REASONS = {
 
 
 def reason(ending: Any) -> str:
-    """Returns the sentence for an `Ending`, or for an array of one element that holds it."""
+    """Returns the sentence for an `Ending`, or for a one-element array that holds it."""
     return REASONS[Ending(int(np.asarray(ending)))]

@@ -3,7 +3,7 @@
 On a CPU, JAX passes a batch to a library call that splits it over the threads that also run the programs of other
 devices. If these programs wait for one another, all deadlock (seen with jaxlib 0.10.2: two devices of one process, or
 several batched calls in one program on two cores). On other platforms a batch is one call. Factors have no derivatives;
-callers supply the derivatives of the solution.
+callers supply those of the solution.
 """
 
 import functools
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 
 def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns the function of arrays with a batching rule that loops over the batch on a CPU."""
+    """Returns a function of arrays whose batching rule loops over the batch on a CPU."""
 
     @jax.custom_batching.custom_vmap
     def of_one(*arguments: Array) -> Any:
@@ -116,7 +116,7 @@ def _substitution(transposed: bool, right: bool) -> Callable[[Array, Array], Arr
 def shared_or_batched(
     one: Callable[[Array, Array], Array], many: Callable[[Array, Array], Array], *, side: int = 1
 ) -> Callable[[Array, Array], Array]:
-    """Returns the solve (matrix, b) -> x of `one`, with a batching rule: `many` solves for a batch of matrices.
+    """Returns the solve (matrix, b) -> x of `one`, batched over matrices by `many`.
 
     If only b is a batch, its members become columns (axis `side`) of one b.
     """

@@ -5,9 +5,9 @@ With D the diagonal of column norms of A, y = D x and the decomposition A D⁻¹
     y = V (S² + ridge 1)⁻¹ S Uᵀ b        minimises |A x - b|² + ridge |D x|²
 
 Scaled columns make rank and condition independent of the units of the unknowns (Golub and Van Loan 2013, "Matrix
-Computations", sections 5.3.8 and 5.5). Singular values that are rounding alone are left out, which gives the shortest y
-of all that fit equally well. A tall A is replaced by its triangular factor first; neither forms AᵀA, whose condition
-number is squared.
+Computations", sections 5.3.8 and 5.5). Singular values that are only rounding are left out, which gives the shortest y
+of all that fit equally well. A tall A is first replaced by its triangular factor. AᵀA, whose condition number is
+squared, is never formed.
 """
 
 from collections.abc import Iterable
@@ -40,16 +40,16 @@ def solve(
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
 ) -> LeastSquaresSolution:
-    """Returns the x that minimises |A x - b|² + ridge |D x|²; of several, the one with the smallest |D x|.
+    """Returns the x that minimises |A x - b|² + ridge |D x|²; if there are several, the one with the smallest |D x|.
 
     Args:
-        A: coefficients; a column of zeros has x = 0.
+        A: coefficients; a column of zeros gives x = 0.
         b: right-hand side.
         ridge: dimensionless; with orthogonal columns it divides the unknowns by 1 + ridge.
         rank_tolerance: singular values below it, relative to the largest, count as zero; by default the rounding of
             the decomposition, 2.2e-16 max(N, P).
-        negligible: columns with a norm up to this fraction of the largest count as zero: rounding that cancelling
-            terms leave would otherwise be scaled up to the size of the other columns.
+        negligible: columns with a norm up to this fraction of the largest count as zero, so that rounding left by
+            cancelling terms is not scaled up to the size of the other columns.
 
     Raises:
         InputError: numbers are not finite, the ridge is negative, or a tolerance is outside [0, 1).

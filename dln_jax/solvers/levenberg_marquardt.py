@@ -7,19 +7,19 @@ g = Jᵀr / N once, and tries dampings until one lowers F:
     (A + damping s I) a = -(J(x)ᵀ r(x + h v) / N - (1 - h) g + h damping s v) / h²     acceleration
     x <- x + v + a,  or x + v where |a| > 0.75 |v|
 
-where s is the largest diagonal entry of the first A. This a is the geodesic acceleration of Transtrum and Sethna (2012,
-arXiv:1201.5885), whose second derivative of r along v is a difference with probe h. It takes a residual, a product and
-a solve with the same factor, and follows the curved valleys of networks: a two-link arm with 260 parameters was at a
-loss of 1e-8 in 24 to 34 iterations instead of 110 to 190. The damping is Nielsen's (1999, IMM-REP-1999-05): times
-max(1/3, 1 - (2 gain - 1)³) after a success, times 2, 4, 8, ... after failures in a row, where gain is the decrease of
-F over that which the quadratic model predicts for v.
+where s is the largest diagonal entry of the first A. Here a is the geodesic acceleration of Transtrum and Sethna (2012,
+arXiv:1201.5885), with the second derivative of r along v as a finite difference of step h. It takes a residual, a
+product and a solve with the same factor, and follows the curved valleys of networks: a two-link arm with 260 parameters
+reached a loss of 1e-8 in 24 to 34 iterations instead of 110 to 190. The damping is Nielsen's (1999, IMM-REP-1999-05):
+times max(1/3, 1 - (2 gain - 1)³) after a success, times 2, 4, 8, ... after successive failures, where gain is the
+decrease of F relative to that predicted by the quadratic model for v.
 
-Normal equations square the condition number of J. They are solved by Cholesky while the damped matrix is regular in
+Normal equations square the condition number of J. They are solved by Cholesky if the damped matrix is regular in
 working precision, else by eigenvalues (`normal_equations.factorise`), which the state counts as a fallback. All
 functions are pure; the caller compiles them.
 
-Devices of a mesh share the samples: a device sums J Jᵀ, J r, J w and |r|² over its samples, and all solve the same
-equations. The sums are reduced over devices once in an iteration (P² / 2 numbers) and three times in a trial (P + 2).
+The devices of a mesh share the samples: each sums J Jᵀ, J r, J w and |r|² over its samples, and all solve the same
+equations. Sums are reduced over devices once per iteration (P² / 2 numbers) and three times per trial (P + 2).
 """
 
 import enum
@@ -44,12 +44,12 @@ LOWER_DAMPING = 1e-16
 UPPER_ACCELERATION = 0.75
 """Largest |a| / |v| at which the acceleration is used; 0 disables it."""
 PROBE = 0.5
-"""Step h of the difference that gives the second derivative along v."""
+"""Step h of the finite difference for the second derivative along v."""
 CHUNK = 256
 """Number of samples whose Jacobian is evaluated at once."""
 KEPT_BYTES = 2**30
-"""Largest Jacobian that is kept through an iteration; for a larger one, reverse mode gives its product for the
-acceleration. `normal_equations.jacobian_bytes` states the memory."""
+"""Largest Jacobian kept through an iteration; for a larger one, reverse mode gives its product for the acceleration.
+`normal_equations.jacobian_bytes` returns the memory."""
 TRIALS = 16
 """Steps tried before an iteration gives up."""
 
@@ -74,11 +74,11 @@ class LevenbergMarquardtState(NamedTuple):
     parameters: Any
     """Tree of float64 arrays."""
     iteration: Array
-    """Iterations done."""
+    """Number of iterations done."""
     status: Array
     """A `Status`; anything but RUNNING makes `run` the identity."""
     loss: Array
-    """Mean over samples of the sum of squared residuals; inf before the first iteration."""
+    """Mean over samples of the sum of squared residuals; infinite before the first iteration."""
     damping: Array
     """Factor on s."""
     growth: Array
@@ -86,9 +86,9 @@ class LevenbergMarquardtState(NamedTuple):
     scale: Array
     """s."""
     trials: Array
-    """Steps tried so far."""
+    """Number of steps tried so far."""
     fallbacks: Array
-    """Factorisations so far for which Cholesky failed."""
+    """Number of factorisations so far for which Cholesky failed."""
 
 
 def init(parameters: Any) -> LevenbergMarquardtState:
@@ -120,10 +120,11 @@ def run(
     *,
     improvement: float = 0.0,
 ) -> LevenbergMarquardtState:
-    """Runs `iterations` iterations, fewer if the status changes or one lowers F by no more than `improvement` F.
+    """Runs `iterations` iterations; stops earlier if the status changes or one lowers F by no more than `improvement`
+    F.
 
-    States with a leading axis of seeds run one after the other and not in lockstep: no seed repeats the failed trials
-    of another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.lapack`).
+    States with a leading axis of seeds run one after the other, not in lockstep: no seed repeats the failed trials of
+    another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.lapack`).
 
     Raises:
         InputError: parameters or residuals are not float64, or arrays differ in length.
@@ -133,7 +134,7 @@ def run(
 
 
 def in_chunks(arrays: Arrays, mesh: Mesh | None = None) -> Chunks:
-    """Returns the samples as chunks for `run_on_chunks`, which `scale.mesh.shard` splits over the devices.
+    """Returns the samples as chunks for `run_on_chunks`; `scale.mesh.shard` splits them over the devices.
 
     Raises:
         InputError: arrays differ in length.
@@ -151,7 +152,7 @@ def run_on_chunks(
     improvement: float = 0.0,
     mesh: Mesh | None = None,
 ) -> LevenbergMarquardtState:
-    """Runs iterations as `run` does, with the chunks of samples shared by the devices of a mesh."""
+    """Runs iterations like `run`, with the chunks of samples shared by the devices of a mesh."""
 
     @jax.custom_batching.sequential_vmap
     def run_one(state: LevenbergMarquardtState, chunks: Chunks, iterations: Array) -> LevenbergMarquardtState:
@@ -165,7 +166,7 @@ def run_on_chunks(
     def on_one(shared: tuple[LevenbergMarquardtState, Array], chunks: Chunks) -> LevenbergMarquardtState:
         state, iterations = shared
         over_seeds = jax.vmap(run_one, in_axes=(0, None, None)) if state.iteration.ndim else run_one
-        # Different devices may round the solution differently, so all continue from the first device's.
+        # Devices may round the solution differently, so all continue from the first device's.
         return first(over_seeds(state, chunks, iterations), mesh)
 
     return on_devices(on_one, mesh)((state, jnp.asarray(iterations)), chunks)
@@ -189,7 +190,7 @@ def _iterate(
     start = _Trial(jnp.zeros_like(at.x), at.loss, no, state.damping, state.growth, none, none)
     last = lax.while_loop(
         lambda trial: finite & ~flat & ~trial.accepted & (trial.tried < TRIALS),
-        # If no parameter has an effect, the scale is zero; any positive number serves, because the step is zero.
+        # If no parameter has an effect, the scale is zero; any positive number will do, because the step is zero.
         lambda trial: _try(sample_residual, at, jnp.where(largest > 0, largest, 1.0), trial, mesh),
         start,
     )
@@ -202,7 +203,7 @@ def _iterate(
     return LevenbergMarquardtState(
         parameters=at.unravel(jnp.where(last.accepted, at.x + last.step, at.x)),
         iteration=state.iteration + (finite & ~flat),
-        status=status.astype(state.status.dtype),  # no longer weakly typed: that would be another program
+        status=status.astype(state.status.dtype),  # weakly typed, it would compile another program
         loss=jnp.where(last.accepted, last.loss, at.loss),
         damping=last.damping,
         growth=last.growth,
@@ -228,7 +229,7 @@ class _Linearised(NamedTuple):
     """g [P]."""
     loss: Array
     jacobian: Array | None
-    """Jacobian of all samples, if small enough to be kept."""
+    """Jacobian of all samples, if small enough to keep."""
 
 
 def _linearise(
@@ -258,7 +259,7 @@ class _Trial(NamedTuple):
 
 
 def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: _Trial, mesh: Mesh | None) -> _Trial:
-    """Tries the step with the current damping: whether it lowers the loss, and the next damping."""
+    """Tries the step with the current damping; returns whether it lowers the loss, and the next damping."""
     damped = trial.damping * scale
     factor, fell_back = equations.factorise(at.matrix + damped * jnp.eye(at.x.size))
     velocity = -equations.solve(factor, at.gradient)
@@ -267,7 +268,7 @@ def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: 
         """Returns v + a from the residuals at x + h v."""
         product = equations.pull_back(sample_residual, at.parameters, at.chunks, at.jacobian, probed, mesh=mesh)
         slope = product / at.samples
-        # Finite or NaN; the selection keeps the rounding of the division, which a fused multiply-add would skip.
+        # Finite or NaN; the selection also keeps the rounding of the division, which a fused multiply-add would skip.
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.nan)
         bend = -equations.solve(factor, slope - (1 - PROBE) * at.gradient + PROBE * damped * velocity) / PROBE**2
         bounded = bend @ bend <= UPPER_ACCELERATION**2 * (velocity @ velocity)  # False for NaN

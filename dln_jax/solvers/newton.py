@@ -3,8 +3,8 @@
     f(x, theta) = 0,    x <- x - J⁻¹ f,    J = df/dx        (Newton)
     dx = -J⁻¹ (df/dtheta) dtheta                            (implicit function theorem)
 
-The derivative is that of the root and not of the iterations: it costs one linear solve, in forward and in reverse
-mode and to any order, and is as accurate as the root.
+The derivative is that of the root, not of the iterations: it costs one linear solve, in forward and in reverse mode and
+to any order, and is as accurate as the root.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from dln_jax.types import InputError, require_positive
 
 Root = Float[Array, " n"]
 
-# A root that is right to the last digit has a residual of about eps |J| |x|; evaluating f adds a few times that.
+# A root that is correct to the last digit has a residual of about eps |J| |x|; evaluating f adds a few times that.
 _ROUNDING_UNITS = 16
 
 
@@ -31,12 +31,11 @@ class SolverInfo(NamedTuple):
     iterations: Int[Array, ""]
     """Newton steps taken."""
     converged: Bool[Array, ""]
-    """Whether the residual is within the tolerance or at the level of rounding; false for values that are not
-    finite."""
+    """Whether the residual is within the tolerance or at the level of rounding; false if values are not finite."""
     definite: Bool[Array, ""] | None = None
-    """Whether the Hessian at a minimum is positive definite (no saddle); `None` unless asked for."""
+    """Whether the Hessian at a minimum is positive definite (no saddle); `None` unless requested."""
     energy_noise: Float[Array, ""] | None = None
-    """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
+    """Size of energy changes at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
     overflow: Bool[Array, ""] | None = None
     """Whether a list of moving elements was too short at a minimum; `None` without moving elements."""
     lists: tuple[Any, Any] = ((), ())
@@ -57,19 +56,19 @@ def find_root(
     """Returns x [n] with function(x, *arguments) = 0, for up to about twenty equations and a start near the root.
 
     There is no line search: from a start too far from the root the iteration may diverge, which `SolverInfo.converged`
-    reports; x is then the last iterate. Derivatives are those of the root, with respect to the arguments and to
-    arrays that the function closes over; the start has none.
+    reports; x is then the last iterate. Derivatives are those of the root, with respect to the arguments and to arrays
+    that the function closes over; the start has none.
 
     Args:
         function: (x [n], *arguments) -> f [n].
         start: first iterate [n].
         arguments: pytrees passed to the function.
         tolerance: largest |f_i| that counts as zero, in the unit of f; rounding, 16 eps |J| |x|, always does. The
-            point that passes is improved by one more step, which about squares its error.
-        iterations: Newton steps after which the search gives up.
+            accepted point is improved by one more step, which about squares its error.
+        iterations: number of Newton steps after which the search gives up.
 
     Raises:
-        InputError: a negative tolerance, no iterations, or a start that is no vector.
+        InputError: a negative tolerance, no iterations, or a start that is not a vector.
     """
     require_positive(iterations=iterations)
     if not tolerance >= 0:

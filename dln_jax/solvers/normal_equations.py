@@ -1,8 +1,8 @@
 """Normal equations of a least-squares problem, summed over chunks of samples, and their factorisation.
 
-A problem is a function of ONE sample, `sample_residual(parameters, *sample) -> [r]`. For N samples and P parameters
-the Jacobian has N r rows; here it is J [P, rows], parameters first, the layout in which J Jᵀ multiplies fastest.
-Only one piece of it is alive at a time, unless the caller wants it kept; `jacobian_bytes` states the memory.
+A problem is a function of ONE sample, `sample_residual(parameters, *sample) -> [r]`. For N samples and P parameters the
+Jacobian has N r rows; here it is J [P, rows], parameters first, the layout in which J Jᵀ multiplies fastest. Only one
+piece of it is alive at a time, unless the caller wants to keep it; `jacobian_bytes` returns the memory.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from dln_jax.types import InputError
 SampleResidual = Callable[..., Array]
 """(parameters, *sample) -> residuals of one sample, [r] or another shape."""
 
-# J Jᵀ is symmetric: this many rows of blocks, each as wide as the lower triangle needs, save up to half the products.
+# J Jᵀ is symmetric: blocks of this many rows, each as wide as the lower triangle needs, save up to half the products.
 _ROWS_PER_BLOCK = 200
 
 
@@ -34,14 +34,14 @@ class Chunks(NamedTuple):
     arrays: tuple[Any, ...]
     """Arrays [k, c, ...], or None."""
     weights: Array
-    """1 for a sample, 0 for a filler, [k, c]."""
+    """1 for a sample, 0 for padding, [k, c]."""
 
 
 class NormalEquations(NamedTuple):
     """Sums over all residuals r; the caller divides by the number of samples."""
 
     matrix: Array
-    """J Jᵀ [P, P]; only its lower triangle is meant to be read."""
+    """J Jᵀ [P, P]; read only its lower triangle."""
     vector: Array
     """J r [P]."""
     squares: Array
@@ -68,8 +68,8 @@ def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size:
     """Returns the bytes of the arrays that grow with the problem: 8 (4 P² + P chunk_size b + [P N r if kept]).
 
     There are P parameters and N samples with r residuals. 4 P² is the matrix, its damped copy, its factor and a spare;
-    a piece of the Jacobian has b = 1 residual per sample by reverse mode (r < P), and b = r by forward mode.
-    The intermediate values of the residual function itself, for `chunk_size` samples, come on top.
+    a piece of the Jacobian has b = 1 residual per sample in reverse mode (r < P), and b = r in forward mode.
+    Intermediate values of the residual function itself, for `chunk_size` samples, come on top.
     """
     size = count(parameters)
     piece = size * min(chunk_size, samples) * (1 if _reverse_is_cheaper(size, residuals) else residuals)
@@ -87,7 +87,7 @@ def check_precision(tree: Any, what: str) -> None:
 
 
 def residual_count(sample_residual: SampleResidual, parameters: Any, chunks: Chunks) -> int:
-    """Returns the number of residuals of a sample.
+    """Returns the number of residuals per sample.
 
     Raises:
         InputError: parameters or residuals are not float64.
@@ -100,7 +100,7 @@ def residual_count(sample_residual: SampleResidual, parameters: Any, chunks: Chu
 
 
 def split(arrays: tuple[Any, ...], chunk_size: int, *, devices: int = 1) -> Chunks:
-    """Splits samples into the smallest number of equal chunks of at most `chunk_size`, equally many per device.
+    """Splits samples into the fewest equal chunks of at most `chunk_size`, with equally many per device.
 
     The first sample serves as padding.
 
@@ -129,8 +129,7 @@ def normal_equations(
 
     With a mesh, call it in a function of `scale.mesh.on_devices`: chunks and Jacobian belong to this device, the sums
     to all devices.
-
-    Reverse mode gives the rows, one residual at a time for all samples of a chunk; forward mode does if a sample has
+    Reverse mode gives the rows, one residual at a time for all samples of a chunk; forward mode is used if a sample has
     at least as many residuals as there are parameters.
     """
     point, unravel = ravel_pytree(parameters)
@@ -223,15 +222,15 @@ def pull_back(
 def factorise(matrix: Float[Array, "P P"]) -> tuple[ScaledFactor, Array]:
     """Returns a factor of a symmetric matrix (lower triangle), and whether the fallback was needed.
 
-    Scaled to unit diagonal, a matrix whose Cholesky factor exists and has all L_ii² > P eps is solved as it is. Else
-    it is singular to working precision: eigenvalues below P eps times the largest are raised to that, and L comes
-    from a QR decomposition, which leaves the other directions as they are. (Golub and Van Loan 2013, sections 4.2, 8.1)
+    A matrix whose Cholesky factor, scaled to unit diagonal, exists and has all L_ii² > P eps is solved unchanged. Else
+    it is singular to working precision: eigenvalues below P eps times the largest are raised to that, and L comes from
+    a QR decomposition, which leaves the other directions unchanged (Golub and Van Loan 2013, sections 4.2, 8.1).
     """
     scaling = lax.rsqrt(jnp.diagonal(matrix))
     scaled = matrix * scaling * scaling[:, None]
     smallest = matrix.shape[0] * jnp.finfo(matrix.dtype).eps
     lower = lax.linalg.cholesky(scaled, symmetrize_input=False)
-    well_conditioned = jnp.min(jnp.diagonal(lower)) ** 2 > smallest  # False for the NaN of a factor that failed
+    well_conditioned = jnp.min(jnp.diagonal(lower)) ** 2 > smallest  # False if the factorisation failed with NaN
 
     def by_eigenvalues() -> Array:
         vectors, values = lax.linalg.eigh(scaled, lower=True, symmetrize_input=False)

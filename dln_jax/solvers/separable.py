@@ -1,4 +1,4 @@
-"""Separable least squares: a few nonlinear unknowns, and many linear ones that are eliminated at every step.
+"""Separable least squares: a few nonlinear unknowns, and many linear ones that are eliminated in every step.
 
     minimise over (x, n) |A(n) x - b(n)|²   =   minimise over n |(1 - U Uᵀ) b|²,   A = U S Vᵀ
 
@@ -24,7 +24,7 @@ from dln_jax.solvers.least_squares import scaled_columns, truncated_svd
 from dln_jax.types import InputError, require_positive
 
 FIRST_DAMPING, LOWER_DAMPING, TRIALS = 1e-3, 1e-12, 30
-"""Damping of the scaled columns of J, first and lower bound; steps tried before an iteration gives up."""
+"""Damping of the scaled columns of J: first value and lower bound; steps tried before an iteration gives up."""
 
 
 class SeparableSolution(NamedTuple):
@@ -40,7 +40,7 @@ class SeparableSolution(NamedTuple):
     """Condition number of these columns, on their rank."""
     covariance: Float[np.ndarray, "K K"]
     """Covariance of (linear, nonlinear), K = P + n, on the determined combinations: s² (GᵀG)⁺ with
-    G = [A, dA/dn x - db/dn] and s² = |A x - b|² / (N - rank - n); it includes correlations of both kinds."""
+    G = [A, dA/dn x - db/dn] and s² = |A x - b|² / (N - rank - n); includes correlations between the two."""
     iterations: int
     converged: bool
     """Whether the last iteration improved by no more than the limit, or not at all."""
@@ -68,13 +68,13 @@ def solve_separable(
     """Returns the unknowns of a local minimum near the start, in float64.
 
     Args:
-        design: (n, *arguments) -> A [N, P] and b [N], in JAX; weights of samples multiply their rows. A function is
+        design: (n, *arguments) -> A [N, P] and b [N], in JAX; sample weights multiply their rows. Every function is
             compiled once.
-        start: n [n], where A and b depend on it; pass positive quantities as logarithms.
+        start: initial n [n]; pass positive quantities as logarithms.
         arguments: arrays, such as the data.
         iterations: largest number of iterations.
         improvement: stop if an iteration lowers the sum of squares by no more than this fraction.
-        longest_step: largest step of a nonlinear unknown in an iteration; damping shortens longer ones.
+        longest_step: largest step of a nonlinear unknown per iteration; damping shortens longer ones.
         rank_tolerance, negligible: for A, as in `least_squares.solve`.
 
     Raises:
@@ -166,7 +166,7 @@ def _projected(A: np.ndarray, b: np.ndarray, rank_tolerance: float | None, negli
 def _svd(
     A: np.ndarray, rank_tolerance: float | None = None, negligible: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns U, S, Vᵀ of the columns of A scaled to norm 1, without singular values of rounding, and the norms."""
+    """Returns U, S, Vᵀ of A with columns scaled to norm 1, without singular values at rounding level, and the norms."""
     scaled, scale = scaled_columns(A, negligible)
     orthogonal, triangle = np.linalg.qr(scaled)
     lower = np.finfo(float).eps * max(A.shape) if rank_tolerance is None else rank_tolerance

@@ -1,7 +1,7 @@
 """Assembles the gradient and the Hessian of a sum of element energies.
 
-The elements' connectivity is known before tracing. Assembly gathers and adds along index arrays that are made once
-here, because a scatter costs a loop iteration per element.
+The elements' connectivity is known before tracing. Assembly gathers and adds along index arrays made once here, because
+a scatter costs a loop iteration per element.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from dln_jax.types import InputError
 
 
 class Pattern(NamedTuple):
-    """Sources of the gradient and of the lower triangle of the Hessian, as static arrays.
+    """Static index arrays that assemble the gradient and the lower triangle of the Hessian.
 
     Unknown number `r` is x.ravel()[r]. Sources index the elements' components (the first component of all elements,
     then the second, ...); an index past the end stands for zero.
@@ -33,11 +33,11 @@ class Pattern(NamedTuple):
     columns: Int[np.ndarray, " entries"]
     """Row and column of every entry of the Hessian; columns <= rows."""
     sources: tuple[Int[np.ndarray, "some terms"], ...]
-    """Element entries whose sum is entry 0, 1, ... of the Hessian, in tables grouped by the number of terms."""
+    """Element entries that sum to entry 0, 1, ... of the Hessian, in tables grouped by the number of terms."""
     diagonal: Int[np.ndarray, " unknowns"]
-    """Index of every unknown's diagonal entry among the entries; past the end if the unknown is not free."""
+    """Index of every unknown's diagonal entry; past the end if the unknown is not free."""
     corners: tuple[Int[np.ndarray, "n b valence"], ...]
-    """For every energy, the element components whose sum is the gradient of an unknown."""
+    """For every energy, the element components that sum to the gradient of an unknown."""
 
     @property
     def unknowns(self) -> int:
@@ -49,7 +49,7 @@ def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: An
     """Returns the sparsity pattern of a sum of element energies on x [blocks, width].
 
     Args:
-        energies: the terms, with their indices.
+        energies: terms of the sum, with their indices.
         blocks: n.
         width: b.
         free: [n, b], which unknowns are solved for; all of them by default.
@@ -100,11 +100,11 @@ def gradient(energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Se
 
 
 def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "s m"]) -> Blocks:
-    """Adds the components of the elements' corners to the blocks there."""
+    """Adds the components of the elements' corners to the blocks of these corners."""
     if corners.shape[2] == 1 and np.array_equal(corners[:, :, 0].T.ravel(), np.arange(components.size)):
         return components.T.reshape(corners.shape[:2])
     padding = components.size
-    # The unknown that a component is added to. The transposed map gathers from there; JAX's own transpose would
+    # The unknown to which each component is added: the transposed map gathers from there. JAX's own transpose would
     # scatter, which costs a loop iteration per element on a CPU.
     unknown, slot = np.divmod(np.flatnonzero(corners.reshape(-1) < padding), corners.shape[2])
     to = np.empty(padding, int)
@@ -113,7 +113,7 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
     def add(flat: Array) -> Array:
         return jnp.append(flat, 0)[corners].sum(-1).reshape(-1)
 
-    # y = G x, whose transpose is to be a gather too, is the second half of the solution of
+    # y = G x, whose transpose should be a gather too, is written as the second half of the solution of
     #     [[1, 0], [-G, 1]] (u, w) = (x, 0),    with the transposed solution u = x + Gᵀ w,
     # because JAX lets callers define the transpose of a linear solve, and can batch it.
     def product(both: Array) -> Array:
@@ -131,7 +131,7 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
 
 
 def entries(at: Pattern, hessians: Sequence[Array]) -> Float[Array, " entries"]:
-    """Returns the Hessian's lower triangle at `at.rows`, `at.columns`, from the Hessians of the elements."""
+    """Returns the lower triangle of the Hessian at `at.rows`, `at.columns`, from the element Hessians."""
     flat = jnp.concatenate([*(h.reshape(-1) for h in hessians), jnp.zeros(1, hessians[0].dtype)])
     return jnp.concatenate([flat[of_group].sum(-1) for of_group in at.sources])
 
@@ -151,7 +151,7 @@ def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[n
 def _group_by_count(
     key: np.ndarray, place: np.ndarray, padding: int
 ) -> tuple[np.ndarray, tuple[Int[np.ndarray, "some terms"], ...]]:
-    """Returns the distinct keys and their places, in two tables: keys with few places, then the rest."""
+    """Returns the distinct keys and their places in two tables: keys with few places, then the rest."""
     distinct, number, counts = np.unique(key, return_inverse=True, return_counts=True)
     table = _group(number, place, len(distinct), padding)
     few = counts <= np.median(counts)

@@ -2,9 +2,9 @@
 
     H p = -g,    x <- x + t p
 
-It uses the true Hessian. Only if its factorisation fails are the element Hessians projected to positive semi-definite
-ones, those of moving elements first: always projecting costs several times the iterations on badly deformed bodies, and
-ten times those of bodies that are pressed together. Moving elements also bound the steps.
+The true Hessian is used. Element Hessians are projected to positive semi-definite ones only if its factorisation fails,
+those of moving elements first: always projecting costs several times the iterations on badly deformed bodies, and ten
+times on bodies that are pressed together. Moving elements also limit the steps.
 """
 
 from collections.abc import Sequence
@@ -34,15 +34,15 @@ from dln_jax.solvers.newton import SolverInfo
 
 # Gradients and energies below this many units of rounding are indistinguishable from zero.
 _ROUNDING_UNITS = 16
-# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, added in turn:
-# projected elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
+# Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn: even
+# projected elements may add up to a singular matrix. They change the search directions, not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
 # How often a step whose list of elements overflows is shortened, eightfold.
 _SHORTENINGS = 6
 
 
 class Sum(NamedTuple):
-    """The sum that is minimised, and the solver of its linear systems."""
+    """The sum to be minimised, and the solver of its linear systems."""
 
     energies: tuple[ElementEnergy, ...]
     at: Pattern
@@ -58,7 +58,7 @@ class _MinimumIterate(NamedTuple):
     iterations: Int[Array, ""]
     stuck: Bool[Array, ""]
     gap: Blocks | None
-    """What fixed unknowns are away from their values, where they approach them; `None` without moving elements."""
+    """Distance of fixed unknowns from the values that they approach; `None` without moving elements."""
 
 
 class _Attempt(NamedTuple):
@@ -75,12 +75,12 @@ class _Attempt(NamedTuple):
 def descend(
     total: Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, iterations: int, start: Blocks
 ) -> tuple[Blocks, SolverInfo]:
-    """Returns the minimum and the outcome of the search from `start`; the arguments are those of `minimise`.
+    """Returns the minimum and the outcome of the search; the arguments are those of `minimise`.
 
     Args:
         total: the sum.
         x0: values of the unknowns that are not free.
-        data: (of the static energies, of the moving ones).
+        data: (data of the static energies, data of the moving ones).
         scale: [n, 1].
         tolerance, iterations: as for `minimise`.
         start: first iterate, where all energies are finite.
@@ -103,7 +103,7 @@ def descend(
         direction, forced = _direction(total, state, hessians, values, of_moving)
         lists, direction, limit = _allowed(total, x, direction, data, state.lists)
         slope = jnp.vdot(direction, gradient)
-        # Terms that cancel in a row of the gradient are of the size of |H| |x|.
+        # Terms that cancel in a row of the gradient have the magnitude of |H| |x|.
         diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(x.shape)
         diagonal = add_diagonals(diagonal, state.lists, of_moving)
         extent = jnp.max(jnp.abs(x), initial=0)
@@ -146,7 +146,7 @@ def _direction(
     values: Array,
     of_moving: Sequence[Array],
 ) -> tuple[Blocks, Array]:
-    """Returns Newton's direction, and whether it must be taken although it may raise the energy."""
+    """Returns Newton's direction, and whether it must be taken even if it raises the energy."""
     right = state.point.gradient
     if state.gap is not None:
         # Fixed unknowns move by their gap; the free ones respond as the linearised forces say.
@@ -160,7 +160,7 @@ def _direction(
 
 
 def _allowed(total: Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) -> tuple[Lists, Blocks, Array]:
-    """Returns the elements along the direction, the direction, shortened if they are too many, and its limit."""
+    """Returns the elements along the direction, the direction, and the largest step that lists and energies allow."""
     if not total.moving:
         return lists, direction, jnp.ones((), x.dtype)
 
@@ -176,7 +176,7 @@ def _allowed(total: Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) 
     begin = lists, jnp.ones((), x.dtype), jnp.asarray(0)
     lists, fraction, _ = jax.lax.while_loop(too_many, shorten, begin)
     limit = fraction * longest_fraction(total.moving, x, fraction * direction, lists, data[1])
-    # With elements left out, no step is known to be allowed.
+    # If elements were left out, no step is known to be allowed.
     return lists, direction, jnp.where(overflow(lists), 0.0, limit)
 
 
@@ -191,8 +191,8 @@ def _descent_direction(
     _, at, solver, moving = total
     shifts = jnp.asarray((*[0.0] * (2 if moving else 1), *_SHIFTS), gradient.dtype)
 
-    # A loop that usually runs once: factorisation and solve are compiled once, and under vmap a branch that projects
-    # would always be taken.
+    # A loop that usually runs once, so that factorisation and solve are compiled once; a branch that projects would
+    # always be taken under vmap.
     def failing(state: _Attempt) -> Array:
         return ~state.descends & (state.number < len(shifts))
 

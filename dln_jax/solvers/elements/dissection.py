@@ -1,9 +1,9 @@
-"""Nested dissection: an elimination order of a sparse symmetric matrix with little fill, from its graph alone.
+"""Nested dissection: an elimination order with little fill for a sparse symmetric matrix, from its graph alone.
 
-A separator splits the graph into two parts that do not touch, the parts are split in turn, and every separator is
-eliminated after the parts on its sides (George 1973). Breadth-first distances from a few distant vertices serve as
-coordinates. Across the longest axis of these coordinates, the smallest separator in a band around the middle is a
-minimum cut (maximum flow) with a capacity of one per vertex.
+A separator splits the graph into two parts that do not touch; the parts are split in turn, and every separator is
+eliminated after the parts on both its sides (George 1973). Breadth-first distances from a few distant vertices serve as
+coordinates. Across the longest axis of these coordinates, the smallest separator within a band around the middle is a
+minimum cut (maximum flow) with unit capacity per vertex.
 """
 
 from collections.abc import Iterator
@@ -14,21 +14,21 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, maximum_flow
 
-# Distant vertices whose distances are the coordinates, and axes of the coordinates that are tried.
+# Number of distant vertices whose distances are the coordinates, and of coordinate axes that are tried.
 _LANDMARKS = 6
 _AXES = 2
-# Share of the vertices that a part keeps at least; what lies between is the band of possible separators.
+# Smallest share of the vertices that a part keeps; the band of possible separators lies between the parts.
 _SMALLEST_PART = 0.36
 
 
 class Node(NamedTuple):
-    """Vertices that are eliminated together, and those that this changes."""
+    """Vertices that are eliminated together, and those affected by it."""
 
     own: Int[np.ndarray, " s"]
     boundary: Int[np.ndarray, " r"]
-    """Neighbours that are eliminated later, in the order of their elimination."""
+    """Neighbours that are eliminated later, in order of elimination."""
     children: tuple[int, ...]
-    """Nodes that are eliminated before, whose boundaries lie in `own` and `boundary`."""
+    """Nodes eliminated earlier, whose boundaries lie in `own` and `boundary`."""
 
 
 def dissect(graph: csr_array, leaf: int) -> list[Node]:
@@ -36,7 +36,7 @@ def dissect(graph: csr_array, leaf: int) -> list[Node]:
 
     Args:
         graph: symmetric, with positive entries off the diagonal and none on it.
-        leaf: vertices below which a part is not split.
+        leaf: parts with at most this many vertices are not split.
     """
     nodes: list[Node] = []
     place = np.empty(len(graph.indptr) - 1, int)
@@ -77,7 +77,7 @@ def bisect(graph: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _work(left: int, right: int, separator: int) -> float:
-    """Compares separators: its own elimination, and that of parts which are out of balance."""
+    """Rates separators: the cost of their own elimination, plus that of unbalanced parts."""
     return separator * (1 + 2 * ((left - right) / (left + right + separator)) ** 2)
 
 
@@ -97,7 +97,7 @@ def _coordinates(graph: csr_array) -> Float[np.ndarray, "n axes"]:
         farthest = np.argmax(np.min(distances, axis=0))
         distances.append(dijkstra(graph, indices=farthest, unweighted=True))
     points = np.stack(distances, axis=1)
-    # Means over the neighbours, because many vertices have equal distances.
+    # Averaged over neighbours, because many vertices have equal distances.
     degree = graph.sum(axis=1)[:, None]
     for _ in range(2):
         points = (points + (graph @ points) / degree) / 2
@@ -109,9 +109,9 @@ def _coordinates(graph: csr_array) -> Float[np.ndarray, "n axes"]:
 def _smallest_separator(
     graph: csr_array, left: np.ndarray, right: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the parts that contain `left` and `right`, and the fewest vertices between them that separate them.
+    """Returns the parts that contain `left` and `right`, and a smallest vertex separator between them.
 
-    A vertex v is an edge of capacity one from node v to node n + v, and is cut if only its first end is reached.
+    A vertex v is an edge of capacity one from node v to node n + v; it is cut if only its first end is reached.
     """
     count = len(graph.indptr) - 1
     source, sink, vertices = 2 * count, 2 * count + 1, np.arange(count)

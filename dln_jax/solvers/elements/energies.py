@@ -2,8 +2,8 @@
 
     E(x) = sum over energies, sum over elements e:  energy(x[indices[e]], data[e]),    x [n, b]
 
-An element couples a few of the n blocks of b unknowns (the corners of a triangle, the ends of a spring), so that
-the Hessian is sparse; `assembly` puts it together.
+An element couples a few of the n blocks of b unknowns (the corners of a triangle, the ends of a spring), so the Hessian
+is sparse; `assembly` puts it together.
 """
 
 import functools
@@ -17,14 +17,14 @@ from jaxtyping import Array, Float, Int
 
 from dln_jax.solvers.lapack import cholesky, symmetric_eigen
 
-# Elements that are decomposed at a time, at most.
+# Largest number of elements that are decomposed at a time.
 _DECOMPOSED = 64
-# Largest Hessians of elements that are projected in one batch.
+# Largest element Hessians that are projected in one batch.
 _SMALL = 36
 
 Blocks = Float[Array, "n b"]
 Corners = Sequence[Sequence[Array]] | Float[Array, "k b"]
-"""x[i][j]: unknown j of corner i, a scalar; `jnp.stack` makes vectors of it. An array [k, b] reads the same."""
+"""x[i][j]: unknown j of corner i, a scalar; `jnp.stack` makes vectors of them. An array [k, b] reads the same."""
 
 
 class ElementEnergy(NamedTuple):
@@ -33,13 +33,14 @@ class ElementEnergy(NamedTuple):
     energy: Callable[[Any, Any], Float[Array, ""]]
     """(unknowns x[i][j] of one element, or their combinations, its data) -> energy."""
     indices: Int[np.ndarray, "m k"]
-    """Blocks of unknowns of the elements; a block occurs at most once in an element."""
+    """Blocks of unknowns of every element; a block occurs at most once per element."""
     unrolled: bool = False
-    """Whether the energy takes scalars (`Corners`) instead of an array [k, b]. Arithmetic of scalars fuses over all
-    elements and makes derivatives several times faster, for elements of up to a dozen unknowns."""
+    """Whether the energy takes scalars (`Corners`) instead of an array [k, b]. Scalar arithmetic fuses over all
+    elements, which makes derivatives several times faster for elements of up to a dozen unknowns."""
     weights: Callable[[Any], Any] | None = None
     """Data of one element -> w[k][j], if the energy takes the combinations y[i][j] = sum over corners k of x[k][i]
-    w[k][j], such as a deformation gradient or an edge: the Hessian by these has fewer columns. Only if unrolled."""
+    w[k][j], such as a deformation gradient or an edge: the Hessian with respect to these is smaller. Only if
+    unrolled."""
 
 
 def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:
@@ -78,7 +79,7 @@ def of_corners(element: ElementEnergy) -> Callable[[Any, Any], Float[Array, ""]]
 
 
 def combinations(x: Corners, weights: Any) -> list[list[Array]]:
-    """Returns y[i][j] = sum over corners k of x[k][i] w[k][j], of one element."""
+    """Returns y[i][j] = sum over corners k of x[k][i] w[k][j] for one element."""
     corners, width, columns = range(len(x)), range(len(x[0])), range(len(weights[0]))
     return [[jnp.asarray(sum(x[k][i] * weights[k][j] for k in corners)) for j in columns] for i in width]
 
@@ -125,7 +126,7 @@ def _unrolled_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Ar
         return _by_scalars(jax.grad(element.energy), y, w, x.shape[1], data)
 
     _, product = jax.linearize(slope, y)
-    # All columns of all elements at once, elements last: column by column it compiles several times longer.
+    # All columns of all elements at once, elements last: compiling column by column takes several times longer.
     unit = jnp.broadcast_to(jnp.eye(len(y), dtype=x.dtype)[:, :, None], (len(y), *y.shape))
     whole = jax.vmap(product)(unit)
     if w is not None:
@@ -139,7 +140,7 @@ def _unrolled_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Ar
 
 
 def _arguments(element: ElementEnergy, x: Blocks, data: Any) -> tuple[Float[Array, "s m"], Array | None]:
-    """Returns the scalars that an unrolled energy takes, elements last, and the weights [k, j, m], if it has any."""
+    """Returns the scalars that an unrolled energy takes, elements last, and its weights [k, j, m], if any."""
     corners = jnp.stack([_take(x, corner).T for corner in element.indices.T])
     weights = element.weights
     if weights is None:
@@ -154,7 +155,7 @@ def _added(parts: Iterable[Array]) -> Array:
 
 
 def _by_scalars(function: Callable, y: Float[Array, "s m"], w: Array | None, width: int, data: Any) -> Any:
-    """Returns the function of the nested scalars and data of one element for all of them, with its trees stacked."""
+    """Maps a function of one element's nested scalars and data over all elements, and stacks its results."""
     columns = width if w is None else w.shape[1]
     rows = [list(y[start : start + columns]) for start in range(0, len(y), columns)]
     results = jax.vmap(function)(rows, data)
@@ -168,12 +169,12 @@ def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
 def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, ...]:
     """Sets negative eigenvalues of element Hessians (lower triangles) to zero, and shifts their diagonals.
 
-    `shift` is relative to the largest diagonal entry of all elements. Elements whose Hessian is positive definite with
-    half of the shift keep it: only the others are decomposed.
+    `shift` is relative to the largest diagonal entry of all elements. An element whose Hessian is positive definite
+    with half of the shift keeps it; only the others are decomposed.
     """
     whole = [jnp.where(jnp.isfinite(h), h, 0) for h in map(square, hessians)]
     largest = functools.reduce(jnp.maximum, [jnp.max(jnp.diagonal(h, axis1=1, axis2=2), initial=0) for h in whole])
-    # Small elements of all kinds form one batch, padded with zeros: one program instead of one for each kind.
+    # Small elements of all kinds form one batch, padded with zeros: one program instead of one per kind.
     small = [number for number, h in enumerate(whole) if h.shape[1] <= _SMALL]
     if len(small) > 1:
         width = max(whole[number].shape[1] for number in small)
@@ -193,7 +194,7 @@ def _projected(hessians: Float[Array, "m s s"], shift: Float[Array, ""]) -> Floa
     count = min(_DECOMPOSED, m)
     unit = jnp.eye(s, dtype=hessians.dtype)
     definite = jnp.isfinite(jax.vmap(cholesky)(hessians + shift / 2 * unit)).all(axis=(1, 2))
-    # Places of the others first; places past the end are read as the last element, and not written.
+    # Places of the others first; places past the end read the last element and are not written.
     order = jnp.append(jnp.argsort(definite), jnp.full(count, m))
 
     def decompose(number: Array, hessians: Array) -> Array:

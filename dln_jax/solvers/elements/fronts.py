@@ -1,11 +1,11 @@
 """Index tables of a multifrontal Cholesky factorisation, made once from the sparsity pattern.
 
-Every node of the elimination tree has a front: a dense matrix over the unknowns that it eliminates and over those that
-this changes, its boundary. Fronts consist of square tiles of one size, whatever their own size, so that few operations
+Every node of the elimination tree has a front: a dense matrix over the unknowns that it eliminates and over its
+boundary, the unknowns that this affects. Fronts of any size consist of square tiles of one size, so that few operations
 are compiled. Only tiles of the lower triangle are stored:
 
-    L    tiles of the eliminated columns, row after row of each front; they are kept
-    U    tiles of the boundary, which the parent adds to its own front; later fronts reuse their place
+        L    tiles of the eliminated columns, row after row of each front; they are kept
+        U    tiles of the boundary, which the parent adds to its own front; later fronts reuse their storage
 """
 
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ Numbers = Int[np.ndarray, " number"]
 
 
 class Steps(NamedTuple):
-    """Columns of tiles that are eliminated, and, after those of a front, the tiles that it leaves for its parent."""
+    """Columns of tiles to eliminate and, after those of a front, the tiles that it leaves for its parent."""
 
     first_target: Numbers
     last_target: Numbers
-    """Range of the tiles that are computed; `last` is past the end here and below."""
+    """Range of the tiles to compute; `last` is past the end here and below."""
     columns: Numbers
-    """1 for a column that is eliminated, else 0."""
+    """1 for a column to eliminate, else 0."""
     diagonal: Numbers
     """The column's diagonal tile."""
     first_below: Numbers
@@ -37,14 +37,14 @@ class Steps(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Tiles to compute: entries of the matrix and parts from the children, minus products of tiles of L."""
+    """Tiles to compute: entries of the matrix plus parts from the children, minus products of tiles of L."""
 
     tile: Numbers
     kept: Numbers
     """1 for tiles of L, which start from entries of the matrix; 0 for tiles of U, which start from zero."""
     left: Numbers
     right: Numbers
-    """First tiles of the rows of L that are multiplied."""
+    """First tiles of the rows of L to multiply."""
     products: Numbers
     """Number of products."""
     first_part: Numbers
@@ -52,11 +52,11 @@ class Targets(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a child adds to a tile: consecutive rows and columns of its U, which lie in two by two tiles at most."""
+    """What a child adds to a tile: consecutive rows and columns of its U, which lie in at most two by two tiles."""
 
     upper: Numbers
     lower: Numbers
-    """First of the two tiles that have the upper rows, and the lower rows."""
+    """First of the two tiles that hold the upper rows, and the lower rows."""
     first_row: Numbers
     first_column: Numbers
     """Number of the first row and column of these tiles in U."""
@@ -71,7 +71,7 @@ class Plan(NamedTuple):
     size: int
     """Rows and columns of a tile."""
     tiles: int
-    """Number of tiles that are stored."""
+    """Number of stored tiles."""
     steps: Steps
     targets: Targets
     parts: Parts
@@ -86,7 +86,7 @@ class Plan(NamedTuple):
     units: Numbers
     """Places of padding on the diagonal, where the matrix is the unit matrix."""
     length: int
-    """Places in the order of elimination, padded to whole tiles."""
+    """Number of places in the order of elimination, padded to whole tiles."""
     places: Numbers
     """Place of every unknown in that order; past its end if the unknown is not eliminated."""
 
@@ -95,13 +95,13 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
     """Returns the tables.
 
     Args:
-        nodes: of unknowns, the children before their parents.
-        rows, columns: of the entries of the matrix, a lower triangle.
+        nodes: nodes of unknowns, children before their parents.
+        rows, columns: rows and columns of the entries of the matrix, a lower triangle.
         unknowns: n.
-        size: of a tile.
+        size: rows and columns of a tile.
     """
     own, beyond = (np.array([-(-len(node[i]) // size) for node in nodes], int) for i in range(2))
-    # Where an unknown is eliminated: the front, and the place in it.
+    # Where an unknown is eliminated: its front, and its place in it.
     front_of, place_in = np.full(unknowns, -1), np.zeros(unknowns, int)
     for number, node in enumerate(nodes):
         front_of[node.own], place_in[node.own] = number, np.arange(len(node.own))
@@ -163,7 +163,7 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
         local[front] = -1
     return Plan(
         size,
-        # Two tiles are read where there may be one.
+        # Two tiles are always read, even where only one exists.
         end + 1,
         Steps(*_columns(steps, 7)),
         Targets(*_columns(targets, 7)),
@@ -179,7 +179,7 @@ def plan(nodes: Sequence[Node], rows: Numbers, columns: Numbers, unknowns: int, 
 
 
 def _columns(rows: list[tuple[int, ...]], count: int) -> Int[np.ndarray, "count number"]:
-    # One row at least, because an empty table cannot be indexed.
+    # At least one row, because an empty table cannot be indexed.
     return np.array(rows or [(0,) * count], np.int32).T
 
 
@@ -195,7 +195,7 @@ def _inside(row: Int[np.ndarray, " tiles"], i: Numbers, j: Numbers, size: int) -
 
 
 def _storage(nodes: Sequence[Node], sizes: Numbers, end: int) -> tuple[Numbers, int]:
-    """Returns places from `end` on for the U of the nodes, which reuse those that were read, and their end."""
+    """Returns places from `end` on for the U of the nodes, reusing those already read, and their end."""
     place, holes = np.zeros(len(nodes), int), []
     for number, node in enumerate(nodes):
         size = int(sizes[number])
@@ -213,7 +213,7 @@ def _storage(nodes: Sequence[Node], sizes: Numbers, end: int) -> tuple[Numbers, 
 
 
 def _with_hole(holes: list[tuple[int, int]], start: int, stop: int) -> list[tuple[int, int]]:
-    """Adds a hole, united with those next to it."""
+    """Adds a hole, merged with those next to it."""
     kept = []
     for hole in holes:
         if hole[1] == start:

@@ -42,18 +42,18 @@ def line_search(
     """Takes the first of the steps l, l/2, l/4, ... that lowers the energy, or the gradient if rounding hides that.
 
     Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
-    improving by many digits beyond that. Returns the point, which is the start if no step is accepted, and the length
-    of the step, then 0.
+    improving by many digits beyond that. Returns the point and the length of the step; if no step is accepted, the
+    start and 0.
 
     Args:
         evaluate: x -> energy and gradient.
         start: the point where the search starts.
         direction: a descent direction.
         slope: derivative of the energy along the direction, <= 0.
-        unclear: changes of the energy that rounding hides.
+        unclear: size of energy changes that rounding hides.
         scale: unit of the gradient's rows.
         longest: the first length l.
-        any_change: whether any step to a finite energy is accepted.
+        any_change: whether to accept any step to a finite energy.
     """
 
     def size(gradient: Blocks) -> Array:

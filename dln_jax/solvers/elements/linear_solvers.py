@@ -1,13 +1,13 @@
 """Solves symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
 
-There are four methods, between which `selection` chooses:
+There are four methods; `selection` chooses one:
 
 - dense Cholesky;
 - block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for narrow bands;
 - multifrontal Cholesky after nested dissection, for wide bands;
 - matrix-free conjugate gradients with a block-Jacobi preconditioner on the element Hessians.
 
-A matrix that is not positive definite gives a solution that is not finite, without shifts or clamping.
+If the matrix is not positive definite, the solution is not finite: there are no shifts and no clamping.
 """
 
 import itertools
@@ -38,15 +38,15 @@ from dln_jax.solvers.elements.symmetric_systems import (
 from dln_jax.solvers.elimination import solve as eliminate
 from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 
-# Bands up to here, in batches of so many, are factorised faster than each matrix by LAPACK; as measured with 56 to 120
-# unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
+# Batches of bands up to this width, and of at least this size, are factorised faster together than by LAPACK one by
+# one; measured with 56 to 120 unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
 _LOWER_BANDS = 4
-# Unknowns of a part of the body that is not dissected any further, and rows of a tile: of 48 to 96 and 96 to 192 the
-# fastest on bodies of 800 to 20,000 unknowns.
+# Number of unknowns below which a part of the body is not dissected, and rows of a tile: the fastest of 48 to 96 and 96
+# to 192 on bodies of 800 to 20,000 unknowns.
 _LEAF_UNKNOWNS = 128
 TILE = 64
-# Relative residuals of the conjugate gradients, and the products after which they give up.
+# Relative residuals of the conjugate gradients, and the number of products after which they give up.
 _SOLVE_RESIDUAL = 1e-10
 SEARCH_RESIDUAL = 1e-2
 _UPPER_PRODUCTS = 10_000
@@ -58,7 +58,7 @@ class LinearSolver(NamedTuple):
     factorise: Callable[[Sequence[Array], Any], Any]
     """(element Hessians, entries of their sum [entries], or what `with_moving` expects) -> factor for the solves."""
     solve: Callable[[Any, Blocks], Blocks]
-    """(factor, b) -> p, to the accuracy of rounding; p is zero where the pattern is not free."""
+    """(factor, b) -> p, accurate to rounding; p is zero where the pattern is not free."""
     search: Callable[[Any, Blocks], Blocks]
     """(factor, b) -> p, accurate enough for a search direction."""
 
@@ -68,7 +68,7 @@ LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 
 def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Factorises the whole matrix by Cholesky; under `vmap`, on a CPU, all narrow bands together."""
+    """Factorises the whole matrix by Cholesky; under `vmap` on a CPU, a batch of narrow bands side by side."""
     table = lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
@@ -96,7 +96,7 @@ def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 def _one_or_many(
     one: Callable[[Array, Columns], Columns], at: Pattern, order: np.ndarray, band: int
 ) -> Callable[[Array, Columns], Columns]:
-    """Returns the solve (entries, b) -> x by `one`, for a batch by banded factorisations side by side."""
+    """Returns the solve (entries, b) -> x by `one`; a batch is solved by banded factorisations side by side."""
     row, column = places(at.unknowns, band)
     numbers = np.append(order, np.full(max(row.max(), column.max()) + 1 - at.unknowns, at.unknowns))
     beyond = (row == column) & (row >= at.unknowns)
@@ -117,11 +117,11 @@ def _one_or_many(
 
 
 def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Factorises by blocks with Cholesky, the unknowns ordered so that only neighbouring blocks couple."""
+    """Factorises by blocks with Cholesky; the unknowns are ordered so that only neighbouring blocks couple."""
     order = narrowest_order(at)
     size = width_of_band(at, order)
     count = -(-at.blocks // size)
-    # Unknowns in their new order; the last block is padded with unknowns that couple to nothing.
+    # Unknowns in the new order; the last block is padded with unknowns that couple to nothing.
     numbers = np.full(count * size * at.width, at.unknowns)
     numbers[: at.unknowns] = (order[:, None] * at.width + np.arange(at.width)).ravel()
     numbers = numbers.reshape(count, size * at.width)
@@ -144,9 +144,9 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 
 
 def sparse(_: Sequence[ElementEnergy], at: Pattern, *, tables: Plan | None = None) -> LinearSolver:
-    """Factorises by multifrontal Cholesky, by `tables` if `elimination_plan` is already computed.
+    """Factorises by multifrontal Cholesky; pass `tables` if `elimination_plan` is already computed.
 
-    The factor is also a preconditioner of similar matrices: `solve` takes any right-hand side.
+    The factor also serves as a preconditioner for similar matrices: `solve` takes any right-hand side.
     """
     tables = elimination_plan(at) if tables is None else tables
 
@@ -181,7 +181,7 @@ def elimination_plan(at: Pattern) -> Plan:
 def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Solves by conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
 
-    A solution that does not reach its relative residual is not finite.
+    A solution that misses its relative residual is not finite.
     """
     n, b = at.blocks, at.width
     numbers = np.arange(n * b).reshape(n, b)
@@ -209,7 +209,7 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 def summed_products(
     energies: Sequence[ElementEnergy], at: Pattern, hessians: Sequence[Float[Array, "_ _ _"]], x: Blocks
 ) -> Blocks:
-    """Returns the product of the sum of whole element Hessians, one array [m, s, s] for each energy, with x."""
+    """Returns the product of the sum of whole element Hessians, one array [m, s, s] per energy, with x."""
     out = jnp.zeros_like(x)
     for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
         at_corners = x[element.indices].reshape(len(element.indices), -1, 1)
@@ -226,7 +226,7 @@ def lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
     def places(row: np.ndarray, column: np.ndarray) -> np.ndarray:
         row, column = np.broadcast_arrays(row, column)
-        # The lower triangle stands for both.
+        # The lower triangle serves for both.
         wanted = np.maximum(row, column) * size + np.minimum(row, column)
         nearest = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
         place = np.where(key[order][nearest] == wanted, order[nearest], len(key))
@@ -245,7 +245,7 @@ def with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"
 
 
 def narrowest_order(at: Pattern) -> Int[np.ndarray, " n"]:
-    """Returns the reverse Cuthill-McKee order, or the present one if its band is narrower (meshes built by rows)."""
+    """Returns the reverse Cuthill-McKee order, or the given one if its band is narrower (meshes built by rows)."""
     rows, columns = at.rows // at.width, at.columns // at.width
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(at.blocks, at.blocks)).tocsr()
     ordering = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
@@ -253,6 +253,6 @@ def narrowest_order(at: Pattern) -> Int[np.ndarray, " n"]:
 
 
 def width_of_band(at: Pattern, order: np.ndarray) -> int:
-    """Returns the largest distance in the order between two blocks that couple, at least 1."""
+    """Returns the largest distance in the order between two coupled blocks, at least 1."""
     place = np.argsort(order)
     return max(1, int(np.abs(place[at.rows // at.width] - place[at.columns // at.width]).max(initial=0)))

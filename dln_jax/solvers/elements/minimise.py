@@ -3,7 +3,7 @@
     x* = argmin E(x; theta),    H p = -g,    x <- x + t p                      (Newton with a line search)
     dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
 
-The iterations are in `descent`. The derivative belongs to the minimum and not to the iterations: it takes one
+The iterations are in `descent`. The derivative is that of the minimum, not of the iterations: it takes one
 factorisation and one solve, in forward and reverse mode and to any order. At a point that is not a minimum the
 derivative is NaN, never a plausible number.
 """
@@ -59,17 +59,17 @@ def minimise(
         x0: start [n, b]; float32 or float64 decides the precision.
         data: for every energy, the data of its elements (leading axis m); for one function, its second argument.
         free: [n, b], which unknowns are solved for (default: all); the others keep their value in x0.
-        scale: positive unit of the gradient's rows, [n] or a number; masses make the residual an acceleration.
-        tolerance: largest |dE/dx| / scale that counts as a minimum; a gradient of rounding size always does.
-        iterations: Newton steps after which the search gives up, which `SolverInfo.converged` reports.
+        scale: positive unit of the gradient's rows, [n] or a number; with masses the residual is an acceleration.
+        tolerance: largest |dE/dx| / scale that counts as a minimum; a gradient at the level of rounding always does.
+        iterations: number of Newton steps after which the search gives up; see `SolverInfo.converged`.
         linear_solver: `by_size`, or one of `solvers.elements.linear_solvers`: `dense`, `block_tridiagonal`,
-            `sparse`, `matrix_free`. Moving energies have a solver of their own.
+            `sparse`, `matrix_free`. Moving energies have their own solver.
         at: the energies' pattern, if already computed.
         definite: also report `SolverInfo.definite`, at the cost of another Hessian, factorisation and accurate solve.
-        moving: further energies, whose elements change with x and which bound the steps.
+        moving: further energies, whose elements change with x and which limit the steps.
         moving_data: the data of these energies.
-        start: start [n, b] that the moving energies allow, if x0 is not one; its unknowns that are not free approach
-            their values in x0 as far as the moving energies allow. It has no derivatives.
+        start: start [n, b] that the moving energies allow, if x0 is not allowed; unknowns that are not free approach
+            their values in x0 as far as these energies allow. It has no derivatives.
 
     Raises:
         InputError: indices, shapes or settings are invalid.
@@ -92,7 +92,7 @@ def minimise(
         x, info = descend(total, x0, data, scale, tolerance, iterations, start)
         if not definite:
             return x, info
-        # For a matrix that is not positive definite, the factor and its solutions are not finite.
+        # If the matrix is not positive definite, the factor and its solutions are not finite.
         solved = total.solver.solve(_factor(total, x, data, _lists_of(info)), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
 
@@ -107,7 +107,7 @@ def minimise(
 
 
 def is_constant(tangent: Any) -> bool:
-    """Whether a tangent of a rule with symbolic zeros is known to be zero."""
+    """Whether a tangent is known to be zero, in a rule with symbolic zeros."""
     return isinstance(tangent, SymbolicZero) or getattr(tangent, "dtype", None) == jax.dtypes.float0
 
 
@@ -129,7 +129,7 @@ def _implicit_derivative(total: Sum, x: Blocks, data: Any, lists: Lists, x0_dot:
     varying = [i for i, dot in enumerate(dots) if not is_constant(dot)]
     moving = not (at.free.all() or is_constant(x0_dot))
 
-    # Reverse mode saves only the arguments: recomputing takes less time than reading saved intermediates.
+    # Reverse mode saves only the arguments: recomputing is faster than reading saved intermediates.
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def response(x: Blocks, leaves: list[Array], varied_dots: list[Array], fixed_dot: Any) -> Blocks:
         data = structure.unflatten(leaves)
@@ -149,7 +149,7 @@ def _implicit_derivative(total: Sum, x: Blocks, data: Any, lists: Lists, x0_dot:
             _, right = jax.jvp(gradient_of, (x, varied), (fixed_dot, varied_dots))
         else:
             _, right = jax.jvp(lambda variables: gradient_of(x, variables), (varied,), (varied_dots,))
-        # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
+        # The solve is differentiated through its product, so that the factor needs no derivatives.
         factor = _factor(total, *jax.lax.stop_gradient((x, data)), lists)
         return jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
 

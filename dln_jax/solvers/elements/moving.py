@@ -1,12 +1,12 @@
 """Sums of element energies whose elements are not known before tracing, such as pairs of primitives in contact.
 
-An energy of moving elements is a function of a few blocks of unknowns, as in `energies`, but which blocks they are
-depends on the unknowns. It lists all elements that may act between two points, in a list of fixed capacity, and bounds
-how far a step may go. Between two such lists the elements are fixed, and so they are in derivatives.
+An energy of moving elements is a function of a few blocks of unknowns, as in `energies`, but the blocks depend on the
+unknowns. It lists all elements that may act between two points, in a list of fixed capacity, and limits how far a step
+may go. Given such a list, the elements are fixed, and so they are in derivatives.
 
-Systems with their Hessians are solved densely, or by conjugate gradients that are preconditioned with the factor of the
-static elements and the diagonal blocks of the moving ones: the iterations needed are at most about the number of
-elements that act.
+Systems with their Hessians are solved densely, or by conjugate gradients preconditioned with the factor of the static
+elements and the diagonal blocks of the moving ones, which need about as many iterations as there are acting elements,
+at most.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,9 +34,9 @@ class Elements(NamedTuple):
     """Elements that may act between two points."""
 
     indices: Int[Array, "capacity k"]
-    """Blocks of unknowns of every element; all different in an element that is used."""
+    """Blocks of unknowns of every element; all different in a used element."""
     data: Any
-    """What else the energy needs to know of them, without derivatives: a pytree with leading axis `capacity`."""
+    """Further data of the elements, without derivatives: a pytree with leading axis `capacity`."""
     overflow: Bool[Array, ""]
     """Whether elements had to be left out."""
 
@@ -74,7 +74,7 @@ def longest_fraction(
 
 
 def overflow(lists: Lists) -> Bool[Array, ""]:
-    """Whether a list was too short."""
+    """Whether any list was too short."""
     return jnp.stack([jnp.asarray(False), *(elements.overflow for elements in lists)]).any()
 
 
@@ -114,7 +114,7 @@ def moving_products(lists: Lists, hessians: Sequence[Array], x: Blocks) -> Block
 
 
 def add_diagonals(diagonal: Blocks, lists: Lists, hessians: Sequence[Array]) -> Blocks:
-    """Adds the sizes of the diagonal entries of moving elements to those of the static ones."""
+    """Adds the absolute diagonal entries of moving elements to those of the static ones."""
     for elements, of_elements in zip(lists, hessians, strict=True):
         own = jnp.abs(jnp.diagonal(of_elements, axis1=1, axis2=2))
         diagonal = diagonal.at[elements.indices].add(own.reshape(*elements.indices.shape, -1))
@@ -122,7 +122,7 @@ def add_diagonals(diagonal: Blocks, lists: Lists, hessians: Sequence[Array]) -> 
 
 
 def with_moving(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Returns the solver of systems with the Hessians of static and of moving elements.
+    """Returns the solver of systems with the Hessians of static and moving elements.
 
     Its `factorise` takes (static element Hessians, (entries of their sum, lists, moving Hessians)).
 
@@ -134,7 +134,7 @@ def with_moving(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 
 
 def _projected(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity s s"]:
-    """Sets negative eigenvalues to zero, one after the other for the elements that act, which are few."""
+    """Sets negative eigenvalues to zero, one acting element after the other: there are few."""
     hessians = jnp.where(jnp.isfinite(hessians), hessians, 0)
     acting = (hessians != 0).any(axis=(1, 2))
     order = jnp.argsort(~acting)

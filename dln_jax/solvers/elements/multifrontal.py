@@ -1,11 +1,11 @@
-"""Multifrontal Cholesky factorisation of a sparse matrix, H = L Lᵀ, along a plan of its fronts (Duff and Reid 1983).
+"""Multifrontal Cholesky factorisation of a sparse matrix, H = L Lᵀ, following a plan of its fronts (Duff, Reid 1983).
 
-A front adds entries of H and the matrices U that its children in the elimination tree left, and is eliminated:
+A front sums entries of H and the matrices U that its children in the elimination tree left; then it is eliminated:
 
     F = [[F11, F21ᵀ], [F21, F22]],    L11 L11ᵀ = F11,    L21 L11ᵀ = F21,    U = F22 - L21 L21ᵀ
 
-by square tiles, left-looking within the front. Loops over tiles have lengths from the plan, so that one compiled body
-serves fronts of any size.
+by square tiles, left-looking within the front. Loops over tiles take their lengths from the plan, so that one compiled
+body serves fronts of any size.
 """
 
 from typing import Any
@@ -35,12 +35,13 @@ def factorise(at: Plan, entries: Float[Array, " entries"]) -> Tiles:
         def add(number: Array, sum_: Array) -> Array:
             part = _row(at.parts, number)
             row, column = (_slice(at.child_rows, first, at.size) for first in (part.rows, part.columns))
-            # Rows and columns have the same order in parent and child: its lower triangle comes from this one's.
+            # Rows and columns have the same order in parent and child, so the parent's lower triangle gives the
+            # child's.
             known = (column >= 0) & (row[:, None] >= column)
             i, j = row - part.first_row, column - part.first_column
             of_row = lax.div(i, size) * (2 * count) + lax.rem(i, size) * size
             place = jnp.where(known, of_row[:, None] + lax.div(j, size) * count + lax.rem(j, size), -1)
-            # The barrier keeps the places from being computed again, slowly, in the loop that reads the numbers.
+            # The barrier keeps XLA from recomputing the places, slowly, in the loop that reads the numbers.
             place = lax.optimization_barrier(place)
             near = jnp.concatenate([_slice(tiles, first, 2) for first in (part.upper, part.lower)])
             return sum_ + jnp.where(place >= 0, _take(near.reshape(-1), jnp.maximum(place, 0)), 0)

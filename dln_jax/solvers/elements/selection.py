@@ -1,4 +1,4 @@
-"""Chooses a linear solver before tracing, by the estimated work for size, structure and stiffness.
+"""Chooses a linear solver before tracing, from the estimated work for size, structure and stiffness.
 
 - `dense` for small systems;
 - `block_tridiagonal` for narrow bands: bodies in the plane, and small or long ones in space;
@@ -6,8 +6,8 @@
 - `matrix_free` for soft bodies in small time steps, and for systems whose factor would not fit into memory.
 
 Stiffness, Poisson's ratio, time step and mesh together determine how many products conjugate gradients need for a
-search direction: it grows with the square root of the condition number of the Hessian. It can be measured only for
-concrete numbers.
+search direction: the number grows with the square root of the Hessian's condition number. It can be measured only with
+concrete values.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,9 +45,9 @@ _DENSE_UNKNOWNS = 160
 # rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
 # unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
 # unknowns takes 6e-10 s m s², within 1.7. A search to 1e-2 takes 1.6 to 5 N^(1/d) products at nu = 0.3 and 7 to 16 at
-# nu = 0.49 or E = 1e8, for N vertices in dimension d; and because it is inexact, a step takes 1.5 to 2 times the Newton
-# iterations. The products below stand for all of that. Whole steps in space by blocks, in units of those without a
-# matrix: 675 unknowns 0.69 (nu = 0.3) and 0.38 (0.49); 1,911: 1.19 and 0.50; 4,131 (6,994 tetrahedra): 1.88 and 0.74.
+# nu = 0.49 or E = 1e8, for N vertices in dimension d; because it is inexact, a step takes 1.5 to 2 times the Newton
+# iterations. `_PRODUCTS` accounts for all of that. Time of whole steps in space by blocks, relative to matrix-free:
+# 675 unknowns 0.69 (nu = 0.3) and 0.38 (0.49); 1,911: 1.19 and 0.50; 4,131 (6,994 tetrahedra): 1.88 and 0.74.
 _BLOCK_SECONDS = 1.3e-10
 _BLOCK_OVERHEAD = 150
 _PRODUCT_SECONDS = 6e-10
@@ -55,14 +55,14 @@ _PRODUCTS = 15
 # An inexact search takes this many times the Newton iterations, also when its products are measured.
 _MORE_ITERATIONS = 1.75
 _LOWER_PRODUCTS = 20
-# Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
+# Largest number of entries n b of the blocks that is stored; values, factor and index tables take 48 bytes per entry.
 _UPPER_ENTRIES = 3e7
-# Operations of the multifrontal factorisation: products of tiles, parts from children, targets, tiles below the
-# diagonal and columns. Measured in the same way (825 to 21,756 unknowns), within a factor of 1.4.
+# Seconds per operation of the multifrontal factorisation: products of tiles, parts from children, targets, tiles below
+# the diagonal and columns. Measured in the same way (825 to 21,756 unknowns), within a factor of 1.4.
 _SPARSE_SECONDS = (22e-6, 15e-6, 7e-6, 20e-6, 25e-6)
-# No tree takes less per unknown: a column of tiles, one below it, and their targets and products.
+# Lower bound per unknown for any tree: a column of tiles, one below it, and their targets and products.
 _LEAST_SPARSE_SECONDS = 1e-4 / TILE
-# Entries of the tiles, 8 bytes each; their places are 32-bit numbers.
+# Largest number of entries of the tiles, 8 bytes each; their places are 32-bit numbers.
 _UPPER_TILE_ENTRIES = 5e8
 
 
@@ -78,7 +78,7 @@ def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, d
 
 
 def known_data(values: Any, data: Callable[[], Any]) -> Any | None:
-    """Data of the elements, or `None` if a value is traced or a control is missing."""
+    """Returns the data of the elements, or `None` if a value is traced or a control is missing."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
         return None
     try:
@@ -113,18 +113,18 @@ def least_work(
         return matrix_free
     product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
     if search_takes_at_most is None:
-        # Vertices along an edge of the body; a product carries information across one of them.
+        # Number of vertices along an edge of the body; a product carries information across one of them.
         across = at.blocks ** (1 / min(at.width, 3))
         return direct if factorisation <= _PRODUCTS * across * product else matrix_free
     affordable = int(factorisation / (_MORE_ITERATIONS * product))
-    # So few products gain little, and the measurement costs a compilation.
+    # So few products gain little, and measuring costs a compilation.
     if affordable < _LOWER_PRODUCTS or not search_takes_at_most(affordable):
         return direct
     return matrix_free
 
 
 def _direct(at: Pattern) -> tuple[LinearSolverFactory | None, float]:
-    """Returns the direct solver with the least work that fits into memory, if one does, and its estimated seconds."""
+    """Returns the direct solver with the least work that fits into memory, if any, and its estimated seconds."""
     size = width_of_band(at, narrowest_order(at)) * at.width
     stored = at.unknowns * size
     seconds = _BLOCK_SECONDS * stored * (size + _BLOCK_OVERHEAD) if stored <= _UPPER_ENTRIES else np.inf
@@ -145,8 +145,7 @@ def search_takes_at_most(
 ) -> bool:
     """Returns whether conjugate gradients with a block-Jacobi preconditioner need at most `products` products.
 
-    It solves with the Hessian at x for a uniform and a random right-hand side, and compiles one product of an element's
-    Hessian.
+    Solves with the Hessian at x for a uniform and a random right-hand side; compiles one element Hessian product.
 
     Args:
         products: the limit, which also bounds the work.

@@ -1,13 +1,13 @@
-"""Symmetric systems of structure: block-tridiagonal and banded Cholesky factorisations, and conjugate gradients.
+"""Structured symmetric systems: block-tridiagonal and banded Cholesky factorisations, and conjugate gradients.
 
-Block-tridiagonal matrices take a scan over the blocks:
+Block-tridiagonal matrices are factorised by a scan over the blocks:
 
     H = [[D_0, C_1ᵀ, ...], [C_1, D_1, C_2ᵀ, ...], ...],    H = L Lᵀ with diagonal blocks L_i and blocks W_i below them:
     L_i L_iᵀ = D_i - W_i W_iᵀ,    W_i L_{i-1}ᵀ = C_i
 
-Many systems with narrow bands are solved side by side, A x = b, A = L Lᵀ. A few hundred operations per unknown are too
-few for one library call per system. Here every number is a vector over the systems, the last axis, so that a loop over
-the columns works on long vectors. Unknowns are taken in pairs:
+Many narrow-band systems A x = b, A = L Lᵀ, are solved side by side: a few hundred operations per unknown are too few
+for one library call per system. Every number is a vector over the systems (the last axis), so that a loop over the
+columns works on long vectors. Unknowns are taken in pairs:
 
     X_J = A_J - sum over P >= 1 of L_{J-P} (L_{J-P}'s pair at J)ᵀ,    L_JJ L_JJᵀ = X_JJ,    L_IJ = X_IJ L_JJ⁻ᵀ
 
@@ -40,7 +40,7 @@ def factorise_blocks(diagonal: Float[Array, "count s s"], below: Float[Array, "c
 
     Args:
         diagonal: D_i; only their lower triangles are read.
-        below: C_1, C_2, ...: block i of the rows against block i - 1 of the columns.
+            below: C_1, C_2, ...: rows of block i, columns of block i - 1.
     """
 
     def eliminate(previous: Array, blocks: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
@@ -83,14 +83,14 @@ def conjugate_gradients(
 ) -> Vector:
     """Returns x with A x = b to a relative residual, |b - A x| <= tolerance |b|, starting from x = 0.
 
-    A direction of curvature <= 0 shows that A is not positive definite. The result is not finite then, or if the
-    iterations do not suffice.
+    A direction of curvature <= 0 shows that A is not positive definite. Then, or if the iterations do not suffice, the
+    result is not finite.
 
     Args:
         product: x -> A x, A symmetric.
         precondition: r -> an approximation of A⁻¹ r, symmetric positive definite.
         tolerance: relative residual.
-        iterations: products after which the search gives up.
+        iterations: number of products after which the search gives up.
     """
     enough = tolerance * jnp.linalg.norm(b.reshape(-1))
 
@@ -117,7 +117,7 @@ def conjugate_gradients(
 
 
 def places(unknowns: int, band: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rows and columns of the entries [pairs, rows, 2] of `Columns`, some of them beyond the matrix.
+    """Returns rows and columns of the entries [pairs, rows, 2] of `Columns`; some are beyond the matrix.
 
     Args:
         unknowns: n.
@@ -132,7 +132,7 @@ def solve_bands(lower: Columns, b: Float[Array, "unknowns k systems"]) -> Float[
     """Returns x with A x = b for all systems; not finite for a matrix that is not positive definite.
 
     Args:
-        lower: entries of A at `places`; those beyond the matrix equal the unit matrix.
+        lower: entries of A at `places`; those beyond the matrix are those of the unit matrix.
         b: k right-hand sides of every system.
     """
     count, rows, _, systems = lower.shape
