@@ -1,7 +1,7 @@
 """Arguments of one state: converts them to vectors of one floating type, or refuses them in one line.
 
-These checks belong to the boundary where functions are handed out; the mechanics behind it checks nothing. Shapes are
-static, so that they cost a compiled function nothing.
+These checks run at the boundary where functions are handed out; the mechanics behind it checks nothing. Shapes are
+static, so the checks cost a compiled function nothing.
 """
 
 from collections.abc import Callable
@@ -22,14 +22,14 @@ Answer = TypeVar("Answer")
 def vectors(size: int | None = None, /, **arguments: Any) -> tuple[Array, ...]:
     """Converts the arguments to vectors [size] of one floating type, in order.
 
-    The type is the widest floating one among them, and JAX's default for whole numbers.
+    The type is the widest floating type among them, or JAX's default if all are integers.
 
     Args:
-        size: of all vectors; by default that of the first.
-        arguments: by name; `types.VectorLike` is accepted.
+        size: size of all vectors; by default that of the first.
+        arguments: arguments by name; `types.VectorLike` is accepted.
 
     Raises:
-        InputError: names the argument that holds no real numbers, or has another shape; use `jax.vmap` for a batch.
+        InputError: an argument, which the message names, is not real or has another shape; use `jax.vmap` for a batch.
     """
     arrays = {name: _real_array(name, value) for name, value in arguments.items()}
     expected = None if size is None else (size,)
@@ -58,7 +58,7 @@ def require_size_of(energy: Callable[..., Any], size: int) -> None:
     """Raises `InputError` unless an energy (q, x) takes vectors [size].
 
     It raises if the energy reads entries beyond them, or depends on neither q nor x of some coordinate. The first test
-    requires an energy that takes NumPy arrays, the second one that depends on no traced values.
+    needs an energy that accepts NumPy arrays, the second one that does not depend on traced values.
     """
     q, x = 0.3 + 0.1 * np.arange(size), 0.7 + 0.2 * np.arange(size)
     wrong = f"the system takes no states of size {size}"
@@ -66,13 +66,13 @@ def require_size_of(energy: Callable[..., Any], size: int) -> None:
         jax.eval_shape(lambda: energy(q, x))
     except IndexError as error:  # NumPy arrays raise it; JAX would take the last element
         raise InputError(f"{wrong} ({error}); give vectors [d] of its own size") from error
-    except Exception:  # an energy need not take NumPy's arrays
+    except Exception:  # an energy need not accept NumPy arrays
         pass
     with jax.ensure_compile_time_eval():
         slopes = jax.jit(jax.grad(energy, argnums=(0, 1)))(jnp.asarray(q), jnp.asarray(x))
     if any(isinstance(slope, Tracer) for slope in slopes):
         return
-    # A coordinate may have no potential or, if the mass matrix is singular, no inertia, but one of them.
+    # A coordinate may lack a potential or, if the mass matrix is singular, inertia, but not both.
     if not (read := np.any(slopes, axis=0)).all():
         unused = ", ".join(str(k) for k in np.flatnonzero(~read))
         raise InputError(f"{wrong}: its energy does not depend on coordinate {unused} (counted from 0) or its rate")

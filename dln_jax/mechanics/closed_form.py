@@ -36,7 +36,7 @@ class ClosedForm(NamedTuple):
     potential: Potential | None = None
     """q -> V, scalar."""
     gravity: Callable[[Array], Array] | None = None
-    """q -> g = dV/dq [d]; `None` exactly where there is no potential."""
+    """q -> g = dV/dq [d]; `None` if and only if there is no potential."""
     dissipation: Dissipation | None = None
     """(q, qd) -> Rayleigh function D, scalar."""
     friction: Callable[[Array, Array], Array] | None = None
@@ -59,21 +59,21 @@ class RecursiveSystem(NamedTuple):
 
 
 Explicit = ClosedForm | RecursiveSystem
-"""Energies with a mass matrix as a function."""
+"""Energies with an explicit mass matrix."""
 
 
 def lagrangian(system: Explicit) -> Lagrangian:
-    """L(q, qd) = ½ qdᵀ M(q) qd - V(q), for the generic functions of `mechanics.lagrangian`."""
+    """Returns L(q, qd) = ½ qdᵀ M(q) qd - V(q), for the generic functions of `mechanics.lagrangian`."""
     return lambda q, qd: minus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
 
 
 def energy(system: Explicit, q: Vector, qd: Vector) -> Scalar:
-    """Energy T + V."""
+    """Returns the energy T + V."""
     return plus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
 
 
 def decompose(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-    """Inertial, Coriolis and gravity force, all [d]."""
+    """Returns the inertial, Coriolis and gravity forces, all [d]."""
     if isinstance(system, RecursiveSystem):
         return decompose_by_differences(system.forces, q, qd, qdd)
     return Decomposition(
@@ -84,7 +84,7 @@ def decompose(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Decomposi
 
 
 def forces(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] of a motion, without friction."""
+    """Returns the generalised force tau [d] of a motion, without friction."""
     if isinstance(system, RecursiveSystem):
         return system.forces(q, qd, qdd)
     tau = system.mass_matrix(q) @ qdd + system.coriolis(q, qd)
@@ -92,7 +92,7 @@ def forces(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Vector:
 
 
 def inverse_dynamics(system: Explicit, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] of a motion, friction included."""
+    """Returns the generalised force tau [d] of a motion, including friction."""
     tau, friction = forces(system, q, qd, qdd), friction_of(system)
     return tau if friction is None else tau + friction(q, qd)
 

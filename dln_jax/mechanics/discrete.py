@@ -5,9 +5,9 @@ A step for controllers is x_next = F(x, u, dt), with A = dF/dx and B = dF/du:
     x = (q, qd) [2 d],   qdd = forward_dynamics(q, qd, tau),   tau = actuation u, held over the step
     x = (q, p) [2 d] in a phase space, without u
 
-It takes a fixed number of operations: its implicit midpoint rule takes a fixed number of Newton steps, while that
-of `mechanics.integrators` iterates until it has converged. Derivatives are exact (for the implicit step by the implicit
-function theorem at the last iterate) and share the Jacobians of `mechanics.jacobians`.
+A step takes a fixed number of operations: the implicit midpoint rule here takes a fixed number of Newton steps, while
+that of `mechanics.integrators` iterates until it has converged. Derivatives are exact (for the implicit step by the
+implicit function theorem at the last iterate) and share the Jacobians of `mechanics.jacobians`.
 """
 
 import functools
@@ -28,13 +28,13 @@ from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, require_positive
 
 ITERATIONS = 3
-"""Newton steps of the implicit midpoint rule."""
+"""Number of Newton steps of the implicit midpoint rule."""
 Step = Callable[[Any, Any, Any], Any]
 """(x, u, dt) -> x_next."""
 PhaseStep = Callable[[Any, Any, Any], Any]
 """(q, p, dt) -> (q, p) after the step."""
 Torque = Literal["held", "interpolated"]
-"""A recorded torque between its samples."""
+"""Course of a recorded torque between its samples."""
 Actuation = Sequence[Sequence[float]] | Float[np.ndarray, "d u"] | None
 """Actuation matrix of `types.Needs`; with `None`, u is tau."""
 
@@ -58,13 +58,13 @@ def implicit_midpoint(
         qdd = forward_dynamics(q + dt/2 v, v, tau),   v = qd + dt/2 qdd;   (q, qd) <- (q + dt v, qd + dt qdd)
 
     Args:
-        forward_dynamics: (q, qd, tau) -> qdd; for derivatives of the step, `jacobians.differentiable_forward_dynamics`.
-        actuation: u -> tau.
+        forward_dynamics: (q, qd, tau) -> qdd; to differentiate the step, `jacobians.differentiable_forward_dynamics`.
+        actuation: matrix [d, u] with tau = actuation u.
         iterations: Newton steps, from the acceleration at x. If the last one still moves the state by more than
             sqrt(eps) (1 + |x|), the step is NaN: take a smaller dt. The error is about the square of the last move.
 
     Raises:
-        InputError: iterations that are not positive.
+        InputError: `iterations` is not positive.
     """
     require_positive(iterations=iterations)
 
@@ -104,7 +104,7 @@ def phase_implicit_midpoint(rates: Rates, *, iterations: int = ITERATIONS) -> Ph
 
 
 def linearised(step: Callable[[Any, Any, Any], Any]) -> Callable[[Array, Array, Array], tuple[Any, Any]]:
-    """(x, u, dt) -> x_next and (A, B) of a step, in one pass; of (q, p, dt) for a `PhaseStep`."""
+    """Returns (x, u, dt) -> x_next and (A, B) of a step, in one pass; for a `PhaseStep`, of (q, p, dt)."""
 
     @functools.wraps(step)
     def function(x: Array, u: Array, dt: Array) -> tuple[Any, Any]:
@@ -119,10 +119,10 @@ def linearised(step: Callable[[Any, Any, Any], Any]) -> Callable[[Array, Array, 
 
 
 def torque_slopes(tau: Float[Array, "T d"], t: Float[Array, " T"], torque: Torque) -> Float[Array, "T-1 d"]:
-    """Rates of the torque within the intervals; zero if it is held, and for intervals of length zero.
+    """Returns the rates of the torque within the intervals; zero if it is held, and for intervals of length zero.
 
     Raises:
-        InputError: a `torque` of another name.
+        InputError: `torque` is neither "held" nor "interpolated".
     """
     if torque not in ("held", "interpolated"):
         raise InputError(f"torque is {torque!r}; expected 'held' or 'interpolated'")
@@ -148,10 +148,10 @@ def driven(
     Args:
         rate: (state, tau) -> rate of the state.
         start: state at the first sample.
-        tau: [T - 1, d], torque at the start of every interval; within it the torque is tau + slopes s.
+        tau: [T - 1, d], torque at the start of every interval; a time s later it is tau + slopes s.
         slopes: [T - 1, d], from `torque_slopes`.
         durations: [T - 1] in s; over a duration of zero the state stays.
-        substeps: per interval.
+        substeps: steps per interval.
         method: field -> step; `integrators.looped_rk4` compiles faster.
     """
 
@@ -173,7 +173,8 @@ def _root(equations: Callable[[Array], Array], start: Array, x: Array, dt: Array
     identity = jnp.eye(start.shape[0], dtype=start.dtype)
 
     def solve_linear(product: Callable[[Array], Array], right: Array) -> Array:
-        # The inverse serves the many right-hand sides of a step's derivatives; elimination would be repeated for each.
+        # The inverse serves the many right-hand sides of a step's derivatives; elimination would be repeated for each
+        # one.
         return solve(jax.vmap(product, out_axes=1)(identity), identity) @ right
 
     def search(equations: Callable[[Array], Array], start: Array) -> tuple[Array, Array]:
@@ -186,5 +187,5 @@ def _root(equations: Callable[[Array], Array], start: Array, x: Array, dt: Array
 
     rate, change = jax.lax.custom_root(equations, start, search, solve_linear, has_aux=True)
     settled = jnp.abs(dt) * change <= jnp.sqrt(jnp.finfo(x.dtype).eps) * (1 + jnp.max(jnp.abs(x)))
-    # A factor rather than a selection, so that derivatives also become NaN.
+    # A factor instead of a selection, so that derivatives also become NaN.
     return rate * jnp.where(settled, jnp.ones_like(dt), jnp.nan)

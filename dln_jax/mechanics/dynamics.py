@@ -26,8 +26,8 @@ class Decomposition(NamedTuple):
 class Dynamics(NamedTuple):
     """Functions of an energy in coordinates and velocities, for one state; use `vmap` for samples.
 
-    Symbols and units are those of `dln_jax.types`. Analytic and learned systems are the same type, so losses, metrics,
-    rollouts and controllers do not distinguish them. The functions take arrays, or lists of numbers, and raise a
+    Symbols and units are those of `dln_jax.types`. Analytic and learned systems have the same type, so losses, metrics,
+    rollouts and controllers need not distinguish them. The functions take arrays or lists of numbers, and raise a
     one-line InputError for arguments that are not one state of the system.
     """
 
@@ -41,20 +41,20 @@ class Dynamics(NamedTuple):
     """(q, qd=None) -> M [d, d], by default at rest, qd = 0: M of a natural system depends on q alone, that of any other
     energy also on qd."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
-    """(q, qd, qdd) -> inertial, Coriolis and gravity force, without friction."""
+    """(q, qd, qdd) -> inertial, Coriolis and gravity forces, without friction."""
     friction: Callable[[VectorLike, VectorLike], Array]
-    """(q, qd) -> the friction force dD/dqd [d]; zero without friction."""
+    """(q, qd) -> friction force dD/dqd [d]; zero without friction."""
 
 
 class PlainDynamics(NamedTuple):
-    """Functions of a system without energy and mass matrix; otherwise as `Dynamics`."""
+    """Functions of a system without energy and mass matrix; otherwise like `Dynamics`."""
 
     inverse_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
     """(q, qd, qdd) -> tau [d]."""
     forward_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
     """(q, qd, tau) -> qdd [d]."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
-    """(q, qd, qdd) -> inertial, Coriolis and gravity force; friction counts as Coriolis force."""
+    """(q, qd, qdd) -> inertial, Coriolis and gravity forces; friction counts as Coriolis force."""
 
 
 Rates = Callable[[VectorLike, VectorLike], tuple[Array, Array]]
@@ -62,7 +62,7 @@ Rates = Callable[[VectorLike, VectorLike], tuple[Array, Array]]
 
 
 class Flow(NamedTuple):
-    """Functions of an energy in coordinates and momenta, without applied forces; otherwise as `Dynamics`."""
+    """Functions of an energy in coordinates and momenta, without applied forces; otherwise like `Dynamics`."""
 
     rates: Rates
     energy: Callable[[VectorLike, VectorLike], Array]
@@ -76,7 +76,7 @@ class PlainFlow(NamedTuple):
 
 
 class InverseForward(NamedTuple):
-    """A system without energy: two functions of one state that need not invert each other."""
+    """A system without energy: two functions of one state that need not be inverses of each other."""
 
     inverse_dynamics: Callable[[Array, Array, Array], Array]
     """(q, qd, qdd) -> tau [d]."""
@@ -85,12 +85,12 @@ class InverseForward(NamedTuple):
 
 
 class PhaseRates(NamedTuple):
-    """Rates of a state of a phase space."""
+    """Rates of a state in a phase space."""
 
     rates: Callable[[Array, Array], tuple[Array, Array]]
     """(q, p) -> (qd, pd), both [d]."""
     hamiltonian: Hamiltonian | None = None
-    """(q, p) -> energy of a part of the field; `None` for a field without one."""
+    """(q, p) -> energy of a part of the field; `None` for a field without energy."""
 
 
 def make_dynamics(
@@ -105,7 +105,7 @@ def make_dynamics(
 ) -> Dynamics:
     """Builds `Dynamics` from frictionless functions of vectors [d] of one type, and the friction of a record.
 
-    Its functions convert or refuse their arguments: without `degrees_of_freedom` the arguments of a call only need to
+    Its functions convert or refuse their arguments; without `degrees_of_freedom` the arguments of a call need only
     agree with one another. `mass_matrix` is called with both q and qd.
     """
     d, force = degrees_of_freedom, friction_of(system)
@@ -163,12 +163,12 @@ def minus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:
 
 
 def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
-    """Generalised force dD/dqd [d] that overcomes friction, for a Rayleigh function D(q, qd)."""
+    """Returns the generalised force dD/dqd [d] that overcomes friction, for a Rayleigh function D(q, qd)."""
     return jax.grad(D, argnums=1)(q, qd)
 
 
 def friction_of(system: Any) -> Callable[[Array, Array], Array] | None:
-    """(q, qd) -> friction force [d] of a record, in closed form where it has one; `None` without friction."""
+    """Returns (q, qd) -> friction force [d] of a record, in closed form if it has one; `None` without friction."""
     force = getattr(system, "friction", None)
     if force is not None or system.dissipation is None:
         return force
@@ -178,7 +178,7 @@ def friction_of(system: Any) -> Callable[[Array, Array], Array] | None:
 def decompose_by_differences(
     inverse_dynamics: Callable[[Array, Array, Array], Array], q: Vector, qd: Vector, qdd: Vector
 ) -> Decomposition:
-    """Inertial, Coriolis and gravity force, all [d], as differences of (q, qd, qdd) -> tau between motion and rest.
+    """Splits (q, qd, qdd) -> tau into inertial, Coriolis and gravity forces, all [d], by differences from rest.
 
     Their sum is tau(q, qd, qdd) if M depends on q alone.
     """

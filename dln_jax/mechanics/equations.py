@@ -4,15 +4,15 @@
 |---|---|---|
 | `NaturalSystem` | factor of M, V, D | `mechanics.natural` |
 | `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural` |
-| `ClosedForm` | M, V, D, and the forces that follow | `mechanics.closed_form` |
+| `ClosedForm` | M, V, D, and the resulting forces | `mechanics.closed_form` |
 | `RecursiveSystem` | M, V, D, and all forces by a recursion | `mechanics.closed_form` |
 | `LagrangianSystem` | L, D | `mechanics.lagrangian` |
 | `HamiltonianSystem` | H, D | `mechanics.hamiltonian` |
-| `LoadedSystem` | any of these, and friction by load | `mechanics.joint_friction` |
+| `LoadedSystem` | any of these, and load-dependent friction | `mechanics.joint_friction` |
 | `InverseForward` | none: tau and qdd | `mechanics.dynamics` |
 | `PhaseRates` | none: (qd, pd) | `mechanics.dynamics` |
 
-All energies have both; `InverseForward` has dynamics only, and `PhaseRates` a flow only.
+All energies have both dynamics and flow; `InverseForward` has dynamics only, `PhaseRates` a flow only.
 """
 
 from functools import partial
@@ -80,11 +80,11 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
 
     Args:
         system: a record of energies, or `InverseForward`.
-        degrees_of_freedom: d; states of another size are refused. Without it the arguments of a call only need to agree
+        degrees_of_freedom: d; states of another size are refused. Without it, the arguments of a call need only agree
             with one another.
 
     Raises:
-        InputError: the rates of a phase space, which do not define forces, or no record.
+        InputError: the system is the rates of a phase space, which do not define forces, or not a record.
     """
     make = _DYNAMICS.get(type(system))
     if make is None:
@@ -98,10 +98,11 @@ def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ..
 @overload
 def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow: ...
 def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow:
-    """Returns the functions of a system in coordinates and momenta, without applied forces; arguments as in `dynamics`.
+    """Returns the functions of a system in coordinates and momenta, without applied forces; arguments as for
+    `dynamics`.
 
     Raises:
-        InputError: an `InverseForward`, which has no flow, or no record.
+        InputError: the system is an `InverseForward`, which has no flow, or not a record.
     """
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
@@ -126,7 +127,7 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
 
 
 def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Generalised force [d] that remains to move the system after friction."""
+    """Returns the generalised force [d] that is left to move the system after friction."""
     if isinstance(system, LoadedSystem):
         return link_force(system, q, qd, tau)
     force = friction_of(system)
@@ -134,7 +135,7 @@ def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vecto
 
 
 def hamiltonian_of(system: Energies) -> Hamiltonian:
-    """H(q, p) of any energies; for a Lagrangian by the Legendre transform, in general with a Newton iteration."""
+    """Returns H(q, p) of any energies; of a Lagrangian by the Legendre transform, in general by Newton's method."""
     match system:
         case HamiltonianSystem():
             return system.hamiltonian

@@ -7,9 +7,9 @@ In coordinates and velocities, with qdd = H_pq qd + H_pp dp/dt along the motion,
     inverse:  H_pp dp/dt = qdd - H_pq qd,   tau = dp/dt + dH/dq + dD/dqd
     forward:  dp/dt from Hamilton,          qdd = d/dt dH/dp
 
-The momentum p(q, qd) comes from the Legendre transform (`legendre`), in general with a Newton iteration. A natural
-system with a factor of the inverse mass matrix needs two triangular solves instead (`mechanics.natural`).
-Nothing is regularised: a singular H_pp gives non-finite values.
+The momentum p(q, qd) comes from the Legendre transform (`legendre`), in general by a Newton iteration. A natural system
+with a factor of the inverse mass matrix needs two triangular solves instead (`mechanics.natural`). Nothing is
+regularised: a singular H_pp gives non-finite values.
 """
 
 import functools
@@ -25,11 +25,11 @@ from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Hamiltonian, Scalar, Vector, require_positive
 
 Energy = Callable[[Array, Array], Array]
-"""Lagrangian or Hamiltonian."""
+"""A Lagrangian or Hamiltonian."""
 Guess = Callable[[Array, Array], Array]
 """(q, slope [d]) -> initial value of a Newton iteration [d]."""
 MOST_STEPS = 30
-"""Newton steps after which the Legendre transform is NaN."""
+"""Number of Newton steps after which the Legendre transform is NaN."""
 
 
 class HamiltonianSystem(NamedTuple):
@@ -46,21 +46,21 @@ class HamiltonianSystem(NamedTuple):
 
 
 def velocity(H: Hamiltonian, q: Vector, p: Vector) -> Vector:
-    """Generalised velocity qd = dH/dp [d]."""
+    """Returns the generalised velocity qd = dH/dp [d]."""
     return jax.grad(H, argnums=1)(q, p)
 
 
 def time_derivative(
     H: Hamiltonian, q: Vector, p: Vector, tau: Vector, *, dissipation: Dissipation | None = None
 ) -> tuple[Vector, Vector]:
-    """(qd, pd), both [d], under a generalised force: Hamilton's equations."""
+    """Returns (qd, pd), both [d], under a generalised force: Hamilton's equations."""
     force, qd = jax.grad(H, argnums=(0, 1))(q, p)
     pd = tau - force
     return qd, pd if dissipation is None else pd - friction_force(dissipation, q, qd)
 
 
 def inverse(H: Hamiltonian, q: Vector, p: Vector, pd: Vector, *, dissipation: Dissipation | None = None) -> Vector:
-    """Generalised force tau = pd + dH/dq + dD/dqd [d] of a motion."""
+    """Returns the generalised force tau = pd + dH/dq + dD/dqd [d] of a motion."""
     force, qd = jax.grad(H, argnums=(0, 1))(q, p)
     tau = pd + force
     return tau if dissipation is None else tau + friction_force(dissipation, q, qd)
@@ -71,11 +71,10 @@ def conjugate(
 ) -> Vector:
     """Solves d(energy)/dx (q, x) = slope for x [d]: the momentum of a velocity (for H), or the reverse (for L).
 
-    It takes full Newton steps from `initial_guess(q, slope)`, by default from zero, until they have converged. After
-    `MOST_STEPS` without convergence the result and its derivatives are NaN. Steps are not damped: an energy that is not
-    convex in x may have no solution. With `iterations` their number is fixed and convergence is not checked: one is
-    exact for an energy that is quadratic in x, as for every natural system; otherwise check `velocity(H, q, x) -
-    slope`.
+    Takes full Newton steps from `initial_guess(q, slope)`, by default from zero, until convergence. After `MOST_STEPS`
+    without convergence the result and its derivatives are NaN. Steps are not damped: an energy that is not convex in x
+    may have no solution. With `iterations` their number is fixed and convergence is not checked: one step is exact for
+    an energy that is quadratic in x, as in every natural system; otherwise check `velocity(H, q, x) - slope`.
 
     Derivatives of all orders are those of the implicit function, also by values that `energy` closes over.
     Raises InputError if `iterations` is not positive.
@@ -100,8 +99,8 @@ def conjugate(
         def turn(state):
             count, x, _ = state
             better, left = step(residual, x)
-            # After a step this small the error is of the order of its square. Near a root at zero this relative test
-            # fails, and that of the residual decides.
+            # After a step this small, the error is of the order of its square. Near a root at zero this relative test
+            # fails, and the test of the residual decides.
             settled = jnp.max(jnp.abs(better - x)) < jnp.sqrt(eps) * jnp.max(jnp.abs(better))
             return count + 1, better, settled | (jnp.max(jnp.abs(left)) <= 16 * eps * jnp.max(jnp.abs(slope)))
 
@@ -118,12 +117,12 @@ def conjugate(
     if iterations is not None:
         return jax.lax.custom_root(residual, start, so_many, solve_hessian)
     x, converged = jax.lax.custom_root(residual, start, until_converged, solve_hessian, has_aux=True)
-    # A factor rather than a selection, so that derivatives also become NaN.
+    # A factor instead of a selection, so that derivatives also become NaN.
     return x * jnp.where(converged > 0, 1, jnp.nan).astype(x.dtype)
 
 
 def legendre(energy: Energy, *, iterations: int | None = None) -> Energy:
-    """H(q, p) = p·qd - L(q, qd) of a Lagrangian, and L(q, qd) of a Hamiltonian: the transform is its own inverse.
+    """Returns H(q, p) = p·qd - L(q, qd) of a Lagrangian, or L(q, qd) of a Hamiltonian: the transform is self-inverse.
 
     `iterations` as for `conjugate`.
     """

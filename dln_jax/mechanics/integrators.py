@@ -11,9 +11,9 @@
 | `stormer_verlet` | 2 | separable fields | symplectic, reversible |
 
 A field is `(t, state) -> rate` of a first-order system y' = f(t, y). A partitioned one has two halves,
-q' = velocity, p' = force; it is separable when the velocity reads p alone and the force q alone, as for
-H = T(p) + V(q). The partitioned steps are explicit. For a Hamiltonian that is not separable they would be implicit,
-or not symplectic: take `implicit_midpoint` or `gauss_legendre4`.
+q' = velocity, p' = force; it is separable if the velocity reads only p and the force only q, as for H = T(p) + V(q).
+The partitioned steps are explicit. For a Hamiltonian that is not separable they would be implicit or not symplectic:
+use `implicit_midpoint` or `gauss_legendre4`.
 Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration" (2006), chapters I, II and VI.
 """
 
@@ -41,7 +41,7 @@ Step = Callable[[Any, Any, Any], Any]
 
 
 class Tableau(NamedTuple):
-    """Coefficients of a Runge-Kutta method; it is explicit when `stages` is strictly lower triangular."""
+    """Coefficients of a Runge-Kutta method, which is explicit if `stages` is strictly lower triangular."""
 
     stages: tuple[tuple[float, ...], ...]
     """a [s, s]: weights of the stages' rates in the stages."""
@@ -50,7 +50,7 @@ class Tableau(NamedTuple):
 
     @property
     def nodes(self) -> tuple[float, ...]:
-        """c [s], the stages' times in units of dt: row sums of a."""
+        """c [s], times of the stages in units of dt: row sums of a."""
         return tuple(sum(row) for row in self.stages)
 
 
@@ -71,13 +71,13 @@ def runge_kutta(tableau: Tableau, field: Field, *, tolerance: float = 1e-9, iter
         Y_i = y + dt sum_j a_ij f(t + c_j dt, Y_j),    y <- y + dt sum_i b_i f(t + c_i dt, Y_i)
 
     Newton's method solves for the stages of an implicit method; derivatives use the implicit function theorem. A step
-    whose stages do not converge gives NaN: take a smaller dt.
+    whose stages do not converge is NaN: take a smaller dt.
 
     Args:
         tableau: the method.
         field: (t, state) -> rate.
-        tolerance: largest error of the equations for Y before the last Newton step, which about squares it, in the
-            state's units; implicit methods only.
+        tolerance: largest error of the equations for Y, in the state's units, before the last Newton step, which about
+            squares it; implicit methods only.
         iterations: largest number of Newton steps; implicit methods only.
     """
     field = jax.jit(field)  # traced once for all stages
@@ -94,9 +94,9 @@ radau3 = functools.partial(runge_kutta, RADAU_3)
 
 
 def looped_rk4(field: Field) -> Step:
-    """`rk4` with its stages in a loop: the field is in the program once instead of four times.
+    """Returns `rk4` with its stages in a loop, so that the program contains the field once instead of four times.
 
-    For fits through an integrator and motions that run once, where compilation takes longer than execution.
+    For fits through an integrator and for motions that run once, where compilation takes longer than execution.
     """
     nodes, weights = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6
 
@@ -115,7 +115,7 @@ def looped_rk4(field: Field) -> Step:
 
 
 def symplectic_euler(velocity: Callable[..., Any], force: Callable[..., Any]) -> Step:
-    """Returns Euler's method with the new momentum in the second half; state (q, p).
+    """Returns Euler's method with the new momentum in the second half; the state is (q, p).
 
         p <- p + dt force(t, q, p),    q <- q + dt velocity(t, q, p)
 
@@ -132,7 +132,8 @@ def symplectic_euler(velocity: Callable[..., Any], force: Callable[..., Any]) ->
 
 
 def stormer_verlet(velocity: Callable[[Any, Any], Any], force: Callable[[Any, Any], Any]) -> Step:
-    """Returns Störmer-Verlet (leapfrog) for separable systems q' = velocity(t, p), p' = force(t, q); state (q, p).
+    """Returns Störmer-Verlet (leapfrog) for separable systems q' = velocity(t, p), p' = force(t, q); the state is (q,
+    p).
 
         p_half = p + dt/2 force(t, q),    q <- q + dt velocity(t + dt/2, p_half),    p <- p_half + dt/2 force(t + dt, q)
 
@@ -149,7 +150,7 @@ def stormer_verlet(velocity: Callable[[Any, Any], Any], force: Callable[[Any, An
 
 
 def second_order(acceleration: Callable[[Any, Array, Array], Array]) -> Field:
-    """The field of q'' = acceleration(t, q, qd), on the state (q, qd)."""
+    """Returns the field of q'' = acceleration(t, q, qd), on the state (q, qd)."""
 
     def field(t, state):
         q, qd = state
@@ -176,7 +177,7 @@ def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, sub
 
     Args:
         step: (t, state, dt) -> state.
-        state: at t[0].
+        state: state at t[0].
         t: times in s, any spacing, forward or backward.
         substeps: steps per interval; only the states at t are kept.
     """
@@ -195,16 +196,17 @@ def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, sub
 def adaptive_rollout(
     field: Field, state: State, t: Float[Array | np.ndarray, " T"], *, tolerance: float, max_steps: int = 100_000
 ) -> tuple[State, Bool[Array, ""]]:
-    """States at the times t [T] by Dormand-Prince 8 with step-size control, and whether the integration finished.
+    """Returns states at the times t [T] by Dormand-Prince 8 with step-size control, and whether the integration
+    finished.
 
     Args:
         field: (t, state) -> rate.
-        state: at t[0].
+        state: state at t[0].
         t: increasing times in s.
-        tolerance: on the error per step, relative and absolute.
+        tolerance: tolerance on the error per step, relative and absolute.
         max_steps: largest number of steps; states not reached are infinite.
     """
-    import diffrax  # here, because it takes longer to import than the rest of this package
+    import diffrax  # here, because its import takes longer than that of the rest of this package
 
     require_positive(tolerance=tolerance)
     solution = diffrax.diffeqsolve(

@@ -4,14 +4,14 @@ For a natural system, tau = M qdd + c + g + dD/dqd with p = M(q) qd and A = dp/d
 
     dtau/dqdd = M,   dtau/dqd = dM/dt + A - Aᵀ + d²D/dqd²,   dtau/dq by d tangents of tau and p together
 
-The second follows from dL/dq = ½ d(qdᵀ M qd)/dq, whose derivative in qd is Aᵀ. No tangent of a velocity or an
-acceleration is pushed through a network. For other systems all Jacobians come from one reverse sweep of d rows. The
-forward model is the inverse one's implicit function:
+The second follows from dL/dq = ½ d(qdᵀ M qd)/dq, whose derivative by qd is Aᵀ. No tangent of a velocity or an
+acceleration is pushed through a network. For other systems all Jacobians come from one reverse sweep over d rows. The
+forward model is the implicit function of the inverse one:
 
     dqdd/dq = -M⁻¹ dtau/dq,   dqdd/dqd = -M⁻¹ dtau/dqd,   dqdd/dtau = M⁻¹        at qdd
 
 M⁻¹ is formed, because it is a result, and one factorisation serves the acceleration and all columns. Forward models of
-a Hamiltonian or a network of their own are differentiated by a reverse sweep instead.
+a Hamiltonian, or with a network of their own, are differentiated by a reverse sweep instead.
 """
 
 import functools
@@ -33,11 +33,11 @@ from dln_jax.types import Matrix, Vector
 Natural = NaturalSystem | ClosedForm | RecursiveSystem | NaturalHamiltonian
 """Energies with a mass matrix that depends on q alone."""
 Jacobians = tuple[Array, Array, Array]
-"""Derivatives [d, d] by three arguments; row i belongs to the i-th result."""
+"""Derivatives [d, d] by three arguments; row i belongs to result i."""
 
 
 def inverse_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, qdd: Vector) -> Jacobians:
-    """dtau/dq, dtau/dqd and dtau/dqdd = M, at a motion; friction included."""
+    """Returns dtau/dq, dtau/dqd and dtau/dqdd = M at a motion, including friction."""
     motion = dynamics(system)
     if not isinstance(system, Natural):
         return jax.jacrev(motion.inverse_dynamics, argnums=(0, 1, 2))(q, qd, qdd)
@@ -49,7 +49,7 @@ def inverse_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, qdd: Vecto
 
 
 def coriolis_jacobians(system: Driven, q: Vector, qd: Vector) -> tuple[Array, Array]:
-    """dc/dq and dc/dqd, both [d, d], of the Coriolis force of `decompose`."""
+    """Returns dc/dq and dc/dqd, both [d, d], of the Coriolis force of `decompose`."""
     decompose = dynamics(system).decompose
 
     def coriolis(q: Vector, qd: Vector) -> Vector:
@@ -61,7 +61,7 @@ def coriolis_jacobians(system: Driven, q: Vector, qd: Vector) -> tuple[Array, Ar
 
 
 def forward_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, tau: Vector) -> tuple[Vector, Jacobians]:
-    """qdd [d] under a generalised force, with dqdd/dq, dqdd/dqd and dqdd/dtau = M⁻¹ there."""
+    """Returns qdd [d] under a generalised force, with dqdd/dq, dqdd/dqd and dqdd/dtau = M⁻¹ there."""
     motion = dynamics(system)
     if isinstance(system, HamiltonianSystem | LoadedSystem | InverseForward):
 
@@ -80,7 +80,7 @@ def forward_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, tau: Vecto
 def differentiable_forward_dynamics(
     system: Driven, *, degrees_of_freedom: int
 ) -> tuple[Callable[..., Array], Callable[..., tuple[Vector, Jacobians]]]:
-    """(q, qd, tau) -> qdd [d], with derivatives that are products with its Jacobians; and `forward_dynamics_jacobians`.
+    """Returns (q, qd, tau) -> qdd [d], differentiated by its Jacobians, and `forward_dynamics_jacobians`.
 
     For derivatives in many directions, such as those of a step by its whole state, which then share one Jacobian. Both
     are jitted: a step that calls them several times traces, compiles and exports them once.
@@ -98,7 +98,7 @@ def differentiable_forward_dynamics(
 
 
 def _natural_jacobians(system: Natural, force: Callable[[Vector], Vector], q: Vector, qd: Vector) -> Jacobians:
-    """Derivatives of a force by q and of the Coriolis force by qd, and M."""
+    """Returns the derivatives of a force by q and of the Coriolis force by qd, and M."""
     mass_matrix = dynamics(system).mass_matrix
 
     def force_and_momentum(q: Vector) -> tuple[Vector, Vector]:

@@ -2,14 +2,14 @@
 
     tau = tau_link + μ |tau_link| tanh(u / v) + dD/dqd,   tau_link = M qdd + c + g
 
-joint by joint, u the joint's rate. Friction by load is no Rayleigh function of qd, because the carried force depends on
-the acceleration. But for μ < 1 the map from tau_link to tau is piecewise linear with positive slopes 1 ± μ tanh, and
-its inverse keeps the sign:
+for every joint, with the joint's rate u. Load-dependent friction has no Rayleigh function of qd, because the carried
+force depends on the acceleration. But for μ < 1 the map from tau_link to tau is piecewise linear with positive slopes
+1 ± μ tanh, and its inverse keeps the sign:
 
     tau_link = y / (1 + sign(y) μ tanh(u / v)),   y = tau - dD/dqd
 
 The corner at tau_link = 0 remains: derivatives there are those of μ = 0, the mean of both sides. Free motion (tau = 0)
-loses nothing by load unless other friction loads the transmission.
+has no loss by load unless other friction loads the transmission.
 """
 
 from typing import Any, NamedTuple
@@ -35,7 +35,7 @@ class Load(NamedTuple):
 
 
 class LoadedSystem(NamedTuple):
-    """Any energies behind transmissions with friction that depends on load."""
+    """Any energies behind transmissions with load-dependent friction."""
 
     link: Any
     """The record without dissipation."""
@@ -50,15 +50,16 @@ class LoadedSystem(NamedTuple):
 
 
 def with_friction(system: Any, dissipation: Dissipation | None, load: Load | None = None) -> Any:
-    """Returns the same system with friction in its joints, added to the friction that it has.
+    """Returns the same system with additional friction in its joints.
 
-    A system without an energy keeps its kind: the force is added on its inverse side, and subtracted on its forward
-    side and in its rates.
+    A system without an energy keeps its kind: the force is added in its inverse model and subtracted in its forward
+    model or its rates.
 
     Args:
         system: one of `mechanics.equations.System`.
         dissipation: (q, qd) -> Rayleigh function, as from `joint_dissipation`.
-        load: friction of the transmissions by load; all other friction, the system's own too, is then before them.
+        load: load-dependent friction of the transmissions; all other friction, including the system's own, is then on
+            the motors' side of them.
 
     Returns:
         The record, or with a load a `LoadedSystem`.
@@ -75,7 +76,7 @@ def with_friction(system: Any, dissipation: Dissipation | None, load: Load | Non
 
 
 def sum_of(first: Dissipation | None, second: Dissipation) -> Dissipation:
-    """Sum of two Rayleigh functions."""
+    """Returns the sum of two Rayleigh functions."""
     if first is None:
         return second
 
@@ -86,20 +87,20 @@ def sum_of(first: Dissipation | None, second: Dissipation) -> Dissipation:
 
 
 def carrying(load: Load, qd: Vector, tau_link: Vector) -> Vector:
-    """Generalised force tau [d] before the transmissions, from tau_link behind them."""
+    """Returns the generalised force tau [d] before the transmissions, from tau_link behind them."""
     at_joints = _to_joints(load, tau_link)
     # By the sign, whose derivative is 0; that of the absolute value is one-sided.
     return _from_joints(load, at_joints * (1 + jnp.sign(at_joints) * _slope(load, qd)))
 
 
 def carried(load: Load, qd: Vector, tau: Vector) -> Vector:
-    """Generalised force tau_link [d] behind the transmissions, from tau before them: the inverse of `carrying`."""
+    """Returns the generalised force tau_link [d] behind the transmissions, from tau before them; inverts `carrying`."""
     at_joints = _to_joints(load, tau)
     return _from_joints(load, at_joints / (1 + jnp.sign(at_joints) * _slope(load, qd)))
 
 
 def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Part of a generalised force that moves the links [d]."""
+    """Returns the part of a generalised force that moves the links [d]."""
     if system.dissipation is not None:
         tau = tau - friction_force(system.dissipation, q, qd)
     return carried(system.load, qd, tau)
@@ -108,7 +109,7 @@ def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vect
 def loaded_dynamics(system: LoadedSystem, link: Dynamics, *, degrees_of_freedom: int | None = None) -> Dynamics:
     """Returns all functions of the system from those of its links.
 
-    `friction(q, qd)` is that of the dissipation alone, and `decompose` is of the links.
+    `friction(q, qd)` is that of the dissipation alone, and `decompose` is that of the links.
     """
     return make_dynamics(
         system,
@@ -122,7 +123,7 @@ def loaded_dynamics(system: LoadedSystem, link: Dynamics, *, degrees_of_freedom:
 
 
 def _dissipating(system: Any, dissipation: Dissipation | None) -> Any:
-    """Replaces the dissipation, and with it a friction force in closed form."""
+    """Replaces the dissipation, and removes a friction force in closed form."""
     return system._replace(dissipation=dissipation, **({"friction": None} if "friction" in system._fields else {}))
 
 
@@ -145,12 +146,12 @@ def _plain(system: InverseForward | PhaseRates, friction: LoadedSystem) -> Inver
 
 
 def _slope(load: Load, qd: Vector) -> Vector:
-    """μ tanh(u / v), within (-1, 1)."""
+    """Returns μ tanh(u / v), within (-1, 1)."""
     return jnp.asarray(load.share, qd.dtype) * jnp.tanh(joint_rates(load.joint_map, qd) / load.velocity_scale)
 
 
 def _to_joints(load: Load, tau: Vector) -> Vector:
-    """Forces at the joints; Jᵀ maps them to generalised forces."""
+    """Returns the forces at the joints, which Jᵀ maps to generalised forces."""
     if load.joint_map is None:
         return tau
     return jnp.asarray(np.linalg.inv(np.asarray(load.joint_map, float)).T, tau.dtype) @ tau

@@ -3,9 +3,8 @@
     d/dt dL/dqd - dL/dq = tau        (Euler-Lagrange)
 
 Only the necessary derivatives are taken: the inverse model is one `jvp` of the gradient; the forward model adds the
-Hessian in qd, which is solved and never inverted.
-
-A singular mass matrix gives non-finite accelerations rather than a regularised answer.
+Hessian by qd, in a linear solve without an inverse. A singular mass matrix gives non-finite accelerations, not a
+regularised answer.
 """
 
 from functools import partial
@@ -26,35 +25,35 @@ class LagrangianSystem(NamedTuple):
     lagrangian: Lagrangian
     """(q, qd) -> L, scalar."""
     dissipation: Dissipation | None = None
-    """(q, qd) -> Rayleigh function D, scalar; `None` for no friction."""
+    """(q, qd) -> Rayleigh function D, scalar; `None` without friction."""
 
 
 def momentum(L: Lagrangian, q: Vector, qd: Vector) -> Vector:
-    """Generalised momentum p = dL/dqd [d]."""
+    """Returns the generalised momentum p = dL/dqd [d]."""
     return jax.grad(L, argnums=1)(q, qd)
 
 
 def energy(L: Lagrangian, q: Vector, qd: Vector) -> Scalar:
-    """Energy E = qdᵀ dL/dqd - L, which is T + V for a natural system."""
+    """Returns the energy E = qdᵀ dL/dqd - L, which is T + V for a natural system."""
     lagrangian, rate = jax.jvp(lambda velocity: L(q, velocity), (qd,), (qd,))
     return rate - lagrangian
 
 
 def mass_matrix(L: Lagrangian, q: Vector, qd: Vector) -> Matrix:
-    """Mass matrix M = d²L/dqd² [d, d]; symmetric, but definite only if the Lagrangian makes it so."""
+    """Returns the mass matrix M = d²L/dqd² [d, d]: symmetric, but definite only if the Lagrangian makes it so."""
     return jax.jacfwd(lambda velocity: momentum(L, q, velocity))(qd)
 
 
 def inverse_dynamics(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau = d/dt dL/dqd - dL/dq [d] of a motion."""
-    # One gradient for force and momentum together: a reverse sweep then passes it once, at two thirds of the work of a
+    """Returns the generalised force tau = d/dt dL/dqd - dL/dq [d] of a motion."""
+    # One gradient for force and momentum together: a reverse sweep through it is shared, at two thirds of the work of a
     # Jacobian.
     (force, _), (_, momentum_rate) = jax.jvp(jax.grad(L, argnums=(0, 1)), (q, qd), (qd, qdd))
     return momentum_rate - force
 
 
 def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Acceleration qdd [d] under a generalised force: solves M qdd = tau - tau(q, qd, 0)."""
+    """Returns the acceleration qdd [d] under a generalised force: solves M qdd = tau - tau(q, qd, 0)."""
     bias = inverse_dynamics(L, q, qd, jnp.zeros_like(qd))
     return solve(mass_matrix(L, q, qd), tau - bias)
 
@@ -62,7 +61,7 @@ def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vecto
 def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
     """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size.
 
-    Without it, they refuse states that lack entries that L reads, or have rates that L ignores.
+    Without it, they refuse states that lack entries which L reads, or have rates that L ignores.
     """
     accepted = set() if degrees_of_freedom is None else {degrees_of_freedom}
 

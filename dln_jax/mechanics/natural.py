@@ -3,8 +3,8 @@
     tau = M qdd + dM/dt qd - dT/dq + dV/dq
 
 `NaturalSystem` has T = ½ |Lᵀ qd|² with M = L Lᵀ, `NaturalHamiltonian` T = ½ |Lᵀ p|² with M⁻¹ = L Lᵀ. The factor makes M
-definite by construction and gives the momentum without a derivative or a Newton iteration; only triangular systems
-are solved. An absent potential is `None` and is never traced.
+definite by construction and gives the momentum without a derivative or a Newton iteration; only triangular systems are
+solved. An absent potential is `None` and is never traced.
 """
 
 from functools import partial
@@ -41,30 +41,30 @@ class NaturalHamiltonian(NamedTuple):
 
 
 def lagrangian(system: NaturalSystem) -> Lagrangian:
-    """L(q, qd) = ½ |Lᵀ qd|² - V(q), for the generic functions of `mechanics.lagrangian`."""
+    """Returns L(q, qd) = ½ |Lᵀ qd|² - V(q), for the generic functions of `mechanics.lagrangian`."""
     return lambda q, qd: minus_potential(_half_square(system.cholesky(q).T @ qd), system.potential, q)
 
 
 def hamiltonian(system: NaturalSystem | NaturalHamiltonian) -> Hamiltonian:
-    """H(q, p) = T + V: ½ |L⁻¹ p|² + V(q) with the factor of M, ½ |Lᵀ p|² + V(q) with that of M⁻¹."""
+    """Returns H(q, p) = T + V: ½ |L⁻¹ p|² + V(q) with the factor of M, ½ |Lᵀ p|² + V(q) with that of M⁻¹."""
     if isinstance(system, NaturalHamiltonian):
         return lambda q, p: plus_potential(_half_square(system.inverse_factor(q).T @ p), system.potential, q)
     return lambda q, p: plus_potential(_half_square(solve_lower(system.cholesky(q), p)), system.potential, q)
 
 
 def mass_matrix(system: NaturalSystem, q: Vector) -> Matrix:
-    """Mass matrix M = L Lᵀ [d, d]."""
+    """Returns the mass matrix M = L Lᵀ [d, d]."""
     factor = system.cholesky(q)
     return factor @ factor.T
 
 
 def forces(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] of a motion, without friction.
+    """Returns the generalised force tau [d] of a motion, without friction.
 
     With y = Lᵀ qd: dp/dt = L (Lᵀ qdd + dL/dtᵀ qd) + dL/dt y, and dT/dq_k = qdᵀ dL/dq_k y.
     """
-    # One derivative of the factor along the motion and one pull-back, instead of all of its d partial derivatives:
-    # faster to train through for d >= 2. With one coordinate a single derivative gives both.
+    # One derivative of the factor along the motion and one pull-back instead of its d partial derivatives: faster to
+    # train through for d >= 2. With one coordinate a single derivative gives both.
     if q.shape[0] == 1:
         factor, slope = jax.jvp(system.cholesky, (q,), (jnp.ones_like(q),))
         factor_rate = slope * qd
@@ -110,7 +110,7 @@ def hamiltonian_dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int 
     """
 
     def motion(q: Vector, qd: Vector):
-        """L, dL/dt y, dL/dtᵀ p and dT/dq."""
+        """Returns L, dL/dt y, dL/dtᵀ p and dT/dq."""
         factor, factor_rate = jax.jvp(system.inverse_factor, (q,), (qd,))
         _, pull_back = jax.vjp(system.inverse_factor, q)
         y = solve_lower(factor, qd)

@@ -1,9 +1,9 @@
-"""Residual of a known system as additional energies, for one state.
+"""Residual of a known system in the form of additional energies, for one state.
 
     tau = tau_known + d/dt dT/dqd - dT/dq + dV/dq + dD/dqd,   T = ½ |Lᵀ qd|²
 
 A potential explains forces that repeat with the position (springs, cables, gear teeth), a Rayleigh function forces that
-also depend on the velocity, and a kinetic energy, which only adds inertia, flexible parts.
+also depend on the velocity, and a kinetic energy, which can only add inertia, flexible parts.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class Residual(NamedTuple):
     potential: Potential | None = None
     """q -> V, scalar."""
     dissipation: Dissipation | None = None
-    """(q, qd) -> D, scalar; it may be negative if it corrects existing friction."""
+    """(q, qd) -> D, scalar; may be negative if it corrects existing friction."""
     cholesky: CholeskyFactor | None = None
     """q -> lower triangular L [d, d]."""
 

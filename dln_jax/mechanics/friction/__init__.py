@@ -1,4 +1,4 @@
-"""Friction of joints: laws, their Rayleigh functions, and load in transmissions."""
+"""Friction of joints: laws, their Rayleigh functions, and load-dependent friction of transmissions."""
 
 from dln_jax.mechanics.friction.curves import joint_dissipation, joint_rates, require_shape, unit_force
 from dln_jax.mechanics.friction.laws import (

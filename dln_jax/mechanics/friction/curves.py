@@ -1,8 +1,8 @@
-"""Rayleigh functions D(q, qd) of friction in joints, whose derivatives by the velocity are the forces.
+"""Rayleigh functions D(q, qd) of joint friction, whose derivatives with respect to velocity are the forces.
 
-They are built of curves of unit coefficients, elementwise in the rate u of a joint. Every curve is the integral of its
-force from rest. Its derivative is written out, because the terms in that of the integral cancel; higher derivatives are
-exact derivatives of the force.
+They consist of curves for unit coefficients, elementwise in the rate u of a joint. Every curve is the integral of its
+force from rest. Its derivative is written out, because terms cancel in the derivative of the integral; higher
+derivatives are exact derivatives of the force.
 """
 
 import math
@@ -23,7 +23,7 @@ NODES, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.l
 
 
 def integral(value: Callable[..., Array], slope: Callable[..., Array]) -> Callable[..., Array]:
-    """Returns the function value(x, *rest), elementwise in x, with the derivative `slope(x, *rest)` by x."""
+    """Returns the function value(x, *rest), elementwise in x, whose derivative by x is `slope(x, *rest)`."""
     function = jax.custom_jvp(value)
 
     def rule(primals, tangents):
@@ -43,12 +43,12 @@ def integral(value: Callable[..., Array], slope: Callable[..., Array]) -> Callab
 
 
 def _log_cosh(x: Vector) -> Vector:
-    """log cosh x without cosh, which overflows."""
+    """Returns log cosh x without cosh, which overflows."""
     return jnp.logaddexp(x, -x) - jnp.log(jnp.asarray(2.0, x.dtype))
 
 
 def _towards(side: int) -> Callable[[Vector], Vector]:
-    """(1 ± tanh x)/2, 1 on one side of rest and 0 on the other."""
+    """Returns (1 ± tanh x)/2: 1 on one side of rest and 0 on the other."""
     return lambda x: 0.5 * (1 + side * jnp.tanh(x))
 
 
@@ -66,7 +66,7 @@ def _one_sided(side: int) -> Callable[[Vector], Vector]:
 
 
 def _stribeck_value(x: Vector, ratio: Vector) -> Vector:
-    """√π/2 erf|x| minus the integral of exp(-s²) (1 - tanh(s / ratio)), whose integrand vanishes away from rest."""
+    """Returns √π/2 erf|x| minus the integral of exp(-s²) (1 - tanh(s / ratio)), which vanishes away from rest."""
     size = jnp.abs(x)
     reach = jnp.minimum(size, jnp.minimum(20 * ratio, 7.0))[..., None]
     s = reach * jnp.asarray(NODES, x.dtype)
@@ -113,11 +113,11 @@ POTENTIALS: Mapping[str, Callable[[Vector, FrictionShape], Vector]] = {
     "coulomb_backward": _scaled(dry_backward, 1),
     "sigmoid": _sigmoid,
 }
-"""Rayleigh function of one unit of a coefficient, by its name, [d] for the joints; W."""
+"""Rayleigh function, in W, of a unit coefficient by its name, [d] for the joints."""
 
 
 def unit_force(coefficient: str, u: Vector, shape: FrictionShape) -> Vector:
-    """The force [d] of one unit of a coefficient at rates u [d]."""
+    """Returns the force [d] of a unit coefficient at rates u [d]."""
     return jax.jvp(lambda rate: POTENTIALS[coefficient](rate, shape), (u,), (jnp.ones_like(u),))[1]
 
 
@@ -138,22 +138,21 @@ def joint_dissipation(
     sigmoid_shift: Any = 0.0,
     joint_map: Any = None,
 ) -> Dissipation | None:
-    """(q, qd) -> D in W, or `None` if all coefficients are absent or known to be zero.
+    """Returns (q, qd) -> D in W, or `None` if all coefficients are absent or known to be zero.
 
-    D is the sum over joints of the laws' integrals. It is smooth at rest, and non-negative for non-negative
-    coefficients (except the part of the offset, which is no loss). The force is exactly that of the formulas in
+    D is the sum of the laws' integrals over all joints. It is smooth at rest, and non-negative for non-negative
+    coefficients (except the part of the offset, which is not a loss). The force is exactly that of the formulas in
     `friction.laws`.
 
     Args:
         viscous, coulomb, offset, stribeck: as in `FrictionCoefficients`; one per joint [d] or one for all.
         viscous_forward, viscous_backward, coulomb_forward, coulomb_backward, sigmoid: likewise.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`.
-        joint_map: known J [d, d] that maps rates of the coordinates to joint rates J qd; D(J qd), with the force
-            Jᵀ dD/du.
+        joint_map: known J [d, d] that maps rates of the coordinates to joint rates J qd; the force is Jᵀ dD/du.
 
     Raises:
-        InputError: a known coefficient of friction that is negative or not finite, or a known velocity or slope that is
-            not positive.
+        InputError: a known friction coefficient is negative or not finite, or a known velocity or slope is not
+            positive.
     """
     coefficients = FrictionCoefficients(
         viscous, coulomb, offset, stribeck,
@@ -185,7 +184,7 @@ def joint_dissipation(
 
 
 def joint_rates(joint_map: Any, qd: Vector) -> Vector:
-    """Joint rates J qd [d]."""
+    """Returns the joint rates J qd [d]."""
     return qd if joint_map is None else jnp.asarray(joint_map, qd.dtype) @ qd
 
 

@@ -6,7 +6,7 @@ With the joint's rate u, and v, w, a, s the velocity scale, Stribeck's velocity,
 |---|---|---|---|
 | viscous | b u | b | |
 | coulomb | c tanh(u / v) | c | v |
-| stribeck | c_s exp(-(u / w)²) tanh(u / v), on top of coulomb's | c_s, static minus dry friction | v, w |
+| stribeck | c_s exp(-(u / w)²) tanh(u / v), on top of coulomb | c_s, static minus dry friction | v, w |
 | offset | o | o | |
 | asymmetric | b₊ u + c₊ forwards, b₋ u - c₋ backwards | b₊, b₋, c₊, c₋ | v |
 | sigmoid | A / (1 + exp(-a (u + s))) - A / (1 + exp(-a s)) | A | a, s |
@@ -30,14 +30,14 @@ LAWS: tuple[FrictionLaw, ...] = get_args(FrictionLaw)
 
 
 class FrictionCoefficients(NamedTuple):
-    """Linear parameters of friction: a number per joint [d], or one for all; `None` for absent laws."""
+    """Linear parameters of friction: one number per joint [d], or one for all; `None` for absent laws."""
 
     viscous: Any = None
     """b, N m s or N s/m."""
     coulomb: Any = None
     """c, N m or N."""
     offset: Any = None
-    """o, N m or N: an offset of sensors and gears rather than a loss; the only one that may be negative."""
+    """o, N m or N: an offset of sensors and gears, not a loss; the only coefficient that may be negative."""
     stribeck: Any = None
     """c_s, N m or N, static minus dry friction."""
     viscous_forward: Any = None
@@ -53,10 +53,10 @@ class FrictionCoefficients(NamedTuple):
 
 
 class FrictionShape(NamedTuple):
-    """Nonlinear parameters of friction: a number per joint [d], or one for all."""
+    """Nonlinear parameters of friction: one number per joint [d], or one for all."""
 
     velocity_scale: Any = 0.01
-    """v, 1/s or m/s, at which dry friction reaches 76 % of its force; a joint at rest creeps more slowly."""
+    """v, 1/s or m/s, at which dry friction reaches 76 % of its force; a joint that sticks creeps more slowly."""
     stribeck_velocity: Any = 0.1
     """w, 1/s or m/s."""
     sigmoid_slope: Any = 10.0
@@ -81,13 +81,13 @@ PARAMETERS: Mapping[FrictionLaw, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def coefficients_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
-    """Names of the coefficients of some laws, in the order of `FrictionCoefficients`."""
+    """Returns the names of the laws' coefficients, in the order of `FrictionCoefficients`."""
     names = {name for law in laws for name in PARAMETERS[law][0]}
     return tuple(name for name in FrictionCoefficients._fields if name in names)
 
 
 def shape_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
-    """Names of the shape parameters of some laws, in the order of `FrictionShape`."""
+    """Returns the names of the laws' shape parameters, in the order of `FrictionShape`."""
     names = {name for law in laws for name in PARAMETERS[law][1]}
     return tuple(name for name in FrictionShape._fields if name in names)
 

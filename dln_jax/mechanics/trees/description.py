@@ -15,15 +15,15 @@ EARTH = (0.0, 0.0, -9.81)
 
 
 class Tree(NamedTuple):
-    """Rigid bodies in a tree of d joints, with one link behind every joint; a link's frame has its origin at its joint.
+    """Rigid bodies in a tree of d joints, one link behind every joint; a link's frame has its origin at its joint.
 
     At q = 0, link i has the rotation `rotations[i]` and the position `positions[i]` in the frame of its parent link. It
-    rotates about `axes[i]`, or slides along it, in its own frame. The structure is plain Python. The numbers are NumPy
-    arrays if they are known (zeros among them then cost nothing) or JAX arrays if they are learned.
+    rotates about `axes[i]`, or slides along it, in its own frame. The structure is plain Python. Known numbers are
+    NumPy arrays (zeros among them then cost nothing), learned ones JAX arrays.
     """
 
     parents: tuple[int, ...]
-    """Parent link of every link, an earlier one; -1 is the ground."""
+    """Parent of every link, an earlier link; -1 is the ground."""
     joints: tuple[JointKind, ...]
     rotations: Any
     """[d, 3, 3]; columns are the axes of the link's frame."""
@@ -32,9 +32,9 @@ class Tree(NamedTuple):
     axes: Any
     """[d, 3], unit vectors."""
     inertias: Any
-    """[d, 10], the links' inertial parameters in their own frames, as `inertia.PARAMETERS`."""
+    """[d, 10], inertial parameters of the links in their own frames, in the order of `inertia.PARAMETERS`."""
     armature: Any
-    """[d], inertias of the motors on the joints' side, kg m² or kg; [d, d] if motors turn with several joints."""
+    """[d], motor inertias seen at the joints, kg m² or kg; [d, d] if motors turn with several joints."""
     gravity: Any = np.array(EARTH)
     """[3], m/s², in the frame of the ground."""
     names: tuple[str, ...] = ()
@@ -67,8 +67,8 @@ def make_tree(
     """Builds a tree of known numbers and checks its structure and shapes; axes are normalised.
 
     Raises:
-        InputError: links out of order, joints of another kind, arrays of another shape or not finite, an invalid
-            rotation, an armature of negative inertia, or an axis of length zero.
+        InputError: links are out of order, joints are of another kind, arrays have another shape or are not finite, a
+            rotation is invalid, an armature is negative, or an axis has length zero.
     """
     d = len(parents)
     if d == 0 or any(not -1 <= parent < link for link, parent in enumerate(parents)):
@@ -101,7 +101,7 @@ def make_tree(
 
 
 def serial(rotations: Any, positions: Any, inertias: Any, *, axes: Any = None, **others: Any) -> Tree:
-    """Builds an arm, a serial chain by default of revolute joints about z. Other arguments as for `make_tree`."""
+    """Builds an arm: a serial chain, by default of revolute joints about z. Other arguments as for `make_tree`."""
     d = np.shape(positions)[0]
     axes = np.tile([0.0, 0.0, 1.0], (d, 1)) if axes is None else axes
     joints = others.pop("joints", ("revolute",) * d)
@@ -109,14 +109,14 @@ def serial(rotations: Any, positions: Any, inertias: Any, *, axes: Any = None, *
 
 
 def dh_frames(rows: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations [d, 3, 3] and positions [d, 3] of an arm whose joints turn about z, from Denavit-Hartenberg rows.
+    """Returns rotations [d, 3, 3] and positions [d, 3] of an arm with joints about z, from Denavit-Hartenberg rows.
 
     Args:
-        rows: [d, 4], modified, after Craig: a row (alpha, a, d, theta) is a rotation by alpha, rad, about x and a shift
-            by a, m, along it, then a rotation by theta about z and a shift by d along it.
+        rows: [d, 4], modified (Craig): a row (alpha, a, d, theta) is a rotation by alpha in rad about x and a shift by
+            a in m along it, then a rotation by theta about z and a shift by d along it.
 
     Raises:
-        InputError: rows of another shape.
+        InputError: rows have another shape.
     """
     table = np.asarray(rows, float)
     if table.ndim != 2 or table.shape[1] != 4:
@@ -133,7 +133,7 @@ def with_payload(tree: Tree, link: int, inertia: Inertia, *, rotation: Any = Non
     """Adds a body fixed to a link; rotation and position are those of the body's frame in the link's frame.
 
     Raises:
-        InputError: no such link.
+        InputError: there is no such link.
     """
     if not 0 <= link < tree.degrees_of_freedom:
         raise InputError(f"link is {link}; expected 0 to {tree.degrees_of_freedom - 1}")
@@ -151,10 +151,10 @@ def tree_to_json(tree: Tree) -> dict[str, Any]:
 
 
 def tree_from_json(values: Any) -> Tree:
-    """Returns the tree of `tree_to_json`.
+    """Returns the tree from the output of `tree_to_json`.
 
     Raises:
-        InputError: fields that are missing or unknown, or that `make_tree` refuses.
+        InputError: fields are missing or unknown, or `make_tree` refuses them.
     """
     if not isinstance(values, Mapping) or set(values) != set(Tree._fields):
         raise InputError(f"tree: expected the fields {', '.join(Tree._fields)}, got {reprlib.repr(values)}")

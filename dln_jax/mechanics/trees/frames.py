@@ -1,7 +1,7 @@
 """Frames of a tree's links, and vectors between them.
 
-All joints are about z of their link here: `aligned` rotates the links of a tree accordingly. Known rotations that only
-exchange axes cost nothing but signs.
+Here all joints are about z of their link: `aligned` rotates the links of a tree accordingly. Known rotations that only
+exchange axes cost only signs.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,7 @@ def aligned(tree: Tree) -> Tree:
 
 
 def _onto(axis: np.ndarray) -> np.ndarray:
-    """A rotation whose third column is the axis, with whole numbers if that is an axis of the frame."""
+    """Returns a rotation whose third column is the axis; its entries are integers if that is an axis of the frame."""
     place = int(np.argmax(np.abs(axis)))
     first = np.eye(3)[(place + 1) % 3]
     first = first - axis * (axis @ first)
@@ -61,7 +61,7 @@ def _onto(axis: np.ndarray) -> np.ndarray:
 
 
 def placed(tree: Tree, q: Vector) -> list[Placed]:
-    """Frames of the links of an aligned tree relative to their parent links."""
+    """Returns the frames of the links of an aligned tree relative to their parent links."""
     frames = []
     for link, kind in enumerate(tree.joints):
         rotation, position = tree.rotations[link], tree.positions[link]
@@ -91,7 +91,7 @@ def inwards(frame: Placed, vector: Vector3) -> Vector3:
 
 
 def _product(matrix: Any, vector: Vector3) -> list[Any]:
-    """Matrix times vector, element by element, without terms that are known to be zero."""
+    """Multiplies a matrix by a vector element by element, without terms that are known to be zero."""
     if not isinstance(matrix, np.ndarray):
         return list(matrix @ vector)
     rows = []
@@ -106,7 +106,7 @@ def _product(matrix: Any, vector: Vector3) -> list[Any]:
 
 
 def cross(a: Any, b: Any) -> Vector3:
-    """a x b, without terms that are known to be zero."""
+    """Returns a x b, without terms that are known to be zero."""
 
     def difference(i: int, j: int) -> Any:
         terms = [(1, a[i], b[j]), (-1, a[j], b[i])]
@@ -124,7 +124,7 @@ def _is_zero(number: Any) -> bool:
 
 
 def world_frames(tree: Tree, q: Vector) -> tuple[Float[Array, "d 3 3"], Float[Array, "d 3"]]:
-    """Rotations and origins of the links' own frames in the ground's frame, for figures and tips."""
+    """Returns rotations and origins of the links' own frames in the ground's frame, for figures and tool points."""
     rotations: list[Any] = []
     origins: list[Any] = []
     for link, (parent, kind) in enumerate(zip(tree.parents, tree.joints, strict=True)):
@@ -142,14 +142,14 @@ def world_frames(tree: Tree, q: Vector) -> tuple[Float[Array, "d 3 3"], Float[Ar
 
 
 def frame_jacobian(tree: Tree, link: int, point: Any = (0.0, 0.0, 0.0)) -> Callable[[Vector], Float[Array, "6 d"]]:
-    """q -> J with (velocity of a point of a link, angular velocity of the link) = J qd, in the ground's frame.
+    """Returns q -> J with (velocity of a point of a link, angular velocity of the link) = J qd, in the ground's frame.
 
     Its transpose maps a force and a moment on the link, about the point, to joint torques.
 
     Args:
         tree: the bodies.
         link: number of the link.
-        point: in the link's own frame, m.
+        point: position in the link's own frame, m.
 
     Raises:
         InputError: there is no such link.
@@ -174,7 +174,7 @@ def frame_jacobian(tree: Tree, link: int, point: Any = (0.0, 0.0, 0.0)) -> Calla
 
 
 def _turn(axis: Vector3, angle: Array) -> Float[Array, "3 3"]:
-    """Rodrigues' formula."""
+    """Rodrigues' rotation formula."""
     x, y, z = axis
     zero = jnp.zeros_like(x)
     hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])

@@ -2,7 +2,7 @@
 
     theta = (m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz)
 
-m in kg; h = m c in kg m, with the centre of mass c; I in kg m² about the origin of the body's frame, along its axes.
+m in kg; h = m c in kg m, with the centre of mass c; I in kg m² about the origin of the body's frame, in its axes.
 """
 
 from typing import Any
@@ -18,24 +18,24 @@ _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 def inertial_parameters(mass: Any, centre: Any, about_centre: Any) -> Inertia:
-    """theta of a body, in NumPy with double precision if all arguments are known.
+    """Returns theta of a body, as a NumPy array in double precision if all arguments are known.
 
     Args:
         mass: m, kg.
-        centre: of mass [3], m.
-        about_centre: moments about the centre of mass [3, 3], kg m².
+        centre: centre of mass [3], m.
+        about_centre: moments of inertia about the centre of mass [3, 3], kg m².
     """
     m, c, about = _alike(mass, centre, about_centre)
     return _joined(m, m * c, about + m * (c @ c * np.eye(3) - c[:, None] * c))
 
 
 def parts(theta: Inertia) -> tuple[Any, Any, Any]:
-    """m, h [3] and I [3, 3]."""
+    """Returns m, h [3] and I [3, 3]."""
     return theta[0], theta[1:4], theta[4:][_PLACES]
 
 
 def moved(theta: Inertia, rotation: Any, position: Any) -> Inertia:
-    """theta of a body in another frame, where its own frame has this rotation (columns are its axes) and position."""
+    """Returns theta of a body in a frame where its own frame has this rotation (columns are its axes) and position."""
     own, R, r = _alike(theta, rotation, position)
     m, h, moments = parts(own)
     turned = R @ h
@@ -45,7 +45,7 @@ def moved(theta: Inertia, rotation: Any, position: Any) -> Inertia:
 
 
 def pseudo_inertia(theta: Inertia) -> Any:
-    """The matrix that is positive definite for physically consistent bodies only (Wensing, Kim and Slotine, RA-L 2018).
+    """Returns J, which is positive definite only for physically consistent bodies (Wensing, Kim, Slotine, RA-L 2018).
 
     J = [[tr(I) / 2 - I, h], [hᵀ, m]]
     """
@@ -57,7 +57,7 @@ def pseudo_inertia(theta: Inertia) -> Any:
 
 
 def body_of_pseudo_inertia(J: Any) -> Inertia:
-    """theta of the body whose `pseudo_inertia` is J [4, 4]."""
+    """Returns theta of the body whose `pseudo_inertia` is J [4, 4]."""
     (own,) = _alike(J)
     numpy = np if isinstance(own, np.ndarray) else jnp
     return _joined(own[3, 3], own[:3, 3], numpy.trace(own[:3, :3]) * np.eye(3) - own[:3, :3])

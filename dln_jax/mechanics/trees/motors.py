@@ -2,11 +2,11 @@
 
     motor rates = S qd,   A = Sᵀ (diag(I) + C) S,   M = M_links + A
 
-S [d, d] is a known constant matrix, the identity if every motor turns with its own joint alone. If a parallelogram or a
-belt drives joint 3 from a motor that does not move with joint 2, its rate is qd_2 + qd_3, so that row 3 of S is
-(0, 1, 1). I [d] are the inertias of the motors at that rate. C is symmetric with zeros on its diagonal, and non-zero at
-stated pairs of joints alone: the constant inertia by which one joint's acceleration loads another one's motor, for gear
-ratios that are unknown. A motor of joint 3 on link 2 with a gear of ratio n, parallel to joint 2, has C_23 = I_3 / n.
+S [d, d] is a known constant matrix, the identity if every motor turns only with its own joint. If a parallelogram or a
+belt drives joint 3 from a motor that does not move with joint 2, its rate is qd_2 + qd_3, so row 3 of S is (0, 1, 1).
+I [d] are the inertias of the motors at that rate. C is symmetric with a zero diagonal, and non-zero only at stated
+pairs of joints: the constant inertia by which one joint's acceleration loads another joint's motor, for unknown gear
+ratios. A motor of joint 3 on link 2 with gear ratio n, parallel to joint 2, has C_23 = I_3 / n.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,11 +21,11 @@ from dln_jax.types import InputError, Vector, finite_array
 Pair = tuple[int, int]
 """Two joints, counted from 0, the lower one first."""
 LARGEST_CONDITION = 1e6
-"""Largest condition number of S, beyond which motor rates hardly determine joint rates."""
+"""Largest condition number of S; beyond it, motor rates hardly determine joint rates."""
 
 
 def require_motors(rates: Any, coupled: Sequence[Pair], d: int) -> None:
-    """Raises `InputError` unless `rates` is an invertible matrix S or `None`, and the pairs are different joints."""
+    """Raises `InputError` unless `rates` is an invertible matrix S or `None`, and the pairs are of different joints."""
     if rates is not None:
         S = finite_array("motors", rates, (d, d))
         if not np.linalg.cond(S) < LARGEST_CONDITION:
@@ -36,7 +36,7 @@ def require_motors(rates: Any, coupled: Sequence[Pair], d: int) -> None:
 
 
 def armature_matrix(inertias: Any, rates: Any = None, coupling: Mapping[Pair, Any] | None = None) -> Any:
-    """Returns A [d, d], or I [d] unchanged if every motor turns with its own joint alone; NumPy if all is known."""
+    """Returns A [d, d], or I [d] unchanged if every motor turns only with its own joint; NumPy if all is known."""
     if rates is None and not coupling:
         return inertias
     entries = (coupling or {}).items()
@@ -52,7 +52,7 @@ def armature_matrix(inertias: Any, rates: Any = None, coupling: Mapping[Pair, An
 
 
 def motor_regressor(rates: Any, coupled: Sequence[Pair], qdd: Vector) -> Float[Array, "d P"]:
-    """Forces of unit I and unit entries of C, in the order of the motors, then of the pairs."""
+    """Returns the forces of unit I and of unit entries of C, in the order of the motors, then of the pairs."""
     S = jnp.eye(qdd.shape[0], dtype=qdd.dtype) if rates is None else jnp.asarray(rates, qdd.dtype)
     u = S @ qdd
     pairs = [S[i] * u[j] + S[j] * u[i] for i, j in coupled]
@@ -62,14 +62,14 @@ def motor_regressor(rates: Any, coupled: Sequence[Pair], qdd: Vector) -> Float[A
 def motors_of(
     armature: Float[np.ndarray, "d d"] | Float[np.ndarray, " d"], rates: Any, coupled: Sequence[Pair]
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " pairs"]]:
-    """I and the entries of C that give an armature.
+    """Returns I and the entries of C that give an armature.
 
     Raises:
-        InputError: motors and pairs that have no such armature.
+        InputError: the motors and pairs cannot have this armature.
     """
     A = np.asarray(armature, float)
     if A.ndim == 1:
-        return A, np.zeros(len(coupled))  # of the motors, whatever they turn
+        return A, np.zeros(len(coupled))  # inertias of the motors, whatever they turn
     if rates is not None:
         back = np.linalg.inv(np.asarray(rates, float))
         A = back.T @ A @ back
@@ -89,8 +89,7 @@ def motors_of(
 def single_motors(armature: Any) -> tuple[Float[np.ndarray, " d"], list[tuple[float, Float[np.ndarray, " d"]]]]:
     """Splits A = diag(a) + sum of I c cᵀ: armatures a of the joints, and motors of inertia I that turn at c qd.
 
-    Elimination from the last joint on gives c = row of S for triangular S. a is not negative, as A is positive
-    semidefinite.
+    Eliminating from the last joint on gives c = row of S for triangular S. As A is positive semidefinite, a >= 0.
     """
     A, motors = np.array(armature, float), []
     if A.ndim == 1:

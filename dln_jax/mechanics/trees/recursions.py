@@ -21,7 +21,7 @@ from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
 
 def newton_euler(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] of a motion, with gravity and armature, without friction."""
+    """Returns the generalised force tau [d] of a motion, with gravity and armature, without friction."""
     tree = aligned(tree)
     frames = placed(tree, q)
     forces: list[Any] = []
@@ -52,14 +52,14 @@ def newton_euler(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
 
 
 def _motor_momentum(tree: Tree, rates: Vector) -> Vector:
-    """A qd of the motors, or their force A qdd."""
+    """Returns A qd, the momentum of the motors, or their force A qdd."""
     return tree.armature @ rates if np.ndim(tree.armature) == 2 else tree.armature * rates
 
 
 def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]:
-    """Angular velocity and acceleration, and the acceleration of the link's origin, with the joint locked.
+    """Returns angular velocity and acceleration, and the acceleration of the link's origin, with the joint locked.
 
-    Angular ones are `None` if they are zero: on the ground, and on prismatic joints from there.
+    Angular quantities are `None` if zero: on the ground, and behind prismatic joints from there.
     """
     if motion is None:
         return None, None, outwards(frame, -jnp.asarray(gravity, jnp.result_type(float)))
@@ -72,7 +72,7 @@ def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]
 
 
 def _force(theta: Any, w: Any, dw: Any, a: Any) -> tuple[Any, Any]:
-    """Force and moment of a body's motion."""
+    """Returns the force and moment that a body's motion needs."""
     m, h, moments = parts(theta)
     force, moment = m * a, cross(h, a)
     if w is not None:
@@ -82,7 +82,7 @@ def _force(theta: Any, w: Any, dw: Any, a: Any) -> tuple[Any, Any]:
 
 
 def composite_bodies(tree: Tree, q: Vector) -> Matrix:
-    """Mass matrix M [d, d], armature included."""
+    """Returns the mass matrix M [d, d], including the armature."""
     tree = aligned(tree)
     frames = placed(tree, q)
     d = len(frames)
@@ -112,7 +112,7 @@ def composite_bodies(tree: Tree, q: Vector) -> Matrix:
 
 
 def _carried(body: tuple[Any, Any, Any], frame: Placed) -> tuple[Any, Any, Any]:
-    """m, h and I of a body in the frame of the parent link."""
+    """Returns m, h and I of a body in the frame of the parent link."""
     m, h, moments = body
     turned = inwards(frame, jnp.asarray(h))
     half = jnp.stack([inwards(frame, column) for column in jnp.asarray(moments).T], axis=1)
@@ -124,7 +124,7 @@ def _carried(body: tuple[Any, Any, Any], frame: Placed) -> tuple[Any, Any, Any]:
 
 
 def regressor(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
-    """Phi with tau = Phi theta; theta holds the links' ten parameters end to end, then an armature [d], P = 11 d."""
+    """Returns Phi with tau = Phi theta; theta is the links' ten parameters end to end, then the armature [d]."""
 
     def force(inertias: Array, armature: Array) -> Vector:
         return newton_euler(tree._replace(inertias=inertias, armature=armature), q, qd, qdd)
@@ -136,7 +136,7 @@ def regressor(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d
 
 
 def kinetic_energy(tree: Tree, q: Vector, qd: Vector) -> Scalar:
-    """T = sum over links of ½ m |v|² + v . (ω x h) + ½ ω . I ω, and ½ qd . A qd of the armature."""
+    """Returns T = sum over links of ½ m |v|² + v . (ω x h) + ½ ω . I ω, plus ½ qd . A qd of the armature."""
     tree = aligned(tree)
     frames, moving = placed(tree, q), []
     total = 0.5 * qd @ _motor_momentum(tree, qd)
@@ -153,7 +153,7 @@ def kinetic_energy(tree: Tree, q: Vector, qd: Vector) -> Scalar:
 
 
 def potential_energy(tree: Tree, q: Vector) -> Scalar:
-    """V = -sum over links of gravity . (m p + R h), zero if all centres of mass are at the ground's origin."""
+    """Returns V = -sum over links of gravity . (m p + R h), zero if all centres of mass are at the ground's origin."""
     tree = aligned(tree)
     frames = placed(tree, q)
     # Mass and first moment of the subtree of a link, from the tips to the ground.
@@ -171,12 +171,12 @@ def potential_energy(tree: Tree, q: Vector) -> Scalar:
 
 
 def lagrangian(tree: Tree) -> Lagrangian:
-    """L(q, qd) = T - V, from which all dynamics follow."""
+    """Returns L(q, qd) = T - V, from which all dynamics follow."""
     return lambda q, qd: kinetic_energy(tree, q, qd) - potential_energy(tree, q)
 
 
 def tree_energies(tree: Tree, dissipation: Dissipation | None = None) -> LagrangianSystem:
-    """Returns a record of the Lagrangian alone, with derivatives as forces; equal to `tree_system`, but slower."""
+    """Returns a record of the Lagrangian alone, with derivatives as forces; equivalent to `tree_system`, but slower."""
     return LagrangianSystem(lagrangian(tree), dissipation)
 
 
@@ -184,7 +184,7 @@ def tree_system(tree: Tree, dissipation: Dissipation | None = None) -> Recursive
     """Returns the record for `equations.dynamics`, with forces by recursions.
 
     Args:
-        tree: of known or learned numbers.
+        tree: a tree of known or learned numbers.
         dissipation: (q, qd) -> Rayleigh function.
     """
     return RecursiveSystem(

@@ -1,7 +1,7 @@
-"""Forces of a tree with learned frames, by one scan over its links: quick to compile, and to differentiate.
+"""Forces of a tree with learned frames, by one scan over its links: quick to compile and to differentiate.
 
 `recursions` unrolls the links, so that zeros of known frames cost nothing. Here no frame is known. In every link's
-frame the scan carries the link's motions for unit rates of the joints (the columns of its Jacobian), its own motion,
+frame the scan carries the link's motions for unit rates of the joints (the columns of its Jacobian), its own motion
 and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008). The forces of the
 links are then independent.
 """
@@ -20,21 +20,21 @@ from dln_jax.types import JointKind, Vector
 
 
 class Skeleton(NamedTuple):
-    """Links and joints of a tree, without inertias; a link's joint is about its z."""
+    """Links and joints of a tree, without inertias; every joint is about z of its link."""
 
     parents: Sequence[int]
-    """As of a `Tree`."""
+    """As in `Tree`."""
     joints: Sequence[JointKind]
     gravity: Any
     """[3], m/s²."""
     rotations: Any
-    """[d, 3, 3], of the links at q = 0 relative to their parent links."""
+    """[d, 3, 3], rotations of the links at q = 0 relative to their parent links."""
     positions: Any
-    """[d, 3], of the links relative to their parent links, m."""
+    """[d, 3], positions of the links relative to their parent links, m."""
 
 
 def scanned_regressor(skeleton: Skeleton, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d d 10"]:
-    """d tau / d theta: forces of the joints for unit inertial parameters of the links, without armature."""
+    """Returns d tau / d theta: joint forces for unit inertial parameters of the links, without armature."""
 
     def of_link(angular: Array, linear: Array) -> Array:
         w, dw, a = _motion(angular, linear)
@@ -48,7 +48,7 @@ def scanned_regressor(skeleton: Skeleton, q: Vector, qd: Vector, qdd: Vector) ->
 
 
 def scanned_forces(skeleton: Skeleton, inertias: Any, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """tau [d] of links with inertial parameters `inertias` [d, 10], as `newton_euler`, without armature."""
+    """Returns tau [d] of links with inertial parameters `inertias` [d, 10], like `newton_euler` without armature."""
 
     def of_link(angular: Array, linear: Array, theta: Array) -> Array:
         w, dw, a = _motion(angular, linear)
@@ -63,7 +63,7 @@ def scanned_forces(skeleton: Skeleton, inertias: Any, q: Vector, qd: Vector, qdd
 def _spatial(
     skeleton: Skeleton, q: Vector, qd: Vector, qdd: Vector
 ) -> tuple[Float[Array, "d 3 n"], Float[Array, "d 3 n"]]:
-    """Angular and linear parts in the links' frames: d columns of the Jacobian, the velocity, the acceleration."""
+    """Returns angular and linear parts in the links' frames: d columns of the Jacobian, velocity, acceleration."""
     parents, joints, gravity, rotations, positions = skeleton
     d = len(parents)
     turns = np.array([kind == "revolute" for kind in joints], float)
@@ -101,7 +101,7 @@ def _spatial(
 
 
 def _motion(angular: Array, linear: Array) -> tuple[Array, Array, Array]:
-    """Angular velocity, its rate, and the acceleration of the link's origin."""
+    """Returns angular velocity, its rate, and the acceleration of the link's origin."""
     w = angular[:, -2]
     return w, angular[:, -1], linear[:, -1] + jnp.cross(w, linear[:, -2])
 
@@ -113,7 +113,7 @@ def _hat(v: Array) -> Array:
 
 
 def _moments(w: Array) -> Array:
-    """[3, 6] with I w = _moments(w) (I_xx, I_xy, I_xz, I_yy, I_yz, I_zz)."""
+    """Returns the matrix [3, 6] with I w = _moments(w) (I_xx, I_xy, I_xz, I_yy, I_yz, I_zz)."""
     x, y, z = w
     zero = jnp.zeros_like(x)
     rows = [[x, y, z, zero, zero, zero], [zero, x, zero, y, z, zero], [zero, zero, x, zero, y, z]]
