@@ -6,13 +6,13 @@
     (qd, pd) = J grad H + grad F,   J grad H = (dH/dp, -dH/dq),   grad F = (dF/dq, dF/dp)
 
 The first two are separate networks, so one need not invert the other. The third is the baseline of Greydanus, Dzamba
-and Yosinski (2019). These three have no energy, no mass matrix and no decomposition of forces, so an absent force saves
-nothing.
+and Yosinski (2019). These three have no energy, no mass matrix and no decomposition of forces, so leaving out a force
+saves nothing.
 
 The last one is a Helmholtz decomposition, published in the same paper with the same canonical J and the same names. The
-solenoidal part J grad H has no divergence and conserves H, the conservative part grad F has no rotation. H and F are
-networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): that of
-a damped spring is F = -½ c p². Fields of harmonic functions have neither divergence nor rotation and may be in either
+solenoidal part J grad H has no divergence and conserves H; the conservative part grad F has no rotation. H and F are
+networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): for a
+damped spring it is F = -½ c p². Fields of harmonic functions have neither divergence nor rotation and may be in either
 part.
 """
 
@@ -106,7 +106,7 @@ def make_helmholtz(
     momentum_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Returns the (init, energies) pair of a field of rates; H of a solenoidal part is the energy of its flow.
+    """Returns the (init, energies) pair of a field of rates; with a solenoidal part, H is the energy of its flow.
 
     Args:
         field: parts of the field: "solenoidal" is a Hamiltonian network, "conservative" a gradient, or "both".
@@ -114,7 +114,7 @@ def make_helmholtz(
         needs, width, depth, activation, dtype: as described in `models.model`; friction in the needs has no effect.
 
     Raises:
-        InputError: an unknown field, or numbers that are not positive.
+        InputError: the field is unknown, or a number is not positive.
     """
     if field not in FIELDS:
         raise InputError(f"field is {field!r}; expected one of {', '.join(FIELDS)}")

@@ -6,10 +6,10 @@
     dissipative:  D = ½ sum_j c_j(q) qd_j²,   c = softplus(network(features(q))) > 0,   dH/dt = -2 D <= 0
 
 The black-box model is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured one
-follows Lutter and Peters 2021, whose network gives the inverse mass matrix, and the separable one Chen et al. 2020,
-"Symplectic recurrent neural networks". The separable model cannot express products of q and p, so that explicit
-symplectic steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems with a constant mass matrix and
-any kinetic energy of p.
+follows Lutter and Peters 2021, with a network for the inverse mass matrix, and the separable one Chen et al. 2020,
+"Symplectic recurrent neural networks". The separable model cannot express products of q and p, so explicit symplectic
+steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems with a constant mass matrix and any kinetic
+energy of p.
 
 `mechanics.equations.flow` turns all of them into Hamilton's equations, and `dynamics` into equations in velocities.
 """
@@ -55,7 +55,7 @@ def make_structured_hamiltonian(
     """Returns the (init, energies) pair of a structured Hamiltonian network.
 
     Args:
-        diagonal_shift: added to the pre-activation of L's diagonal; it sets the initial diagonal.
+        diagonal_shift: added to the pre-activation of L's diagonal; sets the initial diagonal.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M⁻¹.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
@@ -77,9 +77,9 @@ def make_black_box_hamiltonian(
 ) -> Model:
     """Returns the (init, energies) pair of a black-box Hamiltonian network.
 
-    Hamilton's equations need no solution for the momentum and hold for any parameters. Functions of (q, qd) need one,
-    which may not exist for an untrained network. They also need an activation with curvature in p, since M⁻¹ is the
-    second derivative in p. Absent gravity saves nothing.
+    Hamilton's equations hold for any parameters and need no solve for the momentum. Functions of (q, qd) do, and for an
+    untrained network it may have no solution. They also need an activation with curvature in p, since M⁻¹ is the second
+    derivative by p. Leaving out gravity saves nothing.
 
     Args:
         momentum_scale: typical size of p, by which the network's input is divided.
@@ -107,7 +107,7 @@ def make_separable_hamiltonian(
 ) -> Model:
     """Returns the (init, energies) pair of T(p) + V(q), without V if there is no gravity.
 
-    Arguments and the activation are as for `make_black_box_hamiltonian`; `initial_guess` gives p(qd).
+    Arguments and requirements on the activation are as for `make_black_box_hamiltonian`; `initial_guess` returns p(qd).
     """
     require_positive(iterations=iterations)
     networks = perceptrons(width, depth, activation)
@@ -148,12 +148,12 @@ def make_dissipative(
     Args:
         make: needs -> the model.
         needs: needs of the scene; without friction the keywords have no effect.
-        friction_width: hidden units of the network for c; with 0 each coordinate has one coefficient, as `make` has it.
+        friction_width: hidden units of the network for c; 0 keeps the constant coefficients, as in `make`.
         initial_friction: approximate initial value of c, in N m s or N s/m.
         friction_depth, friction_activation, dtype: keywords of the network, as described in `models.model`.
 
     Raises:
-        InputError: a width, depth or friction that is not positive.
+        InputError: a width, depth or friction is not positive.
     """
     if not (needs.friction and friction_width):
         return make(needs)

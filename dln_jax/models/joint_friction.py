@@ -1,13 +1,13 @@
 """Adds joint friction to any model, with the laws that the needs name.
 
-This module decides the parametrisation for all models. Models trained by descent have parameters x with
+All models share the parametrisation of this module. Models trained by descent have parameters x with
 
     coefficients = softplus(x) > 0, offsets = x, sigmoid's shift = x, share of load = 1 / (1 + exp(-x)) in (0, 1)
     Stribeck's velocity and the sigmoid's slope = default exp(x) > 0
 
 The velocity scale is fixed, since only the user knows which steps the integrator takes. In models that are linear in
-their parameters, the coefficients are parameters themselves, fitted by one least-squares problem. They may become
-negative, which shows that the data do not identify the law. Shapes keep their defaults there (`learning.friction` fits
+their parameters, the coefficients themselves are parameters, fitted by one least-squares problem. They may become
+negative, which shows that the data do not identify the law. There, shapes keep their defaults (`learning.friction` fits
 them), and load, which multiplies the forces of the energies, is refused.
 """
 
@@ -32,12 +32,12 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Needs
 
 START = -3.0
-"""Initial x of positive coefficients: softplus gives 0.05 N m or N m s, as for viscous friction of networks."""
+"""Initial x of positive coefficients: softplus gives 0.05 N m or N m s, as for the viscous friction of networks."""
 HELD = "velocity_scale"
 
 
 class FrictionParameters(NamedTuple):
-    """Parameters of joint friction by name, for the laws in use; linear coefficients apart from the others."""
+    """Parameters of joint friction by name, for the laws in use; linear coefficients are separate from the others."""
 
     coefficients: dict[str, Any]
     """Arrays [d] named as in `FrictionCoefficients`, before the parametrisation above."""
@@ -60,12 +60,12 @@ def with_joint_friction(
         needs: `joint_friction` names the laws, `joint_map` maps coordinates to joints, and `velocity_scale` is that of
             dry friction. Without laws the model is returned unchanged.
         linear: keeps a model linear in its parameters.
-        shape: initial values of learned shapes and fixed values of the others; by default with the velocity scale of
-            the needs.
+        shape: initial values of learned shapes and values of fixed ones; by default with the velocity scale of the
+            needs.
         dtype: type of the friction parameters.
 
     Raises:
-        InputError: an unknown law, two laws for the same friction, load in a linear model, or a shape that is not
+        InputError: a law is unknown, two laws describe the same friction, load is in a linear model, or a shape is not
             positive.
     """
     laws = needs.joint_friction
@@ -105,7 +105,7 @@ def with_joint_friction(
 def friction_of(
     parameters: FrictionParameters, start: FrictionShape, *, linear: bool = False
 ) -> tuple[FrictionCoefficients, FrictionShape]:
-    """Returns the coefficients and shapes that parameters stand for; arguments as for `with_joint_friction`."""
+    """Returns coefficients and shapes from the parameters; arguments as for `with_joint_friction`."""
     coefficients = {
         name: x if linear or name == "offset" else jax.nn.softplus(x) for name, x in parameters.coefficients.items()
     }

@@ -56,9 +56,9 @@ def make_delan(
     """Returns the (init, energies) pair of a structured DeLaN.
 
     Args:
-        diagonal_shift: added to the pre-activation of L's diagonal; it sets the initial diagonal.
-        diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; bounds M's eigenvalues
-            away from zero.
+        diagonal_shift: added to the pre-activation of L's diagonal; sets the initial diagonal.
+        diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; keeps M's eigenvalues away
+            from zero.
         shared_trunk: whether factor and potential are outputs of one network instead of two.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
@@ -78,9 +78,9 @@ def make_black_box_lagrangian(
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Returns the (init, energies) pair of a black-box Lagrangian: one network, so absent gravity saves nothing.
+    """Returns the (init, energies) pair of a black-box Lagrangian: one network, so leaving out gravity saves nothing.
 
-    The activation needs curvature in qd, since M is the second derivative.
+    The activation needs curvature in qd, since M is the second derivative by qd.
 
     Args:
         rate_scale: typical size of qd, by which the network's input is divided.
@@ -92,7 +92,7 @@ def make_black_box_lagrangian(
 
 
 def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, floor: float) -> Matrix:
-    """Lower triangular L [d, d]: diagonal softplus(entries[:d] + shift) + floor, the other entries below it."""
+    """Returns lower triangular L [d, d]: diagonal softplus(entries[:d] + shift) + floor, the other entries below."""
     diagonal = jax.nn.softplus(entries[:d] + shift) + floor
     return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
 
@@ -100,7 +100,7 @@ def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, f
 def structured_terms(
     needs: Needs, networks: Networks, factor: str, shift: float, floor: float, *, shared_trunk: bool = False
 ) -> dict[str, Callable[..., Any] | None]:
-    """Returns L(q) under the name of the factor, and the potential and dissipation."""
+    """Returns L(q) under the name `factor`, and the potential and dissipation."""
     d = needs.degrees_of_freedom
     entries = d * (d + 1) // 2
     shared = shared_trunk and needs.gravity

@@ -4,15 +4,15 @@
     z_q = encoder(x_1),  z_p = encoder(x_2) - z_q,     x_1_hat = decoder(z_q),  x_2_hat = decoder(z_q + z_p)
     d(z_q, z_p) / d frame = rates(z_q, z_p)
 
-x_1, x_2 [n / 2] are consecutive frames; the second one determines the velocity. The momentum is the change of the
-coordinate per frame for any parameters; the published autoencoder, (z_q, z_p) = encoder(x_1, x_2), has to learn this.
-Both networks have four layers, the hidden ones residual:
+x_1, x_2 [n / 2] are consecutive frames; the second one determines the velocity. For any parameters the momentum is the
+change of the coordinate per frame; the published autoencoder, (z_q, z_p) = encoder(x_1, x_2), has to learn this. Both
+networks have four layers, the hidden ones residual:
 
     h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
 
-The rates come from an energy of one coordinate, or from a network: any `Model`. The unit of latent time is a frame.
-The networks see numbers divided by their typical size. Images enter as their principal components: fewer numbers with
-nearly the same distances, up to the variance that is lost,
+The rates come from an energy of one coordinate, or from a network: any `Model`. The unit of latent time is a frame. The
+networks see numbers divided by their typical size. Images enter as their principal components, which are fewer numbers
+with nearly the same distances, up to the lost variance,
 
     c = B (x - mean),   x_hat = mean + Bᵀ c,   rows of B [C, n]: the eigenvectors of the covariance, largest first
 """
@@ -84,11 +84,11 @@ def latent_field(
 
     Args:
         name: black-box-hnn or phase-network.
-        momentum_scale: typical size of z_p if that of z_q is 1: 0.2 for motions of 30 frames per period.
+        momentum_scale: typical size of z_p relative to that of z_q: 0.2 for motions of 30 frames per period.
         width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
-        InputError: another name, or a size that is not positive.
+        InputError: the name is unknown, or a size is not positive.
     """
     if name not in get_args(Field):
         raise InputError(f"field is '{name}'; expected one of {', '.join(get_args(Field))}")
@@ -102,8 +102,8 @@ def latent_field(
     return Model(model.init, lambda parameters: slowed(model.energies(parameters), momentum_scale))
 
 
-# The models' states and rates are of order 1. Their motions take 1 / rate frames per unit of the models' time. With
-# P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and of an energy H0(q, P) H = rate² H0.
+# States and rates of the models are of order 1; their motions take 1 / rate frames per unit of the models' time. With
+# P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and for an energy H0(q, P), H = rate² H0.
 
 
 def _slowed_energy(system: HamiltonianSystem, rate: float) -> HamiltonianSystem:
@@ -131,12 +131,12 @@ def make_latent_phase(
 
     Args:
         field: model of the latent plane, from `latent_field`.
-        count: numbers of a frame, n / 2, with a mean of zero.
-        scale: their typical size.
+        count: number of values per frame, n / 2; the values have mean zero.
+        scale: typical size of the values.
         width: hidden units per layer of both networks.
 
     Raises:
-        InputError: a number that is not positive.
+        InputError: a number is not positive.
     """
     require_positive(count=count, scale=scale)
     require_network(width=width, depth=2)
@@ -187,7 +187,7 @@ def principal_components(images: Float[np.ndarray, "*samples n"], count: int) ->
     """Returns the components with the largest variance.
 
     Raises:
-        InputError: a count outside 1..n.
+        InputError: the count is outside 1..n.
     """
     n = images.shape[-1]
     if not 1 <= count <= n:
@@ -200,7 +200,7 @@ def principal_components(images: Float[np.ndarray, "*samples n"], count: int) ->
 
 
 def compress(components: Components, images: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples C"]:
-    """Coefficients of images, in the dtype of the images."""
+    """Returns the coefficients of images, in the dtype of the images."""
     return ((images - components.mean) @ components.basis.T).astype(images.dtype)
 
 

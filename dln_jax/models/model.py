@@ -1,9 +1,9 @@
 """The type of all models (parameters, and the energies that they define), and the parts that models share.
 
-Factories share these keywords: `width` hidden units in all of the `depth` hidden layers of the model's networks; their
-`activation`, which must be smooth if forces are derivatives of an energy; `dtype` of the parameters. `needs` describes
-the scene and decides features and terms. Factories raise InputError for a width, depth or scale that is not positive,
-and for scales that are neither one number nor one per coordinate.
+Factories share these keywords: `width` hidden units in each of the `depth` hidden layers of the model's networks; their
+`activation`, which must be smooth if forces are derivatives of an energy; the `dtype` of the parameters. `needs`
+describes the scene and decides features and terms. Factories raise InputError for a width, depth or scale that is not
+positive, and for scales that are neither one number nor one per coordinate.
 """
 
 import inspect
@@ -33,8 +33,8 @@ Scale = float | tuple[float, ...]
 class Model(NamedTuple):
     """Energies with parameters, as a pair of pure functions.
 
-    `energies` closes over the parameters, so that a trained model and a textbook system are the same type and run
-    through the same mechanics: `mechanics.equations.dynamics(model.energies(parameters))`.
+    `energies` closes over the parameters, so a trained model and a textbook system have the same type and run through
+    the same mechanics: `mechanics.equations.dynamics(model.energies(parameters))`.
     """
 
     init: Callable[[Array], Parameters]
@@ -51,7 +51,7 @@ def model_of(
     Args:
         record: takes functions of one state as keywords; absent terms are not passed.
         terms: builds Haiku modules and returns functions that use them, by name; `None` for absent terms.
-        d: degrees of freedom. The parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
+        d: degrees of freedom. Parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
         dtype: type of the parameters.
     """
 
@@ -98,7 +98,7 @@ def perceptrons(width: int, depth: int, activation: Activation | str) -> Callabl
 
 
 def joint_features(needs: Needs, q: Vector) -> Float[Array, " features"]:
-    """cos and sin of revolute joints, so that a full turn changes nothing; prismatic joints enter directly.
+    """Returns cos and sin of revolute joints, so that a full turn changes nothing; prismatic joints enter directly.
 
     A kind of joint that the scene lacks adds no operation.
     """
@@ -111,12 +111,12 @@ def joint_features(needs: Needs, q: Vector) -> Float[Array, " features"]:
 
 
 def inputs_of(needs: Needs, q: Vector, *scaled: tuple[Vector, tuple[float, ...]]) -> Float[Array, " inputs"]:
-    """Inputs of a network: the features of q, and other vectors x divided by their sizes, as pairs (x, sizes)."""
+    """Returns a network's inputs: features of q, and vectors x divided by their sizes, as pairs (x, sizes)."""
     return jnp.concatenate([joint_features(needs, q), *(x / jnp.asarray(sizes, x.dtype) for x, sizes in scaled)])
 
 
 def unsaturated(x: Float[Array, " inputs"]) -> Float[Array, " inputs"]:
-    """Returns x, with NaN in place of infinities, for which a saturated network would return a plausible number."""
+    """Returns x with NaN in place of infinities, from which a saturated network would make a plausible number."""
     return x + 0 * x
 
 

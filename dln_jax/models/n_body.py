@@ -1,15 +1,15 @@
-"""Bodies that interact in pairs, with an energy of their distance.
+"""Bodies that interact in pairs, with an energy that depends on their distance.
 
     H = sum_i |p_i|² / (2 m_i) + sum over pairs of U(r_ij),    U(r) = w·f(r / scale) + network(f(r / scale))
 
 q and p hold one body after the other, [bodies * dimension], or with `order="axes"` one axis after the other (x1, x2,
-.., y1, y2, ..), as many published files do. H depends on distances only. It is invariant under translation, rotation
-and reflection, so that total momentum and angular momentum are conserved for any parameters; it is also invariant under
+.., y1, y2, ..), as in many published files. H depends only on distances: it is invariant under translation, rotation
+and reflection, so total momentum and angular momentum are conserved for any parameters. It is also invariant under
 exchange of identical bodies.
 
-The features f are r, 1/r and log r by default: the powers of r of a constant force, of Newton's and Coulomb's law in
-space, and in the plane. Their linear term w·f holds these laws exactly and does not saturate as bodies approach, unlike
-a bounded activation; the network learns the rest. To assume none of these laws, leave their features out.
+The features f are r, 1/r and log r by default: the potentials of a constant force and of Newton's and Coulomb's law, in
+space and in the plane. Their linear term w·f is exact for these laws and does not saturate as bodies approach, unlike a
+bounded activation; the network learns the rest. To assume none of these laws, leave their features out.
 
 At r = 0 the energy (with 1/r or log r) and its derivative are not finite: there is no softening.
 """
@@ -54,8 +54,8 @@ def make_pairwise_hamiltonian(
         width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
-        InputError: other needs, fewer than two bodies, numbers that are not positive, an unknown order, or unknown,
-            repeated or no features.
+        InputError: the needs do not fit, there are fewer than two bodies, a number is not positive, the order is
+            unknown, or features are unknown, repeated or missing.
     """
     require_positive(dimension=dimension, distance_scale=distance_scale)
     networks = perceptrons(width, depth, activation)

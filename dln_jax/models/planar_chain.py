@@ -1,4 +1,4 @@
-"""Chain of links in one plane, with unknown lengths, masses and inertias.
+"""Chain of links in one plane with unknown lengths, masses and inertias.
 
 With the links' absolute angles phi, measured from hanging straight down,
 
@@ -7,9 +7,9 @@ With the links' absolute angles phi, measured from hanging straight down,
     D = sum_i ½ b_i w_i² + c_i v log cosh(w_i / v),   w_i = phid_i - phid_{i-1}, the joint's rate
 
 A is symmetric and B skew. B and h vanish if the centres of mass lie on the lines between joints and the zeros of the
-angles are right; the first motor's armature a_1 is part of A_11. All parameters enter linearly
-(`learning.linear.fit_linear`) and are identifiable from motions ("base parameters"): g_2 / A_12 of a double pendulum is
-the acceleration of gravity over the first link's length. Friction acts in the joints, for any coordinates.
+angles are right; the armature a_1 of the first motor is part of A_11. All parameters enter linearly
+(`learning.linear.fit_linear`) and are identifiable from motions ("base parameters"): for a double pendulum, g_2 / A_12
+is the acceleration of gravity divided by the first link's length. Friction acts in the joints, for any coordinates.
 """
 
 from typing import Any, NamedTuple
@@ -58,14 +58,14 @@ def make_planar_chain(
 
     Args:
         needs: revolute joints only; friction adds viscous and dry friction in all joints.
-        coordinates: q_i is the angle of link i relative to the one before ("relative") or to the vertical ("absolute").
+        coordinates: "relative" or "absolute": q_i is the angle of link i from the previous link, or from the vertical.
         symmetric: whether B and h are left out.
         armature: whether joints 2, .., d have armature (the inertia of motors or gears).
         velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
         dtype: type of the parameters.
 
     Raises:
-        InputError: a prismatic joint, other coordinates, or a scale that is not positive.
+        InputError: a joint is prismatic, the coordinates are unknown, or a scale is not positive.
     """
     require_positive(velocity_scale=velocity_scale)
     d = needs.degrees_of_freedom
@@ -133,5 +133,5 @@ def make_planar_chain(
 
 
 def _between(phi: Vector) -> Matrix:
-    """phi_i - phi_j."""
+    """Returns phi_i - phi_j."""
     return phi[:, None] - phi[None, :]

@@ -4,7 +4,7 @@
 
 The phi_k are all products, up to a total degree, of powers of p_j, of powers of the displacements of prismatic joints,
 and of cos(n q_j) and sin(n q_j), of degree n, for revolute joints. The constant is left out, because no motion shows
-it. Hamilton's equations are linear in c, so that linear least squares identifies it from rates of states
+it. Hamilton's equations are linear in c, so linear least squares identifies it from rates of states
 (`learning.rates.match_linear`). The number of terms grows with the degree to the power of the number of coordinates.
 """
 
@@ -33,7 +33,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
         degree: the largest total degree of a term.
 
     Raises:
-        InputError: a scene with friction, a degree below 2, or more than `MOST_TERMS` terms.
+        InputError: the scene has friction, the degree is below 2, or there are more than `MOST_TERMS` terms.
     """
     if needs.friction or needs.joint_friction:
         raise InputError(

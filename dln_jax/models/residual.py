@@ -3,7 +3,7 @@
     V = Σ_j s_j v_j(q),   D = Σ_j s_j r_j d_j(q, qd),   L = diag(√(s / a)) (lower triangle)(q)
 
 v, d, L are outputs of networks; s_j, r_j, a_j are typical sizes of the unexplained torque, of rates and of
-accelerations. The networks' outputs are small initially, so that training starts at the tree.
+accelerations. The networks' outputs start small, so that training starts at the tree.
 """
 
 from collections.abc import Callable
@@ -64,12 +64,12 @@ def make_residual(
 
     Args:
         terms: some of potential, dissipation and inertia.
-        resolved_velocity: 1/s or m/s, resolution of the dissipation's networks for rates near rest.
+        resolved_velocity: rate near rest that the dissipation network resolves, 1/s or m/s.
         torque_scale, rate_scale, acceleration_scale: s, r and a above, in their units.
         needs, width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
-        InputError: no term, an unknown one, or a size that is not positive.
+        InputError: a term is missing or unknown, or a size is not positive.
     """
     require_network(width=width, depth=depth)
     activation = activation_of(activation)

@@ -1,15 +1,15 @@
 """Tree of rigid bodies with known frames; its inertias, armature and friction are the parameters.
 
-Forces are linear in them, so that `learning.linear.fit_linear(..., negligible=1e-12)` identifies all at once.
+Forces are linear in these parameters, so `learning.linear.fit_linear(..., negligible=1e-12)` identifies all at once.
 Data determine only combinations of the eleven numbers per joint ("base parameters"). A fit returns the shortest
 solution that predicts the same forces, which need not be physically consistent.
 
-Forces are not linear in the shape of friction, the share of load and the cooling of friction. They are fixed when the
+Forces are not linear in the shape of friction, the share of load and the cooling coefficient, which are fixed when the
 model is built; `learning.friction.fit_friction` fits them. Viscous friction of warm grease is lower:
 
     b(T) = b exp(-k (T - T_ref))
 
-Motors that turn with several joints, and armature as a matrix: `mechanics.trees.motors`.
+For motors that turn with several joints, and armature as a matrix, see `mechanics.trees.motors`.
 """
 
 from typing import Any, NamedTuple
@@ -40,11 +40,11 @@ Number = float | tuple[float, ...]
 """One number for all joints, or one per joint."""
 Rows = tuple[tuple[float, ...], ...]
 WARM = ("viscous", "viscous_forward", "viscous_backward")
-"""Coefficients that temperature changes."""
+"""Coefficients that depend on temperature."""
 
 
 class RigidTreeParameters(NamedTuple):
-    """All parameters of a tree of d joints that forces are linear in. Absent friction is `None`."""
+    """All parameters of a tree of d joints in which forces are linear. Absent friction is `None`."""
 
     inertias: Any
     """[d, 10], as `mechanics.trees.PARAMETERS`."""
@@ -96,14 +96,14 @@ def make_rigid_tree(
         reference_temperature: T_ref, °C, to which the viscous coefficients refer.
         temperature: T, °C, of all functions (default: T_ref). `energies(parameters, T)` takes another one, a number or
             one per joint.
-        motors: rows of S in motor rates S qd, at which armature and friction act; by default each joint has its own.
-        coupled: pairs of motors, counted from 0, whose armature has an entry off the diagonal, which is a parameter.
+        motors: rows of S in motor rates S qd, on which armature and friction act; by default one motor per joint.
+        coupled: pairs of motors, counted from 0, with an off-diagonal entry of the armature, which is a parameter.
         dtype: type of the parameters.
 
     Raises:
-        InputError: an unknown law, two laws for the same friction, a velocity or slope that is not positive, a share
-            outside [0, 1), or without its law, cooling without viscous friction, motors that do not determine the
-            joints' rates, or an armature of the tree that such motors do not have.
+        InputError: a law is unknown, two laws describe the same friction, a velocity or slope is not positive, a share
+            is outside [0, 1) or lacks its law, cooling lacks viscous friction, motors do not determine the joints'
+            rates, or the tree's armature is impossible with these motors.
     """
     laws = USUAL if friction is True else friction or ()
     require_laws(laws, "friction")
@@ -145,6 +145,6 @@ def make_rigid_tree(
 
 
 def pairs_of(coupling: dict[str, Any] | None) -> dict[Pair, Any]:
-    """Entries of the armature by pairs of motors counted from 0."""
+    """Returns the entries of the armature by pairs of motors counted from 0."""
     named = (coupling or {}).items()
     return {(int(key.partition("_")[0]) - 1, int(key.partition("_")[2]) - 1): value for key, value in named}

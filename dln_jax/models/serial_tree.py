@@ -1,11 +1,11 @@
 """Arm with unknown kinematics: joint frames, inertias, armature and friction are the parameters.
 
-Links form a tree in a stated order, a serial chain by default. Torques do not identify all six numbers of a frame.
-The directions without effect ("gauges") are
+Links form a tree in a given order, a serial chain by default. Torques do not identify all six numbers of a frame. The
+directions without effect ("gauges") are
 
 - rotating a link's frame about its joint's axis, or sliding it along the axis, together with the link's inertia and the
   next frames: an axis in space has four numbers, the direction of a prismatic joint two;
-- the position of the base and its angle about the vertical: only the first axis' angle with gravity counts;
+- the position of the base and its angle about the vertical: only the angle between first axis and gravity counts;
 - mirroring the whole arm, with axes as pseudo-vectors: torques cannot distinguish left-handed from right-handed arms.
 
 `learning.kinematics.fit_tree` fits the parameters.
@@ -66,7 +66,7 @@ def make_serial_tree(
         dtype: type of the parameters.
 
     Raises:
-        InputError: parents that are not earlier links, an acceleration or scale that is not positive, or needs with an
+        InputError: parents are not earlier links, an acceleration or scale is not positive, or the needs have an
             actuation matrix, a joint map or joint friction laws.
     """
     require_positive(acceleration=acceleration, velocity_scale=velocity_scale)
@@ -108,7 +108,7 @@ def tree_of(
     parents: Sequence[int] | None = None,
     acceleration: float = 9.81,
 ) -> Tree:
-    """Returns the tree of these parameters, as one with known frames; other arguments as for `make_serial_tree`."""
+    """Returns the tree of these parameters, like one with known frames; other arguments as for `make_serial_tree`."""
     d = needs.degrees_of_freedom
     return Tree(
         parents=tuple(range(-1, d - 1)) if parents is None else tuple(parents),
@@ -123,7 +123,7 @@ def tree_of(
 
 
 def rotation(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """exp of a rotation vector, by Rodrigues' formula, smooth at zero."""
+    """Returns the rotation matrix exp of a rotation vector, by Rodrigues' formula, smooth at zero."""
     x, y, z = turn
     zero = jnp.zeros_like(x)
     hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])

@@ -24,7 +24,7 @@ PAIRS = 500
 
 
 class States(NamedTuple):
-    """States, as arrays [N, d]; or with axes of pairs after that of the joints."""
+    """States as arrays [N, d], or with axes of pairs after the axis of joints."""
 
     q: Any
     qd: Any
@@ -47,10 +47,10 @@ class Products(NamedTuple):
 def torque_covariance(
     joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States
 ) -> Float[Array, "Nd Nd"]:
-    """cov(tau(state), tau(other)) of N states among each other, with the joints of a state adjacent; (N m)².
+    """Returns cov(tau(state), tau(other)), (N m)², for all pairs of N states; the joints of a state are adjacent.
 
-    Every state is paired with the N/2 that follow it, cyclically; the other pairs are transposes of these. Some rows
-    are computed at a time; derivatives recompute them, because their intermediate values do not fit into caches.
+    Every state is paired with the N/2 that follow it, cyclically; the other pairs are transposes of these. Blocks of
+    rows are computed in turn; derivatives recompute them, because their intermediate values exceed the caches.
     """
     N, d = np.shape(states.q)
     states, width = States(*map(jnp.asarray, states)), N // 2 + 1
@@ -75,14 +75,14 @@ def torque_covariance(
 def _block(
     joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, x: States, y: States
 ) -> Float[Array, "d d R K"]:
-    """Covariance of states x [d, R, 1] with y [d, R, K]; pairs are the last axes, for long inner loops."""
+    """Returns the covariance of states x [d, R, 1] with y [d, R, K]; pairs are the last axes, for long inner loops."""
     d = len(joints)
     pairs = jnp.zeros(np.broadcast_shapes(x.q.shape[1:], y.q.shape[1:]), x.q.dtype)
     turns = _factors(turn_factor, joints, scales.turns, x.q, y.q)
     has_potential = scales.weight is not None and scales.lifts is not None
     lifts = _factors(lift_factor, joints, scales.lifts, x.q, y.q) if has_potential else None
     unit = jnp.eye(d + 1, dtype=pairs.dtype)[:d]
-    # Without the order of a chain only the last body has an energy, and all rates enter before the first joint.
+    # Without a known order only the last body has an energy, and all rates enter before the first joint.
     of_body = (lambda scale: scale) if serial else (lambda scale: jnp.zeros(d, scale.dtype).at[-1].set(scale[0]))
 
     def entered(products: Products, joint: Any, rate: Array) -> Products:
@@ -148,10 +148,10 @@ def _turned(products: Products, c: Any, joint: Any) -> Products:
 
 
 def _kinetic(products: Products) -> Array:
-    """cov(tau_i, tau_j') of one body with unit inertia, [d, d, R, M]."""
+    """Returns cov(tau_i, tau_j') of one body with unit inertia, [d, d, R, M]."""
     PP, PQ, QP, QQ = products
     inner, column, row, corner = _parts(PP), _parts(PQ), _parts(QP), _parts(QQ)
-    # Every product of blocks has its counterpart with v and dv/dt exchanged.
+    # Every product of blocks has a counterpart with v and dv/dt exchanged.
     return 2 * (
         inner.block * corner.end + column.right * row.below
         + column.block * row.end + inner.right * corner.below
@@ -172,7 +172,7 @@ def _parts(X: Array) -> _Parts:
 
 
 def _lifted(heights: Array, h: Any, at: Array) -> Array:
-    """Inner products of (dz/dq_1 .. dz/dq_d, z), where z is the product of functions of the joints so far."""
+    """Returns inner products of (dz/dq_1 .. dz/dq_d, z); z is the product of functions of the joints so far."""
     e = at[:, None, None]
     return (
         h.value * heights

@@ -7,11 +7,11 @@ The basis b is the product over joints of {1, cos q, .., cos nq, sin q, .., sin 
 
     tau = M qdd + dM/dt qd - ½ d(qdᵀ M qd)/dq + dV/dq + friction * qd
 
-is linear in all parameters, so that a linear least-squares problem identifies them (`learning.linear`), as Atkeson,
-An and Hollerbach (1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
+is linear in all parameters, so a linear least-squares problem identifies them (`learning.linear`), as Atkeson, An and
+Hollerbach (1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
 
-The basis contains rigid links on revolute joints: V has degree 1 in every angle, and M degree 1 if the chain is
-planar, 2 if not. M is definite only where the data make it so; a singular M gives non-finite accelerations.
+The basis contains rigid links on revolute joints: V has degree 1 in every angle, and M degree 1 if the chain is planar,
+otherwise 2. M is definite only where the data make it so; a singular M gives non-finite accelerations.
 """
 
 import functools
@@ -28,9 +28,9 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 MOST_COEFFICIENTS = 20_000
-"""Limit on the coefficients of the mass matrix; they grow exponentially with the joints, the fit with their square."""
+"""Limit on the coefficients of the mass matrix, which grow exponentially with the joints (the fit with the square)."""
 SPRING_DEGREE = 2
-"""Lower bound on the degree of the potential in a prismatic displacement, so that it holds a linear spring."""
+"""Lower bound on the degree of the potential in a prismatic displacement, so that it includes a linear spring."""
 
 
 class TrigonometricParameters(NamedTuple):
@@ -62,17 +62,16 @@ def make_trigonometric(
 ) -> Model:
     """Returns the (init, energies) pair of a trigonometric Lagrangian.
 
-    `init` ignores its key: M = 1, V = 0, no friction. The number of parameters grows as (2 degree + 1)^d d²/2.
+    `init` ignores its key: M = 1, V = 0, no friction. The number of parameters grows like (2 degree + 1)^d d²/2.
 
     Args:
-        degree: degree of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential
-            has at least degree 2 (a linear spring).
-        potential_degree: degree of the potential, if it is another: M of a chain on a fixed base does not depend on its
+        degree: degree of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential has
+            at least degree 2 (a linear spring).
+        potential_degree: degree of the potential if it differs: M of a chain on a fixed base does not depend on its
             first joint, but V does.
 
     Raises:
-        InputError: a degree that is not a whole number >= 0, a wrong number of degrees, or a basis that is too large to
-            fit.
+        InputError: a degree is not an integer >= 0, the number of degrees is wrong, or the basis is too large to fit.
     """
     d = needs.degrees_of_freedom
     degrees = _per_joint("degree", degree, d)
@@ -113,12 +112,12 @@ def _per_joint(name: str, degree: int | tuple[int, ...], d: int) -> tuple[int, .
 
 
 def potential_degrees(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> tuple[int, ...]:
-    """Degrees of the potential's basis, which holds a linear spring in every prismatic displacement."""
+    """Returns the degrees of the potential's basis, which includes a linear spring in every prismatic displacement."""
     return tuple(max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(joints, degrees, strict=True))
 
 
 def basis(joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector) -> Basis:
-    """Products over joints of the joints' functions, and their partial derivatives."""
+    """Returns the products over joints of the joints' functions, and their partial derivatives."""
     factors = [_joint_basis(*joint) for joint in zip(joints, degrees, q, strict=True)]
     values = [factor.values for factor in factors]
     slopes = [

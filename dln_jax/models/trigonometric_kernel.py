@@ -12,13 +12,13 @@ k_l,
     cov(V, V') = sum over l of weight_l h_1(q_1, q_1') .. h_l(q_l, q_l')
 
 with c_l(q, q') = a_l + b_l cos(q - q') for a revolute joint and a_l + b_l q q' for a prismatic one. h_l has the same
-form (squared for a prismatic joint, so that it holds springs). V thus has degree 1 in the cosine and sine of every
+form (squared for a prismatic joint, so that it includes springs). V thus has degree 1 in the cosine and sine of every
 angle and T degree 2. Both depend on the same joints as in a chain of rigid bodies: T not on the first. If the order of
 the bodies is unknown (`serial=False`), all rates enter before the first joint and only the last body has an energy:
-every entry of M is then any function of that degree in every joint.
+every entry of M can then be any function of that degree in every joint.
 
-Torques of a Lagrangian process as a linear problem of N d equations: Giacomuzzo, Carli, Romeres and Dalla Libera, T-RO
-2024 (arXiv 2310.06585), whose kernel is a sum over links of products in all joints up to the link.
+The formulation of a Lagrangian process as a linear problem of N d equations is that of Giacomuzzo, Carli, Romeres and
+Dalla Libera, T-RO 2024 (arXiv 2310.06585), whose kernel is a sum over links of products over all joints up to the link.
 `learning.kernel.fit_kernel` fits the parameters.
 """
 
@@ -38,7 +38,7 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 CHUNK = 24
-"""Samples per chunk: so few that C code for seven joints keeps to its stack."""
+"""Number of samples per chunk, small enough that C code for seven joints fits its stack."""
 
 
 class KernelScales(NamedTuple):
@@ -82,7 +82,7 @@ class JointFactor(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """Inner products [n] of the velocity of a body with quantities of the samples."""
+    """Inner products [n] of a body's velocity with quantities of the samples."""
 
     velocity: Array
     """With the sample's velocity v."""
@@ -99,13 +99,13 @@ def make_trigonometric_kernel(
 ) -> Model:
     """Returns the (init, energies) pair; `init` draws random samples and weights, which only have the right shapes.
 
-    One inverse model takes about n d operations, and one mass matrix n d³.
+    One call of the inverse model takes about n d operations, one mass matrix n d³.
 
     Args:
         needs: kinds of joints, gravity, and viscous friction of the coordinates.
         samples: n, number of samples whose torques define the energy; the fit takes n³ d³ operations.
         serial: whether joints form a serial chain; otherwise nothing is assumed about their order.
-        dtype: type of the parameters; weights have either sign and cancel, so that f32 costs accuracy.
+        dtype: type of the parameters; weights have either sign and cancel, so f32 costs accuracy.
 
     Raises:
         InputError: no samples.
@@ -131,7 +131,7 @@ def make_trigonometric_kernel(
 
 
 def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> JointFactor:
-    """c of a joint."""
+    """Returns c of a joint."""
     a, b = pair
     if joint == "prismatic":
         return JointFactor(a + b * x * y, b * y, b * x, b * jnp.ones_like(x * y))
@@ -141,7 +141,7 @@ def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> JointFacto
 
 
 def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> JointFactor:
-    """h of a joint."""
+    """Returns h of a joint."""
     c = turn_factor(joint, pair, x, y)
     if joint == "revolute":
         return c
@@ -175,7 +175,7 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
     potential = _potential(parameters, joints, serial)
     return RecursiveSystem(
         mass_matrix=mass_matrix,
-        # By derivatives of T rather than by M, which would take d times as long.
+        # By derivatives of T instead of M, which would take d times as long.
         forces=functools.partial(
             lagrangian.inverse_dynamics, lambda q, qd: minus_potential(kinetic(q, qd), potential, q)
         ),
@@ -186,7 +186,7 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
 
 
 def _shared(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector) -> Shared:
-    """Inner products for all K bodies with an inertia, as arrays [K, n]; linear in qd."""
+    """Returns inner products for all K bodies with an inertia, as arrays [K, n]; linear in qd."""
     scales = parameters.scales
     moved, accelerated, weights = (array.T for array in (parameters.qd, parameters.qdd, parameters.weights))
     rates = (scales.rates * qd)[:, None]

@@ -1,4 +1,4 @@
-"""Uncertainty of a fitted model: the standard deviation of its torque at any state, and a test of the distribution.
+"""Uncertainty of a fitted model: the standard deviation of its torque at any state, and an out-of-distribution test.
 
 Fitted parameters theta have the covariance Cov(theta) = F Fᵀ. To first order (exactly, if forces are linear in them)
 the torque of joint i at a state has the standard deviation
@@ -6,8 +6,8 @@ the torque of joint i at a state has the standard deviation
     sd_i² = noise_i² + inflation_i |phi_i F|²,   phi_i = d tau_i / d theta
 
 (MacKay 1992, "A practical Bayesian framework for backpropagation networks"; Immer et al. 2021, "Improving predictions
-of Bayesian neural nets via local linearization"). `learning.uncertainty` estimates all of it from data. All functions
-are for one state.
+of Bayesian neural nets via local linearization"). `learning.uncertainty` estimates all quantities from data. All
+functions take one state.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,8 +24,8 @@ from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.types import Vector
 
 UNDETERMINED = 1e-3
-"""Largest share of |phi|, in scaled parameters, in directions that the data never showed; a state above it is out of
-distribution."""
+"""Largest accepted share of |phi|, in scaled parameters, along directions that the data left undetermined; a state with
+a larger share is out of distribution."""
 
 
 class Domain(NamedTuple):
@@ -43,7 +43,7 @@ class Domain(NamedTuple):
     reach: Any
     """[3 d], distances from the middle that the data reach."""
     harmless: Any
-    """[d], |phi F| in N m or N below which a state may leave the range of the data. Zeros for networks, whose
+    """[d], N m or N; with |phi F| below this a state may leave the range of the data. Zeros for networks, whose
     covariance alone cannot be trusted there."""
 
 
@@ -65,7 +65,7 @@ class Scores(NamedTuple):
     parameters: Array
     """[], standard deviation due to parameters, relative to that on the data; the maximum over joints."""
     undetermined: Array
-    """[], share of Phi in directions that the data leave undetermined, relative to `UNDETERMINED`."""
+    """[], share of Phi along directions that the data leave undetermined, relative to `UNDETERMINED`."""
     distance: Array
     """[], distance from the middle of the range of (q, qd, qdd), relative to its reach; the maximum over coordinates. 0
     if the deviation due to parameters is below `Domain.harmless` in all joints."""
@@ -74,13 +74,13 @@ class Scores(NamedTuple):
 def predictive(
     model: Model, parameters: Parameters, factor: Any, noise: Any = 0.0, inflation: Any = 1.0
 ) -> Callable[[Any, Any, Any], Array]:
-    """(q, qd, qdd) -> standard deviation of the torque [d] at one state, N m or N.
+    """Returns (q, qd, qdd) -> standard deviation of the torque [d] at one state, N m or N.
 
     Args:
         model: the fitted model.
         parameters: fitted parameters.
         factor: F [P, K] of their covariance, in the order of `ravel_pytree(parameters)`.
-        noise: standard deviation of one measurement [d]; zero for that of the model's own torque.
+        noise: standard deviation of one measurement [d]; zero for the deviation of the model's own torque.
         inflation: factor on the variance due to parameters, [d].
     """
     d = np.size(noise) if np.ndim(noise) else None
@@ -93,18 +93,18 @@ def predictive(
 
 
 def deviation_of_rows(rows: Float[Array, "d P"], factor: Any, noise: Any, inflation: Any) -> Vector:
-    """Standard deviation of the torque [d] at a state with Phi = `rows`, N m or N."""
+    """Returns the standard deviation of the torque [d] at a state with Phi = `rows`, N m or N."""
     noise, inflation = (jnp.asarray(array, rows.dtype) for array in (noise, inflation))
     return jnp.sqrt(noise**2 + inflation * _parameter_variance(rows, factor))
 
 
 def _parameter_variance(rows: Float[Array, "d P"], factor: Any) -> Vector:
-    """|phi F|² of the joints [d], (N m)² or N²."""
+    """Returns |phi F|² of the joints [d], (N m)² or N²."""
     return jnp.sum((rows @ jnp.asarray(factor, rows.dtype)) ** 2, axis=1)
 
 
 def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Callable[[Any, Any, Any], Scores]:
-    """(q, qd, qdd) -> the three scores of a state, 1 at their thresholds."""
+    """Returns (q, qd, qdd) -> the three scores of a state, 1 at their thresholds."""
 
     def of_state(q: Any, qd: Any, qdd: Any) -> Scores:
         state = vectors(len(uncertainty.noise), q=q, qd=qd, qdd=qdd)
@@ -115,7 +115,7 @@ def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Ca
 
 
 def scores_of_rows(rows: Float[Array, "d P"], state: Sequence[Vector], uncertainty: Uncertainty) -> Scores:
-    """`scores` of a state (q, qd, qdd) with Phi = `rows`."""
+    """Returns the `scores` of a state (q, qd, qdd) with Phi = `rows`."""
     limit, scale, directions, centre, reach, harmless = (jnp.asarray(x, rows.dtype) for x in uncertainty.domain)
     deviation = jnp.sqrt(_parameter_variance(rows, uncertainty.factor))
     distance = jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach)
@@ -131,13 +131,13 @@ def scores_of_rows(rows: Float[Array, "d P"], state: Sequence[Vector], uncertain
 
 
 def exceeds(of_state: Scores) -> Array:
-    """Whether a state with these scores is out of distribution: one of them is above 1, or NaN."""
+    """Returns whether a state with these scores is out of distribution: one of them is above 1 or NaN."""
     return ~(jnp.max(jnp.stack(of_state)) <= 1)
 
 
 def out_of_distribution(
     model: Model, parameters: Parameters, uncertainty: Uncertainty
 ) -> Callable[[Any, Any, Any], Array]:
-    """(q, qd, qdd) -> whether a state is out of distribution: one of its `scores` is above 1, or NaN."""
+    """Returns (q, qd, qdd) -> whether a state is out of distribution: one of its `scores` is above 1 or NaN."""
     of_state = scores(model, parameters, uncertainty)
     return lambda q, qd, qdd: exceeds(of_state(q, qd, qdd))
