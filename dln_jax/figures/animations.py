@@ -19,7 +19,7 @@ from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import InputError, require_positive
 
 DPI, COLOURS = 100, 128
-"""Pixels per inch, and colours of a GIF."""
+"""Pixels per inch, and number of colours of a GIF."""
 ONLY_TRUTH, ONLY_MODEL = np.array([0.0, 0.45, 0.7]), np.array([1.0, 0.55, 0.3])
 """Colours of pixels present in only one of two films; their sum is white."""
 
@@ -34,10 +34,10 @@ def write_gif(
     frames_per_second: float,
     title: str = "",
 ) -> None:
-    """Writes a GIF by calling `show(frame)` for every frame, with the title and, unless `None`, the time t[frame] in s.
+    """Writes a GIF by calling `show(frame)` for every frame, with the title and, unless t is `None`, the time in s.
 
     Raises:
-        InputError: the file cannot be written; it is written completely or not at all.
+        InputError: the file cannot be written. It is written completely or not at all.
     """
     heading = figure.suptitle("", fontsize=style.TEXT, family="monospace")
     figure.set_dpi(DPI)
@@ -49,7 +49,7 @@ def write_gif(
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(dither=Image.Dither.NONE))
         # Fix the axes at the positions of the first frame.
         figure.set_layout_engine("none")
-    # One palette for all frames, without dithering, makes the file a third smaller.
+    # One palette for all frames and no dithering make the file a third smaller.
     some = [image.convert("RGB") for image in images[:: max(1, len(images) // 6)]]
     palette = Image.fromarray(np.concatenate([np.asarray(image) for image in some])).quantize(COLOURS)
     entries = np.reshape(palette.getpalette(), (-1, 3))
@@ -73,7 +73,7 @@ def write_frame_gif(
     Images are intensities in [0, 1], row by row; values beyond are clipped. Times are in s.
 
     Raises:
-        InputError: no system, images that are not square, or another number of images than times.
+        InputError: there is no system, images are not square, or the number of images differs from that of the times.
     """
     require_positive(frames_per_second=frames_per_second)
     _require_common_length(t, {name: images.shape[0] for name, images in frames.items()})
@@ -111,7 +111,7 @@ def write_motion_gif(
     units: tuple[str, str] = ("", ""),
     frames_per_second: float = 20.0,
 ) -> None:
-    """Writes one motion of every system in a panel of its own, over the truth in black if "truth" is among them.
+    """Writes a GIF with one motion of every system in its own panel, over the truth in black if "truth" is among them.
 
     With one coordinate a panel is the phase plane; with 2 n coordinates it shows n bodies in a plane.
 
@@ -119,7 +119,7 @@ def write_motion_gif(
     `units` are those of one coordinate of q and of p, empty for none.
 
     Raises:
-        InputError: no motion, or motions of different lengths.
+        InputError: there is no motion, or motions have different lengths.
     """
     require_positive(tail=tail, stride=stride, frames_per_second=frames_per_second)
     t = next(iter(motions.values())).t if motions else np.zeros(0)

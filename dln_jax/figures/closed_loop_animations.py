@@ -17,13 +17,13 @@ Drawing = Callable[[Axes, Float[np.ndarray, "T d"], int], Callable[[int], None]]
 """(axis, q of all samples, number of samples in the tip's trace) -> function that draws a sample."""
 BODY, POLE, TIP, GROUND = "#3b4252", "#2e6fa7", style.VERMILLION, "0.72"
 TRACE = 0.8
-"""Duration of the tip's trace, s."""
+"""Duration of the tip's trace in s."""
 VIEW = np.deg2rad([35.0, 22.0])
 """Azimuth and elevation of the view of machines in space, rad."""
 
 
 def cart_pole_drawing(length: float) -> Drawing:
-    """Drawing of a cart-pole with q = (cart, pole from upright), m and rad; `length` of the pole in m."""
+    """Returns the drawing of a cart-pole with q = (cart, pole from upright) in m and rad; `length` of the pole in m."""
 
     def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
         wide, tall = 0.55 * length, 0.28 * length
@@ -51,7 +51,7 @@ def cart_pole_drawing(length: float) -> Drawing:
 
 
 def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
-    """Drawing of a rotary pendulum with q = (arm, pole from upright), rad, seen obliquely from above; lengths in m."""
+    """Returns the drawing of a rotary pendulum, q = (arm, pole from upright) in rad, seen obliquely; lengths in m."""
 
     def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
         out = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), 0 * q[:, 0]], axis=1)
@@ -102,16 +102,16 @@ def write_closed_loop_gif(
     Args:
         path: path of the GIF.
         drawing: drawing of the machine, such as `cart_pole_drawing(length)`.
-        t: times [T], s, at any spacing below that of the frames.
+        t: times [T], s, with a spacing below that of the frames.
         q: coordinates [T, d].
         u: control [T], held constant from each time on.
-        limits: limits of the control, in red.
+        limits: limits of the control, drawn in red.
         unit: unit of the control.
         title: title above the drawing.
         frames_per_second: frame rate of the GIF, which plays the run in real time.
 
     Raises:
-        InputError: arrays of different lengths, or coordinates that are not finite.
+        InputError: arrays have different lengths, or coordinates are not finite.
     """
     require_positive(frames_per_second=frames_per_second)
     t, q, u = np.asarray(t), np.asarray(q), np.asarray(u)
@@ -139,7 +139,7 @@ def write_closed_loop_gif(
 
 
 def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray], None]:
-    """A pole with a bob and its trace; returns the function that draws a sample from the position of the foot."""
+    """Draws a pole with a bob and its trace; returns a function that draws a sample from the position of the foot."""
     (trace,) = axis.plot([], [], color=TIP, linewidth=1.2, alpha=0.45, zorder=1.5)
     (pole,) = axis.plot([], [], color=POLE, linewidth=5, solid_capstyle="round", zorder=4)
     (bob,) = axis.plot([], [], "o", color=TIP, markersize=9, zorder=5)
@@ -155,7 +155,7 @@ def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray],
 
 
 def _seen(points: Any) -> np.ndarray:
-    """Orthographic projection of points in space [..., 3] to the drawing plane [..., 2]."""
+    """Projects points in space [..., 3] orthographically to the drawing plane [..., 2]."""
     azimuth, elevation = VIEW
     x, y, z = np.moveaxis(np.asarray(points), -1, 0)
     right = x * np.cos(azimuth) + y * np.sin(azimuth)

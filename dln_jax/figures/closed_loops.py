@@ -28,20 +28,20 @@ def closed_loop_traces(
     energy: Any = None,
     goal_energy: float | None = None,
 ) -> Figure:
-    """Coordinates and energy of some runs over time, with the first in front and its controls between their limits.
+    """Coordinates and energy of runs over time, the first run in front, with its controls between their limits.
 
     Args:
-        runs: K runs along a leading axis, such as from `vmap` of `simulate`.
+        runs: K runs along a leading axis, for example from `vmap` of `simulate`.
         joints: kinds of the joints; angles are shown relative to the goal, in (-pi, pi].
         names: names of the coordinates.
-        goal: state [2 d], dashed; zero by default.
-        limits: limits of the controls, [m] or one for all, in red.
+        goal: state [2 d], drawn dashed; zero by default.
+        limits: limits of the controls, [m] or one for all, drawn in red.
         unit: unit of the controls.
         energy: energy along the runs [K, T], J.
-        goal_energy: J, dashed.
+        goal_energy: energy at the goal, J, drawn dashed.
 
     Raises:
-        InputError: runs without the leading axis, or another number of names than coordinates.
+        InputError: runs lack the leading axis, or there are not as many names as coordinates.
     """
     x, u, d = np.asarray(runs.x), np.asarray(runs.u), len(joints)
     if x.ndim != 3 or x.shape[2] != 2 * d or (names is not None and len(names) != d):
@@ -93,7 +93,7 @@ def phase_portrait(
         angle: angles of the runs [K, T], rad; drawn from -pi to pi.
         rate: their rates [K, T], rad/s.
         energy: angles [a], rates [b] and the energy [b, a] on that grid, drawn as levels.
-        goal_energy: energy whose level, on which the pole swings up by itself, is dashed.
+        goal_energy: energy of the dashed level, along which the pole swings up by itself.
         caught: S [2, 2] and the level of xᵀ S x below which the regulator takes over.
     """
     figure, [[axis]] = style.figure(height=4.2)
@@ -133,7 +133,7 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def _with_gaps(angle: np.ndarray) -> np.ndarray:
-    """NaN where a wrapped angle jumps by a turn."""
+    """Returns angles with NaN where a wrapped angle jumps by a full turn."""
     return np.where(np.abs(np.diff(angle, prepend=angle[0])) > np.pi, np.nan, angle)
 
 
@@ -145,7 +145,7 @@ def angle_ticks(side: Axis) -> None:
 
 
 def _ellipse(S: Any, level: float) -> np.ndarray:
-    """The curve xᵀ S x = level [2, 100]."""
+    """Returns the curve xᵀ S x = level [2, 100]."""
     turn = np.linspace(0, 2 * np.pi, 100)
     sizes, axes = np.linalg.eigh(np.asarray(S))
     return axes @ (np.sqrt(level / sizes)[:, None] * np.stack([np.cos(turn), np.sin(turn)]))

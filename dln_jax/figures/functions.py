@@ -1,4 +1,4 @@
-"""Figures of learned functions: value, gradient and Hessian of truth and model with errors, and ensembles' spread."""
+"""Figures of learned functions: value, gradient and Hessian of truth and model with errors; spread of ensembles."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,7 +25,7 @@ def _keys(data: FunctionSamples) -> list[str]:
 
 
 def function_curves(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """A function of one input: a column each for value, slope and curvature, with the error below every output."""
+    """Draws a function of one input: columns for value, slope and curvature, with the error below every output."""
     order = np.argsort(truth.x[:, 0])
     x, keys = truth.x[order, 0], _keys(truth)
     outputs = min(truth.outputs, MOST_OUTPUTS)
@@ -81,7 +81,7 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 
 
 def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """Surfaces of a function of two inputs: rows for value, norm of the gradient and trace of the Hessian."""
+    """Surfaces of a function of two inputs, in rows: value, norm of the gradient and trace of the Hessian."""
     keys = _keys(truth)
     names = {"y": "$f$", "dy": r"$|\nabla f|$", "d2y": r"trace $\nabla^2 f$"}
     scalars = {"y": np.asarray, "dy": lambda dy: np.linalg.norm(dy, axis=1), "d2y": lambda d2y: d2y.trace(0, 1, 2)}
@@ -128,9 +128,9 @@ def parity(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 def ensemble(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
     """An ensemble of functions of one or two inputs, inside and outside the training data in [-bound, bound].
 
-    Over one input, mean and two standard deviations, and below them spread and error on a logarithmic scale: for a
-    well-trained ensemble the band above is a line. Over two, maps of the spread (root of the sum of squares over
-    components) with the box of the training data; logarithmic if it spans a decade.
+    With one input: mean and two standard deviations, and below them spread and error on a logarithmic scale (for a
+    well-trained ensemble the band above is a line). With two: maps of the spread (root of the sum of squares over
+    components) with the box of the training data, logarithmic if the spread covers a decade.
     """
     if truth.inputs == 1:
         return _ensemble_curves(truth, mean, spread, bound=bound)
@@ -195,7 +195,7 @@ def _square(column: np.ndarray) -> np.ndarray:
 
 
 def _scaled(values: np.ndarray) -> tuple[np.ndarray, str]:
-    """The values over a power of ten, and its label; unchanged, and without a label, if they are near one."""
+    """Returns the values over a power of ten, and its label; unchanged and without a label if they are near one."""
     size = float(np.abs(values).max())
     exponent = int(np.floor(np.log10(size))) if size > 0 and np.isfinite(size) else 0
     return (values, "") if -2 <= exponent <= 2 else (values / 10.0**exponent, rf", $10^{{{exponent}}}$")

@@ -28,12 +28,11 @@ def friction_curves(
     """Friction curves, one panel per joint.
 
     Args:
-        curves: by name, rates [N, d] of the joints, in any order, and forces [N, d].
+        curves: rates [N, d] of the joints, in any order, and forces [N, d], by name of the curve.
         names: names of the joints; by default their numbers.
-        measured: rates and forces [N, d], such as torque minus that of the links, drawn as points; the most extreme
+        measured: rates and forces [N, d], for example torque minus that of the links, drawn as points; the most extreme
             hundredth may lie out of view.
-        rate_unit: one unit for all joints, or one each.
-        force_unit: likewise.
+        rate_unit, force_unit: one unit for all joints, or one per joint.
     """
     arrays = {name: (np.asarray(rates), np.asarray(forces)) for name, (rates, forces) in curves.items()}
     d = next(iter(arrays.values()))[0].shape[1]
@@ -73,13 +72,13 @@ def friction_curves(
 def excitation_figure(
     data: Trajectories, limits: Mapping[str, Any], *, names: Sequence[str], conditions: Mapping[str, Sequence[float]]
 ) -> Figure:
-    """One column per joint with q, qd and tau of every motion and dashed limits; conditions of the regressor below.
+    """One column per joint with q, qd and tau of every motion and dashed limits; below, conditions of the regressor.
 
     Args:
         data: the motions, of equal length.
-        limits: by "q", "qd" and "tau", lower and upper [d, 2]; infinite limits are not drawn.
+        limits: lower and upper limits [d, 2] by "q", "qd" and "tau"; infinite ones are not drawn.
         names: names of the joints.
-        conditions: conditions of the regressor, by the name of the set of motions.
+        conditions: condition numbers of the regressor, by name of the set of motions.
     """
     joints = min(data.degrees_of_freedom, MOST_JOINTS)
     figure = style.blank(height=5.6)

@@ -18,7 +18,7 @@ MOST_POINTS = 3000
 
 
 def cutoff_figure(smoothed: Smoothed) -> Figure:
-    """Spectra of q above their noise floors, and below them the expected error at every cut-off.
+    """Spectra of q above their noise floors and, below them, the expected error at every cut-off.
 
     `smoothed` comes from `data.encoders.smooth` with an automatic cut-off.
     """

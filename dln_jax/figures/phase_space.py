@@ -19,7 +19,7 @@ Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 ROOM = 0.15
 """Smallest margin of an axis above and below the truth, relative to the largest true value."""
 ROUNDING = 1e-17
-"""Relative errors below this are drawn at this value."""
+"""Relative errors below this value are drawn at it."""
 
 
 def motion_figure(
@@ -36,8 +36,8 @@ def motion_figure(
     With one coordinate a panel is the phase plane, with arrows if `fields` give the rates; with 2 n coordinates it
     shows the orbits of n bodies in a plane. The quantity is drawn beside its error relative to the largest true value.
 
-    Among the motions, "truth" is drawn behind every other one. `energies` holds the `quantity` along the motions;
-    `units` are those of q, of p and of the quantity, empty for none.
+    The motion "truth" is drawn behind the others. `energies` holds the `quantity` along the motions; `units` are those
+    of q, of p and of the quantity, empty for none.
     """
     models = [name for name in motions if name != TRUTH]
     truth, plane = plane_paths(motions[TRUTH], shown), motions[TRUTH].q.shape[2] == 1
@@ -70,7 +70,7 @@ def motion_figure(
 
 
 def _draw_over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-    """The truth is dashed in front of the models; a diverging model leaves the panel."""
+    """Draws the truth dashed in front of the models; a diverging model leaves the panel."""
     for name, energy in values.items():
         dash, order = ("--", 3) if name == TRUTH else ("-", 2)
         axis.plot(t, energy, dash, color=style.colour(name), linewidth=1.4, zorder=order, label=name)
@@ -82,7 +82,7 @@ def _draw_over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray])
 
 
 def _draw_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-    """Logarithmic, since errors differ by orders of magnitude; exact values are drawn at rounding level."""
+    """Draws errors logarithmically, since they differ by orders of magnitude; exact values are at rounding level."""
     truth, finite = values[TRUTH], []
     size = float(np.abs(truth).max()) or 1.0
     for name, energy in values.items():
@@ -96,7 +96,7 @@ def _draw_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) ->
 
 
 def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Curves of one motion: (q, p), or (x, y) of every body; gaps for non-finite values."""
+    """Returns the curves of one motion: (q, p), or (x, y) of every body; gaps for non-finite values."""
     q, p = motions.q[shown], motions.p[shown]
     q, p = (np.where(np.isfinite(state), state, np.nan) for state in (q, p))
     if q.shape[1] == 1:
@@ -105,7 +105,7 @@ def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarr
 
 
 def injection_figure(injection: Injection, *, shown: int = 7) -> Figure:
-    """Decoded frames before and after the injection, the latent path, and the energies against time."""
+    """Decoded frames before and after the injection, the latent path, and the energies over time."""
     require_positive(shown=shown)
     total = len(injection.level)
     half = total // 2

@@ -1,4 +1,4 @@
-"""Figures of soft bodies in motion: energies against time, and snapshots; bodies in space are seen obliquely."""
+"""Figures of soft bodies in motion: energies over time, and snapshots; bodies in space are seen obliquely."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -24,21 +24,21 @@ COLOURS = {
 }
 BODY, EDGE, SKIN = np.array((0.62, 0.75, 0.87)), np.array((0.46, 0.58, 0.71)), np.array((0.16, 0.26, 0.38))
 GROUND, GROUND_LINE = "0.90", (0.35, 0.33, 0.30)
-# View of bodies in space: a turn about the vertical axis, then a tilt, in radians; directions to the right, away from
-# the viewer and upwards in the drawing plane.
+# View of bodies in space: a turn about the vertical axis, then a tilt, in rad; the vectors point right, away from the
+# viewer, and up in the drawing plane.
 _TURN, _TILT = np.deg2rad(-55.0), np.deg2rad(22.0)
 _RIGHT = np.array([np.cos(_TURN), np.sin(_TURN), 0.0])
 _AWAY = np.array([-np.sin(_TURN) * np.cos(_TILT), np.cos(_TURN) * np.cos(_TILT), -np.sin(_TILT)])
 _UP = np.cross(_RIGHT, _AWAY)
 _LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
 _HIGHEST = 3.6
-"""Largest height of a panel, inches."""
+"""Largest height of a panel in inches."""
 _FADED = 0.75
-"""How far the earliest snapshot fades towards the background."""
+"""Share by which the earliest snapshot fades towards the background."""
 
 
 class Moments(NamedTuple):
-    """Snapshots of one body, drawn into one panel."""
+    """Snapshots of one body, drawn in one panel."""
 
     title: str
     mesh: Mesh
@@ -55,9 +55,9 @@ class Moments(NamedTuple):
 def energies_against_time(
     t: Float[np.ndarray, " T"], energies: Mapping[str, Float[np.ndarray, " T"]], *, taken: str | None = None, title: str
 ) -> Figure:
-    """Energies from `motion_energies` over time; gravity and total count from the initial gravitational energy.
+    """Energies from `motion_energies` over time; gravity and total are relative to the initial gravitational energy.
 
-    If nothing feeds energy in, `taken` names what dissipates it, and the loss since the start is shaded.
+    If nothing supplies energy, `taken` names what dissipates it, and the loss since the start is shaded.
     """
     power, unit = style.prefixed(max(float(np.abs(values - values[0]).max()) for values in energies.values()), "J")
     start = energies["gravity"][0] if "gravity" in energies else 0.0
@@ -81,7 +81,7 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
     """Snapshots of bodies with their times, one panel per body, earlier ones paler.
 
     Raises:
-        InputError: no panel, or a panel whose positions, times and mesh do not fit.
+        InputError: there is no panel, or positions, times and mesh of a panel do not fit.
     """
     if not panels:
         raise InputError("there is no panel; give at least one")
@@ -155,7 +155,7 @@ def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
     for number, (points, t) in enumerate(zip(place.points, panel.t, strict=True)):
         corner, side = np.array([points[:, 0].mean(), points[:, 1].max()]), np.array([0.0, 1.0])
         if not panel.stacked and count > 1:
-            # A time has most room at the skin vertex that is farthest from the ground and the other snapshots.
+            # The time is placed at the skin vertex that is farthest from the ground and the other snapshots.
             others = np.concatenate([ground, *np.delete(place.points, number, axis=0)])
             room = np.linalg.norm(points[skin][:, None] - others, axis=-1).min(axis=1)
             corner = points[skin][room.argmax()]
@@ -180,7 +180,7 @@ def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
 def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> Callable[..., None]:
     """Adds a body to axes; returns the function (positions [n, dim], offset [2]) that draws it.
 
-    In the plane its triangles are drawn, in space the lit faces of its skin that face the viewer, the farthest first.
+    In the plane its triangles are drawn; in space the lit faces of its skin that face the viewer, the farthest first.
     `pale` is the share of white in its colours.
     """
     skin, plane = boundary(mesh), mesh.dimension == 2
@@ -208,19 +208,19 @@ def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> C
 
 
 def straight_ground(ends: tuple[float, float], level: float, slope: float) -> Float[np.ndarray, "2 2"]:
-    """The line y = level + slope x between two x."""
+    """Returns the line y = level + slope x between two values of x."""
     return np.stack([np.array(ends), level + slope * np.array(ends)], axis=1)
 
 
 def draw_ground(axis: Axes, line: Float[np.ndarray, "g 2"], *, depth: float) -> None:
-    """Draws the ground in the plane below a line as a strip of this depth."""
+    """Draws the ground in the plane below a line, as a strip of this depth."""
     x, y = line.T
     axis.fill_between(x, y, y - depth, color=GROUND, zorder=0, linewidth=0)
     axis.plot(x, y, color=GROUND_LINE, linewidth=1.2, zorder=1)
 
 
 def floor(positions: Float[np.ndarray, "*k 3"], height: float) -> Float[np.ndarray, "4 2"]:
-    """The rectangle at this height below all positions, in the drawing plane."""
+    """Returns the rectangle at this height below all positions, in the drawing plane."""
     flat = positions[..., :2].reshape(-1, 2)
     (west, south), (east, north) = flat.min(axis=0), flat.max(axis=0)
     corners = [[west, south, height], [east, south, height], [east, north, height], [west, north, height]]

@@ -45,14 +45,14 @@ def write_soft_body_gif(
         t: time of every frame, s.
         muscles: pairs of vertices [k, 2], drawn as lines (in the plane).
         actuation: length of the muscles in every frame relative to their rest length; red is short.
-        ground: height of the ground at x = 0, m, or in the plane the points [g, 2] of its line; `None` draws none.
+        ground: height of the ground at x = 0, m, or in the plane the points [g, 2] of its line; `None` for none.
         slope: slope of the ground (in the plane).
         title: title above the drawing.
         stride: frames of the motion per frame of the GIF.
         frames_per_second: frame rate of the GIF.
 
     Raises:
-        InputError: times, vertices or muscles that do not fit the positions, or no frame.
+        InputError: times, vertices or muscles do not fit the positions, or there is no frame.
     """
     require_positive(stride=stride, frames_per_second=frames_per_second)
     if len(t) != len(positions):
@@ -71,7 +71,7 @@ def soft_body_frame(
     ground: float | np.ndarray | None = 0.0,
     slope: float = 0.0,
 ) -> Figure:
-    """One frame of `write_soft_body_gif` as a figure."""
+    """Returns one frame of `write_soft_body_gif` as a figure."""
     lengths = None if actuation is None else np.asarray(actuation)[None]
     figure, show = _prepared(mesh, np.asarray(positions)[None], muscles, lengths, ground, slope)
     show(0)
@@ -81,7 +81,7 @@ def soft_body_frame(
 def _prepared(
     mesh: Mesh, positions: np.ndarray, muscles: Any, actuation: Any, ground: Any, slope: float
 ) -> tuple[Figure, Callable[[int], None]]:
-    """The figure with the ground and axes of equal scale that hold all frames, and the function that draws a frame."""
+    """Returns the figure with ground and equally scaled axes that hold all frames, and the function that draws one."""
     shape = mesh.vertices.shape
     if positions.ndim != 3 or positions.shape[1:] != shape or len(positions) == 0:
         raise InputError(f"positions have shape {list(positions.shape)}; expected [T, {shape[0]}, {shape[1]}], T > 0")

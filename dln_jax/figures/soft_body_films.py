@@ -1,6 +1,6 @@
 """Films of bodies in the plane as lit slabs, seen from the right and above, with their shadows on the ground.
 
-A point (x, y) at depth s behind the front is drawn at (x, y) + s OBLIQUE, so that fronts keep their true shape.
+A point (x, y) at depth s behind the front is drawn at (x, y) + s OBLIQUE, so fronts keep their true shape.
 """
 
 import itertools
@@ -22,14 +22,14 @@ from dln_jax.softbody.mesh.mesh import Mesh, boundary, components
 from dln_jax.types import InputError, require_positive
 
 OBLIQUE = np.array([0.32, 0.40])
-"""Shift in the drawing plane per depth."""
+"""Shift in the drawing plane per unit of depth."""
 TOOL = "0.42"
-"""Colour for rigid bodies such as a palm."""
+"""Colour of rigid bodies, such as a palm."""
 _STONE = np.array([0.80, 0.78, 0.75])
 _LIGHT = np.array([-0.35, 0.80, -0.49])  # to the right, upwards, away from the viewer
 _PIECES = 24
 _DARKEST = 0.38
-"""Share of the light that a body on the ground takes from it."""
+"""Share of the light that a body standing on the ground takes away."""
 
 
 class Slab(NamedTuple):
@@ -56,7 +56,7 @@ def write_slab_film(
     stride: int = 1,
     frames_per_second: float = 20.0,
 ) -> None:
-    """Writes a motion in the plane as a GIF, with a bar for scale and the time.
+    """Writes a motion in the plane as a GIF, with a scale bar and the time.
 
     Args:
         path: path of the GIF.
@@ -64,17 +64,17 @@ def write_slab_film(
         positions: positions of the vertices, m.
         t: time of every frame, s.
         depth: depth of the bodies in the drawing, m.
-        ground: points of the line below which all is ground, from left to right, m; walls are vertical parts of it.
+        ground: points of the line below which all is ground, from left to right, m; vertical parts of it are walls.
         colours: colour of every element, or a function of the frame.
-        slabs: rigid outlines in a frame.
-        label: text after the time in a frame.
-        window: ranges of x and y that are shown, m; by default those of the ground and the motion.
+        slabs: function of the frame that returns rigid outlines.
+        label: function of the frame that returns text next to the time.
+        window: visible ranges of x and y, m; by default those of the ground and the motion.
         width: width of the film, inches.
         stride: frames of the motion per frame of the GIF.
         frames_per_second: frame rate of the GIF.
 
     Raises:
-        InputError: a mesh in space, or times that do not fit the positions.
+        InputError: the mesh is in space, or times do not fit the positions.
     """
     require_positive(depth=depth, stride=stride, frames_per_second=frames_per_second, width=width)
     x = np.asarray(positions)
@@ -109,7 +109,7 @@ def write_slab_film(
 def _bodies(
     axis: Axes, mesh: Mesh, x: np.ndarray, depth: float, ground: np.ndarray, colours, slabs
 ) -> Callable[[int], None]:
-    """Adds all that moves, and returns the function that draws a frame."""
+    """Adds everything that moves, and returns the function that draws a frame."""
     rim, part = boundary(mesh), components(mesh)
     owners = _owners(mesh, rim)
     members = [np.unique(mesh.elements[part == number]) for number in range(part.max() + 1)]
@@ -138,7 +138,7 @@ def _bodies(
         rims = [*(o for o, _ in tools), *at[rim]]
         outlines.set(verts=rims, edgecolor=0.55 * np.concatenate([*(c[None] for _, c in tools), paint[owners]]))
         dark = [_shadow(at[own], ground, shift) for own in members] + [_shadow(o, ground, shift) for o, _ in tools]
-        # The darkest is drawn last, so that shadows do not add up.
+        # The darkest one is drawn last, so that shadows do not add up.
         cast = [(quad, share) for quads, share in sorted(dark, key=lambda shadow: shadow[1]) for quad in quads]
         shadows.set(verts=[quad for quad, _ in cast])
         shadows.set_facecolor([tuple((1.0 - share) * lit_ground) for _, share in cast])
@@ -147,14 +147,14 @@ def _bodies(
 
 
 def _pieces(outline: np.ndarray) -> np.ndarray:
-    """The sides of an outline in short pieces [k, 2, 2], whose order in depth is then right."""
+    """Cuts the sides of an outline into short pieces [k, 2, 2], so that their order in depth is right."""
     along = np.linspace(0.0, 1.0, _PIECES + 1)[None, :, None]
     points = (1 - along) * outline[:, None] + along * np.roll(outline, -1, axis=0)[:, None]
     return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 2)
 
 
 def _side_faces(edges: np.ndarray, paint: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The faces behind edges that the viewer sees, the farthest first, and their lit colours."""
+    """Returns the faces behind edges that the viewer sees, the farthest first, and their lit colours."""
     along = edges[:, 1] - edges[:, 0]
     normal = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -169,7 +169,7 @@ def _brightness(normal: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 1"]:
 
 
 def _shadow(x: np.ndarray, ground: np.ndarray, shift: np.ndarray) -> tuple[list[np.ndarray], float]:
-    """The parts of the ground straight below a body, and how dark they are: less below a higher body."""
+    """Returns the parts of the ground straight below a body, and their darkness, which decreases with its height."""
     (west, bottom), east = x.min(axis=0), x[:, 0].max()
     size, quads, top = float(np.ptp(x, axis=0).max()), [], -np.inf
     for a, b in itertools.pairwise(ground):
@@ -192,7 +192,7 @@ def _draw_ground(axis: Axes, ground: np.ndarray, depth: float, *, bottom: float)
 
 
 def _draw_scale(axis: Axes, window: tuple[tuple[float, float], tuple[float, float]]) -> None:
-    """A bar of a round length, about a sixth of the width, on the front of the ground."""
+    """Draws a bar of a round length, about a sixth of the width, on the front of the ground."""
     (west, east), (south, north) = window
     wanted = (east - west) / 6
     power = 10.0 ** np.floor(np.log10(wanted))
@@ -204,7 +204,7 @@ def _draw_scale(axis: Axes, window: tuple[tuple[float, float], tuple[float, floa
 
 
 def _owners(mesh: Mesh, rim: Int[np.ndarray, "f 2"]) -> Int[np.ndarray, " f"]:
-    """The element of every edge of the boundary."""
+    """Returns the element of every edge of the boundary."""
     sides = np.sort(mesh.elements[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     elements = {tuple(side): number // 3 for number, side in enumerate(sides.tolist())}
     return np.array([elements[tuple(edge)] for edge in np.sort(rim, axis=1).tolist()])

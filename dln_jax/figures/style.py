@@ -1,7 +1,7 @@
 """Common style of all figures: width, text sizes, a light grid, and one colour and marker per model.
 
 Matplotlib's global state is neither read nor set: figures are made without pyplot, and settings that Matplotlib would
-apply later, when it makes ticks, are set on each axis.
+apply later, when it makes ticks, are set on every axis.
 """
 
 from collections.abc import Iterable
@@ -51,12 +51,12 @@ UNKNOWN = ("#555555", "h")
 
 
 def colour(name: str) -> str:
-    """Colour of a model or of its variant "MODEL-..."; grey for an unknown name."""
+    """Returns the colour of a model or of its variant "MODEL-..."; grey for an unknown name."""
     return _look(name)[0]
 
 
 def marker(name: str) -> str:
-    """Marker of a model or of its variant; a default for an unknown name."""
+    """Returns the marker of a model or of its variant; a default for an unknown name."""
     return _look(name)[1]
 
 
@@ -68,7 +68,7 @@ def _look(name: str) -> tuple[str, str]:
 def figure(
     rows: int = 1, columns: int = 1, *, height: float, width: float = WIDTH, dpi: int = DPI, **options
 ) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes [rows, columns], drawn by Agg; sizes in inches, `options` as for `Figure.subplots`."""
+    """Returns a figure and its axes [rows, columns] for Agg; sizes in inches, `options` as for `Figure.subplots`."""
     drawn = blank(height=height, width=width, dpi=dpi)
     axes = drawn.subplots(rows, columns, squeeze=False, **options)
     prepare(*axes.flat)
@@ -76,7 +76,7 @@ def figure(
 
 
 def blank(*, height: float, width: float = WIDTH, dpi: int = DPI) -> Figure:
-    """A figure without axes."""
+    """Returns a figure without axes."""
     drawn = Figure(figsize=(width, height), layout="constrained", dpi=dpi)
     FigureCanvasAgg(drawn)
     return drawn
@@ -106,7 +106,7 @@ def legend(of: Axes | Figure, *args, **options) -> Legend:
 
 
 def scale_of(values: Iterable[float | int]) -> str:
-    """ "log" for positive values that span a decade or more, else "linear"."""
+    """Returns "log" for positive values that span a decade or more, else "linear"."""
     numbers = np.asarray(list(values), float)
     numbers = numbers[np.isfinite(numbers)]
     return "log" if len(numbers) and numbers.min() > 0 and numbers.max() >= 10 * numbers.min() else "linear"
@@ -120,16 +120,16 @@ def prefixed(size: float | int, unit: str) -> tuple[float, str]:
 
 
 def colours_of(names: Iterable[str]) -> dict[str, str]:
-    """Assigns colours in sequence, for everything but models."""
+    """Assigns colours in sequence, for everything except models."""
     return {name: CYCLE[number % len(CYCLE)] for number, name in enumerate(names)}
 
 
 def unit_of(data: Trajectories, joint: int, key: Literal["q", "qd", "tau"] = "tau") -> str:
-    """Unit of a joint's position, velocity or force; a joint of unknown kind counts as revolute."""
+    """Returns the unit of a joint's position, velocity or force; joints of unknown kind count as revolute."""
     prismatic = data.needs is not None and data.needs.joints[joint] == "prismatic"
     return {"q": ("rad", "m"), "qd": ("rad/s", "m/s"), "tau": ("N m", "N")}[key][prismatic]
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Axis label of a quantity, with its unit if it has one."""
+    """Returns the axis label of a quantity, with its unit if it has one."""
     return f"{name}, {unit}" if unit else name

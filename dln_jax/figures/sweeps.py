@@ -23,7 +23,7 @@ class Point(NamedTuple):
     marker: str = ""
     """Value of the option shown by markers."""
     problem: str = ""
-    """Title of its panel."""
+    """Title of the panel that shows it."""
     median: bool = False
     best: bool = False
 
@@ -38,7 +38,7 @@ def error_against_seconds(
         x, y: labels of the axes.
         colour, marker: names of the options shown by colours and markers; empty for none. The legend lists at most
             `MOST_COLOURS` colours.
-        note: text below the axes, for example on missing runs.
+        note: text below the axes, for example about missing runs.
     """
     problems = list(dict.fromkeys(point.problem for point in points))
     columns = min(len(problems), 2)
@@ -87,7 +87,7 @@ def _handle(marker: str, label: str, **looks: Any) -> Line2D:
 
 
 def _colours(values: Sequence[str]) -> dict[str, Any]:
-    """Colours in sequence, or along a colour map if there are more values than colours."""
+    """Returns colours in sequence, or along a colour map if there are more values than colours."""
     if len(values) <= MOST_COLOURS:
         return style.colours_of(values)
     return dict(zip(values, map(tuple, colormaps["viridis"](np.linspace(0, 0.95, len(values)))), strict=True))

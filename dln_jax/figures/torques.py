@@ -1,4 +1,4 @@
-"""Figures of torques: parts and errors, bands, and torques by joint; and paths of an arm's tip under them."""
+"""Figures of torques: parts and errors, bands, and torques by joint; also paths of an arm's tip under them."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -20,15 +20,15 @@ MOST_JOINTS, MOST_MOTIONS, MOST_PATHS = 4, 6, 24
 MOST_BANDS, MOST_BAND_SAMPLES = 7, 400
 """Largest numbers of joints and samples shown with bands."""
 MOST_SAMPLES = 4000
-"""Largest number of samples drawn by joint."""
+"""Largest number of samples drawn per joint."""
 HIGH, LOW = 0.8, 0.36
-"""Height of a panel of forces and of one of errors, inches."""
+"""Heights of a panel of forces and of a panel of errors, inches."""
 
 
 def force_decomposition(data: Trajectories, predicted: dict[str, np.ndarray], *, model: str = "model") -> Figure:
     """Torque and its parts over the first test motions, one column per joint: truth and model, with the error below.
 
-    All errors share one scale. Motions are joined in time; single states are compared point by point.
+    All errors share one scale. Motions are joined in time; isolated states are compared point by point.
 
     `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour.
     """
@@ -77,7 +77,7 @@ def force_decomposition(data: Trajectories, predicted: dict[str, np.ndarray], *,
 
 
 def _running_time(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Continuous time of motions joined at the median spacing of their samples."""
+    """Returns a continuous time of motions, joined at the median spacing of their samples."""
     steps = np.diff(t, prepend=t[0])
     steps[starts[1:]] = np.median(np.delete(steps, starts))
     return np.cumsum(steps)
@@ -124,7 +124,7 @@ def torque_bands(
     *,
     model: str = "model",
 ) -> Figure:
-    """Torque errors in their 95 % bands along the first held-out samples, one row per joint, next to their coverage.
+    """Torque errors within their 95 % bands along the first held-out samples, one row per joint, and their coverage.
 
     States flagged as out of distribution are shaded. `predicted` and `std` are the model's; its name sets the colour.
     """
@@ -174,14 +174,14 @@ def tip_paths(
     motions: Sequence[Motion],
     model: str = "model",
 ) -> Figure:
-    """Test paths of an arm's tip with the model's rollouts over them, one panel each; training paths behind in grey.
+    """Test paths of an arm's tip with the model's rollouts over them, one panel each; training paths in grey behind.
 
     Args:
         data: all trajectories, including those of `test`.
         tip: q -> position [2] in m.
         test: test trajectories with the same indices as in `data`.
-        motions: rollouts of the model from the test's first states under its torques, or none; a
-            path ends when the prediction is no longer valid.
+        motions: rollouts of the model from the test's first states under its torques, or none; a path ends when the
+            prediction is no longer valid.
         model: name of the model, which sets the colour.
     """
     shown = list(np.unique(test.trajectory))[:MOST_PATHS]

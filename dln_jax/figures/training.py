@@ -1,4 +1,4 @@
-"""Figure of a training: loss and errors against steps."""
+"""Figure of a training run: loss and errors against steps."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from dln_jax.figures import style
 from dln_jax.learning.engine.problem import Progress
 
 SHORTEST_SHARE = 0.2
-"""Stages shorter than this fraction of the steps make the stage names vertical."""
+"""If a stage is shorter than this fraction of the steps, the stage names are vertical."""
 
 
 def training_curve(

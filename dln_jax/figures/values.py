@@ -25,15 +25,15 @@ def value_slice(
     limit: float,
     fixed: bool,
 ) -> Figure:
-    """V and the first control where all other states are at the goal, and closed-loop paths projected onto the plane.
+    """V and the first control with all other states at the goal, and closed-loop paths projected onto the plane.
 
     Args:
         nodes: a coordinate, relative to the goal, and its rate.
-        V: at the nodes.
+        V: value at the nodes.
         u: first control at the nodes.
         paths: closed-loop coordinates, relative to the goal, and rates.
-        name: of the coordinate.
-        kind: of the coordinate, for units.
+        name: name of the coordinate.
+        kind: kind of the coordinate, for units.
         limit: limit of the control.
         fixed: whether there are other states, so that paths are projected.
     """
@@ -56,12 +56,12 @@ def value_slice(
 
 
 def sides(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates of a grid's columns and rows."""
+    """Returns the coordinates of a grid's columns and rows."""
     return nodes[:, 0, 0], nodes[0, :, 1]
 
 
 def surface(axis: Axes, nodes: np.ndarray, values: np.ndarray, norm: Normalize, colours: str) -> ScalarMappable:
-    """Draws values at the nodes as colours."""
+    """Draws the values at the nodes as colours."""
     axis.grid(False)
     return axis.pcolormesh(*sides(nodes), values.T, norm=norm, cmap=colours, shading="gouraud", rasterized=True)
 
@@ -75,7 +75,7 @@ def colour_bar(figure: Figure, shown: ScalarMappable, axis: Axes, label: str) ->
 
 
 def path_curves(axis: Axes, paths: np.ndarray, *, turning: bool = True) -> None:
-    """Draws paths; angles of a joint that turns freely are wrapped, with gaps where they are."""
+    """Draws paths; angles of a joint that turns freely are wrapped, with gaps where they jump."""
     for path in paths:
         angle = path[:, 0]
         if turning:
