@@ -8,7 +8,7 @@ from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
 
 
 def mass_spring(*, mass: float = 1.0, stiffness: float = 1.0, friction: float = 0.0) -> Scene:
-    """A mass on a spring: V = ½ k q², with q = 0 at rest; kg, N/m (zero for no spring) and N s/m."""
+    """A mass on a spring: V = ½ k q², with q = 0 at rest; in kg, N/m (zero for no spring) and N s/m."""
     require_positive(mass=mass)
 
     def mass_matrix(q: Vector) -> Matrix:
@@ -70,12 +70,13 @@ def n_body(
     Args:
         n: number of bodies.
         dimension: coordinates per body.
-        masses: one for all, or one per body, kg.
+        masses: one mass for all bodies, or one per body, kg.
         G: gravitational constant, m³/(kg s²); zero for no attraction.
         softening: length s, m; if positive, the force deviates from Newton's law.
 
     Raises:
-        InputError: fewer than two bodies, masses that are not positive or not one per body, or a negative softening.
+        InputError: there are fewer than two bodies, masses are not positive or not one per body, or the softening is
+            negative.
     """
     per_body = masses if isinstance(masses, tuple) else (masses,) * n
     require_positive(dimension=dimension, **{f"mass {index}": mass for index, mass in enumerate(per_body)})
@@ -91,7 +92,7 @@ def n_body(
     strength = G * np.array(per_body)[first] * np.array(per_body)[second]
 
     def pairs(q: Vector):
-        """Difference matrix [pairs, n], separations [pairs, dimension], distances and strengths [pairs]."""
+        """Returns the difference matrix [pairs, n], separations [pairs, dimension], distances and strengths [pairs]."""
         matrix = jnp.asarray(difference, q.dtype)
         separation = jnp.matmul(matrix, q.reshape(n, dimension), precision="highest")
         distance = jnp.sqrt(jnp.sum(separation**2, axis=1) + softening**2)

@@ -9,7 +9,7 @@ from dln_jax.scenes.scene import Scene, no_coriolis, textbook
 from dln_jax.types import InputError, Matrix, Scalar, Vector
 
 LINK_LENGTH = 1.0
-"""m, of both links."""
+"""Length of both links in m."""
 
 # Inertial and gravity constants of the published plant, kg m² and N m.
 _SHOULDER_INERTIA = 1.3727291666666667
@@ -20,7 +20,7 @@ _ELBOW_WEIGHT = 1.5
 
 
 def pendulum(*, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.81, friction: float = 0.0) -> Scene:
-    """The pendulum with q = 0 hanging; kg, m, m/s² (zero for no gravity) and N m s."""
+    """The pendulum with q = 0 hanging; in kg, m, m/s² (zero for no gravity) and N m s."""
     weight = mass * acceleration * length
 
     def mass_matrix(q: Vector) -> Matrix:
@@ -46,7 +46,7 @@ def double_pendulum(
     acceleration: float = 9.81,
     friction: float = 0.0,
 ) -> Scene:
-    """Two point masses on massless rods, both angles from the vertical, q = 0 hanging; kg, m, m/s², N m s at both."""
+    """Two point masses on massless rods, angles from the vertical, q = 0 hanging; in kg, m, m/s², N m s (each joint)."""
     inner, outer = lengths
     total = masses[0] + masses[1]
     coupling = masses[1] * inner * outer
@@ -112,7 +112,7 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
 
 
 def joint_angles(tip: Vector) -> Vector:
-    """Inverse kinematics: q [2] with the elbow bent counter-clockwise (q2 > 0), for a tip [2] in m.
+    """Inverse kinematics: returns q [2] with the elbow bent counter-clockwise (q2 > 0), for a tip [2] in m.
 
     Angle zero is horizontal. A tip out of reach gives NaN.
     """
@@ -127,13 +127,13 @@ class Links(NamedTuple):
     """Parameters of the inner and the outer link."""
 
     masses: tuple[float, float] = (0.5234602302310271, 0.6255677234174437)
-    """kg."""
+    """In kg."""
     lengths: tuple[float, float] = (0.2, 0.3)
-    """m."""
+    """In m."""
     centres: tuple[float, float] = (0.2, 0.25569305436052964)
-    """m, from the joint."""
+    """Distances of the centres of mass from the joints, in m."""
     inertias: tuple[float, float] = (0.031887199591513114, 0.05086984812807257)
-    """kg m², about the joint."""
+    """About the joints, in kg m²."""
 
 
 def two_link_pendulum(
@@ -143,7 +143,7 @@ def two_link_pendulum(
     acceleration: float = 9.81,
     friction: float = 0.0,
 ) -> Scene:
-    """The acrobot or the pendubot with q = 0 hanging and q[1] relative to the first link; m/s² and N m s.
+    """The acrobot or the pendubot with q = 0 hanging and q[1] relative to the first link; in m/s² and N m s.
 
     The default links are those of design C.1, model 1.1, of the benchmark of Wiebe et al. (2022, "RealAIGym").
     """
@@ -178,7 +178,7 @@ def two_link_pendulum(
 def chain(
     d: int, *, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.81, friction: float = 0.0
 ) -> Scene:
-    """Planar chain of uniform rods, angles relative to the previous link, q = 0 hanging; kg, m (a link), m/s², N m s.
+    """Planar chain of uniform rods, angles relative to the previous link, q = 0 hanging; kg, m per link, m/s², N m s.
 
     In absolute angles θ = cumsum(q) the equations are short (a_ij cos(θ_i - θ_j) couples rods i and j). The constant
     matrix S of the sum transforms them to joint coordinates: M = Sᵀ M_θ S, and likewise for forces.
@@ -217,5 +217,5 @@ def chain(
 
 
 def _sum_outwards(forces):
-    """Sᵀ times the rows: a joint's torque is the sum over its own rod and all rods beyond it."""
+    """Multiplies the rows by Sᵀ: a joint's torque is the sum over its own rod and all rods beyond it."""
     return jnp.cumsum(forces[::-1], axis=0)[::-1]

@@ -14,7 +14,7 @@ def cart_pole(
     acceleration: float = 9.81,
     friction: float = 0.0,
 ) -> Scene:
-    """A driven cart with a free pole, q = (cart position, pole angle from upright); kg, m, m/s², N s/m and N m s.
+    """A driven cart with a free pole, q = (cart position, pole angle from upright); in kg, m, m/s², N s/m and N m s.
 
     The pole is a point mass at `length` from its hinge. Only the cart is driven: tau = B f with B = (1, 0)ᵀ.
     """
@@ -54,14 +54,13 @@ def flexible_cart_pole(
     """A cart pulls a second one by a spring, q = (driven cart, extension of the spring, pole angle from upright).
 
     The second cart is at q[0] + q[1]; it carries the pole, a point mass at `length` from its hinge. Only the first cart
-    is driven: tau = B f with B = (1, 0, 0)ᵀ. Defaults are those of Lutter et al.
-    (CoRL 2019).
+    is driven: tau = B f with B = (1, 0, 0)ᵀ. Defaults are those of Lutter et al. (CoRL 2019).
 
     Args:
-        driven_mass: kg.
+        driven_mass: mass of the driven cart, kg.
         carried_mass: mass of the second cart, kg.
-        pole_mass: kg.
-        length: m.
+        pole_mass: mass of the pole, kg.
+        length: distance of the pole's mass from its hinge, m.
         stiffness: stiffness of the spring, N/m.
         acceleration: m/s².
         friction: viscous friction of the two carts on the rail, N s/m, and of the hinge, N m s.

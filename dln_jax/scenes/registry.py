@@ -27,7 +27,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def scene_named(name: str) -> Scene:
-    """The scene with this name; `InputError` lists the names if it is unknown."""
+    """Returns the scene with this name; `InputError` lists the names if it is unknown."""
     if name not in SCENES:
         raise InputError(f"scene '{name}' is unknown; choose from {', '.join(SCENES)}")
     return SCENES[name]()

@@ -1,4 +1,4 @@
-"""Record of a textbook system: its `Needs`, exact energies, equations of motion in closed form, and joint friction."""
+"""Record of a textbook system: its `Needs`, exact energies, closed-form equations of motion and joint friction."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -67,9 +67,9 @@ def textbook(
     friction: float = 0.0,
     actuation: tuple[tuple[float, ...], ...] | None = None,
 ) -> Scene:
-    """Builds a scene from its equations and what moves it.
+    """Builds a scene from its equations, friction and actuation.
 
-    The friction is viscous, D = ½ b |qd|² with the torque b qd; there is none if b (N m s or N s/m) is zero.
+    Friction is viscous, D = ½ b |qd|² with the torque b qd; there is none if b (N m s or N s/m) is zero.
     """
     needs = Needs(joints, gravity=potential is not None, friction=friction != 0, actuation=actuation)
     dissipation = None if friction == 0 else (lambda q, qd: 0.5 * friction * jnp.sum(qd**2))
@@ -77,21 +77,21 @@ def textbook(
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Acceleration qdd [d] by the textbook formulas.
+    """Returns the acceleration qdd [d] by the textbook formulas.
 
-    LAPACK solves for it, on whose last digits generated datasets depend.
+    LAPACK solves for it: the last digits of generated datasets depend on it.
     """
     bias = closed_form.inverse_dynamics(scene.closed_form, q, qd, jnp.zeros_like(qd))
     return jnp.linalg.solve(scene.mass_matrix(q), tau - bias)
 
 
 def no_coriolis(q: Vector, qd: Vector) -> Vector:
-    """Coriolis force for a constant mass matrix."""
+    """Returns the Coriolis force of a constant mass matrix, zero."""
     return jnp.zeros_like(q)
 
 
 def actuation_matrix(needs: Needs) -> Float[Array, "d u"]:
-    """B [d, u] in tau = B control; the identity if every coordinate has its own motor."""
+    """Returns B [d, u] in tau = B control; the identity if every coordinate has its own motor."""
     if needs.actuation is None:
         return jnp.eye(needs.degrees_of_freedom)
     return jnp.asarray(needs.actuation)
@@ -105,7 +105,7 @@ def with_friction(
     """Adds friction to the joints of a scene, in addition to any it already has.
 
     Dry friction is c tanh(u / v) with a small v, `shape.velocity_scale`: a joint "at rest" creeps more slowly than v.
-    An explicit integrator is stable for steps below some 2.8 m v / c, where m is the smallest inertia at the joint.
+    An explicit integrator is stable for steps below about 2.8 m v / c, where m is the smallest inertia at the joint.
 
     Args:
         scene: a scene with any joints.
@@ -113,7 +113,7 @@ def with_friction(
         shape: velocity scale and Stribeck velocity.
 
     Raises:
-        InputError: no coefficient, one of another law, or a negative one.
+        InputError: there is no coefficient, or one belongs to another law or is negative.
     """
     present = {name: value for name, value in coefficients._asdict().items() if value is not None}
     if others := [name for name in present if name not in LAWS]:

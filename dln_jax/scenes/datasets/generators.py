@@ -1,4 +1,4 @@
-"""Datasets sampled from scenes, with exact rates, torques and decomposition, in float64."""
+"""Datasets sampled from scenes, with exact rates, torques and force decomposition, in float64."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -28,9 +28,9 @@ _VERSION = 1  # of the generators' output; a new version makes a new file instea
 
 
 def default_data(scene: Scene) -> Trajectories:
-    """Letters for the two-link arm; random states, which exercise every term, for any other scene.
+    """Returns letters for the two-link arm, and for any other scene random states, which exercise every term.
 
-    They are generated once, then read from the cache.
+    Data are generated once, then read from the cache.
     """
     kind = "characters" if scene.name == "two-link-arm" else "uniform"
     path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
@@ -42,10 +42,10 @@ def default_data(scene: Scene) -> Trajectories:
 
 @in_float64
 def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Trajectories:
-    """Letters written by the tip of the two-link arm, one trajectory each, sampled every `dt` s.
+    """Returns letters written by the tip of the two-link arm, one trajectory each, sampled every `dt` s.
 
-    The outlines come from matplotlib's bundled font, smoothed. Angles, rates and torques are exact derivatives of the
-    tip's path through the inverse kinematics and the closed-form equations of motion.
+    The outlines come from matplotlib's bundled font, smoothed. Angles, rates and torques follow exactly from the tip's
+    path by inverse kinematics, differentiation and the closed-form equations of motion.
     """
     _require(dt=dt)
     paths = [letter_path(letter) for letter in letters]
@@ -65,7 +65,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
 
         return jax.vmap(motion)(t)
 
-    # All letters use the longest duration and thus share a compilation; a path rests beyond its end.
+    # All letters use the longest duration and thus share a compilation; beyond its end a path rests.
     longest = max(map(len, times))
     motions = [states(path.position, dt * np.arange(longest)) for path in paths]
     cut = [[np.asarray(values)[: len(t)] for values in motion] for motion, t in zip(motions, times, strict=True)]
@@ -85,9 +85,9 @@ def uniform(
     control_bound: float = 10.0,
     seed: int = 0,
 ) -> Trajectories:
-    """Independent random states, one per trajectory, uniform in a box symmetric about zero.
+    """Returns independent random states, one per trajectory, uniform in a box symmetric about zero.
 
-    Bounds are in rad or m, 1/s, 1/s² and N m or N. Accelerations are drawn if the scene is fully actuated; otherwise
+    Bounds are in rad or m, 1/s, 1/s² and N m or N. If the scene is fully actuated, accelerations are drawn; otherwise
     controls are drawn and accelerations follow from them.
     """
     _require(samples=samples, position_bound=position_bound, rate_bound=rate_bound)
@@ -119,7 +119,7 @@ def free_swing(
     tolerance: float = 1e-10,
     seed: int = 0,
 ) -> Trajectories:
-    """Motions from rest without torque, integrated adaptively (Dormand-Prince 8) to `tolerance`.
+    """Returns motions from rest without torque, integrated adaptively (Dormand-Prince 8) to `tolerance`.
 
     Without `starts` [K, d], `trajectories` starting postures are drawn within ±π/2 (rad or m).
 
@@ -142,7 +142,7 @@ def _require_room(samples: int, scene: Scene) -> None:
 
 
 def swings(scene: Scene, t, q: Float[np.ndarray, "K T d"], qd: Float[np.ndarray, "K T d"]) -> Trajectories:
-    """Motions without torque at common times t [T]; accelerations are those of the scene at these states."""
+    """Returns motions without torque at common times t [T]; accelerations are those of the scene at these states."""
     count, times, d = q.shape
     q, qd = q.reshape(-1, d), qd.reshape(-1, d)
     qdd = np.asarray(_batched(closed_form_forward_dynamics, scene)(q, qd, np.zeros_like(q)))
@@ -160,7 +160,7 @@ def rollouts(
     *,
     tolerance: float = 1e-10,
 ) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
-    """Reference motions of a scene without torque from K states: q and qd at the times t, which start at 0.
+    """Returns reference motions of a scene without torque from K states: q and qd at the times t, which start at 0.
 
     Raises:
         InputError: the integration does not finish.
@@ -179,7 +179,7 @@ def rollouts(
 
 
 def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
-    """Completes a motion of a scene with exact torques, momenta and the decomposition; arrays as in the schema."""
+    """Adds exact torques, momenta and force decomposition to a motion of a scene; arrays as in the schema."""
 
     def momentum(scene: Scene, q, qd, qdd):
         return jax.jvp(functools.partial(lagrangian.momentum, scene.lagrangian), (q, qd), (qd, qdd))
@@ -187,7 +187,7 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
     def forces(function):
         return _batched(lambda scene, *state: function(scene.closed_form, *state), scene)(q, qd, qdd)
 
-    # Compiled separately, since fusing them would change the last digits of datasets.
+    # Compiled separately, since fusing them would change the last digits of the datasets.
     tau, parts = np.asarray(forces(closed_form.inverse_dynamics)), map(np.asarray, forces(closed_form.decompose))
     p, pd = map(np.asarray, _batched(momentum, scene)(q, qd, qdd))
     return Trajectories(t, q, qd, qdd, tau, trajectory, label, p, pd, *parts, needs=scene.needs)

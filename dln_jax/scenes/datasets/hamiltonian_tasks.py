@@ -11,15 +11,15 @@ Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
 
 Directions of (q, p), and of the triangle, are those of a point drawn in a square, so diagonals are more likely. Two
 bodies start on a circular orbit with speeds multiplied by 1 + 0.05 normal. Three bodies start with every velocity
-component multiplied by 1 + 0.2 uniform(-1, 1), so their centre of mass drifts. All times are evenly spaced, both ends
-included.
+component multiplied by 1 + 0.2 uniform(-1, 1), so their centre of mass drifts. All times are evenly spaced and include
+both ends.
 
-Convention of the derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p are noisy. The
+Convention for the derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p are noisy. The
 true field therefore has a test loss due to the noise: 3.82e-2 on the spring and 3.56e-2 on the pendulum with seed 0. To
 compare models, use `field`, the exact field at the noisy point. Units are those of the table, with unit masses and G.
 
-Added by this project, with the same conventions: `damped_spring` and `damped_pendulum` (the first two with a viscous
-friction of 0.1), and, without noise, 100 trajectories x 50 samples each, the first fifth for the test:
+Added by this project, with the same conventions: `damped_spring` and `damped_pendulum` (the first two tasks with a
+viscous friction of 0.1), and, without noise, 100 trajectories x 50 samples each, the first fifth for the test:
 
 | task | starts | t |
 |---|---|---|
@@ -68,7 +68,7 @@ def pendulum(
 
 @in_float64
 def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-12) -> PhaseTask:
-    """Two bodies on almost circular orbits; q = (x1, y1, x2, y2), and p is the velocity."""
+    """Two bodies on nearly circular orbits; q = (x1, y1, x2, y2), and p is the velocity."""
     random = np.random.RandomState(seed)
     starts = []
     for _ in range(trajectories):
@@ -80,7 +80,7 @@ def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-1
 
 @in_float64
 def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e-12) -> PhaseTask:
-    """Three bodies that depart from a rotating triangle; q = (x1, y1, x2, y2, x3, y3), and p is the velocity."""
+    """Three bodies that start from a rotating triangle; q = (x1, y1, x2, y2, x3, y3), and p is the velocity."""
     random = np.random.RandomState(seed)
     third = 2 * np.pi / 3
     starts = []
@@ -125,11 +125,11 @@ def _without_noise(scene: Scene, H: Hamiltonian, starts: np.ndarray, t: np.ndarr
     return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
 
 
-# One cached object per system, by which jit finds functions already compiled.
+# One cached object per system, so that jit finds functions already compiled.
 @functools.cache
 def _system(make: Callable[[], Scene]) -> tuple[Scene, Hamiltonian]:
     scene = make()
-    # One Newton step is exact: the kinetic energy is quadratic.
+    # One Newton step is exact, because the kinetic energy is quadratic.
     return scene, hamiltonian.legendre(scene.lagrangian, iterations=1)
 
 

@@ -3,14 +3,13 @@
 The outline of a glyph (DejaVu Sans, matplotlib's bundled font) is traced contour by contour:
 
 1. each closed contour is resampled by arc length and smoothed by a Gaussian, which rounds the corners;
-2. it is resampled densely where it is curved, by the weight `(1 + (curvature bend_radius)²)^(1/4)`, blurred:
-   at a constant rate of that phase the pen brakes ahead of bends. (Without the blur its centripetal
-   acceleration would be at most `straight_speed² / bend_radius`.) People write like this: speed falls with a
-   power of the curvature (Lacquaniti, Terzuolo and Viviani, 1983, "The law relating the kinematic and figural
-   aspects of drawing movements");
+2. it is resampled more densely where it is curved, by the weight `(1 + (curvature bend_radius)²)^(1/4)`, blurred: with
+   a constant rate of that phase the pen brakes ahead of bends. (Without the blur its centripetal acceleration would be
+   at most `straight_speed² / bend_radius`.) People write like this: speed falls with a power of the curvature
+   (Lacquaniti, Terzuolo and Viviani, 1983, "The law relating the kinematic and figural aspects of drawing movements");
 3. a Fourier series in the phase replaces the samples: a contour is smooth everywhere and closes exactly;
-4. the rate of the phase rises and falls like a minimum-jerk motion (Flash and Hogan, 1985), for contours and
-   the straight pen-up moves between them. All are joined at rest: velocity and acceleration are continuous.
+4. the rate of the phase rises and falls as in a minimum-jerk motion (Flash and Hogan, 1985), for contours and for the
+   straight pen-up moves between them. All are joined at rest: velocity and acceleration are continuous.
 
 The shapes come from the font's own integer coordinates, so they do not depend on machine, rasteriser or settings.
 """
@@ -36,7 +35,7 @@ LETTERS = "abcdeghlmnopqrsuvwyz"
 """Letters of the embedded dataset `characters`."""
 
 _SAMPLES = 4096
-"""Points per contour from which the Fourier series is computed."""
+"""Number of points per contour from which the Fourier series is computed."""
 _HARMONICS = 96
 """Highest harmonic of the series; with the default smoothing the remainder is below a micrometre."""
 
@@ -47,7 +46,7 @@ class LetterPath(NamedTuple):
     duration: float
     """Time from rest to rest, s."""
     position: Callable[[Scalar], Float[Array, "2"]]
-    """Time in s -> tip (x, y) in m; `jax.jvp` of it gives the velocity, and once more the acceleration.
+    """Time in s -> tip (x, y) in m; `jax.jvp` gives the velocity, and once more the acceleration.
 
     It is a pytree: passed to a jitted function as an argument, all letters with the same number of strokes share one
     compilation. It is constant outside 0..duration and computes in JAX's default float.
@@ -72,7 +71,7 @@ class _TimedStrokes(NamedTuple):
     starts: Float[Array, "strokes"]
     shares: Float[Array, "strokes"]
     ramps: Float[Array, "strokes"]
-    """Fraction of its own time in which a stroke speeds up, and again slows down; at most 1/2."""
+    """Fraction of its own time during which a stroke speeds up, and again slows down; at most 1/2."""
     cosines: Float[Array, "strokes harmonics 2"]
     sines: Float[Array, "strokes harmonics 2"]
     displacements: Float[Array, "strokes 2"]
@@ -85,12 +84,12 @@ class _DesignUnits(TextToPath):
 
 
 def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
-    """Closed polygons along the outline of a glyph of DejaVu Sans, one [points, 2] per contour.
+    """Returns closed polygons along the outline of a glyph of DejaVu Sans, one [points, 2] per contour.
 
-    In font units (1/2048 em), y up from the baseline; the last point repeats the first.
+    Coordinates are in font units (1/2048 em), y up from the baseline; the last point repeats the first.
 
     Raises:
-        InputError: `character` is no single printable character whose glyph has an outline.
+        InputError: `character` is not a single printable character whose glyph has an outline.
     """
     expected = "expected one printable character with an outline in DejaVu Sans, such as 'a'"
     if not isinstance(character, str):
@@ -103,7 +102,7 @@ def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
         raise InputError(f"character is {character!r}, which the font lacks; {expected}")
     font = FontProperties(family="DejaVu Sans", fname=file)
     vertices, codes = _DesignUnits().get_text_path(font, character)
-    # The font's points are integers, and the points that TrueType implies between them are halves.
+    # The font's points are integers, and the points that TrueType implies between them are multiples of one half.
     exact = np.round(2.0 * np.asarray(vertices, np.float64).reshape(-1, 2)) / 2.0
     outlines = Outline(exact, codes).to_polygons() if len(exact) > 0 else []
     # Fonts contain lone anchor points, which draw nothing.
@@ -120,7 +119,7 @@ def _contour(
     smoothing: float,
     bend_radius: float,
 ) -> _Stroke:
-    """The smooth stroke along a closed polygon, from its point nearest to the pen (`None`: top left)."""
+    """Returns the smooth stroke along a closed polygon, from its point nearest to the pen (`None`: top left)."""
     corners = polygon @ np.array([1.0, 1.0j])
     arc = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(corners)))])
     uniform = np.arange(_SAMPLES) / _SAMPLES
@@ -184,13 +183,13 @@ def letter_path(
     bend_radius: float = 0.3,
     ramp_length: float = 0.2,
 ) -> LetterPath:
-    """The tip's motion along the outline of a character; the module docstring describes the steps.
+    """Returns the tip's motion along the outline of a character; the module docstring describes the steps.
 
     Args:
         character: one printable character of DejaVu Sans that has an outline.
         height: height of a lower-case x, m; characters share this scale and keep the font's proportions.
         centre: (x, y) in m of the point midway across the character and half an x-height above the baseline.
-        mean_speed: length of the path over its duration, m/s; it only scales time.
+        mean_speed: length of the path divided by its duration, m/s; it only scales time.
         smoothing: standard deviation of the Gaussian along the contour, m; corners are rounded by about this.
         bend_radius: the pen slows down where the radius of curvature falls below this, m.
         ramp_length: cost of one start and one stop as an equivalent distance at full speed, m.

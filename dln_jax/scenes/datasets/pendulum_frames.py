@@ -3,11 +3,11 @@
 The task is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks", after OpenAI gym's pendulum.
 
 The body is gym's: a uniform rod of 1 kg and 1 m that hangs from its end, in g = 10 m/s². It moves like a point mass of
-3/4 kg on 2/3 m, so H = qd²/6 + 5 (1 - cos q), in J, with q = 0 hanging. There is no torque. Frames are 0.05 s apart.
-Motions start at an angle drawn uniformly within ±π/6 and, as in gym, a velocity drawn uniformly within ±1 rad/s.
+3/4 kg at 2/3 m, so H = qd²/6 + 5 (1 - cos q), in J, with q = 0 hanging. There is no torque. Frames are 0.05 s apart.
+Motions start at an angle drawn uniformly within ±π/6 and, as in gym, at a velocity drawn uniformly within ±1 rad/s.
 
 A pixel at distance d from the rod's axis has the intensity exp(-(d / w)⁴), w = 0.12 m: 1 on the rod, 0 away from it,
-and smooth between and in q. The frame shows 1.6 m x 1.6 m, with the pivot in the middle, 0.4 m below its upper edge.
+and smooth in between and in q. The frame shows 1.6 m x 1.6 m, with the pivot in the middle, 0.4 m below its upper edge.
 The published frames are gym's own images; these need no window and are differentiable.
 """
 
@@ -28,21 +28,21 @@ SIDE = 28
 """Pixels per side."""
 PIXELS = SIDE * SIDE
 FRAME_TIME = 0.05
-"""Seconds between frames."""
+"""Time between frames in s."""
 TRAJECTORIES, FRAMES = 200, 103
-"""Numbers of the published dataset."""
+"""Sizes of the published dataset."""
 LARGEST_ANGLE, LARGEST_VELOCITY = np.pi / 6, 1.0
 """Bounds of the initial states, in rad and rad/s."""
 _LENGTH, _WIDTH, _EXTENT, _ABOVE = 1.0, 0.12, 1.6, 0.4
 
 
 def rod() -> Scene:
-    """The point pendulum with the same motions and energies as the rod."""
+    """Returns the point pendulum with the same motions and energies as the rod."""
     return pendulum(mass=0.75, length=2 / 3, acceleration=10.0)
 
 
 def energy(q: Float[Array, "*shape"], qd: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """H = qd²/6 + 5 (1 - cos q) of the rod, in J, in a form without cancellation near rest."""
+    """Returns H = qd²/6 + 5 (1 - cos q) of the rod in J, in a form without cancellation near rest."""
     return qd**2 / 6 + 10 * jnp.sin(q / 2) ** 2
 
 
@@ -77,7 +77,7 @@ class RodFrames(NamedTuple):
 
 
 class FrameSplit(NamedTuple):
-    """Three disjoint sets of trajectories: for training, for model selection and for the final test."""
+    """Three disjoint sets of trajectories: for training, model selection and the final test."""
 
     train: RodFrames
     validation: RodFrames
@@ -89,7 +89,7 @@ def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int
     """Generates the dataset; states are integrated adaptively to 1e-10 in float64.
 
     Raises:
-        InputError: no trajectory, or fewer than three frames (a pair and its successor).
+        InputError: there is no trajectory, or there are fewer than three frames (a pair and its successor).
     """
     require_positive(trajectories=trajectories)
     if frames < 3:
@@ -103,7 +103,7 @@ def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int
 
 
 def images(q: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape pixels"]:
-    """Frames for angles of any shape, each as one row of 784 pixels, float32."""
+    """Returns frames for angles of any shape, each as one row of 784 pixels, float32."""
     with jax.enable_x64(True):
         drawn = _images(jnp.asarray(q, float).ravel())
     return np.asarray(drawn).reshape(*np.shape(q), PIXELS)
@@ -113,7 +113,7 @@ def split(data: RodFrames, *, validation_share: float = 0.1, test_share: float =
     """Splits trajectories by the seed, with at least one in each set.
 
     Raises:
-        InputError: the shares leave none for training.
+        InputError: the shares leave no trajectory for training.
     """
     require_positive(validation_share=validation_share, test_share=test_share)
     count = len(data.q)

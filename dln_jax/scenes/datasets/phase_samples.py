@@ -36,7 +36,7 @@ class PhaseSamples(NamedTuple):
 
 
 class PhaseTask(NamedTuple):
-    """A published dataset and the system it was made from."""
+    """A published dataset and the system that generated it."""
 
     scene: Scene
     hamiltonian: Hamiltonian
@@ -62,7 +62,7 @@ def make_task(
     """Makes a task from starts (q, p) [K, 2, d] at the times t [T], with noise on both [K, 2, T, d], or `None`.
 
     Raises:
-        InputError: no trajectories on one side of the split.
+        InputError: one side of the split has no trajectories.
     """
     order = np.arange(len(starts))
     train, test = order[trained], np.setdiff1d(order, order[trained])
@@ -102,15 +102,16 @@ def reference_motion(
     dissipation: Dissipation | None = None,
     tolerance: float = 1e-12,
 ) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
-    """Free motions (q, p) at the times t from the states at t[0], integrated adaptively to the tolerance per step.
+    """Returns free motions (q, p) at the times t from the states at t[0], integrated adaptively to a tolerance per
+    step.
 
-    Between steps states are interpolated, with an error of a few hundred times the tolerance.
+    States between steps are interpolated, with an error of a few hundred times the tolerance.
 
     Raises:
-        InputError: an integration does not finish, for example where bodies meet.
+        InputError: an integration does not finish, for example because bodies meet.
     """
     require_positive(tolerance=tolerance)
-    # All motions of a call take as many steps as the slowest; groups reduce the waiting. The last group is padded.
+    # All motions of a call take as many steps as the slowest one, so groups save time. The last group is padded.
     size = min(len(q), _GROUP)
     groups = [np.minimum(np.arange(first, first + size), len(q) - 1) for first in range(0, len(q), size)]
     solved = [_solve(H, dissipation, tolerance, q[group], p[group], t) for group in groups]
@@ -140,5 +141,5 @@ def _field(H: Hamiltonian, dissipation: Dissipation | None, q: Vector, p: Vector
 
 @functools.partial(jax.jit, static_argnames=("H",))
 def _accelerations(H: Hamiltonian, q, p, qd, pd):
-    """qdd = d/dt dH/dp along the motion."""
+    """Returns qdd = d/dt dH/dp along the motion."""
     return jax.vmap(lambda *state: jax.jvp(jax.grad(H, argnums=1), state[:2], state[2:])[1])(q, p, qd, pd)
