@@ -46,7 +46,7 @@ def double_pendulum(
     acceleration: float = 9.81,
     friction: float = 0.0,
 ) -> Scene:
-    """Two point masses on massless rods, angles from the vertical, q = 0 hanging; in kg, m, m/s², N m s (each joint)."""
+    """Two point masses on massless rods, angles from the vertical, q = 0 hanging; in kg, m, m/s², N m s per joint."""
     inner, outer = lengths
     total = masses[0] + masses[1]
     coupling = masses[1] * inner * outer
