@@ -1,7 +1,7 @@
-"""Coverage of predicted standard deviations: how often errors lie within the bands that they predict.
+"""Coverage of predicted standard deviations: how often errors lie within the predicted bands.
 
-The band of level p about a prediction has the half width z_p sd. A standard normal variable lies between -z_p and z_p
-with probability p: 1.96 sd for 95 %.
+The band of level p about a prediction has the half width z_p sd, where a standard normal variable lies between -z_p and
+z_p with probability p: 1.96 sd for 95 %.
 """
 
 from statistics import NormalDist
@@ -13,9 +13,9 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 LEVELS = tuple(np.round([*np.arange(0.05, 0.95, 0.05), 0.95, 0.975, 0.99], 3).tolist())
-"""Levels of a curve."""
+"""Levels of a coverage curve."""
 LEVEL = 0.95
-"""Level of a single number."""
+"""Level of the bands reported as a single number."""
 
 
 class Coverage(NamedTuple):
@@ -26,7 +26,7 @@ class Coverage(NamedTuple):
 
 
 def half_width(level: float) -> float:
-    """z_p, in standard deviations; raises `InputError` for a level outside (0, 1)."""
+    """Returns z_p, in standard deviations; raises `InputError` for a level outside (0, 1)."""
     if not 0 < level < 1:
         raise InputError(f"the level of a band is {level}; expected a number between 0 and 1")
     return NormalDist().inv_cdf(0.5 + level / 2)
@@ -38,10 +38,10 @@ def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Covera
     Args:
         error: predicted minus measured, [N, d].
         std: predicted standard deviations, [N, d].
-        levels: p.
+        levels: levels p of the bands.
 
     Raises:
-        InputError: a level outside (0, 1), or shapes that differ.
+        InputError: a level is outside (0, 1), or shapes differ.
     """
     error, std = np.asarray(error, np.float64), np.asarray(std, np.float64)
     if error.shape != std.shape or error.ndim != 2 or not len(error):

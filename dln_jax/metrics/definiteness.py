@@ -1,4 +1,4 @@
-"""Definiteness of mass matrices: a kinetic energy has a positive definite M, a black-box network need not."""
+"""Definiteness of mass matrices: a kinetic energy has a positive definite M, a black-box network may not."""
 
 from typing import NamedTuple
 
@@ -14,11 +14,11 @@ class Definiteness(NamedTuple):
     """Eigenvalue statistics of the mass matrices of several states."""
 
     smallest_eigenvalue: float
-    """Over all states, in the unit of M; NaN if a matrix is not finite."""
+    """Smallest over all states, in the unit of M; NaN if a matrix is not finite."""
     share_not_definite: float
     """Share of states, 0 to 1, whose M is indefinite, singular to rounding, or not finite."""
     largest_condition_number: float
-    """Largest ratio of eigenvalues' magnitudes; infinite if M is singular or not finite."""
+    """Largest ratio of the eigenvalues' magnitudes; infinite if M is singular or not finite."""
 
 
 def definiteness(
@@ -26,11 +26,11 @@ def definiteness(
 ) -> Definiteness:
     """Evaluates the eigenvalues of the mass matrix at N states. It only reports; nothing is repaired.
 
-    An eigenvalue counts as positive above d times the rounding unit times the largest magnitude of its matrix.
-    A Hamiltonian model gives M = H_pp⁻¹, which is not finite where H_pp is singular.
+    An eigenvalue counts as positive if it exceeds d times the rounding unit times the largest magnitude of its matrix.
+    A Hamiltonian model has M = H_pp⁻¹, which is not finite where H_pp is singular.
 
     Raises:
-        InputError: a model without a mass matrix, or no states.
+        InputError: the model has no mass matrix, or there are no states.
     """
     if not isinstance(dynamics, Dynamics):
         raise InputError("definiteness: the model has no mass matrix; give one that comes from an energy")

@@ -24,11 +24,11 @@ def prediction_program(
 ) -> Callable[[Any, tuple[Any, ...]], dict[str, Array]]:
     """Returns (parameters, samples) -> predictions of the system with these parameters, for `jax.jit`.
 
-    Every sample has `tau`, `qdd`, and the parts of the torque, [N, d]. With recorded momenta and a Hamiltonian (`H`, or
-    that of a system in momenta) also `tau_from_momenta` = pd + dH/dq + friction: as published results of Hamiltonian
-    models were computed.
+    Every sample has `tau`, `qdd` and the parts of the torque, [N, d]. With recorded momenta and a Hamiltonian (`H`, or
+    that of a system in momenta) also `tau_from_momenta` = pd + dH/dq + friction, by which published results of
+    Hamiltonian models were computed.
 
-    Parameters are arguments of the program and not constants in it: one compilation serves every seed. Devices of a
+    Parameters are arguments of the program, not constants in it, so one compilation serves every seed. Devices of a
     mesh share the samples.
     """
 
@@ -67,9 +67,9 @@ def as_arrays(answers: dict[str, Array]) -> dict[str, np.ndarray]:
 
 
 def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, float]:
-    """Mean squared errors over samples, as sums over joints (the published metric; SI units squared).
+    """Returns mean squared errors over samples, summed over joints (the published metric; SI units squared).
 
-    `torque_mse`, `forward_mse` (of qdd), `power_mse` (of qdᵀ tau, which is dE/dt without friction), and, if the data
+    `torque_mse`, `forward_mse` (of qdd), `power_mse` (of qdᵀ tau, which is dE/dt without friction) and, if the data
     have the true parts, `inertial_mse`, `coriolis_mse`, `gravity_mse`. `torque_from_momenta_mse` of a Hamiltonian
     includes the error of the recorded pd. Its lower bound is the value of the true plant (4.4e-6 on the published test
     letters, whose pd are difference quotients).
@@ -92,11 +92,11 @@ def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, fl
 def normalised_error(
     predicted: Float[np.ndarray, "N d"], measured: Float[np.ndarray, "N d"]
 ) -> Float[np.ndarray, " d"]:
-    """nMSE of the joints: mean squared error over the variance of the measurements; NaN if that is zero."""
+    """Returns the nMSE of the joints: mean squared error over the variance of the measurements; NaN if that is zero."""
     variance = np.var(measured, axis=0)
     return np.mean((predicted - measured) ** 2, axis=0) / np.where(variance > 0, variance, np.nan)
 
 
 def mean_square(error: np.ndarray) -> float:
-    """Mean over samples of the sum of squares over joints; error [N, d]."""
+    """Returns the mean over samples of the sum of squares over joints; error [N, d]."""
     return float(np.mean(np.sum(error**2, axis=1)))

@@ -1,11 +1,11 @@
-"""Errors of motions that are predicted as images: estimates the physical state, and its energy, from the images.
+"""Errors of motions predicted as images: estimates the physical state, and its energy, from the images.
 
     q       argmin |render(q) - frame|², on a grid and then by Gauss-Newton
     qd      such that the rod moves from the first frame's q to the second's in the time between them
     energy  mean over starts and times of (H(q, qd) - H(q_true, qd_true))², in J²
 
-The velocity comes from the rod's own motion, and not from a difference quotient, so that true frames have the true
-energy up to the estimator's error, which `energy_floor` measures.
+The velocity comes from the rod's own motion instead of a difference quotient, so that true frames have the true energy
+up to the estimator's error, which `energy_floor` measures.
 """
 
 import functools
@@ -28,7 +28,7 @@ from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_positive
 
 GRID = 180
-"""Angles of the full circle at which the search starts; a Gauss-Newton step is at most their distance."""
+"""Number of angles of the full circle at which the search starts; a Gauss-Newton step is at most their distance."""
 ITERATIONS = 20
 LATE = 1000 + np.arange(32.0)
 """Frame numbers of late predictions."""
@@ -50,7 +50,7 @@ class FrameMotions(NamedTuple):
 
 
 def fitted_angle(frame: Float[Array, " pixels"], grid: Float[Array, " G"], drawn: Float[Array, "G pixels"]) -> Scalar:
-    """q of a frame, in rad, starting from the best angle of a grid with known frames."""
+    """Returns q of a frame, in rad, starting from the best angle of a grid with known frames."""
     spacing = 2 * jnp.pi / GRID
 
     def iteration(_, q: Scalar) -> Scalar:
@@ -62,7 +62,7 @@ def fitted_angle(frame: Float[Array, " pixels"], grid: Float[Array, " G"], drawn
 
 
 def velocity_between(first: Scalar, second: Scalar) -> Scalar:
-    """qd at the first of two angles, in rad/s, with which the rod reaches the second within one frame."""
+    """Returns qd at the first of two angles, in rad/s, with which the rod reaches the second within one frame."""
     scene = rod()
     step = rk4(second_order(lambda t, q, qd: closed_form_forward_dynamics(scene, q, qd, jnp.zeros_like(q))))
 
@@ -79,13 +79,13 @@ def velocity_between(first: Scalar, second: Scalar) -> Scalar:
 
 @in_float64
 def physical_energy(q: Float[np.ndarray, "*shape"], qd: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Energies of states, in J."""
+    """Returns the energies of states, in J."""
     return np.asarray(energy(jnp.asarray(q), jnp.asarray(qd)))
 
 
 @in_float64
 def physical_states(pairs: Float[np.ndarray, "*shape input"]) -> tuple[np.ndarray, np.ndarray]:
-    """(q, qd) at the first of two frames, in rad and rad/s, without the pixel axis."""
+    """Returns (q, qd) at the first of two frames, in rad and rad/s, without the pixel axis."""
     q, qd = _states(jnp.asarray(pairs, float).reshape(-1, 2, PIXELS))
     shape = pairs.shape[:-1]
     return np.asarray(q).reshape(shape), np.asarray(qd).reshape(shape)
@@ -95,7 +95,7 @@ def physical_states(pairs: Float[np.ndarray, "*shape input"]) -> tuple[np.ndarra
 def predict_frames(
     model: LatentModel, parameters: Parameters, pairs: Float[np.ndarray, "K input"], times: int
 ) -> FrameMotions:
-    """Predicts motions from pairs of frames: integrated adaptively in the latent plane, decoded for `times` frames."""
+    """Predicts motions from pairs of frames: integrates adaptively in the latent plane and decodes `times` frames."""
     parameters = with_float64(parameters)
     latent = predict(model.field, parameters["field"], *encoded(model, parameters, pairs), np.arange(float(times)))
     return FrameMotions(latent, decoded(model, parameters, latent))
@@ -105,7 +105,7 @@ def predict_frames(
 def encoded(
     model: LatentModel, parameters: Parameters, pairs: Float[np.ndarray, "*shape input"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(z_q, z_p) of pairs of frames, both [..., 1]."""
+    """Returns (z_q, z_p) of pairs of frames, both [..., 1]."""
     flat = jnp.asarray(pairs, float).reshape(-1, pairs.shape[-1])
     q, p = _applied("encode", model, with_float64(parameters), flat)
     shape = (*pairs.shape[:-1], 1)
@@ -114,7 +114,7 @@ def encoded(
 
 @in_float64
 def decoded(model: LatentModel, parameters: Parameters, latent: Motions) -> Float[np.ndarray, "K T input"]:
-    """Pairs of frames of latent motions."""
+    """Returns the pairs of frames of latent motions."""
     states = (jnp.asarray(state, float).reshape(-1, 1) for state in (latent.q, latent.p))
     pairs = _applied("decode", model, with_float64(parameters), *states)
     return np.asarray(pairs).reshape(*latent.q.shape[:2], -1)
@@ -126,7 +126,7 @@ def recoded(model: LatentModel, parameters: Parameters, truth: RodFrames) -> Flo
 
 
 def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: RodFrames) -> Float[np.ndarray, " K"]:
-    """Mean over times of (H - H_true)² of the motions, in J²; infinite for motions that are not finite."""
+    """Returns the mean over time of (H - H_true)² of the motions in J²; infinite for motions that are not finite."""
     q, qd = physical_states(pairs)
     true = physical_energy(truth.q, truth.qd)[:, : q.shape[1]]
     return finite_or_infinite(np.mean((physical_energy(q, qd) - true) ** 2, axis=1))
@@ -135,7 +135,7 @@ def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: RodFrames) -> Fl
 def frame_errors(model: LatentModel, parameters: Parameters, test: RodFrames) -> tuple[dict[str, float], FrameMotions]:
     """Predicts motions from the first pairs; returns their errors and the motions.
 
-    The errors are `energy_mse` and `frame_mse`, both by `phase_space.summary`.
+    The errors are `energy_mse` and `frame_mse`, both summarised by `phase_space.summary`.
     """
     pairs = test.pairs
     moved = predict_frames(model, parameters, pairs[:, 0], pairs.shape[1])
@@ -145,7 +145,7 @@ def frame_errors(model: LatentModel, parameters: Parameters, test: RodFrames) ->
 
 @in_float64
 def late_energy_errors(model: LatentModel, parameters: Parameters, test: RodFrames) -> Float[np.ndarray, " K"]:
-    """`energy_errors` of the `LATE` frames, which show a drift of the energy."""
+    """Returns the `energy_errors` of the `LATE` frames, which show energy drift."""
     parameters = with_float64(parameters)
     frames = np.concatenate([[0.0], LATE])
     latent = predict(model.field, parameters["field"], *encoded(model, parameters, test.pairs[:, 0]), frames)
@@ -155,7 +155,7 @@ def late_energy_errors(model: LatentModel, parameters: Parameters, test: RodFram
 
 
 def energy_floor(test: RodFrames) -> float:
-    """Mean square error of the energy estimate on true frames, in J²."""
+    """Returns the mean squared error of the energy estimate on true frames, in J²."""
     return float(np.mean(energy_errors(test.pairs, test)))
 
 
@@ -163,7 +163,7 @@ class Injection(NamedTuple):
     """One motion with `times` frames before and `times` frames after its energy is raised."""
 
     latent: Motions
-    """One motion [1, 2 times, 1], by frame number, with both states of the moment of injection."""
+    """One motion [1, 2 times, 1] by frame number, with both states at the moment of injection."""
     pairs: Float[np.ndarray, "T input"]
     """Decoded pairs of frames."""
     level: Float[np.ndarray, " T"]
@@ -206,7 +206,7 @@ def inject_energy(
     H is relative to the rod at rest, whose latent state is the encoding of two frames of the hanging rod.
 
     Raises:
-        InputError: a model without an energy, or a factor or times that are not positive.
+        InputError: the model has no energy, or a factor or `times` is not positive.
     """
     require_positive(factor=factor, times=times)
     parameters = with_float64(parameters)

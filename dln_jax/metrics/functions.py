@@ -14,14 +14,14 @@ from dln_jax.nn.activations import Activation
 from dln_jax.nn.differential_mlp import Layers
 
 QUANTITIES = {"y": "value", "dy": "gradient", "d2y": "hessian"}
-"""Names of the fields in the metrics."""
+"""Names of the quantities in the metrics, by field."""
 
 
 class Prediction(NamedTuple):
     """Predictions of an ensemble at N inputs, with the inputs in `x` of both fields; arrays are float64."""
 
     mean: FunctionSamples
-    """Value, Jacobian and Hessian: of a single network, or means over the members."""
+    """Value, Jacobian and Hessian of a single network, or their means over the members."""
     spread: FunctionSamples | None
     """Sample standard deviation over the members; `None` for a single network."""
 
@@ -41,7 +41,7 @@ def predictions(layers: Layers, x: np.ndarray, *, activation: Activation) -> Pre
 
 
 def errors(predicted: FunctionSamples, truth: FunctionSamples) -> dict[str, float]:
-    """Mean over samples of the squared error summed over components (the published metric).
+    """Returns the mean over samples of the squared error summed over components (the published metric).
 
     `value_mse`, and `gradient_mse` and `hessian_mse` if the truth has derivatives; units are squares of the data's.
     """
@@ -54,7 +54,7 @@ def errors(predicted: FunctionSamples, truth: FunctionSamples) -> dict[str, floa
 
 
 def typical_spread(spread: FunctionSamples, where: np.ndarray) -> float:
-    """Root mean square of the spread of the value over the inputs that the mask `where` [N] selects."""
+    """Returns the root mean square of the value's spread over the inputs selected by the mask `where` [N]."""
     return float(np.sqrt(np.mean(spread.y[where] ** 2)))
 
 

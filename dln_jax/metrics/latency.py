@@ -22,8 +22,8 @@ class Latency(NamedTuple):
 def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, warm_up: int = 200) -> Latency:
     """Times calls of a compiled function, one state at a time, cycling through the states.
 
-    The function is jitted, or one of NumPy arrays, and called as `function(*state)`. All states have one shape; they
-    vary, so that no result comes from a cache.
+    The function is jitted, or takes NumPy arrays, and is called as `function(*state)`. All states have one shape; they
+    differ, so that no result comes from a cache.
     """
     start = time.perf_counter()
     jax.block_until_ready(function(*states[0]))

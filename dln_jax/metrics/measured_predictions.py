@@ -1,8 +1,9 @@
 """Horizon of predictions on motions with measured coordinates: initial states are fitted to the first samples.
 
     VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= threshold, counted from the end of the fitted samples
-    lambda = ln |dx(T) / dx(0)| / T, the growth of the smallest changes of a start along the predicted motion
-    drift = largest |E(t) - E(0) - (work of tau - work lost to friction)| over the largest kinetic energy
+        lambda = ln |dx(T) / dx(0)| / T, the growth rate of infinitesimal changes of the start along the predicted
+        motion
+        drift = largest |E(t) - E(0) - (work of tau - work lost to friction)| relative to the largest kinetic energy
 
 A perturbation e of the initial state grows to e exp(lambda t). Predictions of chaotic motions are measured in Lyapunov
 times, 1 / lambda: a more accurate model extends them only by the logarithm of its accuracy.
@@ -29,7 +30,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
 START_STEPS = 2 * motions.START_STEPS
-"""Gauss-Newton steps to the initial state of a prediction."""
+"""Gauss-Newton steps for the initial state of a prediction."""
 
 
 class Predictions(NamedTuple):
@@ -44,14 +45,14 @@ class Predictions(NamedTuple):
 
 
 def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> MeasuredWindows:
-    """Cuts whole recordings of free motions to predict: gaps are filled with unmeasured times of weight 0.
+    """Cuts recordings of free motions to predict; gaps are filled with unmeasured times of weight 0.
 
     An initial state is fitted to `fitted` consecutive samples without a gap. A recording is predicted from the first
     such place, for `samples` median time steps or until it ends. Further predictions start at intervals of half that
     length, as long as `samples` steps remain. Shorter segments repeat their last time, with weight 0.
 
     Raises:
-        InputError: no recording has more than `fitted` samples in a row and one to predict.
+        InputError: no recording has more than `fitted` consecutive samples, so that there is one to predict.
     """
     recordings = []
     for index in np.unique(data.trajectory):
@@ -73,10 +74,10 @@ def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> Measured
 
 
 def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
-    """Cuts segments of `samples` samples to predict, which begin at every `every`-th sample of the trajectories.
+    """Cuts segments of `samples` samples to predict, starting at every `every`-th sample of the trajectories.
 
     Raises:
-        InputError: no trajectory is that long.
+        InputError: no trajectory is long enough.
     """
     pieces = []
     for index in np.unique(data.trajectory):
@@ -90,16 +91,16 @@ def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWin
 
 
 def grid_places(t: Float[np.ndarray, " N"], *, gap: float = GAP) -> Int[np.ndarray, " N"]:
-    """Indices of samples on a grid with the steps of the samples, and within a gap steps of at most the median."""
+    """Returns the samples' indices on a grid of their own time steps; within a gap, steps are at most the median."""
     steps = np.diff(t)
     median = np.median(steps) if len(steps) else 1.0
-    # Rounding of the times must not add a step to a gap of a whole number of steps.
+    # Rounding of the times must not add a step to a gap of an integer number of steps.
     counts = np.where(steps > gap * median, np.ceil(steps / median - 1e-6), 1).astype(int)
     return np.concatenate([[0], np.cumsum(counts)])
 
 
 def on_grid(t: Float[np.ndarray, " N"], q: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> MeasuredWindows:
-    """One free motion on the grid of its places, as a window; places of weight 0 repeat the sample before."""
+    """Returns one free motion on the grid of its places, as a window; places of weight 0 repeat the previous sample."""
     place = grid_places(t)
     grid = np.arange(place[-1] + 1)
     held = np.searchsorted(place, grid, side="right") - 1
@@ -128,11 +129,11 @@ def predict_measured(
     """Predicts motions from initial states fitted to the first `fitted` samples of q; weight 0 means unmeasured.
 
     Args:
-        model: of any energies, or of accelerations.
+        model: a model of any energies, or of accelerations.
         parameters: its parameters.
         segments: segments to predict.
-        fitted: number of samples that fit the initial state, at least 2.
-        torque: between samples.
+        fitted: number of samples to which the initial state is fitted, at least 2.
+        torque: torque between samples, "held" or "interpolated".
         substeps: RK4 steps between two samples.
         momenta: whether the model is a flow of (q, p), without torques, with p close to qd; its p is returned as qd.
 
@@ -155,7 +156,7 @@ def valid_times(
     fitted: int,
     variance: Float[np.ndarray, " d"],
 ) -> Float[np.ndarray, " W"]:
-    """Valid prediction times of the segments in s, from the last fitted sample on, at measured samples."""
+    """Returns the segments' valid prediction times in s from the last fitted sample on, at measured samples."""
     measured = (segments.weight > 0) & (np.arange(segments.t.shape[1]) >= fitted - 1)
     return np.array(
         [
@@ -179,7 +180,7 @@ def _predict(
         return motion(dynamics(energies), start, t, tau, torque=torque, substeps=substeps)
 
     def drift(states, t, tau):
-        """Drift of the energy relative to the work along the predicted motion."""
+        """Returns the drift of the energy relative to the work along the predicted motion."""
         if momenta or isinstance(energies, InverseForward):
             return jnp.asarray(jnp.nan)
         system, (q, qd) = dynamics(energies), (states[:, :d], states[:, d:])
@@ -210,7 +211,7 @@ def prediction_metrics(
     fitted: int,
     variance: Float[np.ndarray, " d"],
 ) -> dict[str, float]:
-    """Means over the segments, the median valid prediction time, and the bounds on these times.
+    """Returns means over the segments, the median valid prediction time, and upper bounds on these times.
 
     `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `vpt_lyapunov` (in Lyapunov times, if
     motions diverge) and `lyapunov_seconds`, by the model's own growth of small changes; `energy_drift`.

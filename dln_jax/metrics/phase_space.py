@@ -1,12 +1,12 @@
 """Errors of a model of a phase space: of its field at test states, and of its predicted motions.
 
     test loss        mean over samples and components of (rates - measured rates)², as published
-    clean field      the same against the exact field at the same, noisy, states, which distinguishes models
+        clean field      the same against the exact field at the same noisy states, which distinguishes models
     energy           mean over starts and times of (H(x_hat(t)) - H(x(t)))², H the true one
     rollout          mean over starts, times and components of (x_hat(t) - x(t))²
 
-Standard errors are over starts. Single chaotic motions dominate means, so medians over starts are reported too. A
-motion that is not finite, or needs more than `MOST_STEPS`, has infinite errors.
+Standard errors are over starts. A few chaotic motions dominate means, so medians over starts are reported too. A motion
+that is not finite, or needs more than `MOST_STEPS`, has infinite errors.
 """
 
 import functools
@@ -40,13 +40,13 @@ class Motions(NamedTuple):
 def field_rates(
     model: Model, parameters: Parameters, q: Float[np.ndarray, "N d"], p: Float[np.ndarray, "N d"]
 ) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N d"]]:
-    """Rates (qd, pd) of states."""
+    """Returns the rates (qd, pd) of states."""
     qd, pd = _rates(model, parameters, jnp.asarray(q), jnp.asarray(p))
     return np.asarray(qd), np.asarray(pd)
 
 
 def field_errors(model: Model, parameters: Parameters, part: PhaseSamples) -> dict[str, float]:
-    """`loss`, against the measured rates, and `clean_field_mse`, against the exact field at the measured states."""
+    """Returns `loss` against measured rates, and `clean_field_mse` against the exact field at the measured states."""
     data = part.data
     p, measured = momenta(data)
     qd, pd = field_rates(model, parameters, data.q, p)
@@ -74,7 +74,7 @@ def predict(
 
 
 def energies(H: Hamiltonian, motions: Motions) -> Float[np.ndarray, "K T"]:
-    """H along motions; infinite if a state is not finite."""
+    """Returns H along motions; infinite if a state is not finite."""
     return finite_or_infinite(np.asarray(_along(H, jnp.asarray(motions.q), jnp.asarray(motions.p))))
 
 
@@ -84,20 +84,20 @@ def finite_or_infinite(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray,
 
 
 def energy_errors(H: Hamiltonian, predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
-    """Mean over time of (H(x_hat) - H(x))² of the motions; infinite for motions that are not finite."""
+    """Returns the mean over time of (H(x_hat) - H(x))² of the motions; infinite for motions that are not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return finite_or_infinite(np.mean((energies(H, predicted) - energies(H, truth)) ** 2, axis=1))
 
 
 def state_errors(predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
-    """Mean over time and components of (x_hat - x)² of the motions; infinite for motions that are not finite."""
+    """Returns the mean over time and components of (x_hat - x)²; infinite for motions that are not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.concatenate([predicted.q - truth.q, predicted.p - truth.p], axis=2) ** 2
         return finite_or_infinite(np.mean(errors, axis=(1, 2)))
 
 
 def summary(name: str, errors: Float[np.ndarray, " K"]) -> dict[str, float]:
-    """Mean, its standard error (NaN for one error), and median: `name`, `name_standard_error` and `name_median`."""
+    """Returns `name` (mean), `name_standard_error` (NaN for a single error) and `name_median` of errors."""
     count = len(errors)
     finite = bool(np.isfinite(errors).all())
     spread = float(np.std(errors, ddof=1) / np.sqrt(count)) if finite and count > 1 else float("nan")

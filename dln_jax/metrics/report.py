@@ -17,7 +17,7 @@ PACKAGES = ("dln-jax", "jax", "jaxlib", "dm-haiku", "optax", "numpy", "diffrax")
 
 
 class Row(NamedTuple):
-    """One measured number; names are stable, lower case, so that anyone can compare two runs."""
+    """One measured number; names are stable and lower case, so that anyone can compare two runs."""
 
     case: str
     quantity: str
@@ -28,7 +28,7 @@ class Row(NamedTuple):
     bound: float | None = None
     """Bound to meet."""
     at_least: bool = False
-    """Whether the bound is a lower one."""
+    """Whether the bound is a lower bound."""
     expected: str = ""
     """The expectation in words, with the origin of the bound."""
 
@@ -41,7 +41,7 @@ class Row(NamedTuple):
 
 
 def conditions(**facts: Any) -> dict[str, Any]:
-    """Machine, versions, threads, command and date, and all keywords (dtype, seeds, ...)."""
+    """Returns machine, versions, threads, command and date, and all keywords (dtype, seeds, ...)."""
     return {
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}",
         "device": str(jax.devices()[0]),
@@ -56,7 +56,7 @@ def conditions(**facts: Any) -> dict[str, Any]:
 def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
     """Writes `{"conditions": ..., "rows": [...]}` as JSON; a value that is not finite becomes null.
 
-    The expectations of rows in words are part of the conditions.
+    Expectations of rows in words become part of the conditions.
     """
     listed = [{**dict(zip(Row._fields[:6], row, strict=False)), "pass": row.passed} for row in rows]
     words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}

@@ -1,12 +1,11 @@
-"""Long predictions: a system driven by recorded torques from a recorded state, and the time until it fails.
+"""Long predictions: a system driven by recorded torques from a recorded state, and the time until they fail.
 
     VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= threshold        (valid prediction time)
     E(t) - E(0) = work of tau - work lost to friction                        (energy balance)
 
 Protocol: Lutter and Peters, "Combining physics and deep learning to learn continuous-time dynamics models" (2021),
-integrates by RK4 at a twentieth of the samples' spacing, with the torque held over each sample. But a recorded torque
-is a sample of a smooth function, so that even the true plant deviates under held torques; interpolation is more
-accurate.
+integrate by RK4 at a twentieth of the samples' spacing, with the torque held over each sample. But a recorded torque is
+a sample of a smooth function, so even the true plant deviates under held torques; interpolation is more accurate.
 """
 
 import functools
@@ -26,9 +25,9 @@ from dln_jax.mechanics.integrators import looped_rk4
 from dln_jax.types import InputError, Vector, require_positive
 
 TORQUES: tuple[Torque, ...] = ("held", "interpolated")
-"""Torques between two samples; all kinds are compared."""
+"""Kinds of torque between two samples; all are compared."""
 SUBSTEPS = 20
-"""Steps of RK4 per sample, as published."""
+"""RK4 steps per sample, as published."""
 
 
 class Motion(NamedTuple):
@@ -60,12 +59,12 @@ def follow(
     substeps: int = SUBSTEPS,
     torque: Torque = "held",
 ) -> Motion:
-    """Integrates the motion from (q0, qd0) under the torques tau at the times t, by RK4; `vmap` it over trajectories.
+    """Integrates the motion from (q0, qd0) under the torques tau at the times t by RK4; `vmap` it over trajectories.
 
-    Times are in s, with any spacing; a repeated time repeats the state. There are `substeps` of RK4 per sample. The
+    Times are in s, with any spacing; a repeated time repeats the state. There are `substeps` RK4 steps per sample. The
     torque "held" keeps tau[k] until t[k + 1], as published; "interpolated" is linear in between.
 
-    Raises InputError for no substeps, or a `torque` of another name.
+    Raises InputError if `substeps` is not positive or `torque` has another name.
     """
     require_positive(substeps=substeps)
     return _drive(dynamics, q0, qd0, tau, torque_slopes(tau, t, torque), t, substeps)
@@ -76,8 +75,8 @@ def motion_program(
 ) -> Callable[[Any, Records], tuple[Motion, Array | None]]:
     """Returns (parameters, records) -> motions and their energies, for `jax.jit`; leading axes [TORQUES, trajectories].
 
-    The energies, in J, are those of the predicting system at its own states; `None` for one that has no energy.
-    Parameters are arguments of the program and not constants in it: one compilation serves every seed.
+    Energies, in J, are those of the predicting system at its own states; `None` for a system without energy. Parameters
+    are arguments of the program, not constants in it, so one compilation serves every seed.
     """
 
     def motions(parameters: Any, records: Records) -> tuple[Motion, Array | None]:
@@ -99,7 +98,7 @@ def records_of(data: Trajectories, dtype: DTypeLike | None) -> Records:
     """Returns the records for a `motion_program`, in `dtype` (JAX's default if `None`).
 
     Raises:
-        InputError: a trajectory of a single sample.
+        InputError: a trajectory has a single sample.
     """
     groups = _samples(data)
     longest = max(map(len, groups))
@@ -112,7 +111,7 @@ def records_of(data: Trajectories, dtype: DTypeLike | None) -> Records:
 
 
 def by_trajectory(motions: Motion, data: Trajectories) -> dict[Torque, list[Motion]]:
-    """Returns the motions of a `motion_program` as float64 arrays of their lengths."""
+    """Returns the motions of a `motion_program` as float64 arrays of their own lengths."""
     groups, arrays = _samples(data), [np.asarray(leaf, np.float64) for leaf in motions]
     return {
         torque: [Motion(*(leaf[kind, k, : len(group)] for leaf in arrays)) for k, group in enumerate(groups)]
@@ -128,9 +127,9 @@ def valid_prediction_time(
     *,
     threshold: float = 1e-2,
 ) -> float:
-    """Time in s from the start to the first sample with sum_j (q_j - q_hat_j)² / variance_j >= threshold.
+    """Returns the time in s from the start to the first sample with sum_j (q_j - q_hat_j)² / variance_j >= threshold.
 
-    The whole duration if there is none. A prediction that is not finite has failed at that sample.
+    If there is none, returns the whole duration. A prediction that is not finite has failed at that sample.
     """
     # A diverging prediction may overflow; infinity exceeds the threshold, and NaN is not below it.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -142,9 +141,9 @@ def valid_prediction_time(
 def valid_prediction_times(
     data: Trajectories, motions: list[Motion], *, threshold: float = 1e-2
 ) -> Float[np.ndarray, " K"]:
-    """Valid prediction times of the trajectories in s; the variance of q_j is over all samples of the data.
+    """Returns the trajectories' valid prediction times in s; the variance of q_j is over all samples of the data.
 
-    Raises InputError for a coordinate that is the same in all samples, or a threshold that is not positive.
+    Raises InputError if a coordinate is the same in all samples, or the threshold is not positive.
     """
     require_positive(threshold=threshold)
     variance = _variance(data.q, "q")
@@ -157,10 +156,10 @@ def valid_prediction_times(
 
 
 def normalised_state_error(data: Trajectories, motions: list[Motion]) -> float:
-    """Root mean square of (q - q_hat) / sd(q_j) and (qd - qd_hat) / sd(qd_j) over all samples and coordinates.
+    """Returns the root mean square of (q - q_hat) / sd(q_j) and (qd - qd_hat) / sd(qd_j) over samples and coordinates.
 
-    1 is the error of a constant guess; infinite when a prediction is not finite.
-    Raises InputError for a coordinate or rate that is the same in all samples.
+    1 is the error of a constant guess; infinite if a prediction is not finite. Raises InputError if a coordinate or
+    rate is the same in all samples.
     """
     errors, samples = [], np.concatenate(_samples(data))
     for key in ("q", "qd"):
@@ -171,16 +170,16 @@ def normalised_state_error(data: Trajectories, motions: list[Motion]) -> float:
 
 
 def metrics_of_motions(motions: Motion, energies: Array | None, data: Trajectories) -> dict[str, float]:
-    """Means over the trajectories of the motions and energies of a `motion_program` with both kinds of torque.
+    """Returns means over the trajectories of the motions and energies of a `motion_program`, for both kinds of torque.
 
     `vpt_seconds` (torque held, as published), `vpt_interpolated_seconds` and `rollout_seconds` (the duration, which
     bounds them). For the interpolated motions, which are more accurate, also `normalised_state_error` and, if the
     system has an energy, `energy_error_j`: the mean over all samples of |E(t) - E(0) - work(t)|, infinite if a
-    prediction is not finite. It shows the error of the integration, and whether the forward model is consistent with
-    that energy, but not whether the energy is right. Compare a model's figures with those of the true plant, which
-    bound them.
+    prediction is not finite. It shows the integration error, and whether the forward model is consistent with that
+    energy, but not whether the energy is right. Compare a model's figures with those of the true plant, which bound
+    them.
 
-    Raises InputError for a coordinate that never changes.
+    Raises InputError if a coordinate never changes.
     """
     held, interpolated = by_trajectory(motions, data).values()
     metrics = {
@@ -201,7 +200,7 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, t, substeps
 
     def rate(state, tau):
         q, qd, _ = state
-        # The work changes at the rate of the energy, which includes friction.
+        # The work changes at the rate of the energy, including friction.
         at_work = tau - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else tau
         return qd, dynamics.forward_dynamics(q, qd, tau), qd @ at_work
 
@@ -210,7 +209,7 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, t, substeps
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:
-    """Indices of the trajectories' samples."""
+    """Returns the indices of the trajectories' samples."""
     groups = [np.flatnonzero(data.trajectory == index) for index in np.unique(data.trajectory)]
     if not groups:
         raise InputError("there are no trajectories; a rollout needs at least one")

@@ -20,9 +20,9 @@ def motion_energies(
     v: Float[Array, "T n dim"],
     control: Float[Array, "T k"] | None = None,
 ) -> dict[str, Float[np.ndarray, " T"]]:
-    """Kinetic energy, the energies of the terms by name, and their total, in J, at the moments of a motion.
+    """Returns kinetic energy, the energies of the terms by name, and their total, in J, at the moments of a motion.
 
-    The potential of gravity is zero at the origin. Friction stores nothing.
+    Gravity has zero potential at the origin. Friction stores nothing.
     """
     energies = element_energies(scene)
 

@@ -1,4 +1,4 @@
-"""Verdict on a fitted model: good, doubtful or refused, by its torques on held-out motions or by predicted motions.
+"""Verdict on a fitted model, good, doubtful or refused, by its torques on held-out motions or by predicted motions.
 
 The mean squared error e of a joint is compared with four numbers from the same samples: the variance v of its torque
 (the error of predicting the mean), its mean square z (the error of predicting zero), the variance n of its noise, and
@@ -6,17 +6,17 @@ the error of the robot's own file. A joint is
 
     explained     e <= UNEXPLAINED v + NOISE n
     unexplained   e >= v: a constant would have done as well
-    doubtful      in between; if the mean of e / v over all joints is beyond FAILED, the fit is refused
+        doubtful      in between; if the mean of e / v over all joints exceeds FAILED, the fit is refused
     unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: no conclusion
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
 
-A predicted motion escapes if a state is not finite, or a momentum or a position is further from zero than `RANGE` times
-the farthest measured one; angles may grow, as a pendulum turns over. The error of a motion is the mean square of its
-first `EARLY` samples over the variance of the data, because chaotic motions diverge from any model later on.
+A predicted motion escapes if a state is not finite, or if a momentum or a position is further from zero than `RANGE`
+times the farthest measured one; angles may grow, since a pendulum can turn over. The error of a motion is the mean
+square of its first `EARLY` samples over the variance of the data, because chaotic motions later diverge from any model.
 
     refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the spread)
-    doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the share of noise in the variance is added to both
+        doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the share of noise in the variance is added to both limits
 """
 
 from collections.abc import Sequence
@@ -33,19 +33,19 @@ LEVELS: tuple[Level, ...] = ("good", "doubtful", "refused")
 """Levels in the order of their numbers in metrics.json: 0, 1 and 2."""
 UNEXPLAINED, FAILED = 0.05, 0.25
 """Share of a torque's variance that a good model may leave unexplained in any joint (an rms error of 22 %), and mean
-share over all joints at which it is refused (50 %)."""
+share over all joints at which the fit is refused (50 %)."""
 NOISE = 2.0
-"""Errors up to this multiple of the noise's variance count as noise, because that variance is itself an estimate."""
+"""Errors up to this multiple of the noise variance count as noise, because that variance is itself an estimate."""
 WORSE, MUCH_WORSE = 0.01, 2.0
-"""A fit is worse than the robot's file if its mean nMSE is larger by the first number; it is refused if it is also
+"""A fit is worse than the robot's file if its mean nMSE is larger by the first number; it is also refused if it is
 larger by the second as a factor."""
 CONSTANT = 1e-12
 """A torque is constant if its variance is below this share of the mean square of all torques."""
 
 EARLY, RANGE, MOTION_NOISE = 30, 10.0, 4.0
-"""Number of samples of a motion's error, farthest state of a motion that has not escaped relative to the data, and
-factor of the noise: noise in the measured initial state moves a motion as far as the noise that it is compared with,
-and may grow."""
+"""Number of samples that count for a motion's error, distance relative to the data beyond which a motion has escaped,
+and factor on the noise: noise in the measured initial state moves a motion as far as the noise in the measurements that
+it is compared with, and this may grow."""
 
 
 class Verdict(NamedTuple):
@@ -53,7 +53,7 @@ class Verdict(NamedTuple):
 
     level: Level
     reason: str
-    """The numbers behind it."""
+    """Numbers behind the verdict."""
     remedy: str = ""
     """Recommended action; empty if the fit is good."""
 
@@ -84,7 +84,7 @@ class HeldOut(NamedTuple):
 
     @property
     def unit(self) -> Float[np.ndarray, " d"]:
-        """Scale of the errors: the variance, or for a torque that does not vary the mean square of all."""
+        """Scale of the errors: the torque's variance or, if it does not vary, the mean square of all torques."""
         return np.where(self.mean > CONSTANT * self.zero.mean(), self.mean, self.zero.mean())
 
 
@@ -100,12 +100,12 @@ def held_out(
     Args:
         predicted: torques of the model.
         measured: torques of motions that the model has not seen.
-        noise: standard deviations of the measured torques, for example from `data.encoders.noise_of`; not finite
-            if unknown.
+        noise: standard deviations of the noise in the measured torques, for example from `data.encoders.noise_of`; not
+            finite if unknown.
         file: torques of the robot's own file.
 
     Raises:
-        InputError: no samples.
+        InputError: there are no samples.
     """
     if not len(measured):
         raise InputError("there are no held-out samples to judge a fit by; hold out some motions")
@@ -124,7 +124,7 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None) -> Verdict:
 
     Args:
         errors: mean squares of the joints.
-        names: of the joints; by default joint 1, joint 2, ...
+        names: names of the joints; by default joint 1, joint 2, ...
     """
     names = [f"joint {k + 1}" for k in range(len(errors.error))] if names is None else names
     if not errors.zero.any():
@@ -206,7 +206,7 @@ def judge_motions(
 
 
 def worst(first: Verdict, *others: Verdict) -> Verdict:
-    """The most severe of several verdicts; of equal ones that are not good, all reasons and remedies."""
+    """Returns the most severe of several verdicts; of equal ones that are not good, all reasons and remedies."""
     every = [first, *others]
     level = LEVELS[max(verdict.number for verdict in every)]
     if level == "good":
@@ -217,14 +217,14 @@ def worst(first: Verdict, *others: Verdict) -> Verdict:
 
 
 def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]:
-    """Entries of metrics.json: the verdict as a number, and the mean nMSE of the comparisons."""
+    """Returns entries of metrics.json: the verdict as a number, and the mean nMSE of the comparisons."""
     compared = {"zero": errors.zero, "noise": errors.noise, "file": errors.file}
     means = {f"{name}_nmse": float(np.mean(e / errors.unit)) for name, e in compared.items() if e is not None}
     return {"verdict": verdict.number, **means}
 
 
 def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
-    """Formats all of the numbers as a phrase."""
+    """Formats all numbers as a phrase."""
     worst = int(np.argmax(share))
     compared = [f"a guess of zero {np.mean(errors.zero / errors.unit):.3g}"]
     compared += [] if errors.file is None else [f"the robot's file {np.mean(errors.file / errors.unit):.3g}"]
