@@ -11,17 +11,17 @@ from dln_jax.locomotion.task import FALLEN, LocomotionTask, advance, beginning, 
 
 
 def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Spaces of observations and of actions."""
+    """Returns the spaces of observations and of actions."""
     seen = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
     return seen, gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
 
 
 class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Environment of one creature, with the task's rewards; actions in [-1, 1] are commands: the
-    actuation approaches theirs by at most 0.3 a step.
+    """Environment of one creature, with the task's rewards.
 
-    An episode is truncated after the task's number of steps. It is terminated by a fall, or by a step of the simulator
-    that does not converge; `info["converged"]` distinguishes the two.
+    Actions in [-1, 1] are commands: the actuation approaches theirs by at most 0.3 per step. An episode is truncated
+    after the task's number of steps. It is terminated by a fall, or by a step of the simulator that does not converge;
+    `info["converged"]` distinguishes the two.
     """
 
     def __init__(self, task: LocomotionTask):
@@ -35,7 +35,7 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
-        """Returns the observation of a start that the task's variation perturbs: without one, at rest."""
+        """Returns the observation of a start perturbed by the task's variation; without one, at rest."""
         super().reset(seed=seed, options=options)
         self._place = self._begin(jax.random.key(int(self.np_random.integers(2**31))))
         return self._observation(), {}

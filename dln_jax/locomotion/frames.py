@@ -24,7 +24,7 @@ class Frame(NamedTuple):
 
 
 def fitted_frame(vertices: Float[np.ndarray, "n dim"]) -> Frame:
-    """Frame that follows all vertices: the mean, and the images of x (and y) under the affine map of least squares."""
+    """Frame that follows all vertices: their mean, and the images of x (and y) under the least-squares affine map."""
     count, dimension = vertices.shape
     offsets = vertices - vertices.mean(axis=0)
     return Frame(np.full(count, 1 / count), np.linalg.pinv(offsets)[: dimension - 1])
@@ -37,7 +37,7 @@ def vertex_frame(count: int, vertices: Sequence[int]) -> Frame:
 
 
 def axes_of(frame: Frame, x: Float[Array, "n dim"]) -> Float[Array, "dim dim"]:
-    """Rotation R into the frame, whose rows are the axes."""
+    """Returns the rotation R into the frame, whose rows are the axes."""
     a, *others = jnp.asarray(frame.axes, x.dtype) @ x
     a = a / jnp.linalg.norm(a)
     if not others:

@@ -3,17 +3,16 @@
     J(theta) = E[ sum over t < H of gamma^t r_t  +  gamma^H V(o_H) ]  under theta + s eps,    eps ~ N(0, I)
 
 Lanes come in pairs, +eps and -eps. Every lane walks H steps from the end of its last window, for episodes of any
-length. Gradients go back to the beginning of the window and no further, so that they neither explode nor vanish over an
+length. Gradients go back to the beginning of the window and no further, so they neither explode nor vanish over an
 episode; V stands for all later rewards (Xu et al. 2022, "Accelerated policy learning with parallel differentiable
-simulation"). After a fall, rewards and value of a window are zero, and the lane begins a new episode with a start of
-its own.
-V is fitted to TD(lambda) targets, made by a slowly following copy of itself:
+simulation"). After a fall, the window's later rewards and value are zero, and the lane begins a new episode with a
+start of its own. V is fitted to TD(lambda) targets, made by a copy V' that follows it slowly:
 
     G_t = r_t + gamma ((1 - lambda) V'(o_t+1) + lambda G_t+1),    G_H = V'(o_H)
 
 A lane's gradient is clipped, and left out if it is not finite. The gradient is the mean over lanes in their order, so
-that it does not depend on their assignment to devices. The learning rate falls along a cosine, and the policy that is
-evaluated and kept has running averages of the parameters: single updates throw a gait off balance and back.
+it does not depend on their assignment to devices. The learning rate follows a cosine decay. The policy that is
+evaluated and kept has running averages of the parameters, because single updates throw a gait off balance and back.
 """
 
 from collections.abc import Callable, Sequence
@@ -52,38 +51,38 @@ Report = Callable[[int, Record], None]
 
 
 class GradientSettings(NamedTuple):
-    """Settings of the gradients and of their descent, the same for all creatures."""
+    """Settings of gradients and optimiser, the same for all creatures."""
 
     window: int = 32
-    """H, steps that gradients go back."""
+    """H, number of steps that gradients go back."""
     lanes: int = 4
-    """Creatures side by side."""
+    """Number of creatures side by side."""
     deviation: float = 0.01
-    """s, of the parameters."""
+    """s, standard deviation of the parameters' perturbation."""
     learning_rate: float = 0.01
-    """Of Adam, for the policy, at first."""
+    """Initial learning rate of Adam for the policy."""
     last_rate: float = 0.03
-    """The last learning rate relative to the first."""
+    """Last learning rate relative to the first."""
     average: float = 0.99
     """Weight of the earlier parameters in their running average after an update."""
     value_learning_rate: float = 0.002
-    """Of Adam, for the value."""
+    """Learning rate of Adam for the value."""
     value_fits: int = 16
-    """Steps of Adam for the value in an update, of all lanes' windows."""
+    """Adam steps for the value per update, on all lanes' windows."""
     discount: float = 0.99
     """gamma."""
     trace: float = 0.95
     """lambda."""
     following: float = 0.2
-    """Share of the value that its copy takes over in an update."""
+    """Share of the value that its copy adopts per update."""
     updates: int = 5
-    """Between two evaluations by an episode from rest."""
+    """Updates between two evaluations by an episode from rest."""
     varied_updates: int = 100
-    """Between two evaluations by several starts, which take longer."""
+    """Updates between two evaluations by several starts, which take longer."""
 
 
 class GradientState(NamedTuple):
-    """State of the learning."""
+    """State of the training."""
 
     parameters: Parameters
     averaged: Parameters
@@ -92,7 +91,7 @@ class GradientState(NamedTuple):
     value: Parameters
     value_optimiser: Any
     followed: Parameters
-    """Copy of the value that makes targets."""
+    """Copy of the value that makes the targets."""
     lanes: EpisodeState
     """States of the lanes."""
     seed: Int[Array, ""]
@@ -108,12 +107,12 @@ class TrainedPolicies(NamedTuple):
 
     @property
     def best(self) -> Learned:
-        """The seed whose selected policy was evaluated best."""
+        """The seed whose selected policy has the best evaluation."""
         return max(self.learned, key=lambda seed: rank(seed.selected))
 
 
 def settings_of(window: int | None = None, lanes: int | None = None) -> GradientSettings:
-    """Returns the settings, with another window or another number of lanes if they are stated."""
+    """Returns the settings, with another window or number of lanes if given."""
     stated = {name: value for name, value in (("window", window), ("lanes", lanes)) if value is not None}
     return GradientSettings()._replace(**stated)
 
@@ -132,23 +131,23 @@ def train(
     mesh: Mesh | None = None,
     report: Report = lambda seed, record: None,
 ) -> TrainedPolicies:
-    """Learns with several seeds; settings are the same for all seeds and creatures.
+    """Trains with several seeds; settings are the same for all seeds and creatures.
 
     Args:
-        task: to learn.
-        seeds: trained one after the other; programs are compiled once.
-        goal: conditions that end the learning of a seed.
-        width: of the hidden layer of the policy.
-        window: steps that gradients go back (default: 32).
-        lanes: creatures side by side (default: 4).
-        initial: parameters of a policy of this width that is trained further (default: random ones).
-        directory: where states are stored.
+        task: task to learn.
+        seeds: seeds, trained one after the other; programs are compiled once.
+        goal: conditions that end the training of a seed.
+        width: width of the policy's hidden layer.
+        window: number of steps that gradients go back (default: 32).
+        lanes: number of creatures side by side (default: 4).
+        initial: parameters of a policy of this width to train further (default: random).
+        directory: folder where states are stored.
         resume: continue the runs stored there.
         mesh: devices that share the creatures simulated side by side.
         report: called with seed and record after every evaluation.
 
     Raises:
-        InputError: settings out of range, a stored run with others, or a mesh that does not divide the creatures.
+        InputError: settings are out of range, a stored run has others, or the mesh does not divide the creatures.
     """
     settings = settings_of(window, lanes)
     policy = make_policy(task, width=width)
@@ -164,7 +163,7 @@ def train(
 def learn_seeds(
     compiled: CompiledLearner, seeds: Sequence[int], goal: Goal, report: Report, **stored: Any
 ) -> TrainedPolicies:
-    """Learns with several seeds by one compiled learner; `stored` are arguments of `learn` on checkpoints."""
+    """Trains with several seeds by one compiled learner; `stored` are arguments of `learn` for checkpoints."""
     one = partial(learn, compiled, goal=goal, **stored)
     return TrainedPolicies(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
@@ -180,7 +179,7 @@ def make_gradient_learner(
     """Returns the learner, whose learning rate falls over `steps` environment steps.
 
     Raises:
-        InputError: settings out of range, or a mesh that does not divide the lanes.
+        InputError: settings are out of range, or the mesh does not divide the lanes.
     """
     require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
     shares(mesh, settings.lanes, LANES)
@@ -243,7 +242,7 @@ def make_gradient_learner(
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
         parameters, moments = chosen(finite.any(), (moved, moments), (state.parameters, state.optimiser))
-        # The first averages are of a few updates, so that they forget the initial parameters.
+        # The first averages cover few updates, so that they forget the initial parameters.
         kept = jnp.minimum(settings.average, (1.0 + state.updates) / (10.0 + state.updates))
         averaged = optax.incremental_update(parameters, state.averaged, 1.0 - kept)
 
@@ -281,7 +280,7 @@ def make_gradient_learner(
 
 
 def _opposite_pairs(key: Array, parameters: Parameters, lanes: int) -> Parameters:
-    """Normal noise of the shape of the parameters for every lane; each lane's is the negative of its neighbour's."""
+    """Returns normal noise of the parameters' shape for every lane; lanes of a pair have opposite noise."""
     leaves, structure = jax.tree.flatten(parameters)
     keys = jax.random.split(key, len(leaves))
     halves = [jax.random.normal(k, (lanes // 2, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]

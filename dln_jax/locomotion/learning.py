@@ -3,11 +3,11 @@
     command = tanh(W3 tanh(W1 body + W2 clock + b1) + b3)
     change of the actuation = 0.3 tanh((0.625 + 0.375 command - actuation) / 0.3)
 
-Layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. An environment step
-is one step of the simulator for one creature. A policy is evaluated after every call of `improve`, by one
-episode from rest or, if the task varies, by several starts on the steepest slopes that walk for the length of several
-episodes, because falls are rare. The steps of evaluations are counted separately. The policy that is kept is the one
-with most starts that succeed, and among those the one that goes farthest.
+Layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. An environment step is
+one step of the simulator for one creature. After every call of `improve` the policy is evaluated by one episode from
+rest or, if the task varies, by several starts on the steepest slopes that walk for the length of several episodes,
+because falls are rare. Steps of evaluations are counted separately. The policy that is kept is the one with the most
+successful starts, and among those the one that goes farthest.
 """
 
 import math
@@ -41,11 +41,11 @@ from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
 WIDTH = 64
-"""Hidden units of the policy."""
+"""Number of hidden units of the policy."""
 VALIDATION = 2_000_000
-"""Seed of the starts by which a policy is selected; neither learning nor `perturbed` draws them."""
+"""Seed of the starts by which a policy is selected; neither training nor `perturbed` draws them."""
 VALIDATION_STARTS, VALIDATION_EPISODES = 16, 5
-"""Starts, and the length of their walks in episodes."""
+"""Number of starts, and length of their walks in episodes."""
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
 LANES = "creatures side by side"
@@ -67,30 +67,30 @@ class Record(NamedTuple):
     """One evaluation."""
 
     steps: int
-    """Environment steps of learning so far."""
+    """Environment steps of training so far."""
     seconds: float
-    """Wall time so far: compilation, learning and evaluation, without interruptions."""
+    """Wall time so far: compilation, training and evaluation, without interruptions."""
     distance: float
-    """Body lengths in one episode, before a fall: from rest, or the mean of several starts."""
+    """Body lengths in one episode, before a fall: from rest, or the mean over several starts."""
     skipped: int
-    """Updates skipped so far because a step of the simulator did not converge."""
+    """Number of updates skipped so far because a step of the simulator did not converge."""
     succeeded: float = 0.0
-    """Share of the starts that end without a fall, and at least a body length ahead."""
+    """Share of starts that end without a fall and at least a body length ahead."""
 
 
 def rank(record: Record | None) -> tuple[float, float]:
-    """Key by which evaluations are compared: successful starts, then distance."""
+    """Returns the key by which evaluations are compared: successful starts, then distance."""
     if record is None or not math.isfinite(record.distance):
         return -math.inf, -math.inf
     return record.succeeded, record.distance
 
 
 class Learner(NamedTuple):
-    """A way of learning a policy."""
+    """A method of training a policy."""
 
     policy: Policy
     start: Callable[[int], Any]
-    """Seed -> state, a tree of arrays; if it is never stored, any object."""
+    """Seed -> state, a tree of arrays; any object if it is never stored."""
     improve: Callable[[Any], Any]
     """State -> state after some updates; traceable for trees."""
     parameters: Callable[[Any], Parameters]
@@ -114,7 +114,7 @@ class CompiledLearner(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Result of learning with one seed."""
+    """Result of training with one seed."""
 
     parameters: Parameters
     """Parameters of the best evaluation."""
@@ -133,7 +133,7 @@ class Learned(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """Conditions that end learning."""
+    """Conditions that end training."""
 
     steps: int
     """Environment steps; the last update may exceed it."""
@@ -169,7 +169,7 @@ def compile_learner(task: LocomotionTask, learner: Learner, mesh: Mesh | None = 
 def compile_evaluation(
     task: LocomotionTask, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
 ) -> Callable[[Parameters], Any]:
-    """Parameters -> `distance` and `succeeded` of a `Record`: of an episode from rest, or several varied starts.
+    """Returns parameters -> `distance` and `succeeded` of a `Record`, by an episode from rest or several varied starts.
 
     A start with a step that does not converge counts 0. Every device walks, and the first device's result counts.
     """
@@ -188,13 +188,13 @@ def compile_evaluation(
         results = jax.vmap(lambda key: walked(beginning(task, key, steepest=True)))(keys)
         return ones * jnp.nan_to_num(results).mean(axis=0)
 
-    # Devices of different models may round differently, and must come to the same decisions.
+    # Devices of different models may round differently, but must come to the same decisions.
     evaluate = program(lambda parameters: spread(evaluated, mesh)(parameters, jnp.ones((1, 1)))[0], mesh)
     return evaluate.lower(parameters).compile(quick_compilation())
 
 
 def evaluation_steps(task: LocomotionTask) -> int:
-    """Environment steps of one evaluation."""
+    """Returns the number of environment steps of one evaluation."""
     return task.episode * (VALIDATION_STARTS * VALIDATION_EPISODES if any(task.variation) else 1)
 
 
@@ -208,12 +208,12 @@ def learn(
     resume: bool = False,
     report: Callable[[Record], None] = lambda record: None,
 ) -> Learned:
-    """Learns until the goal; with a directory, stores the state of every evaluation there and can resume bit for bit.
+    """Trains until the goal; with a directory, stores the state of every evaluation there and can resume bit for bit.
 
     Args:
-        compiled: from `compile_learner`; without a directory its state may be any object.
+        compiled: result of `compile_learner`; without a directory its state may be any object.
         seed: determines everything random.
-        goal: conditions that end learning.
+        goal: conditions that end training.
         directory: an existing folder for checkpoints.
         settings: JSON values that determine the result; a stored run with others is not continued.
         resume: continue the run in the directory, if it has a checkpoint.

@@ -11,13 +11,13 @@ from dln_jax.locomotion.learning import Parameters, Policy
 from dln_jax.locomotion.task import LocomotionTask, beginning, run_episode
 
 STARTS = 100
-"""Episodes of an evaluation."""
+"""Number of episodes of an evaluation."""
 STEPS = 2000
-"""Steps of its episodes."""
+"""Number of steps of these episodes."""
 LANES = 25
-"""Episodes side by side."""
+"""Number of episodes side by side."""
 SEED = 1_000_000
-"""Of the evaluation's starts, which training does not draw."""
+"""Seed of the evaluation's starts, which training does not draw."""
 
 
 class Trials(NamedTuple):
@@ -31,7 +31,7 @@ class Trials(NamedTuple):
     """Gravity along x, in m/s²: positive downhill, negative uphill, 0 on level ground."""
 
     def standing(self, steps: int) -> Bool[np.ndarray, " n"]:
-        """Which episodes of this many steps end without a fall."""
+        """Returns which episodes of this many steps end without a fall."""
         return np.isfinite(self.distance) & (self.steps >= steps)
 
 
@@ -58,9 +58,9 @@ def perturbed_trials(
 
 
 def numbers_of(trials: Trials, steps: int = STEPS) -> dict[str, float]:
-    """Metrics: episodes, those without a fall, and the distance of the median and of the worst episode.
+    """Returns metrics: episodes, those without a fall, and the distance of the median and of the worst episode.
 
-    On slopes also the episodes without a fall and the median distance downhill and uphill.
+    On slopes also the episodes without a fall, and distances, downhill and uphill.
     """
     standing = trials.standing(steps)
     numbers = {"perturbed_starts": float(len(standing)), "perturbed_steps": float(steps)}

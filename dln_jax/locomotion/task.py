@@ -1,17 +1,17 @@
-"""The task: a creature goes as far along x as it can, and does not fall.
+"""The task: a creature goes as far along x as it can without falling.
 
     observation = [((x - o) Rᵀ - rest) / (0.1 L), v Rᵀ / (L / 1 s), R u, R h (in space), actuation, c]
     actuation of a step = clip(actuation + clip(change, -0.3, 0.3), 0.25, 1)
     reward of a step = s tanh(change of mean x / (s L)) - w posture - (1 if fallen)
     posture = 1 - cos tilt + (max(0, 0.8 - y / y_rest) / 0.2)²
 
-A policy maps the observation to the change of the muscles' actuation, which begins at 1. It sees the body in its own
-frame, of origin o and axes R (`frames`), so that all places along the ground are equivalent. L is the body length, u
+A policy maps the observation to the change of the muscles' actuation, which starts at 1. It sees the body in its own
+frame, with origin o and axes R (`frames`), so all places along the ground are equivalent. L is the body length, u
 points against gravity, and h is the horizontal direction nearest to x. c is a clock, sin and cos of 2 pi t / P at step
-t, and a period P of 0 leaves it out. Speeds far above s are hardly rewarded, because a creature that runs as fast as it
-can falls on slopes downhill; s = 0 rewards all speeds alike. The tilt is the angle between the body's up and the
-ground's normal, and y the mean height. A body that has tilted by more than 1 rad has fallen, which ends the episode,
-and distance after it does not count: tall bodies would go far by rolling.
+t; a period P of 0 leaves it out. Speeds far above s are hardly rewarded, because a creature that runs as fast as it can
+falls on downhill slopes; s = 0 rewards all speeds alike. The tilt is the angle between the body's up and the ground's
+normal, and y is the mean height. A body that has tilted by more than 1 rad has fallen, which ends the episode; distance
+after it does not count, since tall bodies would go far by rolling.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ EPISODE = 400
 SHORTEST = 0.25
 """Smallest actuation: length of a muscle relative to its rest length; the largest is 1."""
 LARGEST_CHANGE = 0.3
-"""Of an actuation in one step, as published."""
+"""Largest change of an actuation in one step, as published."""
 POSITION_UNIT = 0.1
 """Unit of observed positions, in body lengths."""
 UPRIGHT = 0.05
@@ -58,13 +58,13 @@ UPRIGHT = 0.05
 SPEED = 0.04
 """s, in body lengths per step; 0 for no limit."""
 CROUCHED = 0.8
-"""Mean height, relative to that at rest, below which crouching is penalised."""
+"""Mean height relative to that at rest below which crouching is penalised."""
 FALLEN = 1.0
-"""Tilt of a fall, in rad."""
+"""Tilt in rad beyond which a body has fallen."""
 CLOCK_PERIOD = 16.0
-"""P in steps; 0 leaves the clock out."""
+"""P in steps; 0 for no clock."""
 FALL = 1.0
-"""Reward that a fall costs, in body lengths."""
+"""Cost of a fall, in body lengths of reward."""
 
 Act = Callable[[Float[Array, " o"]], Float[Array, " k"]]
 """Observation -> change of the actuation."""
@@ -80,7 +80,7 @@ class LocomotionTask(NamedTuple):
     length: float
     """Body length in m."""
     episode: int
-    """Steps."""
+    """Number of steps of an episode."""
     upright: float
     """w of the reward, in body lengths per step."""
     speed: float
@@ -98,7 +98,7 @@ class LocomotionTask(NamedTuple):
 
     @property
     def clock_size(self) -> int:
-        """Numbers at the end of an observation that show the clock."""
+        """Number of values at the end of an observation that show the clock."""
         return 2 if self.clock_period else 0
 
     @property
@@ -113,7 +113,7 @@ class EpisodeState(NamedTuple):
     state: State
     actuation: Float[Array, " k"]
     steps: Int[Array, ""]
-    """Steps since its beginning."""
+    """Number of steps since its beginning."""
     world: World
 
 
@@ -150,7 +150,7 @@ def make_task(
     """Returns the task of a creature of the "creature" preset, with its published time step.
 
     Raises:
-        InputError: an episode that is not positive, or a variation out of range.
+        InputError: the episode is not positive, or the variation is out of range.
     """
     require_positive(episode=episode, clock_period=clock_period or 1.0)
     require_variation(variation)
@@ -163,14 +163,14 @@ def make_task(
 
 
 def creature_named(name: str) -> Creature:
-    """Returns the creature of this name; `InputError` lists the names."""
+    """Returns the creature of this name; `InputError` lists the names if it is unknown."""
     if name not in CREATURES:
         raise InputError(f"creature '{name}' is unknown; choose from {', '.join(CREATURES)}")
     return CREATURES[name]()
 
 
 def beginning(task: LocomotionTask, key: Array | None = None, *, steepest: bool = False) -> EpisodeState:
-    """Returns the rest shape at rest on level ground, or by a key a start that is perturbed by the task's variation.
+    """Returns the rest shape at rest on level ground or, given a key, a start perturbed by the task's variation.
 
     With `steepest`, all slopes are the largest ones, up or down.
     """
@@ -204,7 +204,7 @@ def observe(task: LocomotionTask, place: EpisodeState) -> Float[Array, " o"]:
 
 
 def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"]) -> tuple[EpisodeState, Walk]:
-    """Returns the place after one step, and the record of the step."""
+    """Returns the state after one step, and the record of the step."""
     change = jnp.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
     actuation = jnp.clip(place.actuation + change, SHORTEST, 1.0)
     start = pushed(place.world, place.state, place.steps)
@@ -219,16 +219,16 @@ def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"
 
 
 def change_of(actuation: Float[Array, " k"], command: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Returns the change towards the actuation of a command in [-1, 1], 0.3 tanh((target - actuation) / 0.3).
+    """Returns the change towards the actuation of a command in [-1, 1]: 0.3 tanh((target - actuation) / 0.3).
 
-    Learners choose a target instead of the change: its limits bound the actuation without a flat gradient.
+    Learners choose a target instead of the change, so that the limits bound the actuation without a flat gradient.
     """
     target = SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + command)
     return LARGEST_CHANGE * jnp.tanh((target - actuation) / LARGEST_CHANGE)
 
 
 def actuation_seen(task: LocomotionTask, observation: Float[Array, " o"]) -> Float[Array, " k"]:
-    """Returns the actuation within an observation."""
+    """Returns the actuation contained in an observation."""
     end = task.observation_size - task.clock_size
     return observation[end - task.muscle_count : end]
 
@@ -244,7 +244,7 @@ def params_of(task: LocomotionTask, world: World) -> Params:
 
 
 def walk(task: LocomotionTask, act: Act, start: EpisodeState, steps: int) -> tuple[EpisodeState, Walk]:
-    """Runs a policy for a number of steps from a place."""
+    """Runs a policy for a number of steps from a state."""
 
     def one(place: EpisodeState, _: None) -> tuple[EpisodeState, Walk]:
         return advance(task, place, act(observe(task, place)))
@@ -286,9 +286,9 @@ def _up(task: LocomotionTask, place: EpisodeState) -> Float[Array, " dim"]:
 
 
 def _posture(task: LocomotionTask, x: Float[Array, "n dim"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Cosine of the tilt, and how far the body has crouched, 0 to 5."""
+    """Returns the cosine of the tilt, and how far the body has crouched, 0 to 5."""
     rest = jnp.asarray(task.creature.mesh.vertices, x.dtype)
     lowered = jnp.maximum(0.0, CROUCHED - x[:, -1].mean() / rest[:, -1].mean()) / (1.0 - CROUCHED)
-    # The direction of the body's frame that points up at rest.
+    # The axis of the body's frame that points up at rest.
     cosine = axes_of(task.frame, rest)[:, -1] @ axes_of(task.frame, x)[:, -1]
     return cosine, lowered

@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 from dln_jax.locomotion.learning import Parameters
 
 VALUE_WIDTH = 64
-"""Units of the two hidden layers of the value."""
+"""Number of units of the two hidden layers of the value."""
 
 
 class Window(NamedTuple):
-    """Records of one lane, for the value."""
+    """Records of one lane's window, for the value."""
 
     seen: Float[Array, "H_plus_1 o"]
     reward: Float[Array, " H"]
@@ -34,7 +34,7 @@ def make_value(size: int) -> tuple[Callable[[Array], Parameters], Callable[[Para
 
 
 def targets(window: Window, values: Float[Array, " H_plus_1"], discount: float, trace: float) -> Float[Array, " H"]:
-    """TD(lambda) targets G_t of a window; `values` are V' of its observations, which count before a fall only."""
+    """Returns TD(lambda) targets G_t of a window; `values` are V' of its observations and count before a fall."""
     values = window.alive * values
 
     def back(later: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -1,8 +1,8 @@
 """How episodes differ: perturbed starts, slopes, rough ground and pushes. What a variation lacks is not traced.
 
 A slope is a direction of gravity, which is exact for plane ground: x runs along the slope. Rough ground is a sum of
-waves with random lengths (half a body length to two), directions and phases, whose amplitudes are equal. A push is a
-jump of the velocity of the whole body, in a random horizontal direction, about every three seconds.
+waves of equal amplitudes with random lengths (half a body length to two), directions and phases. A push is a jump of
+the velocity of the whole body in a random horizontal direction, about every three seconds.
 """
 
 import math
@@ -17,11 +17,11 @@ from dln_jax.softbody.terms.creature import Bumps, ground_height
 from dln_jax.types import InputError
 
 WAVES = 4
-"""Waves of rough ground."""
+"""Number of waves of rough ground."""
 WAVE_LENGTHS = 0.5, 2.0
-"""In body lengths."""
+"""Range of wave lengths, in body lengths."""
 PUSHES = 0.01
-"""Probability of a push in a step."""
+"""Probability of a push per step."""
 GRAVITY = 9.8
 """In m/s²."""
 
@@ -30,13 +30,13 @@ class Variation(NamedTuple):
     """How episodes differ."""
 
     start: float = 0.0
-    """Standard deviation of the vertices' initial positions, in m; that of their velocities is 10/s times as large."""
+    """Standard deviation of the vertices' initial positions in m; that of their velocities is 10/s times as large."""
     slope: float = 0.0
-    """Largest slope, in degrees; half of all slopes have it, and the others are uniform below it."""
+    """Largest slope in degrees; half of all slopes have it, and the others are uniform below it."""
     rough: float = 0.0
-    """Largest height of rough ground, in m."""
+    """Largest height of rough ground in m."""
     push: float = 0.0
-    """Change of the velocity by a push, in m/s."""
+    """Change of velocity by a push, in m/s."""
 
 
 FLAT = Variation()
@@ -49,13 +49,13 @@ class World(NamedTuple):
     """In m/s²."""
     bumps: Bumps | None
     seed: Int[Array, ""] | None
-    """Decides the pushes."""
+    """Seed of the pushes."""
     push: Float[Array, ""] | None
-    """In m/s."""
+    """Change of velocity by a push, in m/s."""
 
 
 def require_variation(variation: Variation) -> None:
-    """Raises `InputError` for negative numbers, those that are not finite, and slopes of 90 degrees."""
+    """Raises `InputError` for numbers that are negative or not finite, and for slopes from 90 degrees on."""
     for name, value in variation._asdict().items():
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"{name} is {value}; expected 0 or a positive number")
@@ -64,7 +64,7 @@ def require_variation(variation: Variation) -> None:
 
 
 def level_world(variation: Variation, dimension: int) -> World:
-    """The world without slope, bumps and pushes, with numbers for those of the variation."""
+    """Returns the world without slope, bumps and pushes, with placeholders for those that the variation has."""
     gravity = jnp.asarray([0.0] * (dimension - 1) + [-GRAVITY]) if variation.slope else None
     flat = Bumps(jnp.zeros(WAVES), jnp.zeros((WAVES, dimension - 1)), jnp.zeros(WAVES)) if variation.rough else None
     pushes = (jnp.asarray(0), jnp.asarray(0.0)) if variation.push else (None, None)
@@ -72,7 +72,7 @@ def level_world(variation: Variation, dimension: int) -> World:
 
 
 def drawn_world(variation: Variation, key: Array, level: World, length: float, *, steepest: bool) -> World:
-    """A random world; `length` is the body's in m, and `steepest` takes the largest slope in a random direction."""
+    """Draws a random world; `length` of the body in m; `steepest` takes the largest slope, in a random direction."""
     for_slope, for_direction, for_length, for_wave, for_phase, for_push = jax.random.split(key, 6)
     gravity, bumps = level.gravity, level.bumps
     if gravity is not None:
@@ -103,7 +103,7 @@ def lifted(world: World, x: Float[Array, "n dim"]) -> Float[Array, "n dim"]:
 
 
 def pushed(world: World, state: State, steps: Array) -> State:
-    """The state after a push, if there is one before this step."""
+    """Returns the state after a push, if there is one before this step."""
     if world.seed is None or world.push is None:
         return state
     whether, direction = jax.random.split(jax.random.fold_in(jax.random.key(world.seed), steps))
@@ -113,6 +113,6 @@ def pushed(world: World, state: State, steps: Array) -> State:
 
 
 def _direction(key: Array, shape: tuple[int, ...], dimension: int) -> Float[Array, "*shape dimension"]:
-    """Random unit vectors: signs in one dimension."""
+    """Returns random unit vectors; in one dimension, signs."""
     drawn = jax.random.normal(key, (*shape, dimension))
     return drawn / jnp.linalg.norm(drawn, axis=-1, keepdims=True)
