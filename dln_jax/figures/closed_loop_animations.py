@@ -100,14 +100,11 @@ def write_closed_loop_gif(
     """Writes a run in real time: the moving machine and its control.
 
     Args:
-        path: path of the GIF.
         drawing: drawing of the machine, such as `cart_pole_drawing(length)`.
         t: times [T], s, with a spacing below that of the frames.
         q: coordinates [T, d].
         u: control [T], held constant from each time on.
         limits: limits of the control, drawn in red.
-        unit: unit of the control.
-        title: title above the drawing.
         frames_per_second: frame rate of the GIF, which plays the run in real time.
 
     Raises:

@@ -33,10 +33,8 @@ def closed_loop_traces(
     Args:
         runs: K runs along a leading axis, for example from `vmap` of `simulate`.
         joints: kinds of the joints; angles are shown relative to the goal, in (-pi, pi].
-        names: names of the coordinates.
         goal: state [2 d], drawn dashed; zero by default.
         limits: limits of the controls, [m] or one for all, drawn in red.
-        unit: unit of the controls.
         energy: energy along the runs [K, T], J.
         goal_energy: energy at the goal, J, drawn dashed.
 

@@ -77,7 +77,6 @@ def excitation_figure(
     Args:
         data: the motions, of equal length.
         limits: lower and upper limits [d, 2] by "q", "qd" and "tau"; infinite ones are not drawn.
-        names: names of the joints.
         conditions: condition numbers of the regressor, by name of the set of motions.
     """
     joints = min(data.degrees_of_freedom, MOST_JOINTS)

@@ -104,8 +104,6 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
 
 
 class _Place(NamedTuple):
-    """Where the snapshots of a panel are drawn."""
-
     offsets: np.ndarray
     """Offset of every snapshot [k, 2]."""
     points: np.ndarray

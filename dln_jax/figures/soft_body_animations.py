@@ -39,7 +39,6 @@ def write_soft_body_gif(
     """Writes a motion with the outline of its first frame, the ground, axes in m, and the time.
 
     Args:
-        path: path of the GIF.
         mesh: mesh to draw; in space only its skin, with axis 2 pointing up.
         positions: positions of the vertices, m.
         t: time of every frame, s.
@@ -47,7 +46,6 @@ def write_soft_body_gif(
         actuation: length of the muscles in every frame relative to their rest length; red is short.
         ground: height of the ground at x = 0, m, or in the plane the points [g, 2] of its line; `None` for none.
         slope: slope of the ground (in the plane).
-        title: title above the drawing.
         stride: frames of the motion per frame of the GIF.
         frames_per_second: frame rate of the GIF.
 

@@ -59,7 +59,6 @@ def write_slab_film(
     """Writes a motion in the plane as a GIF, with a scale bar and the time.
 
     Args:
-        path: path of the GIF.
         mesh: mesh of all bodies, in the plane.
         positions: positions of the vertices, m.
         t: time of every frame, s.

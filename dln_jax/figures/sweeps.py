@@ -34,7 +34,6 @@ def error_against_seconds(
     """Error against time, one panel per problem; runs are faint if there are medians.
 
     Args:
-        points: runs and medians.
         x, y: labels of the axes.
         colour, marker: names of the options shown by colours and markers; empty for none. The legend lists at most
             `MOST_COLOURS` colours.

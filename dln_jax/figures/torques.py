@@ -91,7 +91,6 @@ def torque_by_joint(
     Args:
         data: held-out data.
         predicted: predicted torque of every sample.
-        names: names of the joints.
         units: units of their forces, "N m" or "N".
     """
     shown = np.flatnonzero(data.trajectory == data.trajectory[0])[:MOST_SAMPLES]

@@ -32,9 +32,7 @@ def value_slice(
         V: value at the nodes.
         u: first control at the nodes.
         paths: closed-loop coordinates, relative to the goal, and rates.
-        name: name of the coordinate.
         kind: kind of the coordinate, for units.
-        limit: limit of the control.
         fixed: whether there are other states, so that paths are projected.
     """
     figure, [axes] = style.figure(1, 2, height=3.6)

@@ -93,7 +93,6 @@ class GradientState(NamedTuple):
     followed: Parameters
     """Copy of the value that makes the targets."""
     lanes: EpisodeState
-    """States of the lanes."""
     seed: Int[Array, ""]
     updates: Int[Array, ""]
     skipped: Int[Array, ""]
@@ -134,7 +133,6 @@ def train(
     """Trains with several seeds; settings are the same for all seeds and creatures.
 
     Args:
-        task: task to learn.
         seeds: seeds, trained one after the other; programs are compiled once.
         goal: conditions that end the training of a seed.
         width: width of the policy's hidden layer.

@@ -213,7 +213,6 @@ def learn(
     Args:
         compiled: result of `compile_learner`; without a directory its state may be any object.
         seed: determines everything random.
-        goal: conditions that end training.
         directory: an existing folder for checkpoints.
         settings: JSON values that determine the result; a stored run with others is not continued.
         resume: continue the run in the directory, if it has a checkpoint.

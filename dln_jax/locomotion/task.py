@@ -86,7 +86,6 @@ class LocomotionTask(NamedTuple):
     speed: float
     """s of the reward, in body lengths per step; 0 for no limit."""
     variation: Variation
-    """How episodes differ."""
     clock_period: float
     """P in steps; 0 for no clock."""
 

@@ -151,7 +151,6 @@ def driven(
         tau: [T - 1, d], torque at the start of every interval; a time s later it is tau + slopes s.
         slopes: [T - 1, d], from `torque_slopes`.
         durations: [T - 1] in s; over a duration of zero the state stays.
-        substeps: steps per interval.
         method: field -> step; `integrators.looped_rk4` compiles faster.
     """
 

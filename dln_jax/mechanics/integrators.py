@@ -74,7 +74,6 @@ def runge_kutta(tableau: Tableau, field: Field, *, tolerance: float = 1e-9, iter
     whose stages do not converge is NaN: take a smaller dt.
 
     Args:
-        tableau: the method.
         field: (t, state) -> rate.
         tolerance: largest error of the equations for Y, in the state's units, before the last Newton step, which about
             squares it; implicit methods only.

@@ -41,7 +41,6 @@ def with_residual(system: Any, residual: Residual) -> RecursiveSystem | Lagrangi
 
     Args:
         system: any record of a natural system, a Lagrangian, or one of them behind transmissions.
-        residual: the added energies.
     """
     V, D, factor = residual
     if isinstance(system, LoadedSystem):
@@ -68,7 +67,6 @@ def with_residual(system: Any, residual: Residual) -> RecursiveSystem | Lagrangi
 
 
 def _recursive(system: RecursiveSystem | ClosedForm | NaturalSystem) -> RecursiveSystem:
-    """Returns the same system as a recursive one."""
     if isinstance(system, RecursiveSystem):
         return system
     V, D, friction = system.potential, system.dissipation, friction_of(system)

@@ -165,7 +165,6 @@ class Injection(NamedTuple):
     latent: Motions
     """One motion [1, 2 times, 1] by frame number, with both states at the moment of injection."""
     pairs: Float[np.ndarray, "T input"]
-    """Decoded pairs of frames."""
     level: Float[np.ndarray, " T"]
     """Latent H above rest, relative to its initial value."""
     physical: Float[np.ndarray, " T"]

@@ -130,8 +130,6 @@ def predict_measured(
 
     Args:
         model: a model of any energies, or of accelerations.
-        parameters: its parameters.
-        segments: segments to predict.
         fitted: number of samples to which the initial state is fitted, at least 2.
         torque: torque between samples, "held" or "interpolated".
         substeps: RK4 steps between two samples.

@@ -26,7 +26,6 @@ class Row(NamedTuple):
     reference: float | None = None
     """Published or closed-form value."""
     bound: float | None = None
-    """Bound to meet."""
     at_least: bool = False
     """Whether the bound is a lower bound."""
     expected: str = ""

@@ -209,7 +209,6 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, t, substeps
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:
-    """Returns the indices of the trajectories' samples."""
     groups = [np.flatnonzero(data.trajectory == index) for index in np.unique(data.trajectory)]
     if not groups:
         raise InputError("there are no trajectories; a rollout needs at least one")

@@ -224,7 +224,6 @@ def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]
 
 
 def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
-    """Formats all numbers as a phrase."""
     worst = int(np.argmax(share))
     compared = [f"a guess of zero {np.mean(errors.zero / errors.unit):.3g}"]
     compared += [] if errors.file is None else [f"the robot's file {np.mean(errors.file / errors.unit):.3g}"]

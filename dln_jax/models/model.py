@@ -52,7 +52,6 @@ def model_of(
         record: takes functions of one state as keywords; absent terms are not passed.
         terms: builds Haiku modules and returns functions that use them, by name; `None` for absent terms.
         d: degrees of freedom. Parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
-        dtype: type of the parameters.
     """
 
     def build():

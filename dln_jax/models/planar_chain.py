@@ -62,7 +62,6 @@ def make_planar_chain(
         symmetric: whether B and h are left out.
         armature: whether joints 2, .., d have armature (the inertia of motors or gears).
         velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
-        dtype: type of the parameters.
 
     Raises:
         InputError: a joint is prismatic, the coordinates are unknown, or a scale is not positive.
@@ -133,5 +132,4 @@ def make_planar_chain(
 
 
 def _between(phi: Vector) -> Matrix:
-    """Returns phi_i - phi_j."""
     return phi[:, None] - phi[None, :]

@@ -98,7 +98,6 @@ def make_rigid_tree(
             one per joint.
         motors: rows of S in motor rates S qd, on which armature and friction act; by default one motor per joint.
         coupled: pairs of motors, counted from 0, with an off-diagonal entry of the armature, which is a parameter.
-        dtype: type of the parameters.
 
     Raises:
         InputError: a law is unknown, two laws describe the same friction, a velocity or slope is not positive, a share

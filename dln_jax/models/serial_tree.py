@@ -63,7 +63,6 @@ def make_serial_tree(
         parents: parent link of every link, -1 for the ground; by default the one before.
         acceleration: acceleration of gravity, m/s².
         velocity_scale: velocity scale of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
-        dtype: type of the parameters.
 
     Raises:
         InputError: parents are not earlier links, an acceleration or scale is not positive, or the needs have an

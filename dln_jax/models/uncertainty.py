@@ -77,8 +77,6 @@ def predictive(
     """Returns (q, qd, qdd) -> standard deviation of the torque [d] at one state, N m or N.
 
     Args:
-        model: the fitted model.
-        parameters: fitted parameters.
         factor: F [P, K] of their covariance, in the order of `ravel_pytree(parameters)`.
         noise: standard deviation of one measurement [d]; zero for the deviation of the model's own torque.
         inflation: factor on the variance due to parameters, [d].

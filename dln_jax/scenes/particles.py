@@ -68,7 +68,6 @@ def n_body(
     q holds the positions body by body, [n * dimension]. Without softening, V is -inf where bodies meet.
 
     Args:
-        n: number of bodies.
         dimension: coordinates per body.
         masses: one mass for all bodies, or one per body, kg.
         G: gravitational constant, m³/(kg s²); zero for no attraction.

@@ -42,7 +42,6 @@ def static_solve(
 
     Args:
         scene: the body; without held vertices or springs to the world the minimum is not unique.
-        params: parameters of the scene.
         control: actuation, for scenes with actuators.
         x: initial positions; held vertices stay there.
         tolerance, iterations, linear_solver, definite: as for `make_step`.

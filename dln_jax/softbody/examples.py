@@ -227,7 +227,6 @@ class _Law(NamedTuple):
 
 
 def _solid(mesh: Mesh, law: _Law, *others: Term, held: ArrayLike = ()) -> SoftScene:
-    """Returns the scene of an elastic body from its material and its other terms."""
     density, modulus, ratio, mixed, touching = law
     material = elastic(mesh, density, youngs_modulus=modulus, poisson_ratio=ratio, mixed=mixed)
     contacts = [_contact(mesh, float(np.min(modulus)))] if touching else []

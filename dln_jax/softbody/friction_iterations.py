@@ -73,10 +73,8 @@ def friction_change(
     """Returns the largest change of friction at x between two sets of normal forces, as force per mass in m/s².
 
     Args:
-        scene: its terms and contacts.
         energies: energies of the terms.
         touching: energies of the contacts.
-        x: positions in m.
         before, after: data of the terms, and of the contacts' energies.
     """
     lagged = [number for number, term in enumerate(scene.terms) if term.lagged]

@@ -144,7 +144,6 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
     """Returns the parameters with some values replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
 
     Args:
-        params: parameters of a scene.
         terms: new values by term and parameter name; numbers or arrays, traced or not.
 
     Raises:

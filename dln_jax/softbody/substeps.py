@@ -179,7 +179,6 @@ def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inpu
 
 
 def _with_part(parts: Parts, state: State, x_after: Array, length: Array, accepted: Array) -> Parts:
-    """Appends a part if it is accepted."""
     place = jnp.where(accepted, parts.taken, len(parts.length))
 
     def appended(column: Array, value: Array) -> Array:

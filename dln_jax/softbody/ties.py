@@ -78,7 +78,6 @@ def make_tied_step(
     Args:
         scene: its `held` must contain the tied vertices; other held vertices keep their velocity, as in `make_step`.
         dt: in s.
-        ties: frames and their vertices.
         inverse_dynamics: (q, qd, qdd) -> tau of the robot alone, from a known tree or a learned model.
         integrator: `BACKWARD_EULER` or `BDF2`, for robot and bodies.
         torque_tolerance: largest residual of the joints' equations, in N m (or N).
@@ -98,7 +97,6 @@ def make_tied_step(
     reached = REACHED * float(np.ptp(scene.mesh.vertices, axis=0).max())
 
     def positions(rest: Array, q: Vector) -> Float[Array, "k dim"]:
-        """Positions of the tied vertices."""
         return jnp.concatenate([_moved(tie.pose(q), rest[tie.vertices]) for tie in ties])
 
     def init(q: Any, qd: Any = 0.0, x: Any = None, v: Any = None) -> TiedState:

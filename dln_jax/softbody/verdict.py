@@ -97,7 +97,6 @@ def energy_balance(
         data: data of the terms' elements in this step.
         x, v: positions and velocities at the start and the end of the step.
         work: work of the held vertices, in J.
-        outcome: outcome of the minimisation.
         contact: energies in J of contacts at the start and at the end.
     """
     free = jnp.asarray(scene.free)

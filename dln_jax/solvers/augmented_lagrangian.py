@@ -41,7 +41,6 @@ class Minimum(NamedTuple):
     violation: float
     """Largest positive g, or 0."""
     rounds: int
-    """Number of rounds."""
     converged: bool
     """Whether all constraints hold within the tolerance and the value has settled."""
 
@@ -58,7 +57,6 @@ def make_minimiser(
     """Returns a function (x0, *arguments) -> `Minimum`, compiled once for all starts and arguments of the same shapes.
 
     Args:
-        function: returns f and g.
         rounds: largest number of rounds; the search ends earlier once x satisfies the constraints within `tolerance`
             and f has changed by at most 1e-3 of its size.
         iterations: largest number of L-BFGS iterations per round.

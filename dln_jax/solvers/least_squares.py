@@ -44,7 +44,6 @@ def solve(
 
     Args:
         A: coefficients; a column of zeros gives x = 0.
-        b: right-hand side.
         ridge: dimensionless; with orthogonal columns it divides the unknowns by 1 + ridge.
         rank_tolerance: singular values below it, relative to the largest, count as zero; by default the rounding of
             the decomposition, 2.2e-16 max(N, P).

@@ -74,7 +74,6 @@ class LevenbergMarquardtState(NamedTuple):
     parameters: Any
     """Tree of float64 arrays."""
     iteration: Array
-    """Number of iterations done."""
     status: Array
     """A `Status`; anything but RUNNING makes `run` the identity."""
     loss: Array
@@ -214,8 +213,6 @@ def _iterate(
 
 
 class _Linearised(NamedTuple):
-    """The linearised problem at the start of an iteration."""
-
     parameters: Any
     x: Array
     """The parameters as a vector [P]."""
@@ -246,8 +243,6 @@ def _linearise(
 
 
 class _Trial(NamedTuple):
-    """Outcome of the step with one damping."""
-
     step: Array
     loss: Array
     accepted: Array

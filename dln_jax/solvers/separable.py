@@ -72,7 +72,6 @@ def solve_separable(
             compiled once.
         start: initial n [n]; pass positive quantities as logarithms.
         arguments: arrays, such as the data.
-        iterations: largest number of iterations.
         improvement: stop if an iteration lowers the sum of squares by no more than this fraction.
         longest_step: largest step of a nonlinear unknown per iteration; damping shortens longer ones.
         rank_tolerance, negligible: for A, as in `least_squares.solve`.

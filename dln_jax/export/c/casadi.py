@@ -60,7 +60,6 @@ def external_functions(
     """Returns the source of tables, the C of `casadi_NAME_F` and its derivatives for every F, and reasons for refusals.
 
     Args:
-        name: name of the export.
         functions: as for `export_c`.
         source: an empty source in double precision.
         stack: bytes of stack that a function may use.

@@ -56,7 +56,6 @@ def combination(node: Node) -> Callable[..., str]:
 
 
 def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False) -> str:
-    """Returns the C of an elementwise operation on expressions."""
     operation = OPERATIONS[node.op]
     if node.dtype == "real" or node.args[0].dtype == "real":
         body.spend(**{node.op: 1})

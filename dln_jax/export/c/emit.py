@@ -24,8 +24,6 @@ def body_of(
 
     Args:
         source: tables and helper functions of the file.
-        program: the program.
-        results: results of the program.
         inputs: name of every argument, and whether it is passed by value.
         targets: names of the arrays for the results.
         apart: whether results never overlap arguments.

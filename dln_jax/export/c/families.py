@@ -74,7 +74,6 @@ def functions_of_run(
     """Returns the functions of a trained model.
 
     Args:
-        run: the loaded run.
         precision: f32 or f64, to which the parameters are converted.
         names: names of the functions to return; default: all.
         iterations: as for `functions_of_system`.
@@ -104,8 +103,6 @@ def functions_of_system(
 
     Args:
         system: a record of energies or of closed-form dynamics, such as the `closed_form` of a scene.
-        degrees_of_freedom: d.
-        dtype: dtype of the arguments.
         actuation: matrix [d, u] with tau = actuation u, for the steps; default: u is tau.
         iterations: Newton steps of the implicit midpoint rule, as for `mechanics.discrete.implicit_midpoint`.
     """

@@ -65,7 +65,6 @@ def _windows(
     Args:
         program: program in which they are computed.
         indices: corners of the windows [batch, axes].
-        shape: shape of the operand.
         sizes: size of a window along each axis of the operand.
         mode: mode of `lax.gather` or `lax.scatter`, for windows outside.
         axes: axes of the operand to which the indices refer.

@@ -36,7 +36,6 @@ def load_c(
 
     Args:
         directory: folder with the files that `export_c` wrote.
-        name: name of the export.
         compiler: C compiler; default: the first of $CC, cc, gcc and clang that exists.
         flags: additional compiler flags.
 

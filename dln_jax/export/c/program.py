@@ -194,7 +194,6 @@ class Program:
         return self.gather(elements, np.arange(len(elements)).reshape(batch, m, n))
 
     def _dot(self, left: Iterable[Node], right: Iterable[Node]) -> Node:
-        """Returns the sum of the products of scalars."""
         total: Node | None = None
         for a, b in zip(left, right, strict=True):
             if total is not None and a.dtype == "real":

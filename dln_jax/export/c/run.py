@@ -36,7 +36,6 @@ def export_run(
         directory: folder of the export.
         functions: names from `families.functions_of_run`; default: all that are not too large for C, and for CasADi all
             that are not derivatives.
-        name: name of the export.
         precision: f32 or f64; default: the precision of the training.
         iterations: Newton steps of the implicit midpoint rule.
         temperature: temperature of the C functions in °C, for a robot whose friction depends on it; default: the

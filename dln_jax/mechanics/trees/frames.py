@@ -147,8 +147,6 @@ def frame_jacobian(tree: Tree, link: int, point: Any = (0.0, 0.0, 0.0)) -> Calla
     Its transpose maps a force and a moment on the link, about the point, to joint torques.
 
     Args:
-        tree: the bodies.
-        link: number of the link.
         point: position in the link's own frame, m.
 
     Raises:

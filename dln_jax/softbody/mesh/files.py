@@ -65,8 +65,6 @@ def write_mesh(
     """Writes a mesh with its named sets as .vtu. `read_mesh` returns the same sets (of quadratic meshes the corners).
 
     Args:
-        path: the file to write.
-        mesh: its elements and sets.
         x: positions in m (default: the rest shape).
         vertex_data: arrays [n] or [n, dim] by name.
         element_data: arrays [m] by name.

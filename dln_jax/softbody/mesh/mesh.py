@@ -191,7 +191,6 @@ def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, 
 
 
 def _as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
-    """Converts positions to float64 [n, 2] or [n, 3], all finite; raises `InputError` otherwise."""
     array = _as_array("vertices", vertices)
     if array.dtype.kind not in "iuf":
         raise InputError(f"vertices has type {array.dtype}; expected real numbers: positions in m")
@@ -204,7 +203,6 @@ def _as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
 
 
 def _as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
-    """Converts corners to int64 [m, dim + 1]; raises `InputError` otherwise."""
     array = _as_array("elements", elements)
     kind = WORDS[dim][0]
     if array.ndim != 2 or array.shape[1] != dim + 1 or not array.shape[0]:

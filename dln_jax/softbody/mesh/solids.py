@@ -62,7 +62,6 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
     repeated elements are removed.
 
     Args:
-        content: content of the file.
         scale: length of the file's unit in m, such as 0.001 for millimetres.
         merge: fraction of the largest extent; 0 merges none.
 

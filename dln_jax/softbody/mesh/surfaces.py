@@ -80,7 +80,6 @@ def closed_surface(mesh: Mesh, facets: ArrayLike, *, cap: bool = False) -> Int[n
     part without any boundary facet is turned so that it encloses a positive volume.
 
     Args:
-        mesh: the body.
         facets: [f, dim] vertices, in any orientation and order.
         cap: close openings with flat facets between the vertices of their rims; in the plane, one opening at most.
 

@@ -108,7 +108,6 @@ def _elements(mesh: Mesh) -> Term:
         return gradients, *(jnp.broadcast_to(value, count) for value in parameters)
 
     def energy(F: DeformationGradient, element: tuple[Array, ...]) -> Scalar:
-        """½ mu (I1 - dim) - mu s(J) + ½ lambda s(J)², in J."""
         _, mu, lam = element
         change = determinant(F) - 1.0
         strain = change - 0.5 * change**2

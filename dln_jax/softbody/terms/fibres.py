@@ -58,7 +58,6 @@ def fibres(
         stiffness: k in Pa, one or per element; by default the fibres have no passive stiffness.
         elements: the m elements with fibres, such as `mesh.sets["muscle"].elements`; by default all.
         groups: group of every such element [m], counted from 0; by default all are in group 0.
-        name: name of the term.
 
     Raises:
         InputError: a number is out of range, or shapes do not fit.

@@ -96,13 +96,10 @@ def gas(
     """A sealed amount of gas at constant temperature in a chamber; facets and caps are those of `pressure`.
 
     Args:
-        mesh: the body.
-        facets: facets of the chamber.
         pressure: gauge pressure in Pa of the gas in the rest shape; it sets the amount n R T = (p + p_a) V0. With
             `None`, the amount in J is the control of the step, as for a pump.
         ambient: ambient pressure in Pa.
         cap: close openings.
-        name: name of the term.
 
     Raises:
         InputError: as for `closed_surface`, no gas, or a chamber with more than `MOST_VERTICES` vertices.

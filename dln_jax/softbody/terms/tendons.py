@@ -43,11 +43,8 @@ def tendon_of_length(
     """A tendon that pulls with stiffness k in N/m when longer than l in m, and is slack when shorter.
 
     Args:
-        mesh: the body.
         path: vertices [p], or points [p, dim] of the rest shape in m.
-        stiffness: k.
         length: l; by default l is the control of the step, one number. `path_length` returns that of the rest shape.
-        name: name of the term.
 
     Raises:
         InputError: the path has fewer than two points, leaves the body or has a segment of zero length; or a number is

@@ -78,7 +78,6 @@ def descend(
     """Returns the minimum and the outcome of the search; the arguments are those of `minimise`.
 
     Args:
-        total: the sum.
         x0: values of the unknowns that are not free.
         data: (data of the static energies, data of the moving ones).
         scale: [n, 1].

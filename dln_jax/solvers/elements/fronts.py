@@ -28,7 +28,6 @@ class Steps(NamedTuple):
     columns: Numbers
     """1 for a column to eliminate, else 0."""
     diagonal: Numbers
-    """The column's diagonal tile."""
     first_below: Numbers
     last_below: Numbers
     """Range of the tiles below it."""
@@ -46,7 +45,6 @@ class Targets(NamedTuple):
     right: Numbers
     """First tiles of the rows of L to multiply."""
     products: Numbers
-    """Number of products."""
     first_part: Numbers
     last_part: Numbers
 

@@ -89,7 +89,6 @@ def conjugate_gradients(
     Args:
         product: x -> A x, A symmetric.
         precondition: r -> an approximation of A⁻¹ r, symmetric positive definite.
-        tolerance: relative residual.
         iterations: number of products after which the search gives up.
     """
     enough = tolerance * jnp.linalg.norm(b.reshape(-1))
