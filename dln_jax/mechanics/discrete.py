@@ -172,8 +172,7 @@ def _root(equations: Callable[[Array], Array], start: Array, x: Array, dt: Array
     identity = jnp.eye(start.shape[0], dtype=start.dtype)
 
     def solve_linear(product: Callable[[Array], Array], right: Array) -> Array:
-        # The inverse serves the many right-hand sides of a step's derivatives; elimination would be repeated for each
-        # one.
+        # The inverse serves the many right-hand sides of a step's derivatives; elimination would repeat for each.
         return solve(jax.vmap(product, out_axes=1)(identity), identity) @ right
 
     def search(equations: Callable[[Array], Array], start: Array) -> tuple[Array, Array]:

@@ -38,8 +38,7 @@ class Dynamics(NamedTuple):
     energy: Callable[[VectorLike, VectorLike], Array]
     """(q, qd) -> T + V, scalar."""
     mass_matrix: Callable[..., Array]
-    """(q, qd=None) -> M [d, d], by default at rest, qd = 0: M of a natural system depends on q alone, that of any other
-    energy also on qd."""
+    """(q, qd=None) -> M [d, d], by default at qd = 0; M of a natural system depends on q alone, others also on qd."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
     """(q, qd, qdd) -> inertial, Coriolis and gravity forces, without friction."""
     friction: Callable[[VectorLike, VectorLike], Array]

@@ -80,8 +80,7 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
 
     Args:
         system: a record of energies, or `InverseForward`.
-        degrees_of_freedom: d; states of another size are refused. Without it, the arguments of a call need only agree
-            with one another.
+        degrees_of_freedom: d; states of another size are refused. Without it, arguments need only agree in size.
 
     Raises:
         InputError: the system is the rates of a phase space, which do not define forces, or not a record.
@@ -98,8 +97,7 @@ def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ..
 @overload
 def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow: ...
 def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow:
-    """Returns the functions of a system in coordinates and momenta, without applied forces; arguments as for
-    `dynamics`.
+    """Returns the functions of a system in (q, p), without applied forces; arguments as for `dynamics`.
 
     Raises:
         InputError: the system is an `InverseForward`, which has no flow, or not a record.

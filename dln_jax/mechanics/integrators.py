@@ -131,8 +131,7 @@ def symplectic_euler(velocity: Callable[..., Any], force: Callable[..., Any]) ->
 
 
 def stormer_verlet(velocity: Callable[[Any, Any], Any], force: Callable[[Any, Any], Any]) -> Step:
-    """Returns Störmer-Verlet (leapfrog) for separable systems q' = velocity(t, p), p' = force(t, q); the state is (q,
-    p).
+    """Returns Störmer-Verlet (leapfrog) for separable systems q' = velocity(t, p), p' = force(t, q); state (q, p).
 
         p_half = p + dt/2 force(t, q),    q <- q + dt velocity(t + dt/2, p_half),    p <- p_half + dt/2 force(t + dt, q)
 
@@ -195,8 +194,7 @@ def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, sub
 def adaptive_rollout(
     field: Field, state: State, t: Float[Array | np.ndarray, " T"], *, tolerance: float, max_steps: int = 100_000
 ) -> tuple[State, Bool[Array, ""]]:
-    """Returns states at the times t [T] by Dormand-Prince 8 with step-size control, and whether the integration
-    finished.
+    """Returns states at the times t [T] by Dormand-Prince 8 with step-size control, and whether it finished.
 
     Args:
         field: (t, state) -> rate.

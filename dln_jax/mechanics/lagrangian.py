@@ -46,8 +46,7 @@ def mass_matrix(L: Lagrangian, q: Vector, qd: Vector) -> Matrix:
 
 def inverse_dynamics(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Vector:
     """Returns the generalised force tau = d/dt dL/dqd - dL/dq [d] of a motion."""
-    # One gradient for force and momentum together: a reverse sweep through it is shared, at two thirds of the work of a
-    # Jacobian.
+    # One gradient for force and momentum together shares a reverse sweep: two thirds of the work of a Jacobian.
     (force, _), (_, momentum_rate) = jax.jvp(jax.grad(L, argnums=(0, 1)), (q, qd), (qd, qdd))
     return momentum_rate - force
 

@@ -176,8 +176,7 @@ def metrics_of_motions(motions: Motion, energies: Array | None, data: Trajectori
     bounds them). For the interpolated motions, which are more accurate, also `normalised_state_error` and, if the
     system has an energy, `energy_error_j`: the mean over all samples of |E(t) - E(0) - work(t)|, infinite if a
     prediction is not finite. It shows the integration error, and whether the forward model is consistent with that
-    energy, but not whether the energy is right. Compare a model's figures with those of the true plant, which bound
-    them.
+    energy, but not whether the energy is right. The figures of the true plant bound a model's.
 
     Raises InputError if a coordinate never changes.
     """

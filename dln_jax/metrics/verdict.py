@@ -100,8 +100,7 @@ def held_out(
     Args:
         predicted: torques of the model.
         measured: torques of motions that the model has not seen.
-        noise: standard deviations of the noise in the measured torques, for example from `data.encoders.noise_of`; not
-            finite if unknown.
+        noise: standard deviations of the torques' noise, as from `data.encoders.noise_of`; not finite if unknown.
         file: torques of the robot's own file.
 
     Raises:

@@ -6,14 +6,12 @@
     (qd, pd) = J grad H + grad F,   J grad H = (dH/dp, -dH/dq),   grad F = (dF/dq, dF/dp)
 
 The first two are separate networks, so one need not invert the other. The third is the baseline of Greydanus, Dzamba
-and Yosinski (2019). These three have no energy, no mass matrix and no decomposition of forces, so leaving out a force
-saves nothing.
+and Yosinski (2019). These three have no energy, mass matrix or force decomposition, so absent forces save nothing.
 
 The last one is a Helmholtz decomposition, published in the same paper with the same canonical J and the same names. The
 solenoidal part J grad H has no divergence and conserves H; the conservative part grad F has no rotation. H and F are
 networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): for a
-damped spring it is F = -½ c p². Fields of harmonic functions have neither divergence nor rotation and may be in either
-part.
+damped spring it is F = -½ c p². Fields without divergence and rotation may be in either part.
 """
 
 from functools import partial

@@ -8,8 +8,7 @@
 The black-box model is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured one
 follows Lutter and Peters 2021, with a network for the inverse mass matrix, and the separable one Chen et al. 2020,
 "Symplectic recurrent neural networks". The separable model cannot express products of q and p, so explicit symplectic
-steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems with a constant mass matrix and any kinetic
-energy of p.
+steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems whose kinetic energy depends on p alone.
 
 `mechanics.equations.flow` turns all of them into Hamilton's equations, and `dynamics` into equations in velocities.
 """

@@ -60,13 +60,11 @@ def with_joint_friction(
         needs: `joint_friction` names the laws, `joint_map` maps coordinates to joints, and `velocity_scale` is that of
             dry friction. Without laws the model is returned unchanged.
         linear: keeps a model linear in its parameters.
-        shape: initial values of learned shapes and values of fixed ones; by default with the velocity scale of the
-            needs.
+        shape: initial values of learned shapes, values of fixed ones; by default the velocity scale of the needs.
         dtype: type of the friction parameters.
 
     Raises:
-        InputError: a law is unknown, two laws describe the same friction, load is in a linear model, or a shape is not
-            positive.
+        InputError: an unknown law, two laws for one friction, load in a linear model, or a shape that is not positive.
     """
     laws = needs.joint_friction
     require_laws(laws, "joint_friction")

@@ -57,8 +57,7 @@ def make_delan(
 
     Args:
         diagonal_shift: added to the pre-activation of L's diagonal; sets the initial diagonal.
-        diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; keeps M's eigenvalues away
-            from zero.
+        diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; keeps M regular.
         shared_trunk: whether factor and potential are outputs of one network instead of two.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """

@@ -94,8 +94,7 @@ def make_rigid_tree(
         load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
         cooling: k, 1/K; not fitted.
         reference_temperature: T_ref, °C, to which the viscous coefficients refer.
-        temperature: T, °C, of all functions (default: T_ref). `energies(parameters, T)` takes another one, a number or
-            one per joint.
+        temperature: T, °C, of all functions (default: T_ref). `energies(parameters, T)` takes another, also per joint.
         motors: rows of S in motor rates S qd, on which armature and friction act; by default one motor per joint.
         coupled: pairs of motors, counted from 0, with an off-diagonal entry of the armature, which is a parameter.
 

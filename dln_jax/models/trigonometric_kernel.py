@@ -5,8 +5,7 @@ formed. T and V are independent Gaussian processes, and the model is their mean 
 
     L(q, qd) = sum over samples n, joints i of weights[n, i] cov(L(q, qd), tau_i(q_n, qd_n, qdd_n))
 
-Covariances are those of a chain of bodies with random frames and inertias. The velocity of body l has the covariance
-k_l,
+Covariances are those of a chain of bodies with random frames and inertias. The velocity of body l has covariance k_l,
 
     k_l(x, x') = c_l(q_l, q_l') k_(l-1)(x, x') + rates_l qd_l qd_l',   cov(T, T') = sum over l of inertia_l k_l²
     cov(V, V') = sum over l of weight_l h_1(q_1, q_1') .. h_l(q_l, q_l')

@@ -74,8 +74,7 @@ def n_body(
         softening: length s, m; if positive, the force deviates from Newton's law.
 
     Raises:
-        InputError: there are fewer than two bodies, masses are not positive or not one per body, or the softening is
-            negative.
+        InputError: there are fewer than two bodies, masses are not positive or not one per body, or softening < 0.
     """
     per_body = masses if isinstance(masses, tuple) else (masses,) * n
     require_positive(dimension=dimension, **{f"mass {index}": mass for index, mass in enumerate(per_body)})

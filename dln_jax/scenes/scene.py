@@ -77,10 +77,7 @@ def textbook(
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Returns the acceleration qdd [d] by the textbook formulas.
-
-    LAPACK solves for it: the last digits of generated datasets depend on it.
-    """
+    """Returns the acceleration qdd [d] by textbook formulas and LAPACK, on which datasets' last digits depend."""
     bias = closed_form.inverse_dynamics(scene.closed_form, q, qd, jnp.zeros_like(qd))
     return jnp.linalg.solve(scene.mass_matrix(q), tau - bias)
 

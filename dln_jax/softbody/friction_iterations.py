@@ -4,8 +4,7 @@
 
 These are the friction iterations of Li et al. 2020 (Incremental Potential Contact). A fixed point obeys Coulomb's law
 with the normal forces at the end of the step. Convergence is not guaranteed, but the error usually falls by a constant
-factor per iteration. Every solution warm-starts the next search, which takes no Newton step once the forces have
-stopped changing.
+factor per iteration. Every solution warm-starts the next, which takes no Newton step once forces are constant.
 
 The iterations are one loop of fixed length. Its derivative goes through the minimum of every iteration taken and is
 exact whether or not the forces have stopped changing.

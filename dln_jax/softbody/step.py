@@ -1,7 +1,4 @@
-"""Implicit time steps that minimise an incremental potential (Rojas, Sifakis, Kavan 2021; Martin et al. 2011).
-
-`integrators` states the potential.
-"""
+"""Implicit time steps that minimise the potential of `integrators` (Rojas et al. 2021; Martin et al. 2011)."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

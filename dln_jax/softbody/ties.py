@@ -85,8 +85,7 @@ def make_tied_step(
         settings: tolerance, iterations, linear_solver and definite of `make_step`.
 
     Raises:
-        InputError: the integrator does not end where forces balance, there is no tie, or a vertex is not held or is
-            tied twice.
+        InputError: the integrator does not end where forces balance, there is no tie, a vertex is free or tied twice.
     """
     require_positive(dt=dt, torque_tolerance=torque_tolerance, joint_iterations=joint_iterations)
     if integrator.span != 1.0 or integrator.averaged:

@@ -50,8 +50,7 @@ class Info(NamedTuple):
     energy_at_hand: Float[Array, ""] | None = None
     """Energy available to the step, in J, including rounding and tolerance. `None` for a static solve."""
     diverged: Bool[Array, ""] | None = None
-    """Whether the step, or the motion up to it, created more than `LARGEST_GROWTH` of the energy at hand. `None` for a
-    static solve."""
+    """Whether step or motion created more than `LARGEST_GROWTH` of the energy at hand. `None` for a static solve."""
     least_J: Float[Array, ""] | None = None
     """Smallest ratio of volume to rest volume over elements that resist deformation, if any; quadratic elements are
     evaluated at their quadrature points."""
@@ -66,8 +65,7 @@ class Info(NamedTuple):
     """Largest change of friction on a vertex, as force per mass in m/s², if normal forces and directions were taken
     from the end of the step; `None` without friction or `friction_iterations`. Does not affect `converged`."""
     overflow: Bool[Array, ""] | None = None
-    """Whether the lists of pairs in contact were too short, which needs a larger `capacity`; such a step does not
-    converge."""
+    """Whether lists of contact pairs were too short: the step does not converge and needs a larger `capacity`."""
 
 
 class Balance(NamedTuple):

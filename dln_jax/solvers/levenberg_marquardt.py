@@ -119,8 +119,7 @@ def run(
     *,
     improvement: float = 0.0,
 ) -> LevenbergMarquardtState:
-    """Runs `iterations` iterations; stops earlier if the status changes or one lowers F by no more than `improvement`
-    F.
+    """Runs `iterations` iterations, fewer if the status changes or one lowers F by no more than `improvement` F.
 
     States with a leading axis of seeds run one after the other, not in lockstep: no seed repeats the failed trials of
     another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.lapack`).

@@ -68,8 +68,7 @@ def solve_separable(
     """Returns the unknowns of a local minimum near the start, in float64.
 
     Args:
-        design: (n, *arguments) -> A [N, P] and b [N], in JAX; sample weights multiply their rows. Every function is
-            compiled once.
+        design: (n, *arguments) -> A [N, P] and b [N], in JAX; sample weights multiply their rows. Compiled once.
         start: initial n [n]; pass positive quantities as logarithms.
         arguments: arrays, such as the data.
         improvement: stop if an iteration lowers the sum of squares by no more than this fraction.

@@ -1,8 +1,7 @@
 """The text of one C function under construction: lines, variables that hold nodes, and expressions that read them.
 
 A read takes an integer array of positions with one axis per surrounding loop (a scalar outside loops). Slices,
-transposes and gathers become indexing of that integer array, and constants are stored in the order in which they are
-read.
+transposes and gathers become indexing of that integer array, and constants are stored in the order of their reading.
 """
 
 from collections import Counter

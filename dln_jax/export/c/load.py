@@ -53,8 +53,7 @@ def load_c(
             between.write_text(binding(name, signatures, precision))
             texts = [str(Path(folder) / f"{name}.c"), str(between)]
             compile_c([*STANDARD, *flags, "-fPIC", "-shared", *_UNDEFINED, *texts, "-lm", "-o", str(built)], compiler)
-            # PyDLL keeps the interpreter's lock: releasing it takes longer than the functions, which run for
-            # microseconds.
+            # PyDLL keeps the interpreter's lock: releasing it takes longer than the functions, some microseconds.
             library = ctypes.PyDLL(str(built))
     except OSError as error:
         raise InputError(f"{directory}: not to be built in a temporary folder ({error}); set TMPDIR") from error

@@ -141,8 +141,7 @@ def joint_dissipation(
     """Returns (q, qd) -> D in W, or `None` if all coefficients are absent or known to be zero.
 
     D is the sum of the laws' integrals over all joints. It is smooth at rest, and non-negative for non-negative
-    coefficients (except the part of the offset, which is not a loss). The force is exactly that of the formulas in
-    `friction.laws`.
+    coefficients (except the part of the offset, which is not a loss). The force is exactly that in `friction.laws`.
 
     Args:
         viscous, coulomb, offset, stribeck: as in `FrictionCoefficients`; one per joint [d] or one for all.
@@ -151,8 +150,7 @@ def joint_dissipation(
         joint_map: known J [d, d] that maps rates of the coordinates to joint rates J qd; the force is Jᵀ dD/du.
 
     Raises:
-        InputError: a known friction coefficient is negative or not finite, or a known velocity or slope is not
-            positive.
+        InputError: a known coefficient is negative or not finite, or a known velocity or slope is not positive.
     """
     coefficients = FrictionCoefficients(
         viscous, coulomb, offset, stribeck,

@@ -11,8 +11,7 @@ Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
 
 Directions of (q, p), and of the triangle, are those of a point drawn in a square, so diagonals are more likely. Two
 bodies start on a circular orbit with speeds multiplied by 1 + 0.05 normal. Three bodies start with every velocity
-component multiplied by 1 + 0.2 uniform(-1, 1), so their centre of mass drifts. All times are evenly spaced and include
-both ends.
+component multiplied by 1 + 0.2 uniform(-1, 1), so their centre of mass drifts. Times are evenly spaced, ends included.
 
 Convention for the derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p are noisy. The
 true field therefore has a test loss due to the noise: 3.82e-2 on the spring and 3.56e-2 on the pendulum with seed 0. To

@@ -102,8 +102,7 @@ def reference_motion(
     dissipation: Dissipation | None = None,
     tolerance: float = 1e-12,
 ) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
-    """Returns free motions (q, p) at the times t from the states at t[0], integrated adaptively to a tolerance per
-    step.
+    """Returns free motions (q, p) at times t from states at t[0], integrated adaptively to a tolerance per step.
 
     States between steps are interpolated, with an error of a few hundred times the tolerance.
 

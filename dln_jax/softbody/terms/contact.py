@@ -4,8 +4,7 @@
 
 with the signed distance d to the surface. phi is twice continuously differentiable for w > 0; a vertex rests at the
 depth where k |phi'(d)| carries its weight. Contact and friction are one term with shared parameters: the normal force
-of the friction comes from the same k and is differentiable by it. Without a friction coefficient no friction is
-computed.
+of the friction comes from the same k and is differentiable by it. Without a coefficient, friction is not computed.
 
     D = mu lambda_n f(|u|),   u = (1 - n nᵀ)(x - x_n),   f(u) = u²/e - u³/(3 e²) for u < e,  u - e/3 beyond,
 

@@ -8,8 +8,7 @@ A step of length dt from x_n minimises the dissipation
 with the velocity v = (x - x_n)/dt. The second is a Kelvin-Voigt material whose viscosities are beta times the Lamé
 parameters: rotations do not dissipate, and for small strains its force is -beta K v with the stiffness K of linear
 elasticity. A vibration of frequency omega decays as exp(-(alpha + beta omega²) t / 2). A static solve has no damping.
-Backward Euler and bdf2 integrate these forces with a first-order error in dt, the other integrators with a second-order
-error.
+Backward Euler and bdf2 integrate these forces with an error of first order in dt, other integrators of second order.
 """
 
 from typing import Any, NamedTuple

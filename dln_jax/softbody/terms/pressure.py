@@ -52,8 +52,7 @@ def pressure(
     """Gauge pressure in Pa in a chamber with these facets, such as `inner_surface(mesh)` or `facets_in(mesh, name)`.
 
     It pushes against the material; a positive pressure on an outer surface compresses the body. By default the pressure
-    is the control of the step, one number. Openings need caps, your own or those of `cap=True`; the force on a cap acts
-    on its rim.
+    is the control of the step, one number. Openings need caps, your own or `cap=True`; a cap's force acts on its rim.
 
     Raises:
         InputError: as for `closed_surface`, or the pressure is not finite.

@@ -77,8 +77,7 @@ def corotated(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
 
     In invariants, W = mu (I1 - 2 s + dim) + lambda/2 (s - dim)², where s = tr(RᵀF) is the sum of the singular values,
     the smallest with the sign of J. Where the two smallest cancel, R is not unique and W has a crease: at mirror images
-    in 2-D, and in 3-D at elements collapsed to a line or mirrored in the plane of equal stretches. See
-    `rotation_trace`.
+    in 2-D, in 3-D at elements collapsed to a line or mirrored in the plane of equal stretches. See `rotation_trace`.
     """
     s, dimension = rotation_trace(F), len(F)
     return mu * (squared_norm(F) - 2.0 * s + dimension) + 0.5 * lam * (s - dimension) ** 2

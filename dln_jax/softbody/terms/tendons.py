@@ -47,8 +47,7 @@ def tendon_of_length(
         length: l; by default l is the control of the step, one number. `path_length` returns that of the rest shape.
 
     Raises:
-        InputError: the path has fewer than two points, leaves the body or has a segment of zero length; or a number is
-            out of range.
+        InputError: the path has fewer than two points, leaves the body or repeats a point, or a number is out of range.
     """
     parameters = TendonOfLength(
         material("stiffness", stiffness, 1, "tendon"),

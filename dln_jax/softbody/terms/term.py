@@ -54,8 +54,7 @@ class Term(NamedTuple):
     """Vertices of the elements."""
     energy: Callable[[Corners, Any], Float[Array, ""]]
     """(positions x[k][i] of one element's vertices, its data) -> J. The positions are scalars (`Corners`), whose
-    arithmetic fuses over all elements, unlike slices and stacks of arrays. With `weights` it takes combinations of
-    positions."""
+    arithmetic fuses over all elements, unlike slices and stacks of arrays. With `weights`, combinations of them."""
     parameters: Any
     """Default parameters: a NamedTuple of arrays, SI units."""
     prepare: Callable[[Any, Context], Any]

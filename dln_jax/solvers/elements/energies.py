@@ -39,8 +39,7 @@ class ElementEnergy(NamedTuple):
     elements, which makes derivatives several times faster for elements of up to a dozen unknowns."""
     weights: Callable[[Any], Any] | None = None
     """Data of one element -> w[k][j], if the energy takes the combinations y[i][j] = sum over corners k of x[k][i]
-    w[k][j], such as a deformation gradient or an edge: the Hessian with respect to these is smaller. Only if
-    unrolled."""
+    w[k][j], such as a deformation gradient or an edge: its Hessian by these is smaller. Only if unrolled."""
 
 
 def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:

@@ -42,8 +42,7 @@ def line_search(
     """Takes the first of the steps l, l/2, l/4, ... that lowers the energy, or the gradient if rounding hides that.
 
     Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
-    improving by many digits beyond that. Returns the point and the length of the step; if no step is accepted, the
-    start and 0.
+    improving by many digits beyond that. Returns point and step length, or the start and 0 if no step is accepted.
 
     Args:
         evaluate: x -> energy and gradient.

@@ -5,8 +5,7 @@ unknowns. It lists all elements that may act between two points, in a list of fi
 may go. Given such a list, the elements are fixed, and so they are in derivatives.
 
 Systems with their Hessians are solved densely, or by conjugate gradients preconditioned with the factor of the static
-elements and the diagonal blocks of the moving ones, which need about as many iterations as there are acting elements,
-at most.
+elements and the diagonal blocks of the moving ones, with at most about as many iterations as acting elements.
 """
 
 from collections.abc import Callable, Sequence

@@ -35,8 +35,7 @@ def factorise(at: Plan, entries: Float[Array, " entries"]) -> Tiles:
         def add(number: Array, sum_: Array) -> Array:
             part = _row(at.parts, number)
             row, column = (_slice(at.child_rows, first, at.size) for first in (part.rows, part.columns))
-            # Rows and columns have the same order in parent and child, so the parent's lower triangle gives the
-            # child's.
+            # Parent and child have rows and columns in the same order, so one lower triangle gives the other.
             known = (column >= 0) & (row[:, None] >= column)
             i, j = row - part.first_row, column - part.first_column
             of_row = lax.div(i, size) * (2 * count) + lax.rem(i, size) * size

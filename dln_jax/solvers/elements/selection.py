@@ -6,8 +6,7 @@
 - `matrix_free` for soft bodies in small time steps, and for systems whose factor would not fit into memory.
 
 Stiffness, Poisson's ratio, time step and mesh together determine how many products conjugate gradients need for a
-search direction: the number grows with the square root of the Hessian's condition number. It can be measured only with
-concrete values.
+search direction; it grows with the square root of the condition number, and can be counted for known values only.
 """
 
 from collections.abc import Callable, Sequence
