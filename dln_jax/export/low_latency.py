@@ -28,8 +28,7 @@ def enable_low_latency() -> None:
     """Makes JAX compute on the CPU in the calling thread, for the whole process from now on.
 
     Raises:
-        InputError: a backend has already started (any array, or a list of devices, starts it), or JAX computes on a
-            device other than the CPU.
+        InputError: a backend has already started (any array or list of devices starts it), or JAX is not on the CPU.
     """
     platforms = getattr(jax.config, "jax_platforms")  # noqa: B009  JAX adds its settings as it starts
     if platforms and platforms.split(",")[0] != "cpu":
@@ -51,8 +50,7 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
         examples: one example per argument, with the shape and dtype of later calls.
         numpy: copy all arguments into one buffer, for a single transfer, and return NumPy arrays. Arguments are
             converted to one common dtype, and because of the buffer only one thread may call at a time. By default
-            arguments are NumPy or device arrays (a device array saves 2 us) and results are device arrays; another
-            shape or dtype recompiles.
+            arguments are NumPy or device arrays (2 us faster), results device arrays; other shapes or dtypes recompile.
 
     Raises:
         InputError: there are no examples, `numpy` examples have several dtypes, or the default device is not a CPU;

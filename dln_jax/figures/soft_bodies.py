@@ -24,8 +24,7 @@ COLOURS = {
 }
 BODY, EDGE, SKIN = np.array((0.62, 0.75, 0.87)), np.array((0.46, 0.58, 0.71)), np.array((0.16, 0.26, 0.38))
 GROUND, GROUND_LINE = "0.90", (0.35, 0.33, 0.30)
-# View of bodies in space: a turn about the vertical axis, then a tilt, in rad; the vectors point right, away from the
-# viewer, and up in the drawing plane.
+# View of bodies in space: a turn about the vertical, then a tilt, in rad; vectors right, away from the viewer, and up.
 _TURN, _TILT = np.deg2rad(-55.0), np.deg2rad(22.0)
 _RIGHT = np.array([np.cos(_TURN), np.sin(_TURN), 0.0])
 _AWAY = np.array([-np.sin(_TURN) * np.cos(_TILT), np.cos(_TURN) * np.cos(_TILT), -np.sin(_TILT)])

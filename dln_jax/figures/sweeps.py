@@ -35,8 +35,7 @@ def error_against_seconds(
 
     Args:
         x, y: labels of the axes.
-        colour, marker: names of the options shown by colours and markers; empty for none. The legend lists at most
-            `MOST_COLOURS` colours.
+        colour, marker: names of the options that they show, or empty; the legend lists up to `MOST_COLOURS` colours.
         note: text below the axes, for example about missing runs.
     """
     problems = list(dict.fromkeys(point.problem for point in points))

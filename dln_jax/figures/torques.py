@@ -179,8 +179,7 @@ def tip_paths(
         data: all trajectories, including those of `test`.
         tip: q -> position [2] in m.
         test: test trajectories with the same indices as in `data`.
-        motions: rollouts of the model from the test's first states under its torques, or none; a path ends when the
-            prediction is no longer valid.
+        motions: rollouts from the test's first states under its torques, or none; drawn as long as they are valid.
         model: name of the model, which sets the colour.
     """
     shown = list(np.unique(test.trajectory))[:MOST_PATHS]

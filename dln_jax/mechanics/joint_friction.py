@@ -52,14 +52,12 @@ class LoadedSystem(NamedTuple):
 def with_friction(system: Any, dissipation: Dissipation | None, load: Load | None = None) -> Any:
     """Returns the same system with additional friction in its joints.
 
-    A system without an energy keeps its kind: the force is added in its inverse model and subtracted in its forward
-    model or its rates.
+    A system without an energy keeps its kind; the inverse model adds the force, the forward model or rates subtract it.
 
     Args:
         system: one of `mechanics.equations.System`.
         dissipation: (q, qd) -> Rayleigh function, as from `joint_dissipation`.
-        load: load-dependent friction of the transmissions; all other friction, including the system's own, is then on
-            the motors' side of them.
+        load: load-dependent friction of the transmissions; all other friction is then on their motors' side.
 
     Returns:
         The record, or with a load a `LoadedSystem`.

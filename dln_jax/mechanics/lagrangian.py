@@ -3,8 +3,7 @@
     d/dt dL/dqd - dL/dq = tau        (Euler-Lagrange)
 
 Only the necessary derivatives are taken: the inverse model is one `jvp` of the gradient; the forward model adds the
-Hessian by qd, in a linear solve without an inverse. A singular mass matrix gives non-finite accelerations, not a
-regularised answer.
+Hessian by qd, in a linear solve. Nothing is regularised: a singular mass matrix gives non-finite accelerations.
 """
 
 from functools import partial

@@ -25,11 +25,9 @@ def prediction_program(
     """Returns (parameters, samples) -> predictions of the system with these parameters, for `jax.jit`.
 
     Every sample has `tau`, `qdd` and the parts of the torque, [N, d]. With recorded momenta and a Hamiltonian (`H`, or
-    that of a system in momenta) also `tau_from_momenta` = pd + dH/dq + friction, by which published results of
-    Hamiltonian models were computed.
+    that of a system in momenta) also `tau_from_momenta` = pd + dH/dq + friction, as published for such models.
 
-    Parameters are arguments of the program, not constants in it, so one compilation serves every seed. Devices of a
-    mesh share the samples.
+    Parameters are arguments, not constants: one compilation serves every seed. Devices of a mesh share the samples.
     """
 
     def answers(parameters: Any, samples: tuple[Any, ...]) -> dict[str, Array]:

@@ -6,8 +6,7 @@ the torque of joint i at a state has the standard deviation
     sd_i² = noise_i² + inflation_i |phi_i F|²,   phi_i = d tau_i / d theta
 
 (MacKay 1992, "A practical Bayesian framework for backpropagation networks"; Immer et al. 2021, "Improving predictions
-of Bayesian neural nets via local linearization"). `learning.uncertainty` estimates all quantities from data. All
-functions take one state.
+of Bayesian neural nets via local linearization"). `learning.uncertainty` estimates these. Functions take one state.
 """
 
 from collections.abc import Callable, Sequence

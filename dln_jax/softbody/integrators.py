@@ -11,8 +11,7 @@
 
 Backward Euler is of first order and damps; bdf2 is of second order and damps little. The midpoint rule is of second
 order and conserves momentum and angular momentum, but not energy: use it for smooth motions. The average-vector-field
-method (Quispel and McLaren 2008) is of second order and conserves momentum and energy, but not angular momentum. Its
-force is the average along the step,
+method (Quispel and McLaren 2008), of second order, conserves momentum and energy, not angular momentum, with the force
 
     F = -∫ grad V(x_n + s (x - x_n)) ds over 0 <= s <= 1,    so that    F·(x - x_n) = V(x_n) - V(x),
 

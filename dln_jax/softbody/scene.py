@@ -103,8 +103,8 @@ def make_scene(
         contacts: barrier contacts with obstacles and between bodies, which otherwise pass through each other.
 
     Raises:
-        InputError: two terms have the same name, an index or a mass is out of range, no vertex is free, or surfaces in
-            contact cross in the rest shape.
+        InputError: a name is used twice, an index or mass is out of range, no vertex is free, or surfaces in contact
+            cross in the rest shape.
     """
     n = len(mesh.vertices)
     terms = tuple(terms)

@@ -49,8 +49,7 @@ def make_step(
         scene: the body; only its own terms are compiled.
         dt: in s; a traced value, whose sign is not checked, lets one program serve several step lengths.
         integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, `AVERAGE_VECTOR_FIELD` or a custom one.
-        tolerance: largest residual force per mass, in m/s², of a converged step; residuals at the level of rounding
-            always count as converged.
+        tolerance: largest residual force per mass, in m/s², of a converged step; rounding always counts as converged.
         iterations: largest number of Newton steps per time step; `Info.converged` reports whether they sufficed.
         linear_solver: solver of the linear systems; by default the cheapest for the stiffness in `scene.params` and
             this time step (`by_size` if either is traced, or if a term's preparation needs a control). Parameters

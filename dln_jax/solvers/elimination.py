@@ -1,8 +1,7 @@
 """Small linear systems, unrolled row by row: Gaussian elimination, and substitution with triangular matrices.
 
 The Hessians of learned energies need not be definite, so Cholesky does not apply. The matrices of mechanics have a few
-rows and come in batches. Unrolled, they fuse with the surrounding code, which is faster than one library call per
-matrix up to a dozen rows.
+rows and come in batches. Unrolled, they fuse with their surroundings: up to a dozen rows faster than library calls.
 """
 
 import functools

@@ -6,8 +6,7 @@ With D the diagonal of column norms of A, y = D x and the decomposition A D⁻¹
 
 Scaled columns make rank and condition independent of the units of the unknowns (Golub and Van Loan 2013, "Matrix
 Computations", sections 5.3.8 and 5.5). Singular values that are only rounding are left out, which gives the shortest y
-of all that fit equally well. A tall A is first replaced by its triangular factor. AᵀA, whose condition number is
-squared, is never formed.
+of all that fit equally well. A tall A is first replaced by its triangular factor; AᵀA is never formed.
 """
 
 from collections.abc import Iterable

@@ -46,8 +46,7 @@ def _elementwise(name: str) -> Rule:
 def _moved(move: Callable[..., Any]) -> Rule:
     """Returns the rule of a primitive that only moves elements.
 
-    `move` takes one array of element indices per argument, and the parameters; it returns the index array of the
-    result, or a list of them.
+    `move` takes one array of element indices per argument, and the parameters; returns those of the results.
     """
 
     def rule(program: Program, parameters: Parameters, *nodes: Node) -> Any:

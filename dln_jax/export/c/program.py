@@ -1,8 +1,7 @@
 """A program of small arrays: a graph of interned nodes, simplified as it is built.
 
 There are few kinds of nodes, because everything that only moves numbers (slices, transposes, concatenations, padding,
-gathers and selections at constant indices) is a `gather`: it states the source element of every element. A gather of
-gathers is one gather.
+gathers and selections at constant indices) is a `gather`: it names the source of every element. Nested gathers merge.
 
 | op | value |
 |---|---|

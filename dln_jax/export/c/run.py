@@ -34,8 +34,7 @@ def export_run(
     Args:
         run: folder of the run.
         directory: folder of the export.
-        functions: names from `families.functions_of_run`; default: all that are not too large for C, and for CasADi all
-            that are not derivatives.
+        functions: names from `families.functions_of_run`; default: all of suitable size, for CasADi no derivatives.
         precision: f32 or f64; default: the precision of the training.
         iterations: Newton steps of the implicit midpoint rule.
         temperature: temperature of the C functions in °C, for a robot whose friction depends on it; default: the
@@ -43,8 +42,7 @@ def export_run(
         libm, casadi, finite, overwrite: as for `export_c`.
 
     Raises:
-        InputError: the folder holds no run, a function does not exist, the model does not depend on the temperature, or
-            `export_c` refuses a function.
+        InputError: no run in the folder, an unknown or refused function, or a model independent of temperature.
     """
     trained = load(run)
     if temperature is not None:

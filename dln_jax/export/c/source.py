@@ -71,8 +71,7 @@ def export_c(
         name: a C name; every file and public function starts with it.
         precision: f32 or f64, for all real numbers; default: the precision of the examples.
         libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones.
-        casadi: also write NAME_casadi.c, the functions with exact derivatives for CasADi's `external`; a collection
-            names the functions to include.
+        casadi: also write NAME_casadi.c: all functions, or those named, with exact derivatives for CasADi's `external`.
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
             NAME_casadi.c functions that CasADi cannot take; the files list the omitted functions.
         stack: bytes of stack that a function may use; a plan over many steps may need more than the default.

@@ -1,7 +1,6 @@
 """Frames of a tree's links, and vectors between them.
 
-Here all joints are about z of their link: `aligned` rotates the links of a tree accordingly. Known rotations that only
-exchange axes cost only signs.
+All joints are about z of their link: `aligned` rotates links accordingly. Exchanges of axes cost only signs.
 """
 
 from collections.abc import Callable

@@ -4,8 +4,7 @@
 
 with the signed distance d of a vertex to the obstacle, positive outside, and b of `barrier`. The distance limits the
 steps of the minimisation, so that no vertex enters an obstacle, however fast it is. Only vertices are in contact: an
-obstacle smaller than the triangles of a body can pass between them. Model such an obstacle as a body with held
-vertices, in a `body_contact`.
+obstacle smaller than the triangles of a body can pass between them. Model it as a held body in a `body_contact`.
 
 A distance function must not overestimate the distance (its slope is at most 1) and must be twice differentiable almost
 everywhere outside the obstacle. To move an obstacle, change its parameters from step to step, by less than the gap.
@@ -133,8 +132,7 @@ def box(centre: Numbers, half_lengths: Numbers, rotation: Any = None) -> Obstacl
 def heightfield(heights: Any, origin: Numbers, spacing: float) -> Obstacle:
     """Returns the ground below the cubic B-spline of heights in m, [k] or [k, l].
 
-    The distance never exceeds the true one: it is the height above the ground divided by sqrt(1 + s²), with s the
-    largest slope of the control points.
+    The distance, at most the true one, is the height over sqrt(1 + s²), s the largest slope of the control points.
     """
     require_positive(spacing=spacing)
     heights = jnp.asarray(heights, float)

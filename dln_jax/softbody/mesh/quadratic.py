@@ -16,8 +16,7 @@ def quadratic(mesh: Mesh) -> Mesh:
 
     The new vertices follow those of the mesh, whose corners keep their indices; named sets are extended by
     `with_midsides`. Edges are straight; for a curved rest shape, move vertices by `mesh._replace(vertices=...)`. With
-    curved edges, uniform strains stay exact in the plane but not in space, where the quadrature is not exact: move only
-    mid-side nodes on the boundary.
+    curved edges, uniform strains are exact in the plane but not in space: move only mid-side nodes on the boundary.
 
     Raises:
         InputError: the mesh is already quadratic.

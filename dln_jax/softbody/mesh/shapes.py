@@ -2,8 +2,7 @@
 
 A creature stands on y = 0 and faces right. It is drawn in square cells (`#`), with two triangles per cell, and pointed
 ends (`<`, `>`). All edges of the outline except those on the ground are muscles: on both sides of the legs, to bend
-them, and on the upper and lower side of the body. Sizes suit the material of the "creature" preset, whose energies are
-per triangle, not per area.
+them, and on the upper and lower side of the body. Sizes suit the "creature" preset, with energies per triangle.
 """
 
 import itertools

@@ -58,8 +58,7 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
     """Builds the body in a mesh file.
 
     The body is the file's tetrahedra or, without any, its triangles in a plane z = const. Cells of higher order are
-    reduced to their corners. Vertices closer than `merge` times the largest extent are merged; loose vertices and
-    repeated elements are removed.
+    reduced to their corners. Close vertices are merged, loose vertices and repeated elements removed.
 
     Args:
         scale: length of the file's unit in m, such as 0.001 for millimetres.

@@ -190,8 +190,7 @@ def _descent_direction(
     _, at, solver, moving = total
     shifts = jnp.asarray((*[0.0] * (2 if moving else 1), *_SHIFTS), gradient.dtype)
 
-    # A loop that usually runs once, so that factorisation and solve are compiled once; a branch that projects would
-    # always be taken under vmap.
+    # A loop that usually runs once: factorisation and solve are compiled once, and vmap would always take a branch.
     def failing(state: _Attempt) -> Array:
         return ~state.descends & (state.number < len(shifts))
 

@@ -51,8 +51,7 @@ def minimise(
 ) -> tuple[Blocks, SolverInfo]:
     """Returns the x [n, b] near x0 that minimises the sum of the energies, and the outcome of the search.
 
-    Derivatives are those of the minimum, with respect to `data` and to the entries of x0 that are not free. Arrays that
-    an energy closes over are constants.
+    Derivatives are those of the minimum by `data` and by entries of x0 that are not free, not by closed-over arrays.
 
     Args:
         energies: the terms of the sum, or one function (x [n, b], data) -> scalar of all unknowns.

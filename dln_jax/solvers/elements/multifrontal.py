@@ -4,8 +4,7 @@ A front sums entries of H and the matrices U that its children in the eliminatio
 
     F = [[F11, F21ᵀ], [F21, F22]],    L11 L11ᵀ = F11,    L21 L11ᵀ = F21,    U = F22 - L21 L21ᵀ
 
-by square tiles, left-looking within the front. Loops over tiles take their lengths from the plan, so that one compiled
-body serves fronts of any size.
+by square tiles, left-looking within the front. The plan has the loops' lengths: one compiled body serves all fronts.
 """
 
 from typing import Any

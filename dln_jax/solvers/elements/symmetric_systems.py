@@ -11,8 +11,7 @@ columns works on long vectors. Unknowns are taken in pairs:
 
     X_J = A_J - sum over P >= 1 of L_{J-P} (L_{J-P}'s pair at J)ᵀ,    L_JJ L_JJᵀ = X_JJ,    L_IJ = X_IJ L_JJ⁻ᵀ
 
-(left-looking; Golub and Van Loan 2013, sections 4.2 and 4.3). Right-hand sides are rows below the matrix, which the
-factorisation turns into L⁻¹ b.
+(left-looking; Golub and Van Loan 2013, sections 4.2 and 4.3). Right-hand sides are rows below A and become L⁻¹ b.
 """
 
 from collections.abc import Callable
@@ -83,8 +82,7 @@ def conjugate_gradients(
 ) -> Vector:
     """Returns x with A x = b to a relative residual, |b - A x| <= tolerance |b|, starting from x = 0.
 
-    A direction of curvature <= 0 shows that A is not positive definite. Then, or if the iterations do not suffice, the
-    result is not finite.
+    The result is not finite if A is not positive definite (a direction of curvature <= 0) or iterations run out.
 
     Args:
         product: x -> A x, A symmetric.
