@@ -122,10 +122,7 @@ def conjugate(
 
 
 def legendre(energy: Energy, *, iterations: int | None = None) -> Energy:
-    """Returns H(q, p) = p·qd - L(q, qd) of a Lagrangian, or L(q, qd) of a Hamiltonian: the transform is self-inverse.
-
-    `iterations` as for `conjugate`.
-    """
+    """Returns H(q, p) = p·qd - L(q, qd) of a Lagrangian, or the reverse; `iterations` as for `conjugate`."""
     _require_iterations(iterations)
 
     def transform(q: Vector, slope: Vector) -> Scalar:

@@ -105,10 +105,7 @@ def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vect
 
 
 def loaded_dynamics(system: LoadedSystem, link: Dynamics, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system from those of its links.
-
-    `friction(q, qd)` is that of the dissipation alone, and `decompose` is that of the links.
-    """
+    """Returns all functions; `friction` is that of the dissipation alone, and `decompose` that of the links."""
     return make_dynamics(
         system,
         lambda q, qd, qdd: carrying(system.load, qd, link.inverse_dynamics(q, qd, qdd)),

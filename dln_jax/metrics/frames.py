@@ -133,10 +133,7 @@ def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: RodFrames) -> Fl
 
 
 def frame_errors(model: LatentModel, parameters: Parameters, test: RodFrames) -> tuple[dict[str, float], FrameMotions]:
-    """Predicts motions from the first pairs; returns their errors and the motions.
-
-    The errors are `energy_mse` and `frame_mse`, both summarised by `phase_space.summary`.
-    """
+    """Predicts motions from the first pairs; returns `energy_mse` and `frame_mse` by `summary`, and the motions."""
     pairs = test.pairs
     moved = predict_frames(model, parameters, pairs[:, 0], pairs.shape[1])
     images = np.mean((moved.pairs - pairs) ** 2, axis=(1, 2))
@@ -172,10 +169,7 @@ class Injection(NamedTuple):
 
 
 def raise_energy(H: Hamiltonian, q: Vector, p: Vector, wanted: Scalar) -> tuple[Vector, Vector]:
-    """Moves (q, p) to the level H = wanted along dz/ds = grad H / |grad H|², the steepest ascent, which adds s to H.
-
-    The gradient must not vanish on the way.
-    """
+    """Moves (q, p) to H = wanted along dz/ds = grad H / |grad H|², which adds s to H where the gradient is not zero."""
 
     def direction(state: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
         slopes = jax.grad(H, argnums=(0, 1))(*state)

@@ -53,10 +53,7 @@ def conditions(**facts: Any) -> dict[str, Any]:
 
 
 def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
-    """Writes `{"conditions": ..., "rows": [...]}` as JSON; a value that is not finite becomes null.
-
-    Expectations of rows in words become part of the conditions.
-    """
+    """Writes conditions (with the expectations of rows) and rows as JSON; a value that is not finite becomes null."""
     listed = [{**dict(zip(Row._fields[:6], row, strict=False)), "pass": row.passed} for row in rows]
     words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}
     write_json(path, {"conditions": {**facts, **({"expected": words} if words else {})}, "rows": listed})

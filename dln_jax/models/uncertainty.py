@@ -23,8 +23,7 @@ from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.types import Vector
 
 UNDETERMINED = 1e-3
-"""Largest accepted share of |phi|, in scaled parameters, along directions that the data left undetermined; a state with
-a larger share is out of distribution."""
+"""Largest accepted share of |phi|, in scaled parameters, along directions that the data left undetermined."""
 
 
 class Domain(NamedTuple):

@@ -53,10 +53,7 @@ class Drive(NamedTuple):
 
 
 def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
-    """Returns the inputs of `steps` steps of dt in s, starting at step number `first`.
-
-    Held vertices get the velocities that keep them exactly on their path.
-    """
+    """Returns inputs of `steps` steps of dt in s from step `first` on, with held velocities that follow their paths."""
     t = dt * np.arange(first, first + steps + 1)
     dtype = example.scene.params.rest.dtype
     control = (

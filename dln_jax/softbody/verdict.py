@@ -41,8 +41,7 @@ class Info(NamedTuple):
     iterations: Int[Array, ""]
     """Newton iterations."""
     converged: Bool[Array, ""]
-    """Whether the result can be trusted: forces are balanced, the motion has not `diverged`, and no element is inverted
-    (`least_J` > 0). Otherwise derivatives are NaN."""
+    """Whether to trust the result: forces balance, no divergence, no inverted element. Else derivatives are NaN."""
     definite: Bool[Array, ""] | None = None
     """Whether the Hessian at the minimum is positive definite; `None` unless requested."""
     energy_growth: Float[Array, ""] | None = None
@@ -52,8 +51,7 @@ class Info(NamedTuple):
     diverged: Bool[Array, ""] | None = None
     """Whether step or motion created more than `LARGEST_GROWTH` of the energy at hand. `None` for a static solve."""
     least_J: Float[Array, ""] | None = None
-    """Smallest ratio of volume to rest volume over elements that resist deformation, if any; quadratic elements are
-    evaluated at their quadrature points."""
+    """Smallest volume ratio J of elements that resist deformation, if any; at quadrature points if quadratic."""
     overlaps: Int[Array, ""] | None = None
     """Number of pairs of overlapping mesh components, which pass through each other without contact. `None` for a mesh
     of one component and for a scene with contacts. Does not affect `converged`."""
@@ -109,10 +107,7 @@ def energy_balance(
 
 
 def with_energies(info: Info, balance: Balance, before: Growth | None) -> tuple[Info, Growth | None]:
-    """Adds the verdict on energies to that on forces and positions.
-
-    Returns the outcome, and the energy created so far if the state before the step carries it.
-    """
+    """Adds the verdict on energies; returns the outcome, and the energy created so far if the state carries it."""
     growth, at_hand, unclear = balance
     sound, so_far = growth <= LARGEST_GROWTH * at_hand, None
     if before is not None:

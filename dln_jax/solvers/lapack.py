@@ -116,10 +116,7 @@ def _substitution(transposed: bool, right: bool) -> Callable[[Array, Array], Arr
 def shared_or_batched(
     one: Callable[[Array, Array], Array], many: Callable[[Array, Array], Array], *, side: int = 1
 ) -> Callable[[Array, Array], Array]:
-    """Returns the solve (matrix, b) -> x of `one`, batched over matrices by `many`.
-
-    If only b is a batch, its members become columns (axis `side`) of one b.
-    """
+    """Returns the solve (matrix, b) -> x, by `many` for a batch of matrices; a batch of b alone becomes columns."""
 
     @jax.custom_batching.custom_vmap
     def solve(matrix: Array, b: Array) -> Array:

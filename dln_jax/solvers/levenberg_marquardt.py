@@ -48,8 +48,7 @@ PROBE = 0.5
 CHUNK = 256
 """Number of samples whose Jacobian is evaluated at once."""
 KEPT_BYTES = 2**30
-"""Largest Jacobian kept through an iteration; for a larger one, reverse mode gives its product for the acceleration.
-`normal_equations.jacobian_bytes` returns the memory."""
+"""Largest Jacobian kept through an iteration (see `jacobian_bytes`); beyond it, reverse mode gives its products."""
 TRIALS = 16
 """Steps tried before an iteration gives up."""
 

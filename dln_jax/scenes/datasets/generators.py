@@ -28,10 +28,7 @@ _VERSION = 1  # of the generators' output; a new version makes a new file instea
 
 
 def default_data(scene: Scene) -> Trajectories:
-    """Returns letters for the two-link arm, and for any other scene random states, which exercise every term.
-
-    Data are generated once, then read from the cache.
-    """
+    """Returns letters for the two-link arm, else random states that exercise every term; cached once generated."""
     kind = "characters" if scene.name == "two-link-arm" else "uniform"
     path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
     if not path.exists():

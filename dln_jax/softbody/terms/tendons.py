@@ -68,10 +68,7 @@ def tendon_of_length(
 
 
 def tendon_of_tension(mesh: Mesh, path: ArrayLike, *, tension: float | None = None, name: str = "tendon") -> Term:
-    """A tendon with the tension T in N at any length; by default T is the control of the step, one number.
-
-    Path and errors are those of `tendon_of_length`.
-    """
+    """A tendon with tension T in N, by default the control of the step; path and errors as in `tendon_of_length`."""
     parameters = TendonOfTension(None if tension is None else material("tension", tension, 1, "tendon", NOT_NEGATIVE))
 
     def prepare(parameters: TendonOfTension, context: Context) -> Array:

@@ -98,10 +98,7 @@ def material(
 
 
 def control_of(name: str, context: Context, shape: tuple[int, ...], meaning: str) -> Float[Array, "..."]:
-    """Returns the control of a driven term in its shape; if it is missing, `InputError` says what it means.
-
-    A single number may have the shape [] or [1].
-    """
+    """Returns the control of a driven term (a number as [] or [1]); if it is missing, `InputError` explains it."""
     control = context.control
     if control is None or (jnp.shape(control) != shape and not jnp.size(control) == math.prod(shape) == 1):
         got = "no control" if control is None else f"a control of shape {jnp.shape(control)}"
