@@ -1,4 +1,4 @@
-"""Fits a model's accelerations to those of the data, in coordinates and velocities, with or without torques.
+"""Fits a model to measured accelerations, with or without torques.
 
     residual = (qdd_hat(q, qd, tau) - qdd) / spread of qdd
 
@@ -44,7 +44,7 @@ def problem(
         seed: seed of the draw and of the order of the samples.
 
     Raises:
-        InputError: motions without torques and without a gauge, or numbers that are too large.
+        InputError: the data have no torques and there is no gauge, or numbers are too large.
     """
     require_positive(most_samples=most_samples)
     check_gauge(gauge, data.tau, data.degrees_of_freedom)

@@ -192,7 +192,7 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
 def grow_width(
     sets: SampleSplit, network: Network, fit: Callable[[Network], Training], *, widths: Sequence[int] = WIDTHS
 ) -> tuple[Trial, list[Trial]]:
-    """Trains networks of growing width with `fit` and chooses the smallest that no other betters significantly.
+    """Trains networks of growing width with `fit` and chooses the smallest that no other beats significantly.
 
     The outcome of a trial is its `Training`.
     """

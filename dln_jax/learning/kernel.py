@@ -89,7 +89,7 @@ def fit_kernel(
     with jax.enable_x64(True):
         unit = np.asarray(torque_scale(train))
         columns = _friction(needs, train.qd)
-        # S of a coefficient: 1 over the root mean square torque of one unit of it, in units of the deviations.
+        # S of a coefficient: 1 / (RMS torque of one unit of it, relative to the torques' deviations).
         sizes = np.sqrt(np.mean(np.sum((columns / unit[:, None]) ** 2, axis=1), axis=0))
         deviations = 1.0 / np.where(sizes > 0, sizes, 1.0)
         every = _equations(train, columns * deviations, samples)

@@ -54,7 +54,7 @@ class LinearFit(NamedTuple):
     parameter_count: int
     """P, the number of parameters."""
     rank: int
-    """Number of combinations of parameters that the data determine; the solution has no part in the other P - rank."""
+    """Number of combinations of parameters that the data determine; the solution is zero in the other P - rank."""
     condition: float
     """Condition number of the scaled columns that count: the largest amplification of relative errors of the data."""
     torque_mse: float
@@ -152,9 +152,9 @@ def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
 def design_chunks(
     linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int, *, even: bool = True
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= chunk_size samples at a time.
+    """Yields Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= chunk_size samples at a time.
 
-    Even chunks waste no work; chunks that are not, of `chunk_size` samples, share one program for any number of them.
+    Even chunks waste no work; chunks of exactly `chunk_size` samples share one program for any number of samples.
     """
     samples = len(data.tau)
     length = -(-samples // -(-samples // chunk_size)) if even else chunk_size

@@ -134,7 +134,7 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
 
 
 def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> int:
-    """Estimates the delay of torques in samples: the smallest residual of a model linear in its parameters decides.
+    """Estimates the delay of torques in samples by the smallest residual of a model that is linear in its parameters.
 
     Args:
         model: model that is linear in its parameters, such as `models.make_trigonometric`.

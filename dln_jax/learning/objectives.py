@@ -33,7 +33,7 @@ class Objective(NamedTuple):
 
     @property
     def of_torques(self) -> bool:
-        """Whether its residuals are those of torques, and of nothing else."""
+        """Whether its residuals are torque errors and nothing else."""
         return self.residual is TORQUE.residual
 
 

@@ -1,4 +1,4 @@
-"""Learning while a robot works: samples accumulate in a replay, and a model is refitted to all of them.
+"""Learning while a robot works: samples accumulate in a replay buffer, and a model is refitted to all of them.
 
     for visit in learn_online(references, drive, refit, model.init(key), empty_replay(2000, 2)): ...
 

@@ -46,7 +46,7 @@ def problem(
         train: trajectories with p and pd.
         validation: trajectories that select the parameters, with p and pd; `data.splits.hold_out` draws some.
         seed: seed of the initial parameters, of the drawn samples, and of their order.
-        most_samples: largest number of samples to fit, and to validate; larger sets are drawn from.
+        most_samples: largest number of samples to fit, and to validate; larger sets are subsampled at random.
 
     Raises:
         InputError: no p or pd in the data, numbers whose squares overflow, or settings out of range.

@@ -1,6 +1,6 @@
 """Fits models to a recording of q and commanded torques: an identified model and a network.
 
-1. Unless it is known, the delay of the torques is the one with the smallest residual of an identified model.
+1. The delay of the torques, unless known, is the one that gives an identified model the smallest residual.
 2. q is smoothed (`data.encoders`), which also gives qd; torques are not filtered, and held between samples.
 3. The identified model is the trigonometric one, fitted in weak form. Its residuals in the joints' equations are the
    scales of a network's errors, so that joints with and without a motor both count.
@@ -67,7 +67,7 @@ class PreparedRecording(NamedTuple):
     """A recording that is ready for fits."""
 
     train: Trajectories
-    """With rates, and torques as they acted."""
+    """With rates and acting torques."""
     validation: Trajectories
     delay: int
     """Delay of the torques in samples."""
@@ -121,11 +121,11 @@ def identified(data: Trajectories, needs: Needs, *, chain: bool = False) -> Fitt
     """Fits the trigonometric model with viscous and dry friction.
 
     Args:
-        data: with rates, and torques as they acted.
+        data: recording with rates and acting torques.
         needs: needs of the plant.
         chain: whether the plant is a chain of rigid bodies on a fixed base, in relative coordinates: its mass matrix
-            does not depend on the first one, and its potential has degree 1 in every angle. Fewer parameters need
-            fewer motions.
+            does not depend on the first coordinate, and its potential has degree 1 in every angle. Fewer parameters
+            need fewer motions.
 
     Raises:
         InputError: as for `fit_momentum`.

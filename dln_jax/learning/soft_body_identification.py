@@ -34,7 +34,7 @@ class ObservedMotions(NamedTuple):
     v0: Float[Array, "K n dim"]
     """Velocities at the start, in m/s."""
     controls: Any
-    """Actuation of the steps: an array [K, T, controls], [K, T, 0] for a body without, or a dict of arrays [K, T, ...]
+    """Actuation of the steps: an array [K, T, controls] ([K, T, 0] without actuation), or a dict of arrays [K, T, ...]
     by the names of the actuated terms."""
     x: Float[Array, "K T n dim"]
     """Positions after every step, in m; not finite for vertices that were not seen."""

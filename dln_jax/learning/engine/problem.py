@@ -1,4 +1,4 @@
-"""Inputs, stages and results of a training, for any model and optimiser, and what devices share of it."""
+"""Inputs, stages and results of a training run, for any model and optimiser, and how devices share the work."""
 
 import math
 from collections.abc import Callable, Iterable

@@ -35,7 +35,7 @@ FINALISTS, NEAR = 3, 2.0
 """Largest number of local minima that are refined and compared by validation, and the largest ratio of their loss to
 the lowest."""
 ROUNDS = 2
-"""Rounds of weighting the joints by their unexplained torques; further rounds change the weights by percents."""
+"""Rounds of weighting the joints by their unexplained torques; more rounds change the weights by a few per cent."""
 CHUNK = 4096
 """Samples whose columns are in memory at a time."""
 LEAST_NOISE = 1e-7
@@ -62,9 +62,9 @@ class TreeFit(NamedTuple):
     losses: Float[np.ndarray, " K"]
     """Final losses of all descents, lowest first: mean squares in units of the torques' standard deviations."""
     agreeing: int
-    """Descents that ended at the lowest loss."""
+    """Number of descents that ended at the lowest loss."""
     agreement: int
-    """Descents that the search required to agree (`Search.agreement`)."""
+    """Number of descents that the search required to agree (`Search.agreement`)."""
     twin: Twin | None
     """Comparison with another descent to the same loss; `None` if there is none, or none was asked for."""
     seconds: float
@@ -152,7 +152,7 @@ def fit_tree(
                 report(f"two descents to this tree's loss found {twin.words}")
             if (twin is not None and twin.same) or searched.starts >= settings.starts or time.perf_counter() > until:
                 break
-            # One more wave of starts, whatever agrees already.
+            # One more wave of starts, however many agree already.
             wanted = settings._replace(agreement=agreeing(descents) + 1)
         losses = np.array([float(descent.at.loss) for descent in descents])
         frames, solution = best.state.frames, best.solution
@@ -175,13 +175,13 @@ def fit_tree(
 
 
 class _Finished(NamedTuple):
-    """A descent, refined, with its linear parameters and mean squared errors by joint."""
+    """A refined descent with its linear parameters and mean squared errors by joint."""
 
     state: Descent
     solution: least_squares.LeastSquaresSolution
     trained: Float[np.ndarray, " d"]
     judged: Float[np.ndarray, " d"]
-    """On validation samples, or those of training without them."""
+    """On the validation samples, or on the training samples if there are none."""
 
 
 def _some(data: Trajectories, most: int, seed: int) -> Samples:

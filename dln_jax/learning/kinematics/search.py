@@ -19,7 +19,7 @@ from dln_jax.learning.kinematics.projection import Descent, Program, Samples, St
 from dln_jax.types import require_positive, require_seed
 
 WAVE = 8
-"""Starts between two tests of agreement; it is independent of the number of threads, and so are the results."""
+"""Starts between two tests of agreement. It does not depend on the number of threads, so neither do the results."""
 ALIKE = 0.02
 """Largest relative difference of two losses that count as the same local minimum."""
 
