@@ -100,7 +100,7 @@ def write_robot(
 
     Raises:
         InputError: the tree has other joints, a link is not physically consistent, an MJCF file includes or repeats
-            elements or has locked joints, `path` is `original`, or as `read_robot`.
+            elements or has locked joints, `path` is `original`, or `read_robot` refuses the original.
     """
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
@@ -231,7 +231,7 @@ def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[dict
 
 
 def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Mapping[str, Any]]) -> None:
-    """Replaces the fixed tendons of coupled motors, by name; others stay, but their inertia is now in the motors'."""
+    """Replaces the fixed tendons of coupled motors, by name; others lose their armature, which the motors' contain."""
     group = root.find("tendon")
     for tendons in root.findall("tendon"):
         for tendon in tendons.findall("fixed"):

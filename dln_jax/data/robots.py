@@ -73,7 +73,7 @@ def opened(
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
 
-    For a URDF, shapes and inertias are left out. Errors as `read_robot`.
+    For a URDF, shapes and inertias are left out. Errors as for `read_robot`.
     """
     if root.tag == "mujoco":
         mujoco, model = _compiled(path, root, ())

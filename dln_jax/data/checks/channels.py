@@ -20,7 +20,7 @@ WEAK = 0.03
 COARSE = 3e-4
 """rad: smallest encoder step reported, 1/20000 of a turn."""
 RUN = 4
-"""Samples at exactly the same extreme value that make a flat top."""
+"""Samples at exactly the same extreme value that count as a flat top."""
 SHARE = 2e-3
 """Fraction of samples in flat tops above which a channel counts as saturated."""
 SPIKE = 4.0

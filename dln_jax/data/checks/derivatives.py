@@ -32,7 +32,7 @@ class Match(NamedTuple):
     """Delay of the measured signal in samples."""
     correlation: Float[np.ndarray, " d"]
     gained: Float[np.ndarray, " d"]
-    """Squared error at no delay over that at `delay`."""
+    """Squared error without delay, divided by that at `delay`."""
 
 
 def match(

@@ -21,7 +21,7 @@ from dln_jax.data.checks.evidence import Explanation, Prior
 from dln_jax.data.schema import Trajectories
 
 DECISIVE = 15.0
-"""Log likelihood ratio over all blocks that decides: odds of three million to one."""
+"""Log likelihood ratio over all blocks that is required to decide: odds of three million to one."""
 MOST_BLOCKS = 0.8
 """Fraction of blocks that must agree."""
 BETTER = 0.8
@@ -53,7 +53,7 @@ class Log(NamedTuple):
     delay: float = 0.0
     """Delay of the torques in samples."""
     speed: float = 1.0
-    """True speed of the joints relative to that by t."""
+    """True speed of the joints, relative to the speed that t implies."""
     gravity: np.ndarray | None = None
     """m/s² [3]; `None` for the stated gravity."""
 
@@ -110,7 +110,7 @@ class Torques(NamedTuple):
 
     @property
     def gain(self) -> str:
-        """What the repairs gain, in words."""
+        """Gain of the repairs, as text."""
         before, after = (way.unexplained.mean() for way in (self.explanation, self.repaired))
         return f"unexplained in left-out blocks: {before:.2%} now, {after:.2%} if repaired"
 
