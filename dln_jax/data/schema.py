@@ -110,7 +110,7 @@ def load_arrays(
     torque_factor: Any = None,
     robot: Sequence[str] = (),
 ) -> Data:
-    """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors as `load`."""
+    """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors: see `load`."""
     suffix, folder = Path(path).suffix.lower(), is_folder(Path(path))
     if units is not None and suffix != ".csv":
         raise InputError(f"{path!s:.200}: units are for CSV; npz files and bags are in SI units")

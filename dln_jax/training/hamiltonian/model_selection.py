@@ -94,7 +94,7 @@ def description_of(problem: Problem, model: str, *, precision: str = "f64", **ke
 
 
 def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
-    """How a pairwise model reads the coordinates: as stated, or as balances the measured forces.
+    """Arrangement of the coordinates for a pairwise model: as stated, or the one in which measured forces balance.
 
     Raises:
         InputError: the order is neither stated nor determined by the measurements.
@@ -113,7 +113,7 @@ def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
 
 
 def polynomial_degree(problem: Problem) -> int:
-    """The smallest sufficient degree by validation trajectories."""
+    """The smallest sufficient degree, chosen by validation trajectories."""
     fitted, validation = hold_out(problem.fitted, VALIDATION_SHARE, 0)
 
     def fit(degree: int):

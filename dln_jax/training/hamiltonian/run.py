@@ -41,7 +41,7 @@ KEYWORDS = ("width", "depth", "activation", "degree", "coordinates", "order", "f
 
 
 class Case(NamedTuple):
-    """A phase space to learn, and how."""
+    """A phase space to learn, with its model and optimiser."""
 
     problem: Problem
     description: dict[str, Any]
@@ -89,7 +89,7 @@ def prepare(options: Any) -> Case:
 
 
 def refuse_iterations(options: Any, problem: Problem, description: dict[str, Any]) -> None:
-    """Refuses options of iterations for the polynomial model, whose fit of rates is one least-squares problem."""
+    """Refuses iteration options for the polynomial model, whose fit of rates is one least-squares problem."""
     if options.optimizer == "adam":
         raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
     for name in ("steps", "seconds", "processes"):

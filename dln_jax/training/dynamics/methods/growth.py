@@ -30,7 +30,7 @@ DEPTHS = (1, 2)
 
 
 class Candidate(NamedTuple):
-    """A network that was trained, with its error and speed."""
+    """A trained network with its error and speed."""
 
     width: int
     depth: int
