@@ -106,10 +106,10 @@ def write_run(
 
     Args:
         folder: where files are written.
-        task: of the policies.
-        policies: at least one of which has a finite distance.
-        settings: of the learning, stored with the model.
-        method: of the learning.
+        task: task of the policies.
+        policies: trained policies, of which at least one has a finite distance.
+        settings: settings of the training, stored with the model.
+        method: name of the training method.
         figures: whether to draw.
 
     Raises:

@@ -23,7 +23,7 @@ from dln_jax.zoo.run import save
 
 
 class Fitted(NamedTuple):
-    """A fitted model, and whatever the kind's own `judge` needs of the fit."""
+    """A fitted model, and the record that the kind's own `judge` needs."""
 
     description: Description
     """Description of the model, final choices included."""
@@ -33,7 +33,7 @@ class Fitted(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """What is known of a fitted model once it has been evaluated."""
+    """Evaluation of a fitted model."""
 
     metrics: dict[str, float | int]
     """Contents of metrics.json, apart from those that are still being measured."""

@@ -41,7 +41,7 @@ def store_uncertainty(
         parameters: fitted parameters.
         train: data that the parameters were fitted to.
         validation: data that calibrate the bands.
-        torque: the torques that the bands are of, in words.
+        torque: description of the torques that the bands refer to.
         options: as for `learning.uncertainty.estimate`.
     """
     try:
