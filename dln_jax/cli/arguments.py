@@ -25,7 +25,7 @@ _rules = ConstructorRegistry()
 
 @_rules.primitive_rule
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Reads int and float, and says what was expected in the words of every other message."""
+    """Reads int and float, with error messages in the style of all others."""
     kinds = {int: "a whole number", float: "a number"}
     if info.type not in kinds:
         return None
@@ -75,12 +75,12 @@ def choice(names: Iterable[str], *, several: bool = False, unstated: bool = Fals
 
 
 class Variants(NamedTuple):
-    """Options that exist for some choices of a command only, such as those of one model: its attribute `VARIANTS`."""
+    """Options that exist only for some choices of a command, such as one model: its attribute `VARIANTS`."""
 
     chosen: Callable[[Mapping[str, Any]], Sequence[type]]
     """Options that were typed or stored, by name -> dataclasses of further options that they bring."""
     known: Mapping[type, str]
-    """For each of these dataclasses the options that bring it, in words."""
+    """For each of these dataclasses, a description of the options that bring it."""
 
 
 def arguments_for(arguments: type, stated: Mapping[str, Any]) -> type:
@@ -170,7 +170,7 @@ def _complaint(event: ParseErrorEvent, arguments: type) -> str:
 
 
 def _unknown(option: str, arguments: type) -> str:
-    """Says what an option needs that exists for other choices of the command only."""
+    """Message on an option that is unknown, or that exists only for other choices of the command."""
     name, known = option.lstrip("-").partition("=")[0].replace("-", "_"), {}
     if (variants := getattr(arguments, "VARIANTS", None)) is not None:
         known = variants.known

@@ -60,7 +60,7 @@ class Devices:
     """Devices of one process that share the work."""
 
     devices: Unstated[int] = None
-    """Devices per process (default: 1; of several processes all)."""
+    """Devices per process (default: 1, or all with several processes)."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def run(
     from_shell: bool = False,
     joining: int | None = None,
 ) -> None:
-    """Parses the command line and runs `main`; errors and exit statuses as `as_one_line`.
+    """Parses the command line and runs `main`; errors and exit statuses as for `as_one_line`.
 
     Args:
         main: body of the command.
@@ -39,7 +39,7 @@ def run(
         prog: the command as the user typed it.
         line: words after the command (default: those of this process).
         from_shell: whether the process runs only this command; compiled programs are then kept.
-        joining: seconds that several processes wait for each other to start (default: as `scale.processes`).
+        joining: seconds that several processes wait for each other to start (default: that of `scale.processes`).
     """
     with as_one_line(prog, None):
         common = NoCompilationCache if getattr(arguments, "MEASURES_COMPILATION", False) else CompilationCache
@@ -85,8 +85,8 @@ def run(
 def as_one_line(prog: str, options: Any) -> Iterator[None]:
     """Reports errors in one line and sets the exit status.
 
-    A user's mistake, or memory, a device or disk space that the machine lacks, is 2, a refused fit 1, a lost process 3,
-    an interrupt 130, a closed output pipe 141.
+    The status is 2 for a user's mistake, and for memory, devices or disk space that the machine lacks; 1 for a refused
+    fit, 3 for a lost process, 130 for an interrupt, 141 for a closed output pipe.
     """
     try:
         yield

@@ -29,7 +29,7 @@ class Arguments(Folder):
     push: Unstated[float] = None
     """Change of velocity by the pushes, m/s (default: the training's)."""
     starts: int = 100
-    """Episodes."""
+    """Number of episodes."""
     steps: int = 2000
     """Steps of an episode, 0.033 s each."""
     seed: int = 1_000_000
