@@ -107,7 +107,7 @@ def value_jacobian_and_hessian(
 
 
 def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
-    """Sweep with the fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
+    """Sweep with fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
     inputs, *widths, outputs = sizes
     if not widths:
         return "forward"
@@ -118,7 +118,7 @@ def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
 
 
 def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
-    """Sweep with the fewer operations for Jacobian and Hessian, without the J_l that both sweeps need.
+    """Sweep with fewer operations for Jacobian and Hessian, without the J_l that both sweeps need.
 
     Counted in multiply-adds. Backward, per output: the adjoint, then per layer n columns to scale and n² products of a
     width. Forward, per pair of inputs: the weights after the first, then three operations per hidden unit.

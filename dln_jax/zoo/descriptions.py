@@ -64,7 +64,7 @@ def describe_for(
     """Describes a model of the catalogue for training data, with the typical sizes of these data.
 
     Raises:
-        InputError: as `describe` and `typical_sizes`.
+        InputError: raised by `describe` or `typical_sizes`.
     """
     sizes = typical_sizes(name, data, pooled=pooled)
     return describe(name, precision=precision, **{"needs": needs, **keywords, **sizes})
@@ -76,8 +76,8 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
     Args:
         name: name in the catalogue.
         data: training data.
-        pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have the
-            arrays; otherwise missing arrays leave the factory's default.
+        pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have all
+            the arrays; otherwise missing arrays leave the factory's default.
 
     Raises:
         InputError: numbers so large or small that their squares overflow or vanish, or missing momenta.
@@ -136,10 +136,10 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
 def functions_of(
     name: str, factory: Callable[..., Any] | None = None, *, trust: bool = False
 ) -> tuple[Callable[..., Any], ...]:
-    """The functions that make the model of a name: additions and factory of the catalogue, or a factory of one's own.
+    """The functions that make the model of a name: additions and factory of the catalogue, or a user's own factory.
 
     Raises:
-        InputError: as `build`.
+        InputError: as for `build`.
     """
     module, colon, function = name.partition(":")
     if not colon and name != OWN:

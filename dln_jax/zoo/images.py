@@ -103,6 +103,6 @@ def make_image_model(
 
 
 def with_components(components: Components, parameters: Any, dtype: DTypeLike = jnp.float32) -> Any:
-    """The parameters of a `ImageModel`, from those of the model of its coefficients."""
+    """The parameters of an `ImageModel`, from those of the model of its coefficients."""
     arrays = {"mean": components.mean, "basis": components.basis, "scale": components.scale}
     return {"parameters": parameters, "components": {name: jnp.asarray(array, dtype) for name, array in arrays.items()}}

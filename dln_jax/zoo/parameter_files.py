@@ -31,7 +31,7 @@ class Shape(TypedDict):
 
 
 class Manifest(msgspec.Struct):
-    """What every manifest states."""
+    """Entries that every manifest has."""
 
     schema_version: int
     tensor_file: str

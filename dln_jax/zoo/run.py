@@ -36,7 +36,7 @@ class Run:
     """A trained model with jitted functions of one state.
 
     The functions take arrays or lists of numbers and compute in the precision of the training. To continue training, to
-    differentiate by parameters or to extend the model, use `model` and `parameters`:
+    differentiate in parameters or to extend the model, use `model` and `parameters`:
     `mechanics.equations.dynamics(run.model.energies(parameters))`.
     """
 
@@ -75,7 +75,7 @@ class Run:
 
     @functools.cached_property
     def images(self) -> LatentPhase:
-        """Encoder, decoder, and flow of the latent plane. Raises InputError unless the model is one of images."""
+        """Encoder, decoder and flow of the latent plane. Raises InputError for a model that is not of images."""
         system = self._of("images", ImageModel).images(self.parameters)
         encode, decode = (_jitted(function, self.dtype) for function in (system.encode, system.decode))
         return LatentPhase(encode, decode, compiled(system.field, self.dtype))
