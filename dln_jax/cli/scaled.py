@@ -40,10 +40,7 @@ def mesh_of(options: Any) -> Mesh | None:
 
 def membership_in(options: Any) -> Membership | None:
     """How this process joins others; `None` for a single process. On a CPU, sets the number of devices.
-
-    Raises:
-        InputError: the options or the cluster's environment variables are inconsistent, or --out is missing.
-    """
+    Raises `InputError` if the options or the cluster's environment variables are inconsistent, or --out is missing."""
     if not isinstance(options, Scaled):
         return None
     processes.host_devices(options.devices)
@@ -113,10 +110,7 @@ def wait_for_all(options: Any) -> None:
 @contextlib.contextmanager
 def copied_folder(options: Any, resume: bool) -> Iterator[Path]:
     """Yields a temporary folder for this process, with a copy of the run if it is resumed.
-
-    Raises:
-        InputError: the run's folder cannot be copied.
-    """
+    Raises `InputError` if the run's folder cannot be copied."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if resume:

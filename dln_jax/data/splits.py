@@ -78,10 +78,7 @@ def segments(
     t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
 ) -> list[Int[np.ndarray, " n"]]:
     """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
-
-    Raises:
-        InputError: `gap` is not above 1, or no trajectory has two samples.
-    """
+    Raises `InputError` if `gap` is not above 1, or no trajectory has two samples."""
     if not gap > 1:
         raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
     if not (np.diff(trajectory) == 0).any():
@@ -118,10 +115,7 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
 
 def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
     """At most `most` samples, drawn by the seed and kept in their order.
-
-    Raises:
-        InputError: `most` is not positive, or the seed is out of range.
-    """
+    Raises `InputError` if `most` is not positive, or the seed is out of range."""
     require_positive(samples=most)
     require_seed(seed)
     count = len(data.t)
@@ -152,11 +146,7 @@ def in_blocks(data: Trajectories, blocks: int) -> Trajectories:
 
 
 def label_indices(data: Trajectories, labels: Sequence[str]) -> np.ndarray:
-    """Indices of the trajectories with these labels.
-
-    Raises:
-        InputError: a label that the data do not have.
-    """
+    """Indices of the trajectories with these labels. Raises `InputError` for a label that the data do not have."""
     known = list(data.label)
     unknown = [label for label in labels if label not in known]
     if unknown:
@@ -198,10 +188,7 @@ def split(
 
 def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories, Trajectories]:
     """Training and validation trajectories, at least one of each, drawn by the seed.
-
-    Raises:
-        InputError: fewer than two trajectories, a share outside (0, 1), or a seed out of range.
-    """
+    Raises `InputError` for fewer than two trajectories, a share outside (0, 1), or a seed out of range."""
     require_seed(seed)
     present = np.unique(data.trajectory)
     count = held_out(len(present), share, "trajectories")
@@ -211,10 +198,7 @@ def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories,
 
 def held_out(count: int, share: float, what: str) -> int:
     """Number of items held out for validation; at least one is held out and one left for training.
-
-    Raises:
-        InputError: fewer than two items, or a share outside (0, 1).
-    """
+    Raises `InputError` for fewer than two items, or a share outside (0, 1)."""
     if count < 2:
         raise InputError(f"there are {count} {what} to train on and to validate by; expected at least 2: add {what}")
     if not 0 < share < 1:

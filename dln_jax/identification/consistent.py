@@ -77,10 +77,7 @@ def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[boo
 
 def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
     """Raises the eigenvalues of a body's pseudo-inertia to at least `SMALLEST` times the largest.
-
-    Raises:
-        InputError: no eigenvalue is positive.
-    """
+    Raises `InputError` if no eigenvalue is positive."""
     values, vectors = np.linalg.eigh(pseudo_inertia(np.asarray(theta, float)))
     if not values[-1] > 0:
         raise InputError("a link that is to be identified has no mass; expected a rough value for it")

@@ -85,10 +85,7 @@ def published_adam(
 
 def targets(data: FunctionSamples, network: Network) -> Targets:
     """Returns the arrays that the loss reads, on the device.
-
-    Raises:
-        InputError: settings are out of range, the data lack a derivative, or the squares of numbers overflow.
-    """
+    Raises `InputError` if settings are out of range, the data lack a derivative, or the squares of numbers overflow."""
     require_positive(members=network.members)
     require_seed(network.seed)
     require_network(width=network.width, depth=network.depth)
@@ -159,10 +156,7 @@ def train(
 
 def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
     """Builds the problem of an ensemble: the sum of its members' losses, or (for Gauss-Newton) members as seeds.
-
-    Raises:
-        InputError: raised by `targets`.
-    """
+    Errors as for `targets`."""
     ours, theirs = (targets(data, network) for data in sets)
     sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
     layers = ensembles.init(

@@ -48,10 +48,7 @@ def batch_mesh(devices: int | None = None) -> Mesh | None:
 
 def shares(mesh: Mesh | None, count: int, what: str) -> int:
     """Returns the number of items per device.
-
-    Raises:
-        InputError: the number of devices does not divide `count`; `what` names the items, in the plural.
-    """
+    Raises `InputError` if the number of devices does not divide `count`; `what` names the items, in the plural."""
     devices = 1 if mesh is None else mesh.size
     if count % devices:
         remedy = f"give a multiple of {devices}, or fewer devices"
@@ -61,10 +58,7 @@ def shares(mesh: Mesh | None, count: int, what: str) -> int:
 
 def shard(tree: Any, mesh: Mesh | None) -> Any:
     """Splits arrays along axis 0; all processes pass the same whole arrays, and keep their part.
-
-    Raises:
-        InputError: the number of devices does not divide the length of an array.
-    """
+    Raises `InputError` if the number of devices does not divide the length of an array."""
     if mesh is None:
         return tree
     for leaf in jax.tree.leaves(tree):

@@ -44,10 +44,7 @@ class Membership(NamedTuple):
 
 def host_devices(count: int | None) -> None:
     """Splits the CPU into `count` JAX devices, unless it is None or JAX has already been used.
-
-    Raises:
-        InputError: the number is not positive.
-    """
+    Raises `InputError` if the number is not positive."""
     if count is None:
         return
     if count < 1:

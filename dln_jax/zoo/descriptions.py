@@ -62,10 +62,7 @@ def describe_for(
     name: str, data: Trajectories, needs: Needs, *, precision: str, pooled: bool = False, **keywords: Any
 ) -> Description:
     """Describes a model of the catalogue for training data, with the typical sizes of these data.
-
-    Raises:
-        InputError: raised by `describe` or `typical_sizes`.
-    """
+    Errors as for `describe` and `typical_sizes`."""
     sizes = typical_sizes(name, data, pooled=pooled)
     return describe(name, precision=precision, **{"needs": needs, **keywords, **sizes})
 
@@ -137,10 +134,7 @@ def functions_of(
     name: str, factory: Callable[..., Any] | None = None, *, trust: bool = False
 ) -> tuple[Callable[..., Any], ...]:
     """The functions that make the model of a name: additions and factory of the catalogue, or a user's own factory.
-
-    Raises:
-        InputError: as for `build`.
-    """
+    Errors as for `build`."""
     module, colon, function = name.partition(":")
     if not colon and name != OWN:
         entry = entry_of(name)
@@ -206,10 +200,7 @@ def _as_json(key: str, value: Any) -> Any:
 
 def _keywords(values: Mapping[str, Any], functions: tuple[Callable[..., Any], ...]) -> dict[str, Any]:
     """Converts JSON values to the types in the signatures, with lists as tuples so that they are hashable.
-
-    Raises:
-        InputError: a value does not fit its annotation.
-    """
+    Raises `InputError` if a value does not fit its annotation."""
     keywords: dict[str, Any] = {}
     for key, parameter in _parameters(functions).items():
         hint, value = parameter.annotation, values[key]

@@ -88,10 +88,7 @@ def require_fitting(tree: Any, like: Any) -> None:
 
 def load_manifest(directory: Path, name: str) -> dict[str, Any]:
     """Reads the manifest `name.json` and checks its schema version.
-
-    Raises:
-        InputError: it is missing, no JSON object, or of another schema.
-    """
+    Raises `InputError` if it is missing, no JSON object, or of another schema."""
     path = directory / f"{name}.json"
     if not is_file(path):
         raise InputError(f"{path}: no such file; give the folder of a run that has written one")
@@ -107,10 +104,7 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
 
 def load_tree(directory: Path, name: str, like: Any) -> Any:
     """Reads the stored tree into the structure of `like`.
-
-    Raises:
-        InputError: a file is missing, truncated or altered, or its tensors do not fit `like`.
-    """
+    Raises `InputError` if a file is missing, truncated or altered, or its tensors do not fit `like`."""
     manifest = load_manifest(directory, name)
     path = directory / manifest["tensor_file"]
     if not is_file(path):

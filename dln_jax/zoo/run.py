@@ -155,10 +155,7 @@ def save_model(
 
 def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
     """Like `save_model`, but replaces the model in the folder of a run that is being trained.
-
-    Raises:
-        InputError: parameters of another model.
-    """
+    Raises `InputError` for parameters of another model."""
     name = description.get("name")
     if name == OWN or ":" in str(name):
         like = jax.tree.map(np.asarray, parameters)  # the factory is the user's, so only the structure is known

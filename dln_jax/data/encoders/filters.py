@@ -96,10 +96,7 @@ def derivatives(
     q: Float[np.ndarray, "n k"], *, rate: float
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
     """qd and qdd of one segment at equal steps, from the quintic spline through its samples.
-
-    Raises:
-        InputError: fewer than six samples.
-    """
+    Raises `InputError` for fewer than six samples."""
     require_positive(rate=rate)
     if len(q) < 6:
         raise InputError(f"a segment has {len(q)} samples; its rates take at least 6: record longer motions")

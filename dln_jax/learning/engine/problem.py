@@ -86,10 +86,7 @@ def selected_by(
 
 def arrays_of(record: Any, keys: Iterable[str] | None = None, dtype: Any = jnp.float64) -> tuple[Array, ...]:
     """Returns fields of a record of NumPy arrays on the device, all of them by default.
-
-    Raises:
-        InputError: squares of numbers overflow in that dtype.
-    """
+    Raises `InputError` if squares of numbers overflow in that dtype."""
     return tuple(on_device(key, getattr(record, key), dtype) for key in keys or record._fields)
 
 
@@ -231,10 +228,7 @@ class Sharing(NamedTuple):
 
 def sharing(problem: Problem, mesh: Mesh | None) -> Sharing:
     """Returns what the devices of a mesh share in this problem: seeds or samples.
-
-    Raises:
-        InputError: one seed, with a loss that is not the mean of the losses of parts of a batch.
-    """
+    Raises `InputError` for one seed, with a loss that is not the mean of the losses of parts of a batch."""
     if mesh is None or np.size(problem.seed) > 1:
         return Sharing(mesh, None)
     if problem.loss is not None and not problem.loss_is_mean:
