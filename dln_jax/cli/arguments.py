@@ -66,8 +66,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 def choice(names: Iterable[str], *, several: bool = False, unstated: bool = False) -> Any:
     """Shows the allowed names of an option in its help, for `Annotated[str, ...]`.
 
-    With `several` the option takes a list of names, by default all. With `unstated` the default is not shown, as for
-    `Unstated`.
+    With `several` the option takes a list of names, by default all; `unstated` hides the default, as for `Unstated`.
     """
     return tyro.conf.arg(
         metavar="{" + ",".join(names) + "}" + "[,...]" * several, help_behavior_hint="" if several or unstated else None

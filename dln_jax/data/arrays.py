@@ -165,8 +165,7 @@ def spread(name: str, array: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"
     """Standard deviation of each column, in float64.
 
     Raises:
-        InputError: squares overflow, nonzero numbers are so small that all squares vanish, or some exceed the median by
-            `MOST_TIMES_TYPICAL`.
+        InputError: squares overflow, nonzero squares all vanish, or numbers exceed `MOST_TIMES_TYPICAL` medians.
     """
     _require_squares(name, array, np.float64)
     sizes = np.abs(array[array != 0])

@@ -56,8 +56,7 @@ def read(path: Path, *, topics: Sequence[str] = (), choose: Choose = tuple) -> t
 
     Args:
         path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
-        topics: topics to read; where two have the same quantity of a joint, the first counts. Default: the only topic
-            of joint states.
+        topics: topics to read; if quantities repeat, the first topic counts. Default: the only topic of joint states.
         choose: selects joints.
 
     Raises:

@@ -1,8 +1,7 @@
 """Reads the XML of URDF and MJCF files: elements, the inertias of a URDF, and the limits of joints.
 
 Other formats, and files larger than any robot's, are refused. So are malformed limits: MuJoCo treats a range that is
-NaN, empty, swapped or half stated as no range, and a motion designed from such a file would drive the joint into its
-stop.
+NaN, empty, swapped or half stated as no range, and a motion designed with it would drive the joint into its stop.
 """
 
 import xml.etree.ElementTree as ET

@@ -92,8 +92,7 @@ def load(
             brings them into this order.
 
     Raises:
-        InputError: the file is missing, is not of its format, holds pickled objects, breaks the schema, or lacks a
-            stated joint or topic.
+        InputError: the file is missing, damaged or pickled, breaks the schema, or lacks a stated joint or topic.
     """
     stated = {"joints": joints, "topics": topics, "torque_factor": torque_factor, "robot": robot}
     return load_arrays(path, from_arrays, rate=rate, units=units, **stated)

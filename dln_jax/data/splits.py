@@ -94,8 +94,7 @@ def segments(
 def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tuple[np.ndarray, np.ndarray]:
     """Sample indices [W, T] of consecutive windows, which share their end samples, and the weights of the samples.
 
-    Windows lie within segments. The remainder of a segment is a shorter window, padded with its last sample at weight
-    0.
+    Windows lie within segments. The rest of a segment is a shorter window, padded with its last sample at weight 0.
 
     Raises:
         InputError: a length below 2, or no two samples without a gap between them.

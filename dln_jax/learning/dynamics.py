@@ -61,8 +61,7 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
             the results have a leading axis of seeds.
 
     Raises:
-        InputError: the data cannot determine the model, lack a key of the objective, or overflow in the model's
-            precision.
+        InputError: the data cannot determine the model, lack a key of the objective, or overflow in its precision.
     """
     for seed in (seeds,) if isinstance(seeds, int) else seeds:
         require_seed(seed)

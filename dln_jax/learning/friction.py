@@ -83,8 +83,7 @@ def fit_friction(
         held: names of shapes that stay at their initial value.
         cooling: whether viscous friction depends on the log's temperature; its mean becomes the reference.
         motors, coupled: as for `models.make_rigid_tree`.
-        noise: standard deviations of the joints' torques [d], which weight the samples; the torque's own deviation by
-            default.
+        noise: standard deviations of the joints' torques [d], which weight the samples (default: the torque's own).
         negligible: as for `learning.linear.fit_linear`.
         iterations: largest number of Gauss-Newton iterations.
 

@@ -3,9 +3,8 @@
     tau = O L + Phi c + noise,   cov = K + Phi S² Phiᵀ + diag(noise²),   weights = cov⁻¹ tau,   c = S² Phiᵀ weights
 
 O is the Euler-Lagrange operator and K the `torque_covariance` of the samples. Phi is the friction with coefficients c,
-whose prior is normal with deviations S. The noise of the joints is the only regulariser. Scales and noises maximise the
-marginal likelihood of the torques on a subset of the samples (L-BFGS with the exact gradient); the weights solve N d
-equations (Cholesky).
+whose prior is normal with deviations S. The joints' noise is the only regulariser. Scales and noises maximise the
+marginal likelihood of the torques on a subset of the samples (L-BFGS); the weights solve N d equations (Cholesky).
 """
 
 import time
@@ -37,9 +36,8 @@ class KernelFit(NamedTuple):
     parameters: Any
     """Parameters of the catalogue's `trigonometric-kernel`, in float64, for `samples` samples."""
     noise: Float[np.ndarray, " d"]
-    """Standard deviation of the torque noise in the equations, N m or N; it includes torque that no such energy
-    explains. It exceeds the most likely value if the covariance would otherwise not be positive definite to
-    rounding."""
+    """Standard deviation of the torque noise in the equations, N m or N, including torque that no such energy explains.
+    It exceeds the most likely value if rounding would otherwise make the covariance indefinite."""
     likelihood: float
     """Logarithm of the marginal likelihood per torque, over all fitted samples; higher is better."""
     torque_mse: float
@@ -120,8 +118,7 @@ def choose_kernel(
 ) -> tuple[Trial, list[Trial]]:
     """Fits a serial chain and a model without that assumption; returns the better in validation, and both trials.
 
-    The candidate of a `Trial` is `serial` and its outcome the `KernelFit`. Its errors are squared torques in units of
-    the joints' deviations.
+    The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.
 
     Raises:
         InputError: as for `fit_kernel`.

@@ -74,17 +74,15 @@ def fit_linear(
 ) -> LinearFit:
     """Fits the parameters that minimise the torque error on the data, in float64 whatever the model's dtype.
 
-    It takes about N d P² operations. If the data leave combinations of parameters undetermined, the result is the
-    shortest solution (see `solvers.least_squares`), which predicts the same forces along motions like those of the
-    data.
+    It takes about N d P² operations. If data leave combinations of parameters undetermined, the result is the shortest
+    solution (see `solvers.least_squares`), which predicts the same forces along motions like those of the data.
 
     Args:
         model: linear in its parameters.
         data: trajectories to fit; hold out those that will judge the result.
         ridge: dimensionless, as in `solvers.least_squares.solve`.
         rank_tolerance: as in `solvers.least_squares.solve`; by default rounding alone.
-        negligible: as in `solvers.least_squares.solve`; use about 1e-12 for rigid trees, because some of their columns
-            hold only rounding errors.
+        negligible: as in `solvers.least_squares.solve`; 1e-12 for rigid trees, some of whose columns are rounding.
         chunk_size: samples whose design matrix is in memory at a time.
 
     Raises:

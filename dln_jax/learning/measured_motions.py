@@ -7,8 +7,7 @@ energies of `mechanics.equations.dynamics` work. The residual of a window of T s
 
 with the second part only if qd was measured. The fit minimises the sum over windows of |r_w|² over theta and all starts
 z_w. Starts are eliminated window by window: Gauss-Newton solves for z_w(theta), and the derivative of the remaining r_w
-is that of Kaufman (`learning.motions`). The problem's parameters are those of the model alone, for any number of
-windows.
+is Kaufman's (`learning.motions`). The problem's parameters are the model's alone, for any number of windows.
 
 Torque errors drive simulated motions off course. With `Noise.tau` every window has an unknown constant torque e_w and a
 residual e_w / noise_tau: a compromise between matching motions under exact torques and torques of exact motions.

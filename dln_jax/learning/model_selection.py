@@ -163,8 +163,7 @@ def select_model(
         candidates: candidates, most structured first; of two equally good ones the first is chosen.
         train: samples to fit; the variances of their torques are the units of the errors.
         validation: other motions.
-        noise: standard deviation of the joints' measured torques, N m or N, if known: the selection ends once the
-            errors equal it.
+        noise: standard deviation of the joints' torque noise, N m or N, if known; the selection ends at such errors.
         seconds: time limit; at least the first candidate that can be fitted is.
         report: called with the result of every candidate.
 

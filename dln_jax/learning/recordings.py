@@ -124,8 +124,7 @@ def identified(data: Trajectories, needs: Needs, *, chain: bool = False) -> Fitt
         data: recording with rates and acting torques.
         needs: needs of the plant.
         chain: whether the plant is a chain of rigid bodies on a fixed base, in relative coordinates: its mass matrix
-            does not depend on the first coordinate, and its potential has degree 1 in every angle. Fewer parameters
-            need fewer motions.
+            does not depend on the first coordinate, its potential has degree 1 in every angle; fewer motions suffice.
 
     Raises:
         InputError: as for `fit_momentum`.

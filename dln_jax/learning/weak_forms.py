@@ -85,16 +85,13 @@ def fit_momentum(
 
     Args:
         model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
-        data: at equal time steps, with smooth velocities and torques as measured, for example from
-            `data.encoders.smooth`.
+        data: at equal time steps, with smooth velocities and measured torques, such as from `data.encoders.smooth`.
         window: length in s, at least `FEWEST` steps.
-        noise: standard deviations of the torques' noise, by which the equations are divided (default: those of the
-            torques themselves).
+        noise: deviations of the torques' noise that divide the equations (default: those of the torques themselves).
         tolerances: ridge, rank_tolerance and negligible of `solvers.least_squares.solve`.
 
     Raises:
-        InputError: steps that are not equal, no segment as long as a window, torques that do not vary, or settings out
-            of range.
+        InputError: unequal steps, no segment as long as a window, torques that do not vary, or settings out of range.
     """
     form = Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
     return fit_form(form, model, data, window=window, noise=noise, **tolerances)

@@ -121,8 +121,7 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
     """Runs a function on every device's share; it must return the same on all, by `total`, `mean` or `first`.
 
-    The number of devices must divide the batch. Loops and branches that contain collectives need conditions that are
-    equal on all devices.
+    The number of devices must divide the batch. Conditions of loops and branches with collectives must agree on all.
     """
     if mesh is None:
         return function

@@ -120,8 +120,7 @@ def of_run(folder: Path, wishes: Wishes) -> Chosen:
     """The plant of a learned or identified model in a run folder.
 
     Raises:
-        InputError: raised by `load` and `own_problem`; or the model has no dynamics, or limits, motors or a goal must
-            be stated.
+        InputError: as for `load` and `own_problem`; or the model has no dynamics, or lacks limits, motors or a goal.
     """
     run = load(folder)
     if not isinstance(run.model, Model) or isinstance(run.energies, PhaseRates) or "needs" not in run.description:

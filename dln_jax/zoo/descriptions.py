@@ -42,8 +42,7 @@ def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any
         model: a name of the catalogue; a factory of your own, which must be passed again to load the model; or
             "package.module:function", which is imported and stored, so that `load(folder, trust=True)` finds it.
         precision: f32 or f64, the factory's `dtype`.
-        keywords: keywords of the factory, in Python or as JSON (an activation or its name, `Needs` or their
-            dictionary).
+        keywords: keywords of the factory, in Python or as JSON (an activation or its name, `Needs` or a dictionary).
 
     Raises:
         InputError: an unknown name or keyword, a missing keyword, or a value that cannot be stored as JSON.
@@ -133,8 +132,7 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
 def functions_of(
     name: str, factory: Callable[..., Any] | None = None, *, trust: bool = False
 ) -> tuple[Callable[..., Any], ...]:
-    """The functions that make the model of a name: additions and factory of the catalogue, or a user's own factory.
-    Errors as for `build`."""
+    """Functions that make a named model: additions and factory of the catalogue, or a user's; errors as for `build`."""
     module, colon, function = name.partition(":")
     if not colon and name != OWN:
         entry = entry_of(name)

@@ -60,8 +60,7 @@ def make_image_model(
         momentum_scale: typical latent momentum, for a typical coordinate of 1.
 
     Raises:
-        InputError: an unknown field, a size that is not positive, or more than `MOST_NUMBERS` entries in the
-            components.
+        InputError: an unknown field, a size that is not positive, or components of more than `MOST_NUMBERS` entries.
     """
     require_positive(pixels=pixels, components=components)
     if pixels * components > MOST_NUMBERS:

@@ -97,8 +97,7 @@ def jobs_of(
         folder: folder of the sweep.
 
     Raises:
-        InputError: an option that the command lacks or that the sweep sets itself, a value of the wrong type, or a
-            missing file.
+        InputError: an option that the command lacks or the sweep sets itself, a wrong value, or a missing file.
     """
     # Options that only some choices read, such as a model's, are those of the first job.
     stated = {**fixed, **{name: texts[0] for name, texts in grid.items()}}

@@ -134,8 +134,7 @@ def _saturated(data: Trajectories, key: str, word: str, remedy: str) -> list[Fin
 def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
     """Fraction of samples in runs at the largest or smallest value that are entered or left abruptly.
 
-    A smooth extreme is approached ever more slowly and a joint at rest does not move, whereas a limit cuts a motion
-    off.
+    A smooth extreme is approached ever more slowly and a joint at rest does not move; a limit cuts a motion off.
     """
     size = np.ptp(channel)
     if size == 0:

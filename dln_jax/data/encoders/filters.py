@@ -8,9 +8,8 @@ without a time shift, ½ at the cut-off. It is linear, so it commutes with a mod
 F(Phi theta) = F(Phi) theta: if the torques pass `low_pass`, so must the columns of Phi. Columns of a filtered q are not
 filtered columns if a force has a wider band than the motion, such as dry friction.
 
-At the ends the filter knows one side only. It extends the signal there by reflection, after a slow polynomial is
-subtracted. This makes accelerations at the end 2 to 40 times more accurate; from 1.5 periods on they are as accurate as
-elsewhere.
+At the ends the filter knows one side only. It extends the signal by reflection, after subtracting a slow polynomial,
+which makes accelerations there 2 to 40 times more accurate; from 1.5 periods on they are as accurate as elsewhere.
 
 Derivatives are those of the quintic spline through the filtered samples. A second derivative is exact to 0.02 % at a
 tenth of the rate and to 1.3 % at a quarter, where central differences taken twice lose 12 % and 60 %.

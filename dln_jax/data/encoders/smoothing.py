@@ -84,8 +84,7 @@ def smooth(
         trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
 
     Raises:
-        InputError: settings out of range, a decimation to less than twice the cut-off, or no segment that is long
-            enough.
+        InputError: settings out of range, a decimation below twice the cut-off, or no segment that is long enough.
     """
     require_positive(decimate=decimate)
     if trim is not None and not trim >= 0:

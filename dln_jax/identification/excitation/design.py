@@ -1,7 +1,6 @@
 """Optimal excitation: gradient-based design of informative motions within a robot's limits.
 
-The unknowns are the Fourier coefficients of the joints. The criterion is a function of A, the information of a sample
-(`excitation.task`):
+The unknowns are the joints' Fourier coefficients. The criterion is a function of A (`excitation.task`):
 
     information    log det A: the product of all parameters' errors, independent of units (D-optimal)
     condition      largest over smallest singular value of the regressor with columns of unit length

@@ -89,8 +89,7 @@ def limits_of_robot(
         velocity: 1/s or m/s.
         acceleration: 1/s² or m/s².
         force: N m or N, in either direction.
-        allow_unlimited: names of joints that may lack limits of position (revolute ones) and force, with the wildcards
-            * and ?.
+        allow_unlimited: names (with * and ?) of joints that may lack limits of position (revolute ones) and force.
 
     Raises:
         InputError: a joint that is not in `allow_unlimited` lacks a limit, a limit of velocity or of a prismatic

@@ -1,8 +1,7 @@
 """Compares two fitted trees: are their joint axes at q = 0 the same, up to what torques cannot determine?
 
 The axes of one arm are moved onto those of the other by a rotation and a shift, with or without a mirror. A point may
-slide along its axis, and the axes of prismatic joints have directions only. Gravity, if there is any, is one more
-direction.
+slide along its axis, axes of prismatic joints have directions only, and gravity, if any, is one more direction.
 """
 
 from collections.abc import Sequence

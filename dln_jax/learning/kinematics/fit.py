@@ -32,8 +32,7 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Needs, require_positive
 
 FINALISTS, NEAR = 3, 2.0
-"""Largest number of local minima that are refined and compared by validation, and the largest ratio of their loss to
-the lowest."""
+"""Largest number of local minima to refine and compare by validation, and largest ratio of their loss to the lowest."""
 ROUNDS = 2
 """Rounds of weighting the joints by their unexplained torques; more rounds change the weights by a few per cent."""
 CHUNK = 4096
@@ -106,8 +105,7 @@ def fit_tree(
         report: called with lines of text about the search.
 
     Raises:
-        InputError: torques that do not vary, a number of joints that differs from the data's, or a setting out of
-            range.
+        InputError: torques that do not vary, a number of joints unlike the data's, or a setting out of range.
     """
     require_positive(ridge=ridge, most_samples=most_samples, samples=settings.samples)
     if needs.degrees_of_freedom != train.degrees_of_freedom:

@@ -57,9 +57,8 @@ def rough_frames(kinematic_prior: Frames, random: np.random.Generator, *, angle:
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:
     """Indices into a flat step [d, 6] of the coordinates that torques may identify; the others are gauges.
 
-    A link's frame may rotate about its own z and slide along it, which leaves four coordinates: two tilts of the axis
-    and two shifts across it. The axis of a prismatic joint, and of a joint on the base, has a direction but no
-    position.
+    A link's frame may rotate about its own z and slide along it, which leaves two tilts of the axis and two shifts
+    across it. The axis of a prismatic joint, and of a joint on the base, has a direction but no position.
     """
     places = []
     for link, (parent, kind) in enumerate(zip(parents, joints, strict=True)):

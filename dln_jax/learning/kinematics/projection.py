@@ -30,8 +30,7 @@ LENGTH = 0.3
 LARGEST_STEP = 0.6
 """Largest step of a coordinate, in rad, and in units of `LENGTH` for positions: longer steps are scaled down."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e3
-"""Initial, smallest and largest damping, relative to the mean of the normal matrix' diagonal; a descent ends at the
-largest."""
+"""Initial, smallest and largest damping, relative to the mean diagonal of JᵀJ; a descent ends at the largest."""
 FEWER, MORE = 0.2, 5.0
 """Factors on the damping after a step that lowers the loss, and after one that does not."""
 CHUNK = 10

@@ -48,8 +48,7 @@ class Stated(NamedTuple):
     """Facts about measurements that the user states in addition to their file."""
 
     needs: Needs | None = None
-    """`Needs` of the plant. Default: those in the file, else bodies whose forces balance, else revolute joints with a
-    potential and friction."""
+    """`Needs` of the plant (default: the file's, else balanced bodies, else revolute joints, potential, friction)."""
     test: str | None = None
     """Labels of the test trajectories, separated by commas, or an npz file with test trajectories."""
     noise: tuple[float, ...] | None = None

@@ -1,8 +1,7 @@
 """The pixel pendulum: data, models, training, errors and images, as a kind of the pipeline.
 
 Models: black-box-hnn (an energy in the latent plane) and phase-network (a network for the rates there), with the same
-autoencoder, loss and budget. The data are those of seed 0; a seed determines the parameters and the order of the
-samples.
+autoencoder, loss and budget. The data are those of seed 0; a seed sets parameters and the order of samples.
 """
 
 from collections.abc import Callable, Iterator
