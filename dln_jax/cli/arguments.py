@@ -116,10 +116,7 @@ def parse(
     """Parses a command line; `--help` prints the help and exits.
 
     Args:
-        arguments: dataclass of the command.
         prog: the command as the user typed it.
-        description: text above the options.
-        line: words after the command.
         common: dataclass of options that every command has.
 
     Raises:
@@ -218,9 +215,7 @@ def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive
 
     Args:
         option: name, such as --noise.
-        text: text as typed.
         counts: allowed counts of numbers (default: any).
-        positive: whether all numbers must be positive.
 
     Raises:
         InputError: wrong count, text that is not a number, or a number out of range.

@@ -34,8 +34,6 @@ def run(
     """Parses the command line and runs `main`; errors and exit statuses as for `as_one_line`.
 
     Args:
-        main: body of the command.
-        arguments: dataclass of its arguments.
         prog: the command as the user typed it.
         line: words after the command (default: those of this process).
         from_shell: whether the process runs only this command; compiled programs are then kept.

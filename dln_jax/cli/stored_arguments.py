@@ -66,7 +66,6 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
     A file or folder may have moved, if its content is the same.
 
     Args:
-        typed: arguments on the command line.
         arguments: dataclass of the command, whose choices in the run decide which options exist.
 
     Raises:

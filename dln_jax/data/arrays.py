@@ -47,9 +47,7 @@ def load_file(
     """Reads the arrays with these keys, if present, and passes them to `from_arrays`, which checks them.
 
     Args:
-        path: path of an npz file.
         from_arrays: converts arrays by key into the result.
-        keys: keys to read.
         readers: readers of other formats, by the ending of the name such as ".csv"; that of folders is `FOLDER`.
 
     Raises:

@@ -57,7 +57,6 @@ def read(path: Path, *, topics: Sequence[str] = (), choose: Choose = tuple) -> t
     Args:
         path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
         topics: topics to read; if quantities repeat, the first topic counts. Default: the only topic of joint states.
-        choose: selects joints.
 
     Raises:
         InputError: rosbags is missing, the file is no bag, a topic is absent or ambiguous, messages are malformed, or

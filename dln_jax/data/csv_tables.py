@@ -72,7 +72,6 @@ def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[
     """Reads a CSV file: the arrays by schema key, in SI units, and the titles of ignored columns.
 
     Args:
-        path: path of the file.
         units: units of titles without one: "si", or "degrees" for angles in degrees and all else in SI.
 
     Raises:

@@ -88,7 +88,6 @@ def write_robot(
     place for them: a comment states them.
 
     Args:
-        path: path of the new file.
         original: URDF or MJCF file from which the tree's structure was read; it stays unchanged.
         tree: tree with the joints of that file, by name.
         damping: viscous friction of each joint (or motor) [d], N m s or N s/m; by default unchanged.

@@ -46,7 +46,6 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
     URDF inertias are read as stated, even if they are not physically consistent.
 
     Args:
-        path: path of the file.
         lock: joints to lock, such as those of a gripper: names (locked at zero), or positions by name, rad or m.
             "*finger*" matches all names that contain finger. Bodies behind a locked joint become fixed.
 

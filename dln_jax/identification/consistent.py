@@ -103,7 +103,6 @@ def fit_consistent(
             that explains a hundredth of the torque. A body with ten zeros is absent and stays zero.
         regularisation: cost of a unit of divergence, dimensionless (in squares of the noise); positive, since data
             never determine all parameters.
-        iterations: upper limit of Newton iterations.
 
     Raises:
         InputError: `regularisation` is not positive, or a body has no mass.

@@ -86,7 +86,6 @@ def identify(
         rank_tolerance: as for `fit_weighted`.
         consistent: also fit physically consistent parameters.
         regularisation: as for `fit_consistent`.
-        seed: seed of the random states.
 
     Raises:
         InputError: the data lack torques or have another number of joints, the model is not linear, or a bad setting.

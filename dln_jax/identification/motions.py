@@ -174,7 +174,6 @@ def fit_motions(
 
     Args:
         model: a model that is linear in its parameters, such as `models.make_rigid_tree`.
-        columns: columns of the parameters.
         prior: values that undetermined directions keep.
         start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
         windows: from `cut_motions`.
@@ -182,8 +181,6 @@ def fit_motions(
         noise_q: standard deviation of q, forces that were not recorded included, rad or m (default: the root mean
             square distance of the motions simulated with the initial parameters).
         torques: triangular factor of the torques' equations in units of noise.
-        share: weight of the torques.
-        delay: whether to fit a delay of the torques.
         regularisation: as for `fit_consistent`.
         reweightings: number of times that windows are weighted by their distance and the fit is repeated.
 

@@ -70,7 +70,6 @@ def fit_weighted(
     """Fits the parameters by weighted least squares.
 
     Args:
-        data: equations of the data.
         known: prior values.
         noise: standard deviation of each joint's torque, N m or N; estimated by default, starting from equal noise.
         correlation: correlation time of each joint's residuals in samples; the covariance counts that many as one.

@@ -36,11 +36,9 @@ def problem(
 
     Args:
         model: built from any energies, or from accelerations, with float64 parameters.
-        parameters: initial parameters.
         data: training samples; if there are more than `most_samples`, a random subset is drawn.
         validation: samples that select the parameters.
         gauge: fixes the scale of the energies; needed only for motions without torques.
-        most_samples: largest number of samples to fit.
         seed: seed of the draw and of the order of the samples.
 
     Raises:

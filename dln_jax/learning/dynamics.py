@@ -54,7 +54,6 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
     """Builds the problem of fitting a model to an objective, in the precision of the model.
 
     Args:
-        model: model of `dln_jax.models`.
         sets: samples for training, for selecting the parameters, and for monitoring.
         objective: residual to minimise, from `learning.objectives`.
         seeds: seeds of the initial parameters and of the order of the samples. Several seeds train in one program, and

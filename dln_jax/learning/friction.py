@@ -76,7 +76,6 @@ def fit_friction(
     All samples are held in memory, N d (11 d + coefficients) numbers: decimate long logs.
 
     Args:
-        tree: tree with known frames.
         data: samples to fit; hold out the trajectories that will judge the result.
         laws: friction laws, as in `mechanics.friction.laws`.
         shape: initial shapes; the defaults of `FrictionShape` if omitted.

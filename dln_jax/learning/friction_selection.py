@@ -42,9 +42,6 @@ def choose_terms(
     """Tries candidates one after another and keeps those that lower the cross-validation error significantly.
 
     Args:
-        tree: tree with known frames.
-        data: training data.
-        terms: terms that are always there.
         candidates: name of each candidate, and the terms that it adds.
 
     Raises:

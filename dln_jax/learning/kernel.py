@@ -68,7 +68,6 @@ def fit_kernel(
         samples: largest number of samples, evenly spaced; memory is 16 samples² d² bytes, time grows as the cube.
         serial: as for `make_trigonometric_kernel`.
         likelihood_samples: number of these samples used to fit the scales and the noise.
-        iterations: largest number of L-BFGS iterations.
         least_noise: lower bound on a joint's noise, relative to its torque's deviation, for data without noise. If it
             is too low for the rounding of the equations, it is multiplied by `NOISIER` until it suffices; the result's
             noise holds the final value.

@@ -123,14 +123,12 @@ def problem(
     Args:
         model: built from any energies, or from accelerations, with float64 parameters.
         parameters: initial parameters, for example from `learning.accelerations`.
-        windows: windows to fit.
         validation: windows that select the parameters.
         noise: standard deviations of the measurements; noise alone then gives a loss of d (2 d if velocities were
             measured), less what the starts absorb.
         gauge: fixes the scale of the energies; needed only for motions without torques.
         torque: torque between samples.
         substeps: RK4 steps between two samples.
-        seed: seed of the order of the windows.
 
     Raises:
         InputError: no windows, noise that is not positive, neither torques nor a gauge, or a gauge of the wrong size.

@@ -82,11 +82,8 @@ def momentum_problem(
 
     Args:
         model: model of energies in coordinates and velocities.
-        parameters: initial parameters.
-        windows: windows to fit.
         validation: windows that select the parameters.
         unit: scale of the joints' residuals [d], N m or N, for example the residuals of another model (`deviations`).
-        seed: seed of the order of the windows.
 
     Raises:
         InputError: a unit that is not positive, or validation windows of another length.
@@ -114,7 +111,6 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     after it. The first torques of a trajectory, before the first command, are zero.
 
     Args:
-        data: recording with commanded torques.
         delay: delay of the commands in samples.
 
     Raises:

@@ -127,11 +127,9 @@ def problem(
     Args:
         model: a phase model with float64 parameters.
         parameters: initial parameters, for example from a fit of rates.
-        windows: windows to fit.
         validation: windows that select the parameters.
         weights: standard deviations that divide the residuals.
         substeps: RK4 steps between two samples.
-        seed: seed of the order of the windows.
 
     Raises:
         InputError: no windows, weights that are not positive, or rates that the windows lack.

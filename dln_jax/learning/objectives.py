@@ -126,8 +126,6 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Ob
     """Returns the objective of a model of the catalogue; a Hamiltonian needs momenta, and otherwise fits torques.
 
     Args:
-        name: name of the model in the catalogue.
-        data: training data.
         stated: name from `STATED` that overrides the model's own objective.
 
     Raises:

@@ -60,7 +60,6 @@ def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int
     """Returns the replay with a further recording in its next empty places.
 
     Args:
-        replay: earlier recordings.
         q, qd, qdd, tau: the recording [n, d], in order of time.
         blocks: number of equal parts of the recording; the middle one is held out, unless there are fewer samples.
 
@@ -98,7 +97,6 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
 
     Args:
         model: model with parameters and energies in float64.
-        rounds: number of rounds.
         iterations: Levenberg-Marquardt iterations per round.
 
     Raises:
@@ -186,7 +184,6 @@ def learn_online(
         drive: (parameters, reference) -> outcome, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
         refit: result of `make_refit` or `make_linear_refit`.
         parameters: parameters that drive the first reference.
-        replay: replay with places for all recordings.
 
     Raises:
         InputError: a recording that `appended` refuses.

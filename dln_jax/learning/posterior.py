@@ -89,7 +89,6 @@ def left_out(
     ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
 
     Args:
-        spectrum: spectrum of all training data.
         noise: standard deviations from `posterior`.
         columns: Phi D⁻¹ V of the samples.
         residual: tau_hat - tau of the samples.

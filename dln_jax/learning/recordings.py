@@ -122,7 +122,6 @@ def identified(data: Trajectories, needs: Needs, *, chain: bool = False) -> Fitt
 
     Args:
         data: recording with rates and acting torques.
-        needs: needs of the plant.
         chain: whether the plant is a chain of rigid bodies on a fixed base, in relative coordinates: its mass matrix
             does not depend on the first coordinate, its potential has degree 1 in every angle; fewer motions suffice.
 
@@ -150,10 +149,6 @@ def learned(
     """Trains a structured DeLaN with viscous and dry friction and keeps the parameters that are best in validation.
 
     Args:
-        prepared: the recording.
-        needs: needs of the plant.
-        steps: Gauss-Newton iterations.
-        seed: seed of the initial parameters.
         report: as for `learning.engine.fit`.
         keywords: width, depth and activation, as for `models.make_delan`.
 

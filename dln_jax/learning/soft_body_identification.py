@@ -67,7 +67,6 @@ def identify(
         stepper: result of `make_step`.
         params_of: theta -> the scene's parameters.
         guess: initial theta, float64 arrays.
-        motions: observed motions.
         noise: standard deviation of the positions, in m, which divides the residuals.
         iterations: largest number of Levenberg-Marquardt iterations.
         mesh: devices that share the motions; every device simulates its own.

@@ -89,7 +89,6 @@ def estimate(
 
     Args:
         model: fitted to torques.
-        parameters: fitted parameters.
         train: data of the fit.
         validation: other trajectories, used for model selection at most.
         ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.

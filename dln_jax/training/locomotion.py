@@ -105,12 +105,8 @@ def write_run(
     """Writes model, metrics, figure and GIF (of the first steps) of the best seed; returns the metrics.
 
     Args:
-        folder: where files are written.
-        task: task of the policies.
         policies: trained policies, of which at least one has a finite distance.
         settings: settings of the training, stored with the model.
-        method: name of the training method.
-        figures: whether to draw.
 
     Raises:
         InputError: no evaluation converged.

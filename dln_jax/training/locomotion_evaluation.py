@@ -51,7 +51,6 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
     """Loads the policy of a run of `train_locomotion`.
 
     Args:
-        folder: run folder.
         variation: fields of `Variation` for the task, instead of those of the training; `None` for the training's.
 
     Raises:

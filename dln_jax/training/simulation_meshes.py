@@ -24,7 +24,6 @@ def own_mesh(options: Any, youngs_modulus: float) -> tuple[dict[str, Any], tuple
     """Returns the arguments of a scene that --mesh and its options set, and statements about the file.
 
     Args:
-        options: options of the command line.
         youngs_modulus: modulus of the elements that --youngs-modulus-of does not name, Pa.
 
     Raises:

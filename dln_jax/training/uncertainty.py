@@ -36,9 +36,7 @@ def store_uncertainty(
     """Estimates the uncertainty of a model fitted to torques, and stores it in the run's folder.
 
     Args:
-        folder: folder of the run, with its model.
         model: the model in float64.
-        parameters: fitted parameters.
         train: data that the parameters were fitted to.
         validation: data that calibrate the bands.
         torque: description of the torques that the bands refer to.
@@ -63,11 +61,7 @@ def uncertainty_metrics(
     Empty for a run without uncertainty.
 
     Args:
-        folder: folder of the run.
-        model: its model in float64.
-        test: test data.
-        predicted: the model's torques on them [N, d].
-        name: name of the model in the figure.
+        predicted: the model's torques on the test data [N, d].
     """
     run = load(folder)
     if run.uncertainty is None:

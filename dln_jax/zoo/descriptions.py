@@ -70,8 +70,6 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
     """Typical sizes by which a model divides, to three digits: standard deviations of the data.
 
     Args:
-        name: name in the catalogue.
-        data: training data.
         pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have all
             the arrays; otherwise missing arrays leave the factory's default.
 

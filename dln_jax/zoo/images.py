@@ -52,8 +52,6 @@ def make_image_model(
 
     Args:
         field: kind of dynamics in the latent plane.
-        pixels: pixels n per image.
-        components: principal components per image.
         field_width: hidden units per layer of the latent dynamics.
         field_depth: hidden layers of the latent dynamics.
         width: hidden units per layer of encoder and decoder.

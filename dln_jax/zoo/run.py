@@ -137,9 +137,7 @@ def save_model(
     """Writes `model.safetensors` and `model.json` into an existing folder, for `load`; public as `dln_jax.save`.
 
     Args:
-        directory: folder of the run.
         description: from `describe`.
-        parameters: parameters of the described model.
         overwrite: replace the model in the folder and discard the uncertainty of its parameters.
 
     Raises:

@@ -90,11 +90,7 @@ def jobs_of(
     """The jobs of a grid, in folders jobs/0000, jobs/0001, ... of `folder`; the last option changes fastest.
 
     Args:
-        command: name of the command.
-        arguments: its dataclass of arguments.
-        grid: values by option.
         fixed: values of the options common to all jobs.
-        folder: folder of the sweep.
 
     Raises:
         InputError: an option that the command lacks or the sweep sets itself, a wrong value, or a missing file.

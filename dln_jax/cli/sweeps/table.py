@@ -88,11 +88,9 @@ def compared(
     """Compares all jobs.
 
     Args:
-        jobs: the jobs, done or not.
         over: options that medians are taken over.
         metric: metric that chooses the best job; default: the first of `VALIDATION` that jobs have.
         error: metric that is shown beside it; default: the first of `ERRORS`.
-        largest: whether the largest metric is the best.
 
     Raises:
         InputError: jobs have metrics, but none has the requested one.

@@ -80,7 +80,6 @@ def covariances(
 
     Args:
         states, others: q, qd and qdd [n, d].
-        joints: kinds of the joints.
         sizes: magnitudes of inertias [d]: W = diag(sizes) for an arbitrary energy, their mean for joints of a body.
     """
     relative = np.sqrt(sizes / sizes.max())

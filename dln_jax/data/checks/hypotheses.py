@@ -133,7 +133,6 @@ def examine_torques(
         equations: number n d of equations used.
         ambiguous: whether the prior fits any robot. It then allows negative inertias, so the common sign of all torques
             is tested too, and couples joints so weakly that a fault is judged by the joints it concerns.
-        faults: whether to search for faults at all.
         others: proposes further faults, as logs in which they are repaired.
     """
     d = data.degrees_of_freedom

@@ -70,7 +70,6 @@ def against_tree(
 
     Args:
         data: samples in the robot's joint order.
-        robot: the robot's description.
         names: joint names of the data, if stated.
         driven: whether there are torques.
         farthest: largest delay tried, in samples.

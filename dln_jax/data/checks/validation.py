@@ -118,7 +118,6 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
     """Runs all checks.
 
     Args:
-        recording: the log.
         robot: description of the robot, with the joints of the data.
         equations: number of torques, over all joints, used to search for faults of sign, order and delay.
 

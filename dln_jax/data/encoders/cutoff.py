@@ -74,7 +74,6 @@ def choose_cutoff(
 
     Args:
         q: coordinates at equal steps.
-        trajectory: trajectory of every sample.
         rate: Hz.
         noise: standard deviation of the noise of every coordinate.
 

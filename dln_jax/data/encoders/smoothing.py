@@ -76,7 +76,6 @@ def smooth(
     """Estimates derivatives and smooths a log's q, t and tau for learning; existing rates are not used.
 
     Args:
-        data: the log.
         cutoff: Hz, infinite for none (default: chosen from the data, see `cutoff`).
         rate: rate of the equal steps, Hz (default: the median of the data).
         filter_torque: whether to filter tau as well (default: only if samples are dropped).

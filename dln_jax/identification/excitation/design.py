@@ -73,7 +73,6 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
     """Makes an optimiser that is compiled once for all starts.
 
     Args:
-        task: limits, model and series.
         criterion: function of the information, such as one of `CRITERIA`.
         rounds: upper limit of rounds of the augmented Lagrangian.
         iterations: L-BFGS iterations per round.
@@ -119,9 +118,7 @@ def best_design(
     """The best design among the optimised starts and the starts themselves.
 
     Args:
-        task: task of the starts.
         optimise: from `make_optimiser`, for the same task and criterion.
-        criterion: criterion of the selection.
         starts: such as `random_designs`.
         known: information already available from other motions [B, B].
 
@@ -151,9 +148,7 @@ def design_set(
     """Designs motions for identification, each complementing those before it, and a separate one for validation.
 
     Args:
-        task: limits, model and series.
         drawn: starts such as `random_designs`, divided equally among the motions.
-        trajectories: number of motions for identification.
         criterion: a name in `CRITERIA`.
         say: called with the number of finished motions and the last result as text.
 
@@ -198,10 +193,6 @@ def as_trajectories(
     """Samples motions from rest to rest at equal steps, with the torques of the nominal model.
 
     Args:
-        designs: designs of one period.
-        labels: a name for each design.
-        model: model of the parameters.
-        parameters: nominal parameters.
         rate: samples per second.
         needs: `Needs` of the dataset; its torques include friction if the model does.
 

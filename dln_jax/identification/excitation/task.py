@@ -67,9 +67,7 @@ def make_task(
     Smooth any friction that has a step at rest, on a scale of velocities that motions pass slowly.
 
     Args:
-        model: model to identify.
         parameters: nominal parameters, which give the forces to compare with their limits.
-        limits: limits of the joints.
         period: period of the motions, s.
         harmonics: harmonics of the series, at least 2.
         clearance: q -> [K], m, that must stay positive.

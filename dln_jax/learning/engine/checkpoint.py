@@ -83,9 +83,6 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
     """Returns the rows under a key of a manifest.
 
     Args:
-        path: path of the manifest, for messages.
-        manifest: JSON values.
-        key: key of the rows.
         row: type of a row, such as `tuple[int, float | None]`.
 
     Raises:

@@ -92,7 +92,6 @@ def fit_tree(
     arbitrary. The search goes on until another descent to the same loss has found the same arm (`agreement`).
 
     Args:
-        needs: kinds of joints, gravity, friction.
         train: samples to fit, with accelerations.
         validation: samples that choose the local minimum; the training error chooses without them.
         parents: parent link of every link; a serial chain by default.

@@ -118,9 +118,6 @@ def project(
     """Eliminates the linear parameters and returns the normal equations of a step of the frames.
 
     Args:
-        structure: known properties of the tree.
-        frames: current frames.
-        samples: states and measured torques.
         unit: scale of the joints' torques, N m or N.
         ridge: added to the diagonal of the Gram matrix of the columns, scaled to length one.
     """

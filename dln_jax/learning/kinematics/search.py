@@ -72,11 +72,7 @@ def search(
     """Descends from random starts, and from moves of the best, until enough descents agree on the lowest loss.
 
     Args:
-        structure: known properties of the tree.
         program: descent of the structure, from `compiled`.
-        samples: samples of the data for the search.
-        unit: scale of the joints' torques.
-        settings: limits of the search.
         until: reading of `time.perf_counter` at which the search ends.
         before: an earlier search, which another wave of starts continues.
 

@@ -88,7 +88,6 @@ def problem_of(
         name: from `TASKS`.
         trajectories: number of generated trajectories, in place of the task's own.
         data: npz or CSV file; required for measurements, refused otherwise.
-        stated: further facts about measured motions.
 
     Raises:
         InputError: an unknown name, too few trajectories, or a file that is missing or unsuitable.

@@ -83,10 +83,8 @@ def fit_by(
 
     Args:
         by: "motions" or "both".
-        model: the rigid tree.
-        known: its parameters in the robot's file.
+        known: parameters of the rigid tree in the robot's file.
         solution: consistent fit of the torques.
-        train: its training data.
         sets: motions; those of `sets.train` have the trajectories of `train`.
         window: length of the windows, s (default: chosen from `WINDOWS` by inner splits).
         options: of `identify`, for the fits of torques in inner splits.

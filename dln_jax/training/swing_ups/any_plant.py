@@ -50,7 +50,6 @@ def learn_to_swing_up(
 
     Args:
         plant: plant to swing up; exploration guards it.
-        exploration: settings of the exploration.
         estimator: one of `plants.ESTIMATORS`, from which the law gets its states.
         seed: seed of the noise and of the trials.
         say: called with a line of text after every step.
@@ -100,8 +99,6 @@ def try_plant(
 
     Args:
         make: seed -> a simulated plant with its own start and noise.
-        tuned: the controller.
-        starts: number of plants.
         seed: seed of the first plant; the others follow.
         seconds: duration of a trial, s.
 
