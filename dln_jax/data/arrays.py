@@ -153,8 +153,7 @@ def numeric(
 
 
 def on_device(name: str, array: np.ndarray, dtype: Any) -> Array:
-    """Converts an array of samples to a dtype on the device.
-    Raises `InputError` if the sum of its squares overflows in that dtype."""
+    """Converts an array of samples to a dtype on the device; `InputError` if the sum of its squares overflows."""
     _require_squares(name, array, dtype)
     return jnp.asarray(array, dtype)
 

@@ -142,8 +142,7 @@ def column(data: Trajectories, key: str) -> np.ndarray:
 
 
 def from_arrays(arrays: dict[str, Any]) -> Trajectories:
-    """Checks arrays against the schema and completes them.
-    An `InputError` names the key, what it holds, what was expected and what to do."""
+    """Checks arrays against the schema and completes them; an `InputError` names the key, its content and a remedy."""
     q = numeric(arrays, "q")
     if q.ndim != 2 or q.shape[1] == 0:
         raise InputError(f"q has shape {q.shape}; expected [N, d] with d >= 1: one column per coordinate")

@@ -113,8 +113,7 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
 
 
 def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
-    """At most `most` samples, drawn by the seed and kept in their order.
-    Raises `InputError` if `most` is not positive, or the seed is out of range."""
+    """At most `most` samples, drawn by the seed and kept in their order; `InputError` if either is out of range."""
     require_positive(samples=most)
     require_seed(seed)
     count = len(data.t)

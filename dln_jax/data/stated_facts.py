@@ -31,8 +31,7 @@ def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]
 
 
 def scaled(arrays: dict[str, Any], torque_factor: Any) -> dict[str, Any]:
-    """Multiplies tau by the stated factors (see `data.joint_names.factors`).
-    Raises `InputError` if there is no tau, or `factors` refuses the factors."""
+    """Multiplies tau by the stated factors (see `data.joint_names.factors`); `InputError` if there is no tau."""
     if torque_factor is None:
         return arrays
     if np.ndim(arrays.get("tau")) != 2:

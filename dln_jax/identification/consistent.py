@@ -76,8 +76,7 @@ def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[boo
 
 
 def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
-    """Raises the eigenvalues of a body's pseudo-inertia to at least `SMALLEST` times the largest.
-    Raises `InputError` if no eigenvalue is positive."""
+    """Raises the eigenvalues of a pseudo-inertia to `SMALLEST` times the largest; `InputError` if none is positive."""
     values, vectors = np.linalg.eigh(pseudo_inertia(np.asarray(theta, float)))
     if not values[-1] > 0:
         raise InputError("a link that is to be identified has no mass; expected a rough value for it")

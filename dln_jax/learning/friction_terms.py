@@ -98,8 +98,7 @@ class Log(NamedTuple):
 
 
 def reference_temperature(data: Trajectories) -> float:
-    """Mean temperature of a log to 0.1 °C.
-    Raises `InputError` if the log has no temperature, or that of a joint hardly varies."""
+    """Mean temperature of a log to 0.1 °C; `InputError` if there is none, or that of a joint hardly varies."""
     if data.temperature is None:
         raise InputError("the data have no temperature, on which friction is to depend; add it (°C), or leave that out")
     deviations = data.temperature.std(axis=0)

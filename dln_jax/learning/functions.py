@@ -155,8 +155,7 @@ def train(
 
 
 def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
-    """Builds the problem of an ensemble: the sum of its members' losses, or (for Gauss-Newton) members as seeds.
-    Errors as for `targets`."""
+    """Builds an ensemble's problem: the sum of its members' losses, or for Gauss-Newton members as seeds."""
     ours, theirs = (targets(data, network) for data in sets)
     sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
     layers = ensembles.init(

@@ -142,8 +142,7 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Ob
 
 
 def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:
-    """Returns the arrays that an objective reads, on the device.
-    Raises `InputError` if an array is missing, or its squares overflow in that precision."""
+    """Returns the arrays that an objective reads, on the device; `InputError` if one is missing or squares overflow."""
     missing = [key for key in objective.keys if getattr(data, key) is None]
     if missing:
         raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")

@@ -49,8 +49,7 @@ class Replay(NamedTuple):
 
 
 def empty_replay(capacity: int, d: int) -> Replay:
-    """Returns a replay with `capacity` empty places for samples of d joints.
-    Raises `InputError` for a size that is not positive."""
+    """Returns a replay with `capacity` empty places for samples of d joints; `InputError` unless both are positive."""
     require_positive(capacity=capacity, d=d)
     motion, weight = np.zeros((capacity, d)), np.zeros(capacity)
     return Replay(motion, motion, motion, motion, weight, weight)

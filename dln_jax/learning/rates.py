@@ -88,8 +88,7 @@ def match_linear(
 
 
 def samples(data: Trajectories, dtype: Any = jnp.float64, chosen: Any = slice(None)) -> tuple[Array, ...]:
-    """q, p, qd, pd of all samples, or of those chosen, on the device.
-    Raises `InputError` if the data have no p or pd, or squares overflow."""
+    """q, p, qd, pd of all samples, or of those chosen, on the device; `InputError` without p or pd, or on overflow."""
     p, pd = momenta(data)
     named = {"q": data.q, "p": p, "qd": data.qd, "pd": pd}
     return tuple(on_device(name, array[chosen], dtype) for name, array in named.items())

@@ -50,8 +50,7 @@ FOLDS = 10
 MOST_SAMPLES = 2_000
 """Largest number of validation samples, evenly spaced."""
 HARMLESS = 0.01
-"""No state of a linear model is out of distribution if its uncertainty due to parameters is below this share of the
-torque's standard deviation."""
+"""States of linear models whose deviation due to parameters is below this share of the torque's are never flagged."""
 STILL = 1e-3
 """Lower bound on the range of a coordinate, in rad, m, 1/s or 1/s², for coordinates that rest in all data."""
 CHUNK = 256

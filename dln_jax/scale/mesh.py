@@ -47,8 +47,7 @@ def batch_mesh(devices: int | None = None) -> Mesh | None:
 
 
 def shares(mesh: Mesh | None, count: int, what: str) -> int:
-    """Returns the number of items per device.
-    Raises `InputError` if the number of devices does not divide `count`; `what` names the items, in the plural."""
+    """Returns the number of items (`what`, plural) per device; `InputError` if the devices do not divide `count`."""
     devices = 1 if mesh is None else mesh.size
     if count % devices:
         remedy = f"give a multiple of {devices}, or fewer devices"

@@ -60,8 +60,7 @@ def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any
 def describe_for(
     name: str, data: Trajectories, needs: Needs, *, precision: str, pooled: bool = False, **keywords: Any
 ) -> Description:
-    """Describes a model of the catalogue for training data, with the typical sizes of these data.
-    Errors as for `describe` and `typical_sizes`."""
+    """Describes a model with the typical sizes of training data; errors as for `describe` and `typical_sizes`."""
     sizes = typical_sizes(name, data, pooled=pooled)
     return describe(name, precision=precision, **{"needs": needs, **keywords, **sizes})
 

@@ -152,8 +152,7 @@ def save_model(
 
 
 def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
-    """Like `save_model`, but replaces the model in the folder of a run that is being trained.
-    Raises `InputError` for parameters of another model."""
+    """Like `save_model`, but replaces the model of a run in training; `InputError` for parameters of another model."""
     name = description.get("name")
     if name == OWN or ":" in str(name):
         like = jax.tree.map(np.asarray, parameters)  # the factory is the user's, so only the structure is known

@@ -67,8 +67,7 @@ class Arguments(Folder, Drawn):
     """--mesh: total force in N on named sets, as tip=0,-5 or tip=0,-5;side=2,0: two components in the plane, three in
     space, spread over the area of the set, or over its vertices if it covers no part of the surface."""
     contact: bool = False
-    """beam, twist, drop: keep the bodies of the mesh apart, and each from itself, with friction 0.3; backward-euler or
-    bdf2."""
+    """beam, twist, drop: keep bodies apart, and each from itself, with friction 0.3; backward-euler or bdf2."""
     vtu: bool = False
     """Also write motion.pvd and its .vtu files, for ParaView (extra [mesh])."""
     precision: Literal["f32", "f64"] = "f64"

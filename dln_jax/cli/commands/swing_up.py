@@ -31,8 +31,7 @@ class Arguments(Folder, Drawn):
     plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta", "FILE"))] = "rotary-pendulum"
     """The plant; furuta is another name of the rotary pendulum. FILE is the path of an MJCF or URDF file."""
     actuated: Unstated[str] = None
-    """Joints of the file with a motor, by name or number from 0, comma separated (default: those on which an actuator
-    acts)."""
+    """Joints of the file with a motor, comma-separated names or numbers from 0 (default: those with an actuator)."""
     control: Unstated[float] = None
     """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
     model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None

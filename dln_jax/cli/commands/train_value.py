@@ -28,8 +28,7 @@ class TrainingOptions:
     run: Unstated[Path] = None
     """Folder of a learned or identified model that is the plant (default: --plant)."""
     actuated: Unstated[str] = None
-    """Own plant: joints with a motor, by name or number from 0, comma separated (default: those of the file's
-    actuators, or of the model)."""
+    """Own plant: joints with a motor, comma-separated names or numbers from 0 (default: the file's or the model's)."""
     control: Unstated[str] = None
     """Own plant: largest force of the motors, N m or N, one for all or one each (default: as stated in the file)."""
     positions: Unstated[str] = None

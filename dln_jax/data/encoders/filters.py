@@ -26,8 +26,7 @@ ORDER = 4
 PERIODS = 3
 """Length of the reflected extension at both ends of a segment, in periods of the cut-off."""
 END_PERIODS, END_DEGREE = 1.0, 5
-"""Length of the end fit in periods of the cut-off, and degree of its polynomial, from which value, slope and curvature
-at an end are estimated."""
+"""Length in periods of the cut-off, and degree, of the polynomial from which values at an end are estimated."""
 
 
 def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
@@ -94,8 +93,7 @@ def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"
 def derivatives(
     q: Float[np.ndarray, "n k"], *, rate: float
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-    """qd and qdd of one segment at equal steps, from the quintic spline through its samples.
-    Raises `InputError` for fewer than six samples."""
+    """qd and qdd of one segment at equal steps, from its quintic spline; `InputError` for fewer than six samples."""
     require_positive(rate=rate)
     if len(q) < 6:
         raise InputError(f"a segment has {len(q)} samples; its rates take at least 6: record longer motions")

@@ -144,8 +144,7 @@ def heights_above(tree: Tree, height: float) -> Clearance | None:
 
 
 def used(limits: MotionLimits, share: float) -> MotionLimits:
-    """Limits reduced to a share in (0, 1]; ranges shrink towards their middles.
-    Raises `InputError` if the share is outside (0, 1]."""
+    """Limits reduced to a share in (0, 1], else `InputError`; ranges shrink towards their middles."""
     if not 0 < share <= 1:
         raise InputError(f"share is {share}; expected a number in (0, 1], of the limits that may be used")
     middle = limits.position.mean(axis=1, keepdims=True)

@@ -85,8 +85,7 @@ def selected_by(
 
 
 def arrays_of(record: Any, keys: Iterable[str] | None = None, dtype: Any = jnp.float64) -> tuple[Array, ...]:
-    """Returns fields of a record of NumPy arrays on the device, all of them by default.
-    Raises `InputError` if squares of numbers overflow in that dtype."""
+    """Returns fields of a record of NumPy arrays on the device (default: all); `InputError` if squares overflow."""
     return tuple(on_device(key, getattr(record, key), dtype) for key in keys or record._fields)
 
 

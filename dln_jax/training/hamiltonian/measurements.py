@@ -36,8 +36,7 @@ FREE_OF_NOISE = 1e-3
 LEAST_RATE_NOISE = 0.01
 """Lower limit of the noise of measured rates, relative to their spread, since no model has them exactly."""
 ANCHOR = 30.0
-"""Noise assigned to estimated momenta, in units of their spread. They are noisy, but without any weight a model is free
-to choose its own momentum."""
+"""Noise of estimated momenta, in units of their spread: without any weight, a model could choose its own momentum."""
 SURVEYED = 1_500
 """Approximate number of samples used to estimate noise; this gives its standard deviation to 2 %."""
 WINDOW = {REAL: 30, MEASURED: 30}

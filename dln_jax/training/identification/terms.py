@@ -31,8 +31,7 @@ class Wanted(NamedTuple):
 
 
 def wanted(options: Any, laws: tuple[FrictionLaw, ...], data: Trajectories) -> Wanted:
-    """Parses and checks the options.
-    Raises `InputError` for invalid motors or pairs, or a temperature that the data lack."""
+    """Parses and checks the options; `InputError` for invalid motors or pairs, or a temperature that the data lack."""
     rows, pairs, d = None, [], data.degrees_of_freedom
     if options.motors is not None:
         rows = tuple(numbers_of("--motors", row, [d]) for row in options.motors.split(";"))
