@@ -137,10 +137,7 @@ def _say(last: str) -> None:
 
 
 def interrupted(command: str, options: Any, folder: Path | None = None) -> str:
-    """Message after an interrupt: how to resume the run, or that its folder is incomplete.
-
-    A command can resume if its arguments have `resume`.
-    """
+    """Message after an interrupt: how to resume (if the arguments have `resume`), or that the folder is incomplete."""
     if folder is None:
         return "interrupted"
     if hasattr(options, "resume") and (folder / "config.json").is_file():

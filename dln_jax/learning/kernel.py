@@ -118,9 +118,7 @@ def choose_kernel(
     """Fits a serial chain and a model without that assumption; returns the better in validation, and both trials.
 
     The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.
-
-    Raises:
-        InputError: as for `fit_kernel`.
+    Raises as `fit_kernel`.
     """
     trials = []
     for serial in (True, False):

@@ -99,10 +99,7 @@ def design(
     """Finds theta (a rest shape, say) whose equilibrium is closest to the wanted positions.
 
     Held vertices stay where the scene's own rest shape has them; coordinates of `wanted` that are not finite do not
-    count. The other arguments are those of `identify`.
-
-    Raises:
-        InputError: as for `identify`.
+    count. The other arguments, and the errors, are those of `identify`.
     """
     require_positive(noise=noise, iterations=iterations)
 

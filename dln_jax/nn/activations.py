@@ -134,10 +134,7 @@ ALL: dict[str, Activation] = {g.name: g for g in (relu, softplus, tanh, cos, sin
 
 
 def activation(name: str | Activation) -> Activation:
-    """Returns the activation of that name, for example from a command line or a file; or the activation itself.
-
-    Raises InputError for an unknown name.
-    """
+    """Returns the activation of that name, or the activation itself; `InputError` for an unknown name."""
     if isinstance(name, Activation):
         return name
     if not isinstance(name, str) or name not in ALL:

@@ -77,10 +77,7 @@ def uncertainty_metrics(
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations of the torques [N, d], and whether the samples are out of distribution [N].
-
-    Reuses the program that the estimate compiled to linearise the torques; `Run.torque_std` would compile it again.
-    """
+    """Deviations of the torques [N, d] and out-of-distribution flags [N], by the program that the estimate compiled."""
     parts, first = [], 0
     with jax.enable_x64(True):
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)

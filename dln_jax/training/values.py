@@ -171,10 +171,7 @@ def by_equation(
     *,
     disturbance: Disturbance | None = None,
 ) -> list[Trained]:
-    """Fits value functions by the residual of the Hamilton-Jacobi-Bellman equation, one per seed.
-
-    Devices of a mesh share the samples.
-    """
+    """Fits one value function per seed by the Hamilton-Jacobi-Bellman residual; devices of a mesh share the samples."""
     network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
     stages = len(discounts) - 1 + ROUNDS
     trained: list[Trained] = []

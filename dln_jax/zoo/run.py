@@ -82,10 +82,7 @@ class Run:
 
     @functools.cached_property
     def torque_std(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
-        """(q, qd, qdd) -> standard deviation [d] of a measured torque about the model's, N m or N.
-
-        Raises InputError for a run without uncertainty.
-        """
+        """(q, qd, qdd) -> deviation [d] of a measured torque, N m or N; `InputError` for a run without uncertainty."""
         factor, noise, inflation, _ = self._known_uncertainty
         return _jitted(predictive(self._of("torque_std", Model), self.parameters, factor, noise, inflation), self.dtype)
 

@@ -70,10 +70,7 @@ def as_recording(data: Trajectories) -> Recording:
 
 
 def read(path: str | Path, **stated: Any) -> Recording:
-    """Reads a file in the schema; arguments and errors as for `schema.load`.
-
-    Samples out of order and duplicates, which `schema.load` refuses, are repaired and reported.
-    """
+    """Reads a file as `schema.load` does, but repairs and reports samples out of order and duplicates."""
     return schema.load_arrays(path, _from_arrays, **stated)
 
 

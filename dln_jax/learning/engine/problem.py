@@ -95,10 +95,7 @@ def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def require_finite_start(problem: Problem, arrays: tuple[Any, ...]) -> None:
-    """Raises `InputError` unless the initial loss on these arrays is finite (with several seeds, that of the first).
-
-    This compiles the loss.
-    """
+    """Raises `InputError` unless the initial loss on these arrays (of the first seed) is finite; compiles the loss."""
     parameters = jax.tree.map(lambda leaf: leaf[0], problem.parameters) if problem.several else problem.parameters
     options = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
     if not np.isfinite(jax.jit(loss_of(problem), compiler_options=options)(parameters, arrays)):
@@ -202,10 +199,7 @@ Dispatch = Callable[[Any], tuple[Any, Array]]
 
 
 class Stage(NamedTuple):
-    """Part of a training with one compiled program, as the loop in `fit` sees it.
-
-    States are those of the optimiser; the loop reads only their `step` and `best`.
-    """
+    """Part of a training with one compiled program; the loop in `fit` reads only `step` and `best` of its states."""
 
     name: str
     start: Callable[[Any], Any]

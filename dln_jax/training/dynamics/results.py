@@ -168,10 +168,7 @@ def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dic
 
 
 def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:
-    """Test rollouts under interpolated torques, and valid prediction times with the true plant's as the upper bound.
-
-    Empty for independent states, which are no motion.
-    """
+    """Test rollouts under interpolated torques, and prediction times with the true plant's; none for single states."""
     test = task.sets.test
     if len(np.unique(test.trajectory)) == len(test.t):
         return [], {}
