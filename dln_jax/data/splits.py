@@ -205,10 +205,7 @@ def held_out(count: int, share: float, what: str) -> int:
 
 
 def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
-    """Raises `InputError` if a test trajectory is a copy of one in the training data, which would void the test.
-
-    Trajectories of constant state, such as single samples, are not compared.
-    """
+    """Raises `InputError` if a test trajectory is a copy of a training one; motionless ones are not compared."""
 
     def contents(data: Trajectories) -> dict[bytes, int]:
         states = np.hstack([data.q, data.qd, data.qdd, data.tau])

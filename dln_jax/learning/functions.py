@@ -138,9 +138,7 @@ def train(
     The resulting layers have a leading axis of ensemble members, even if there is only one. With Adam, all members see
     the same batches and share one best step; Gauss-Newton keeps the best step of every member. Reports and history are
     means over the members. Devices of a mesh share the members if Gauss-Newton trains several, otherwise the samples.
-
-    Raises:
-        InputError: raised by `targets` or `fit`.
+    Errors as for `targets` and `fit`.
     """
     together = isinstance(optimiser, Adam)
     members = network.members if together else 1

@@ -36,10 +36,7 @@ class Checkpoint(NamedTuple):
 
 
 def identity(optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any) -> dict[str, Any]:
-    """Returns the identity of a run: its optimiser, a fingerprint of its data, and all settings that decide its result.
-
-    The time limit is not part of it: a run may continue with more time.
-    """
+    """Returns the identity of a run: optimiser, data fingerprint, settings, but not the time limit, which may grow."""
     stated = {"optimiser": type(optimiser).__name__, **optimiser._asdict(), **settings}
     return {"settings": stated, "data": fingerprint(arrays)}
 

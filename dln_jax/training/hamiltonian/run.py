@@ -53,10 +53,7 @@ class Case(NamedTuple):
 
 
 def prepare(options: Any) -> Case:
-    """Resolves the options into the problem, the model's description and the optimiser.
-
-    Everything is checked before anything is written, and the log before models are compared on it.
-    """
+    """Resolves options into problem, description and optimiser, and checks them and the log; writes nothing."""
     until = deadline(options.seconds)
     require_seed(options.seed)
     require_positive_if_given(options, ["width", "depth", "degree", "steps", "trajectories", "seconds"])
