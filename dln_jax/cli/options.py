@@ -97,7 +97,7 @@ class Checked(Logged):
     """How to treat a log with errors."""
 
     accept_log: bool = False
-    """Go on although the check of the log found errors."""
+    """Continue although the check of the log found errors."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class Messages(NamedTuple):
     """Series of one topic, and remarks about its stamps."""
 
     series: dict[tuple[str, str], Series]
-    """By field and joint."""
+    """Series by field and joint."""
     remarks: tuple[str, ...]
 
 

@@ -1,6 +1,6 @@
 """Mesh files: npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], fixed vertices.
 
-The formats of meshing programs are those of `softbody.mesh.files`.
+`softbody.mesh.files` reads the formats of meshing programs.
 """
 
 from pathlib import Path

@@ -38,7 +38,7 @@ LOSSES = ("type1", "type2")
 WIDTHS = (2, 4, 8, 16)
 """Widths of the hidden layers, for `grow_width`."""
 GAUSS_NEWTON = GaussNewton(steps=40, coarse_steps=200, improvement=1e-7)
-"""For networks of `WIDTHS`."""
+"""Optimiser for networks of `WIDTHS`."""
 
 
 class Network(NamedTuple):

@@ -67,7 +67,7 @@ class PreparedRecording(NamedTuple):
     """A recording that is ready for fits."""
 
     train: Trajectories
-    """With rates and acting torques."""
+    """Episodes to fit, with rates and acting torques."""
     validation: Trajectories
     delay: int
     """Delay of the torques in samples."""

@@ -86,7 +86,7 @@ def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
 
 
 def is_file_of_plant(plant: str) -> bool:
-    """Whether the name of a plant is that of a file."""
+    """Whether a plant is named by a file."""
     return Path(plant).suffix.lower() in FILES or Path(plant).is_file()
 
 

@@ -122,7 +122,7 @@ def announce(case: Case) -> Iterator[str]:
 
 
 def fit(case: Case, options: Any, folder: Path, mesh: Mesh | None) -> Fitted:
-    """Trains once per seed and keeps the best by validation; a stored value function is taken as it is."""
+    """Trains once per seed and keeps the best by validation; a stored value function stays unchanged."""
     if case.family is None or case.stored is not None:
         return Fitted({}, None, (case.stored, {}))
     trained = trainings(case, case.family, options, folder, mesh)

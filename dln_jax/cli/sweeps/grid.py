@@ -1,4 +1,4 @@
-"""From the text of a grid, such as `width=8,16 seed=0:10`, to jobs: one for each combination of the values.
+"""Turns the text of a grid, such as `width=8,16 seed=0:10`, into jobs, one for each combination of the values.
 
 Options and values are checked against the command's own arguments before anything starts.
 """

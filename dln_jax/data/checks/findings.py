@@ -19,7 +19,7 @@ class Finding(NamedTuple):
     check: str
     """Stable lower-case name of the check."""
     observation: str
-    """What was observed, with numbers."""
+    """The observation, with numbers."""
     remedy: str
     """Recommended action."""
     joints: tuple[int, ...] = ()

@@ -66,7 +66,7 @@ class Lines(NamedTuple):
     """Joint axes in space at q = 0."""
 
     directions: Float[np.ndarray, "n 3"]
-    """Of all joints, then of gravity."""
+    """Directions of all joint axes, then of gravity."""
     points: Float[np.ndarray, "d 3"]
 
 

@@ -65,7 +65,7 @@ class TreeFit(NamedTuple):
     agreement: int
     """Number of descents that the search required to agree (`Search.agreement`)."""
     twin: Twin | None
-    """Comparison with another descent to the same loss; `None` if there is none, or none was asked for."""
+    """Comparison with another descent to the same loss; `None` without one, or if not requested."""
     seconds: float
     """Duration of the whole call, compilation included."""
 

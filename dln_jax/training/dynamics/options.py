@@ -1,4 +1,4 @@
-"""Options of the commands that train dynamics: those of every model, and those of each way of fitting.
+"""Options of the commands that train dynamics, for every model and for each way of fitting.
 
 Importing this module does not import JAX, so that `--help` is quick.
 """

@@ -79,7 +79,7 @@ class SampledOptions:
 
 
 def options_of(stated: Mapping[str, Any]) -> tuple[type, ...]:
-    """Options of the optimiser, and those of a named function."""
+    """Options of the optimiser and of a named function."""
     named = (SampledOptions,) if stated["function"] in NAMES else ()
     return (*named, AdamOptions if stated["optimizer"] == "adam" else NewtonOptions)
 

@@ -69,7 +69,7 @@ class Chosen(NamedTuple):
 
     @property
     def line(self) -> str:
-        """What was chosen, and why."""
+        """The choice and its reason, as text."""
         shown = ", ".join(f"{name} {value:.3g} s" for name, value in self.seconds.items())
         kept = "parameters by torques" if self.window is None else f"windows of {self.window:g} s"
         return f"chosen by inner splits of the training data: {kept} (prediction times: {shown})"

@@ -46,7 +46,7 @@ class Robot:
     uncertainty: bool = True
     """Estimate the uncertainty of the torques, and flag states out of distribution."""
     residual: bool = False
-    """Add a small network for what the rigid robot leaves unexplained, if held-out motions ask for one."""
+    """Add a small network for torques that the rigid robot does not explain, if it improves held-out motions."""
     noise: Unstated[str] = None
     """Standard deviation of each joint's torque, N m or N, comma separated (default: estimated)."""
     robust: bool = False
