@@ -118,15 +118,12 @@ def _linear(needs: Needs, chain: bool) -> Description:
 
 
 def identified(data: Trajectories, needs: Needs, *, chain: bool = False) -> FittedPlant:
-    """Fits the trigonometric model with viscous and dry friction.
+    """Fits the trigonometric model with viscous and dry friction; errors as for `fit_momentum`.
 
     Args:
         data: recording with rates and acting torques.
         chain: whether the plant is a chain of rigid bodies on a fixed base, in relative coordinates: its mass matrix
             does not depend on the first coordinate, its potential has degree 1 in every angle; fewer motions suffice.
-
-    Raises:
-        InputError: as for `fit_momentum`.
     """
     description = _linear(needs, chain)
     model, windows = build(description), cut_momentum_windows(data)

@@ -95,15 +95,12 @@ def model_of(recording: Trajectories) -> Dynamics:
 def try_plant(
     make: Callable[[int], Plant], tuned: Tuned, *, starts: int = 100, seed: int = 1000, seconds: float = SECONDS
 ) -> tuple[Trials, list[PlantRun]]:
-    """Swings up plants from many starts, in step.
+    """Swings up plants from many starts, in step; errors as for `run`.
 
     Args:
         make: seed -> a simulated plant with its own start and noise.
         seed: seed of the first plant; the others follow.
         seconds: duration of a trial, s.
-
-    Raises:
-        InputError: as for `run`.
     """
     require_positive(starts=starts)
     plants = [make(seed + number) for number in range(starts)]
