@@ -115,7 +115,6 @@ def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) ->
 
 
 def _checked(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
-    """The stored arguments of a dataclass."""
     expected = stored_arguments(arguments())
     if absent := [key for key in expected if key not in values]:
         raise InputError(f"{path}: {absent[0]} is missing; {REMEDY}")

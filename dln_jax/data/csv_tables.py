@@ -170,7 +170,6 @@ def _spelled(unit: str) -> str:
 
 
 def _factor(column: Column, stated: str | None) -> float:
-    """Conversion factor to SI."""
     known = UNITS[column.key]
     if not known:
         return 1.0
@@ -232,7 +231,6 @@ def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.nda
 
 
 def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
-    """Describes the first invalid line."""
     rows = _rows(path)
     next(rows)
     for line, cells in rows:

@@ -88,7 +88,6 @@ def _by_prefix(own: Sequence[str], wanted: Sequence[str]) -> list[dict[str, str]
 
 
 def _common_ending(first: str, second: str) -> int:
-    """Number of equal characters at the end of both."""
     count = 0
     while count < min(len(first), len(second)) and first[-1 - count] == second[-1 - count]:
         count += 1

@@ -41,7 +41,6 @@ def needs_from_json(stated: Any) -> Needs:
 
 
 def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] | None:
-    """Reads a matrix with one row per joint."""
     if stated is None:
         return None
     rows: list[tuple[Any, ...]] = []

@@ -121,5 +121,4 @@ def fit_residual(
 
 
 def _typical(name: str, values: Float[np.ndarray, "N d"]) -> tuple[float, ...]:
-    """Typical magnitudes by joint, to three digits."""
     return tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, values))

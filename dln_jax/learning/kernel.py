@@ -172,7 +172,6 @@ def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: i
 
 
 def _parameters(needs: Needs, scales: KernelScales, states: States, weights: np.ndarray, friction: np.ndarray) -> Any:
-    """Parameters of the catalogue's model."""
     d = needs.degrees_of_freedom
     own, of_laws = np.split(friction, [d if needs.friction else 0])
     kernel = jax.tree.map(jnp.asarray, KernelParameters(*states, weights, scales, own if needs.friction else None))

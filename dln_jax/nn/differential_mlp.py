@@ -201,7 +201,6 @@ def _congruence_jvp(primals, tangents):
 def _derivatives_by_two_sweeps(
     layers: Layers, preactivations: list[Array], activation: Activation
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-    """Jacobian and Hessian, by a backward sweep per output."""
     jacobians = _input_jacobians(layers[:-1], preactivations, activation)
     inputs, width = jacobians[0].shape
     # J_1 = W_1 is the same for all states of a batch: with its products formed first, the term is one matrix product.
@@ -224,7 +223,6 @@ def _derivatives_by_two_sweeps(
 def _derivatives_by_forward_sweep(
     layers: Layers, preactivations: list[Array], activation: Activation
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-    """Jacobian and Hessian, by one forward sweep for all outputs."""
     jacobians = _input_jacobians(layers, preactivations, activation)
     inputs = jacobians[0].shape[0]
     rows, columns = np.triu_indices(inputs)

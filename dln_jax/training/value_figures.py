@@ -22,7 +22,6 @@ def _runs(run: ValueRun) -> Returns:
 
 
 def _described(plant: ValuePlant, own: OwnProblem | None) -> tuple[tuple[JointKind, ...], tuple[str, ...]]:
-    """Kinds and names of the coordinates."""
     if own is not None:
         return own.joints, own.names
     d = len(plant.problem.goal) // 2

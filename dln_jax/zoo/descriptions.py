@@ -155,7 +155,6 @@ def functions_of(
 
 
 def _parameters(functions: tuple[Callable[..., Any], ...]) -> dict[str, inspect.Parameter]:
-    """Parameters that a description stores."""
     variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     return {
         key: parameter

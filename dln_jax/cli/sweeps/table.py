@@ -185,7 +185,6 @@ def _print_jobs(results: Results, title: str) -> None:
 
 
 def _print_groups(results: Results) -> None:
-    """Prints the median and worst metrics of the groups."""
     rows = []
     for group in results.groups:
         medians = {name: group.medians.get(name) for name in results.shown}
@@ -265,5 +264,4 @@ def _short(text: str) -> str:
 
 
 def _spaced(name: str) -> str:
-    """A metric's or option's name as words."""
     return " ".join(word.upper() if word in ("mse", "nmse") else word for word in name.split("_"))

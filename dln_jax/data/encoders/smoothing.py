@@ -149,7 +149,6 @@ def smooth(
 def _filtered(
     q: np.ndarray, tau: np.ndarray, rate: float, cutoff: float, *, filter_torque: bool
 ) -> tuple[np.ndarray, ...]:
-    """q, qd, qdd and tau of one segment."""
     q = low_pass(q, rate=rate, cutoff=cutoff)
     return q, *derivatives(q, rate=rate), low_pass(tau, rate=rate, cutoff=cutoff) if filter_torque else tau
 

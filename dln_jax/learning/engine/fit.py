@@ -19,8 +19,6 @@ from dln_jax.types import InputError, require_positive
 
 
 class _Run(NamedTuple):
-    """State of a training run; resuming from it is exact."""
-
     state: Any
     """State of the optimiser."""
     stage: Array

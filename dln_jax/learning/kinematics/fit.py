@@ -234,7 +234,6 @@ def _solved(
 
 
 def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
-    """Mean squared error of every joint's torque."""
     chunks = design_chunks(columns, frames, data, CHUNK)
     return np.sum([np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, _, tau in chunks], axis=0) / len(data.tau)
 
@@ -249,7 +248,6 @@ def _columns(structure: Structure) -> Callable:
 
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
-    """Parameters of the model."""
     armature, *friction = linear[len(structure.inertial) :].reshape(-1, len(structure.joints))
     turns = np.array([rotation_vector(R) for R in np.asarray(frames.rotations)])
     inertias = inertias_of(structure, jnp.asarray(linear))

@@ -93,7 +93,6 @@ def grow_to_target(
 def _try(
     task: Task, optimiser: Optimiser, folder: Path, *, resume: bool, mesh: Mesh | None
 ) -> tuple[Candidate, Task, Training]:
-    """Trains one candidate and measures it."""
     model, wanted = build(task.description), task.description
     networks = 1 if wanted["shared_trunk"] else 2
     name = f"checkpoint_{wanted['width']}x{wanted['depth']}_{networks}"

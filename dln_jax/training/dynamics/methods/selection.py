@@ -216,7 +216,6 @@ def _with_network(recorded: Recorded, base: FittedModel | None, left: float) -> 
 
 
 def _as_rigid(learned: FittedModel, recorded: Recorded) -> FittedModel:
-    """Converts a learned tree to a tree with known frames."""
     task: Task = learned.outcome[0]
     needs, stated, solution = needs_of_tree(recorded.needs), task.description, learned.parameters
     tree = tree_of(solution, needs, parents=stated["parents"], acceleration=stated["acceleration"])
