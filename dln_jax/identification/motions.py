@@ -45,7 +45,6 @@ ROUNDS, SETTLED = 12, 1e-4
 CHUNK = 64
 """Windows that are linearised at a time."""
 REWEIGHTINGS = 2
-"""Default number of reweightings."""
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""
 TYPICAL_DELAY = 1e-3

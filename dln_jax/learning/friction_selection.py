@@ -18,9 +18,7 @@ from dln_jax.learning.model_selection import segments, significantly_better
 from dln_jax.mechanics.trees.description import Tree
 
 FOLDS = 4
-"""Number of folds of the cross-validation."""
 MOST_SAMPLES = 2_000
-"""Largest number of samples of the cross-validation."""
 MARGIN = 2.0
 """Number of standard errors by which a term must lower the error; about one log in forty does so by chance."""
 

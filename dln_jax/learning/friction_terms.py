@@ -36,7 +36,6 @@ from dln_jax.solvers.separable import SeparableSolution, solve_separable
 from dln_jax.types import FrictionLaw, InputError
 
 FIRST_LOAD = 0.05
-"""Initial share of load."""
 LONGEST_STEP = 1.0
 """Largest change of an unknown per iteration: a factor e for quantities fitted by their logarithm."""
 MOST_ROUNDS = 5

@@ -51,7 +51,6 @@ class Network(NamedTuple):
     activation: str = "cos"
     width: int = 128
     depth: int = 1
-    """Hidden layers."""
     members: int = 1
     """Networks in the ensemble, which differ in their initial parameters."""
     precision: str = "f32"

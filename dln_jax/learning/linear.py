@@ -33,7 +33,6 @@ from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 
 LARGEST_DEGREE = 4
-"""Largest degree that is tried."""
 MOST_PARAMETERS = 1_500
 """Largest basis that is tried; a fit takes about N d P² operations."""
 ROUNDING = 1e-10

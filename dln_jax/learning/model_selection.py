@@ -134,7 +134,6 @@ class Assessment(NamedTuple):
     reason: str = ""
     """Reason why there is no model."""
     tried: bool = True
-    """Whether a fit was attempted."""
 
 
 class Selection(NamedTuple):

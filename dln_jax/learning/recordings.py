@@ -35,14 +35,12 @@ from dln_jax.zoo.descriptions import Description, build, describe
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
 """Friction laws of the models; other friction of the plant, near rest, is not modelled."""
 MOST_DELAY = 4
-"""Largest delay that is tried, in samples."""
 ROUNDS = 2
 """Number of fits; the later ones are weighted by the residuals of the one before."""
 DEGREES = {"revolute": 2, "prismatic": 0}
 """Degrees of the identified model: enough for rigid bodies; displacements along a level rail have no effect."""
 NETWORK = {"width": 8, "depth": 2}
 STEPS = 40
-"""Gauss-Newton iterations."""
 FRICTION_START = 0.02
 """Initial friction coefficients of a network, relative to the deviation of the torques."""
 FLOOR = 0.05

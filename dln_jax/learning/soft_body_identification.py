@@ -48,7 +48,6 @@ class SoftBodyFit(NamedTuple):
     misfit: float
     """Root mean square of the final residuals, in units of the noise; NaN if a step did not converge."""
     iterations: int
-    """Number of Levenberg-Marquardt iterations."""
 
 
 def identify(

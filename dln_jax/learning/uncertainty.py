@@ -41,7 +41,6 @@ from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, require_positive
 
 RIDGES = tuple(10.0**power for power in range(-18, 0, 2))
-"""Ridges that are tried for networks."""
 RATIOS = (0.0, *(10.0 ** (power / 4) for power in range(-8, 25)))
 """Ratios b / a that are tried."""
 MOST_PARAMETERS, DIRECTIONS = 1_500, 400

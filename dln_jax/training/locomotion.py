@@ -33,7 +33,6 @@ from dln_jax.zoo.run import MODEL
 GOAL = 5.0
 """Distance in body lengths at which the effort of learning is measured."""
 STEPS = 400_000
-"""Default number of environment steps."""
 FILMED = 160
 """Steps of the film."""
 SHOWN = 3_000_000

@@ -40,7 +40,6 @@ class Judged(NamedTuple):
     rows: Callable[[dict[str, float | int]], Iterable[Sequence[str]]]
     """All metrics -> rows of the printed table."""
     title: str
-    """Title of the table."""
     columns: tuple[str, ...] = ("quantity", "value", "unit")
     measured: Callable[[], dict[str, float]] = dict
     """Waits for metrics that another process measures while the figures are drawn."""

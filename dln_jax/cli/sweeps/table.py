@@ -28,7 +28,6 @@ PROBLEM = (
 WIDTH = 200
 """Width of tables in columns. A narrow terminal wraps their lines, since truncated numbers would be useless."""
 MOST_ROWS = 200
-"""Largest number of rows of a printed table."""
 MOST_PANELS = 6
 """Largest number of problems drawn in panels of their own."""
 
@@ -61,7 +60,6 @@ class Results(NamedTuple):
 
     entries: list[Entry]
     metrics: list[str]
-    """Names of all metrics."""
     validation: str | None
     error: str | None
     seconds: str | None

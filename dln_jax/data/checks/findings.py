@@ -21,7 +21,6 @@ class Finding(NamedTuple):
     observation: str
     """The observation, with numbers."""
     remedy: str
-    """Recommended action."""
     joints: tuple[int, ...] = ()
     """Joints concerned, counted from 0; empty if the finding concerns the whole log."""
 

@@ -22,7 +22,6 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import JointKind
 
 MOST = 800
-"""Number of samples used."""
 PADDED = 200
 """Batches are padded to a multiple of this number of samples."""
 RELATED = 0.5

@@ -29,7 +29,6 @@ SEGMENT = 8.0
 SEEN = 1.5
 """A smoothed spectrum above this multiple of the floor belongs to the motion."""
 CANDIDATES = 200
-"""Number of cut-offs tried."""
 TOP = 0.45
 """Highest cut-off tried, as a fraction of the sampling rate."""
 MOVES = 2.0

@@ -20,7 +20,6 @@ from dln_jax.types import InputError, require_positive
 
 class _Run(NamedTuple):
     state: Any
-    """State of the optimiser."""
     stage: Array
     """[] index of the stage."""
 

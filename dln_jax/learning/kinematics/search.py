@@ -40,7 +40,6 @@ class Search(NamedTuple):
     confirm: bool = True
     """Whether to search until two descents end at the same arm, with the same validation error."""
     seed: int = 0
-    """Seed of the starts and of the samples."""
     threads: int = 2
     kinematic_prior: Frames | None = None
     """Kinematic prior: frames near which to start, for example from a drawing with link lengths and rough axes."""

@@ -47,7 +47,6 @@ class Case(NamedTuple):
     description: dict[str, Any]
     optimiser: Optimiser
     findings: list[str]
-    """Findings about the log."""
     until: float
     """Deadline by `time.perf_counter`."""
 

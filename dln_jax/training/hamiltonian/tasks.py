@@ -72,11 +72,9 @@ class Problem(NamedTuple):
     tests: MeasuredWindows | None = None
     """Recordings to predict, across their gaps, with starts fitted to their first `WINDOW` samples."""
     trust: Trust | None = None
-    """Trust in measurements, in coordinates and momenta."""
     assumed: bool = False
     """Whether the needs are not stated, so that the data decide between candidates."""
     gaps: int = 0
-    """Number of gaps in the test recordings."""
 
 
 def problem_of(

@@ -32,7 +32,6 @@ from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.zoo.descriptions import build
 
 RATES, MOTIONS = "rates", "motions"
-"""The stages of a training."""
 OUT_OF_TIME = "out of time"
 WINDOWS_OF_A_STEP = 64
 """Batch size of Adam, in windows, for the fit of motions."""

@@ -54,7 +54,6 @@ class Case(NamedTuple):
     noise: np.ndarray | None
     """Noise of the torques, if stated."""
     locked: tuple[str, ...]
-    """Names of the locked joints."""
     lines: tuple[str, ...]
     """Lines for the user: the origin of the rates, and findings about the log."""
     torque: str = "measured torques"
