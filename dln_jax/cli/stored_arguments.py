@@ -102,7 +102,7 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
 
 
 def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
-    """The arguments of a command in a config.json; `InputError` if it is damaged, or a release with others wrote it."""
+    """The arguments of a command in a config.json; `InputError` if it is damaged or of another release."""
     values = {key: value for key, value in values.items() if key not in (CHOSEN, FILES)}
     _checked(path, values, arguments)  # the choices, on which the other options depend
     whole = arguments_for(arguments, values)

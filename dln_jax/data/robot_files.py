@@ -230,7 +230,7 @@ def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[dict
 
 
 def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Mapping[str, Any]]) -> None:
-    """Replaces the fixed tendons of coupled motors, by name; others lose their armature, which the motors' contain."""
+    """Replaces the fixed tendons of coupled motors, by name; others lose their armature, now part of the motors'."""
     group = root.find("tendon")
     for tendons in root.findall("tendon"):
         for tendon in tendons.findall("fixed"):

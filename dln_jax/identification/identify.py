@@ -88,7 +88,7 @@ def identify(
         regularisation: as for `fit_consistent`.
 
     Raises:
-        InputError: the data lack torques or have another number of joints, the model is not linear, or a bad setting.
+        InputError: no torques, numbers of joints that differ, a model that is not linear, or a setting out of range.
     """
     d = data.degrees_of_freedom
     joints = ("revolute",) * d if joints is None else joints

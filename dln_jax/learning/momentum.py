@@ -38,7 +38,7 @@ class MomentumWindows(NamedTuple):
 
 
 def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> MomentumWindows:
-    """Cuts overlapping windows of a length in s within segments without a gap; `InputError` if none is that long."""
+    """Cuts overlapping windows of a length in s within gapless segments; `InputError` if no segment is long enough."""
     require_positive(window=window)
     pieces = segments(data.t, data.trajectory)
     dt = float(np.median(np.concatenate([np.diff(data.t[piece]) for piece in pieces])))

@@ -6,9 +6,9 @@ time, which show what the implicit step damps), moments.png, metrics.json, repor
 
 Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1)
 and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with constant
-z a body in the plane; physical groups become named sets, for --pin. The command prints what it left out or
-repaired. An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0)
-and, for the beam, optionally `held` [k] (vertices; by default those of the smallest x).
+z a body in the plane; physical groups become named sets, for --pin. The command prints what it left out or repaired.
+An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the
+beam, optionally `held` [k] (vertices; by default those of the smallest x).
 """
 
 from dataclasses import dataclass

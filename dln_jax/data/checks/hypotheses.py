@@ -2,7 +2,7 @@
 
 A hypothesis is accepted if it predicts left-out blocks of time much better than the log as recorded, in nearly all
 blocks. Without a robot, the torques have the prior of an arbitrary energy with friction (`energies`), valid for arms
-of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the rest.
+of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the next.
 """
 
 import functools

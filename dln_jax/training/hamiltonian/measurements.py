@@ -47,7 +47,7 @@ class Stated(NamedTuple):
     """Facts about measurements that the user states in addition to their file."""
 
     needs: Needs | None = None
-    """`Needs` of the plant (default: the file's, else balanced bodies, else revolute joints, potential, friction)."""
+    """`Needs` of the plant (default: the file's, else bodies if forces balance, else revolute joints with friction)."""
     test: str | None = None
     """Labels of the test trajectories, separated by commas, or an npz file with test trajectories."""
     noise: tuple[float, ...] | None = None
@@ -119,7 +119,7 @@ def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[
 
 def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Trajectories, Noise]:
     """Adds velocities and accelerations from local polynomials if they were not measured, and estimates the noise.
-    Raises `InputError` for noise for another number of coordinates, or segments that are too short."""
+    Raises `InputError` for noise of another number of coordinates, or segments that are too short."""
     d = data.degrees_of_freedom
     if noise is not None and len(noise) not in (1, d):
         raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates")
@@ -144,7 +144,7 @@ def with_momenta(data: Trajectories) -> Trajectories:
 
 def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | None:
     """Weights of data with momenta from stated or estimated noise; `None` if all segments are too short.
-    Raises `InputError` for noise for another number of coordinates, or noise stated for segments that are too short."""
+    Raises `InputError` for noise of another number of coordinates, or noise stated for segments that are too short."""
     d, own = data.degrees_of_freedom, "p" not in data.estimated
     if noise is not None and len(noise) not in ((1, d, 2 * d) if own else (1, d)):
         more = f", or {2 * d} of q and then p" if own else ""
