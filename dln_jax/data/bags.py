@@ -59,8 +59,7 @@ def read(path: Path, *, topics: Sequence[str] = (), choose: Choose = tuple) -> t
         topics: topics to read; if quantities repeat, the first topic counts. Default: the only topic of joint states.
 
     Raises:
-        InputError: rosbags is missing, the file is no bag, a topic is absent or ambiguous, messages are malformed, or
-            topics do not overlap in time.
+        InputError: no rosbags, no bag, an absent or ambiguous topic, malformed messages, or no overlap in time.
     """
     bags = paths(path)
     parts = []

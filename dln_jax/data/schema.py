@@ -81,15 +81,13 @@ def load(
     """Reads and checks an npz file, a CSV file or a ROS bag; never unpickles.
 
     Args:
-        path: path of the file; CSV if its name ends in .csv (see `data.csv_tables`), a bag if it ends in .db3, .mcap or
-            .bag or is a folder (see `data.bags`).
+        path: .csv for CSV (see `data.csv_tables`); .db3, .mcap, .bag or a folder for a bag (see `data.bags`).
         rate: sampling rate of all trajectories, Hz, for a file without t.
         units: units of CSV titles without one, "si" or "degrees".
         joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joint_names.chosen`).
         topics: topics of joint states in a bag; by default the only one.
         torque_factor: factor of tau, N m per A for currents: one number, one for each joint, or numbers by name.
-        robot: names of the robot's joints. Of a bag, only the joints that match them are read; `splits.with_joints`
-            brings them into this order.
+        robot: names of the robot's joints; of a bag only those are read (`splits.with_joints` orders them).
 
     Raises:
         InputError: the file is missing, damaged or pickled, breaks the schema, or lacks a stated joint or topic.

@@ -100,8 +100,7 @@ def fit_consistent(
         columns: columns of the P parameters; the ten of a body are adjacent.
         known: prior and initial values. An inconsistent body is replaced by `nearest_body`, a zero coefficient by one
             that explains a hundredth of the torque. A body with ten zeros is absent and stays zero.
-        regularisation: cost of a unit of divergence, dimensionless (in squares of the noise); positive, since data
-            never determine all parameters.
+        regularisation: cost of a unit of divergence, in squares of the noise; positive, as data never determine all.
 
     Raises:
         InputError: `regularisation` is not positive, or a body has no mass.

@@ -56,8 +56,7 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
     Args:
         sets: samples for training, for selecting the parameters, and for monitoring.
         objective: residual to minimise, from `learning.objectives`.
-        seeds: seeds of the initial parameters and of the order of the samples. Several seeds train in one program, and
-            the results have a leading axis of seeds.
+        seeds: seeds of initial parameters and sample order; several train in one program and add an axis to results.
 
     Raises:
         InputError: the data cannot determine the model, lack a key of the objective, or overflow in its precision.

@@ -87,8 +87,7 @@ def fit_friction(
         iterations: largest number of Gauss-Newton iterations.
 
     Raises:
-        InputError: unknown laws, torques that do not vary, a noise that is not positive, or cooling without viscous
-            friction or without a temperature that varies.
+        InputError: unknown laws, constant torques, a noise <= 0, or cooling without viscous friction or a temperature.
     """
     began = time.perf_counter()
     d, terms = tree.degrees_of_freedom, terms_of(laws, shape, held, cooling=cooling, motors=motors, coupled=coupled)

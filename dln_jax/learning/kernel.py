@@ -69,12 +69,10 @@ def fit_kernel(
         serial: as for `make_trigonometric_kernel`.
         likelihood_samples: number of these samples used to fit the scales and the noise.
         least_noise: lower bound on a joint's noise, relative to its torque's deviation, for data without noise. If it
-            is too low for the rounding of the equations, it is multiplied by `NOISIER` until it suffices; the result's
-            noise holds the final value.
+            is too low for rounding, it is multiplied by `NOISIER` until it suffices; the result holds the final value.
 
     Raises:
-        InputError: torques that do not vary, a number of joints that differs from the data's, friction by load, or a
-            setting that is not positive.
+        InputError: constant torques, another number of joints than the data's, friction by load, or a setting <= 0.
     """
     from scipy.linalg import cho_solve
 

@@ -43,8 +43,7 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     A channel that does not vary (a joint without a motor) is scaled by the root mean square of those that do.
 
     Raises:
-        InputError: no channel varies, so that the data cannot distinguish a Lagrangian from its multiples; or the
-            squares of numbers are infinite or zero.
+        InputError: no torque varies, so any multiple of a Lagrangian fits; or squares are infinite or zero.
     """
     message = (
         "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "

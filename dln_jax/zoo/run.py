@@ -169,9 +169,8 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
         trust: import the factory that the file names. Use it only for files that you have written: importing runs code.
 
     Raises:
-        InputError: the folder has no model, or one that is damaged, altered or of another schema; a factory outside the
-            catalogue is neither passed nor trusted; or the model is in double precision while JAX computes in single
-            (the message names the line to add).
+        InputError: the folder has no model, or a damaged or altered one or one of another schema; a factory outside the
+            catalogue is neither passed nor trusted; or the model needs double precision (the message names the line).
     """
     directory = Path(directory)
     description = read_description(directory)
