@@ -101,7 +101,10 @@ def class_with(arguments: type, more: Sequence[type]) -> type:
 
 def arguments_of(arguments: type, **stated: Any) -> Any:
     """A command's options as Python values, as typed on its command line.
-    Raises `InputError` for an option that the command does not read for these choices."""
+
+    Raises:
+        InputError: an option that the command does not read for these choices.
+    """
     whole = arguments_for(arguments, stated)
     names = {field.name for field in dataclasses.fields(whole)}
     for name in stated:

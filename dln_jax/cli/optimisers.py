@@ -12,7 +12,10 @@ NAMES: dict[str, type[Optimiser]] = {"adam": Adam, "gauss-newton": GaussNewton}
 
 def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
     """Builds an optimiser by name. Settings that it lacks are ignored; a setting of `None` takes its default.
-    Raises `InputError` for an unknown name, a setting out of range, or Gauss-Newton in a precision other than f64."""
+
+    Raises:
+        InputError: an unknown name, a setting out of range, or Gauss-Newton in a precision other than f64.
+    """
     if name not in NAMES:
         raise InputError(f"optimizer is '{name}'; expected one of {', '.join(NAMES)}")
     kind = NAMES[name]

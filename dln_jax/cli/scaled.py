@@ -40,7 +40,10 @@ def mesh_of(options: Any) -> Mesh | None:
 
 def membership_in(options: Any) -> Membership | None:
     """How this process joins others; `None` for a single process. On a CPU, sets the number of devices.
-    Raises `InputError` if the options or the cluster's environment variables are inconsistent, or --out is missing."""
+
+    Raises:
+        InputError: the options or the cluster's environment variables are inconsistent, or --out is missing.
+    """
     if not isinstance(options, Scaled):
         return None
     processes.host_devices(options.devices)

@@ -133,7 +133,10 @@ def on_one_clock(
     series: dict[tuple[str, str], Series],
 ) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray], tuple[str, ...]]:
     """Stamps of the slowest series, values of all series there, and remarks, by the rules of the module.
-    Raises `InputError` if the series do not overlap in time."""
+
+    Raises:
+        InputError: the series do not overlap in time.
+    """
     steps = {key: np.median(np.diff(one.stamps)) if len(one.stamps) > 1 else np.inf for key, one in series.items()}
     # Steps that agree to 1 % count as one rate; take the series of that rate with the fewest messages.
     slowest = max(steps.values())

@@ -261,7 +261,10 @@ def write_motion(
     joints: tuple[JointKind, ...],
 ) -> None:
     """Writes t, q and qd for a robot's controller; the header is like `t [s],q elbow [rad],..,qd elbow [rad/s]`.
-    Raises `InputError` if a name contains a comma, a quote or a line break, or the file cannot be written."""
+
+    Raises:
+        InputError: a name contains a comma, a quote or a line break, or the file cannot be written.
+    """
     if broken := [name for name in names if set(name) & set(',"\r\n')]:
         raise InputError(f"joint {broken[0]!r} cannot be a title in CSV; rename it without commas, quotes and lines")
     units = ["rad" if kind == "revolute" else "m" for kind in joints]

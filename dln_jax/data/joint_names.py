@@ -97,7 +97,10 @@ def factors(
     stated: float | int | Sequence[float | int] | Mapping[str, float | int], names: Sequence[str]
 ) -> list[float]:
     """Factor of every joint's torque, from one number, one per joint, or numbers by name (1 for other joints).
-    Raises `InputError` for another number of factors than joints, an unknown name, or a factor of zero."""
+
+    Raises:
+        InputError: another number of factors than joints, an unknown name, or a factor of zero.
+    """
     if isinstance(stated, Mapping):
         if unknown := [name for name in stated if name not in names]:
             raise InputError(f"--torque-factor: '{unknown[0]:.60}' is not among the log's joints ({_listed(names)})")

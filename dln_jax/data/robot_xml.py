@@ -82,7 +82,10 @@ def parsed(path: Path) -> ET.Element:
 
 def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
     """Inertial parameters [10] of every URDF link that states them, physically consistent or not, by name.
-    Raises `InputError` if an <inertial> is incomplete, not numeric or has a negative mass."""
+
+    Raises:
+        InputError: an <inertial> is incomplete, not numeric or has a negative mass.
+    """
     parameters = {}
     for link in root.findall("link"):
         inertial = link.find("inertial")

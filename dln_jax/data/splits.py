@@ -78,7 +78,10 @@ def segments(
     t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
 ) -> list[Int[np.ndarray, " n"]]:
     """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
-    Raises `InputError` if `gap` is not above 1, or no trajectory has two samples."""
+
+    Raises:
+        InputError: `gap` is not above 1, or no trajectory has two samples.
+    """
     if not gap > 1:
         raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
     if not (np.diff(trajectory) == 0).any():
@@ -144,7 +147,11 @@ def in_blocks(data: Trajectories, blocks: int) -> Trajectories:
 
 
 def label_indices(data: Trajectories, labels: Sequence[str]) -> np.ndarray:
-    """Indices of the trajectories with these labels. Raises `InputError` for a label that the data do not have."""
+    """Indices of the trajectories with these labels.
+
+    Raises:
+        InputError: a label that the data do not have.
+    """
     known = list(data.label)
     unknown = [label for label in labels if label not in known]
     if unknown:
@@ -186,7 +193,10 @@ def split(
 
 def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories, Trajectories]:
     """Training and validation trajectories, at least one of each, drawn by the seed.
-    Raises `InputError` for fewer than two trajectories, a share outside (0, 1), or a seed out of range."""
+
+    Raises:
+        InputError: fewer than two trajectories, a share outside (0, 1), or a seed out of range.
+    """
     require_seed(seed)
     present = np.unique(data.trajectory)
     count = held_out(len(present), share, "trajectories")
@@ -196,7 +206,10 @@ def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories,
 
 def held_out(count: int, share: float, what: str) -> int:
     """Number of items held out for validation; at least one is held out and one left for training.
-    Raises `InputError` for fewer than two items, or a share outside (0, 1)."""
+
+    Raises:
+        InputError: fewer than two items, or a share outside (0, 1).
+    """
     if count < 2:
         raise InputError(f"there are {count} {what} to train on and to validate by; expected at least 2: add {what}")
     if not 0 < share < 1:

@@ -12,7 +12,10 @@ from dln_jax.types import InputError, require_positive
 
 def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]:
     """Selects, orders and renames the joints as stated (see `data.joint_names.chosen`).
-    Raises `InputError` if joints are stated, but the file names none, or `chosen` refuses them."""
+
+    Raises:
+        InputError: joints are stated, but the file names none, or `chosen` refuses them.
+    """
     if not joints:
         return arrays
     names = np.asarray(arrays.get("joint_names", ()))
@@ -47,7 +50,10 @@ def scaled(arrays: dict[str, Any], torque_factor: Any) -> dict[str, Any]:
 
 def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
     """Completes the arrays with t, from the rate, and with trajectory, as one recording, if they are absent.
-    Raises `InputError` if there is neither t nor a rate, there are both, or the rate is not positive."""
+
+    Raises:
+        InputError: there is neither t nor a rate, there are both, or the rate is not positive.
+    """
     if "q" not in arrays:
         return arrays  # `from_arrays` refuses them
     samples = len(np.atleast_1d(np.asarray(arrays["q"])))

@@ -22,7 +22,11 @@ def needs_from_text(text: str) -> Needs:
 
 
 def needs_from_json(stated: Any) -> Needs:
-    """`Needs` from parsed JSON. Raises `InputError` for unknown or missing fields, or values of the wrong kind."""
+    """`Needs` from parsed JSON.
+
+    Raises:
+        InputError: unknown or missing fields, or values of the wrong kind.
+    """
     if not isinstance(stated, dict) or not set(stated) <= set(Needs._fields) or "joints" not in stated:
         raise _wrong("JSON", stated, f"the fields {', '.join(Needs._fields)}")
     if isinstance(laws := stated.get("joint_friction", ()), list | tuple):

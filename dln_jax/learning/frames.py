@@ -89,7 +89,10 @@ def loss(model: LatentModel, matching: Matching, parameters: Parameters, windows
 
 def windows(frames: Float[np.ndarray, "K T pixels"], length: int) -> Float[np.ndarray, "N length pixels"]:
     """Cuts the frames of trajectories into consecutive windows; the remainder at the end of a trajectory is dropped.
-    Raises `InputError` if trajectories are shorter than a window."""
+
+    Raises:
+        InputError: trajectories are shorter than a window.
+    """
     K, T, pixels = frames.shape
     count = T // length
     if count == 0:

@@ -84,7 +84,10 @@ def published_adam(
 
 def targets(data: FunctionSamples, network: Network) -> Targets:
     """Returns the arrays that the loss reads, on the device.
-    Raises `InputError` if settings are out of range, the data lack a derivative, or the squares of numbers overflow."""
+
+    Raises:
+        InputError: settings are out of range, the data lack a derivative, or the squares of numbers overflow.
+    """
     require_positive(members=network.members)
     require_seed(network.seed)
     require_network(width=network.width, depth=network.depth)

@@ -75,7 +75,10 @@ class Gauge(NamedTuple):
 
 def cut_measured_windows(data: Trajectories, length: int, *, gap: float = GAP) -> MeasuredWindows:
     """Cuts consecutive windows of `length` samples within segments without a gap.
-    Raises `InputError` for a length below 2, or no two samples without a gap between them."""
+
+    Raises:
+        InputError: a length below 2, or no two samples without a gap between them.
+    """
     indices, weight = window_indices(data, length, gap=gap)
     t = data.t[indices]
     return MeasuredWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], weight)

@@ -150,7 +150,11 @@ def problem(
 
 
 def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
-    """Returns the arrays of both sets that a fit reads, on the device. Errors as for `problem`."""
+    """Returns the arrays of both sets that a fit reads, on the device.
+
+    Raises:
+        InputError: as for `problem`.
+    """
     require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
     if weights.rate is not None and (windows.rate is None or validation.rate is None):
         raise InputError("the weights count rates, which the windows lack; leave their weight out")

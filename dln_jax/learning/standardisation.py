@@ -34,7 +34,10 @@ def own_units(data: FunctionSamples) -> Units:
 
 def standard_units(data: FunctionSamples) -> Units:
     """Returns the means and standard deviations of the columns; a column that does not vary has size 1.
-    Raises `InputError` if the squares of numbers of x or y are infinite or zero."""
+
+    Raises:
+        InputError: the squares of numbers of x or y are infinite or zero.
+    """
     deviations = (spread(name, array) for name, array in (("x", data.x), ("y", data.y)))
     sizes = [np.where(deviation > 0, deviation, 1.0) for deviation in deviations]
     return Units(data.x.mean(axis=0), sizes[0], data.y.mean(axis=0), sizes[1])

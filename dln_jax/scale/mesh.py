@@ -57,7 +57,10 @@ def shares(mesh: Mesh | None, count: int, what: str) -> int:
 
 def shard(tree: Any, mesh: Mesh | None) -> Any:
     """Splits arrays along axis 0; all processes pass the same whole arrays, and keep their part.
-    Raises `InputError` if the number of devices does not divide the length of an array."""
+
+    Raises:
+        InputError: the number of devices does not divide the length of an array.
+    """
     if mesh is None:
         return tree
     for leaf in jax.tree.leaves(tree):

@@ -76,7 +76,10 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
 
 def parameters_for(task: LocomotionTask, width: int, folder: Path) -> Parameters:
     """Loads the parameters of a stored policy, to train it further on a task.
-    Raises `InputError` if `load_policy` refuses the folder, or the policy has another creature, width or clock."""
+
+    Raises:
+        InputError: `load_policy` refuses the folder, or the policy has another creature, width or clock.
+    """
     stored = load_policy(folder)
     policies = ((task, width), (stored.task, stored.width))
     sizes, own = ({"creature": t.creature.name, "width": w, "clock-period": t.clock_period} for t, w in policies)

@@ -31,7 +31,10 @@ class Kept(NamedTuple):
 
     def restore(self, seed: int, state: IterationState) -> IterationState:
         """The stored state of a seed, or the one that it would start with.
-        Raises `InputError` if the stored run had other settings, or its files are damaged."""
+
+        Raises:
+            InputError: the stored run had other settings, or its files are damaged.
+        """
         name = CHECKPOINT.format(seed)
         if not (self.resume and is_file(self.folder / f"{name}.json")):
             return state

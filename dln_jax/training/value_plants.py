@@ -100,7 +100,10 @@ def published(name: str, goal: Sequence[float] | None) -> Chosen:
 
 def of_file(path: Path, wishes: Wishes) -> Chosen:
     """The plant of an MJCF or URDF file: its tree of rigid bodies with viscous friction.
-    Errors as for `read_robot`, `layout_of_file` and `own_problem`."""
+
+    Raises:
+        InputError: raised by `read_robot`, `layout_of_file` and `own_problem`.
+    """
     robot = read_robot(path)
     robot_layout = layout_of_file(path, wishes.actuated, control=wishes.control, goal=wishes.goal)
     needs = robot.tree.needs._replace(actuation=tuple(map(tuple, robot_layout.actuation.tolist())))

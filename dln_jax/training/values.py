@@ -119,7 +119,10 @@ def usual(chosen: Chosen, method: str) -> ValueSettings:
 
 def worst_of(chosen: Chosen, share: float) -> Disturbance | None:
     """Worst-case errors of the plant's uncertain numbers, up to a share of each; `None` for a share of 0.
-    Raises `InputError` for a share that is not between 0 and 1."""
+
+    Raises:
+        InputError: a share that is not between 0 and 1.
+    """
     if not 0 <= share < 1:
         raise InputError(f"robust is {share}; expected a share of masses and motors of at least 0 and less than 1")
     if share == 0:
@@ -240,7 +243,10 @@ def save_value(
 
 def load_value(folder: str | Path) -> ValueRun:
     """Loads the value function from the folder of a run of train_value.
-    Raises `InputError` if there is none, or its files are damaged or of another release."""
+
+    Raises:
+        InputError: there is none, or its files are damaged or of another release.
+    """
     folder = Path(folder)
     path = folder / f"{VALUE}.json"
     stored = as_type(load_manifest(folder, VALUE), Stored, name=str(path), remedy=REMEDY)

@@ -174,7 +174,11 @@ CATALOGUE = {
 
 
 def entry_of(name: str) -> Entry:
-    """The catalogue entry with this name. Raises `InputError` for an unknown name."""
+    """The catalogue entry with this name.
+
+    Raises:
+        InputError: an unknown name.
+    """
     if name not in CATALOGUE:
         raise InputError(f"model is {name!r:.60}; this release knows {', '.join(CATALOGUE)}")
     return CATALOGUE[name]

@@ -194,7 +194,10 @@ def _as_json(key: str, value: Any) -> Any:
 
 def _keywords(values: Mapping[str, Any], functions: tuple[Callable[..., Any], ...]) -> dict[str, Any]:
     """Converts JSON values to the types in the signatures, with lists as tuples so that they are hashable.
-    Raises `InputError` if a value does not fit its annotation."""
+
+    Raises:
+        InputError: a value does not fit its annotation.
+    """
     keywords: dict[str, Any] = {}
     for key, parameter in _parameters(functions).items():
         hint, value = parameter.annotation, values[key]

@@ -103,7 +103,10 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
 
 def load_tree(directory: Path, name: str, like: Any) -> Any:
     """Reads the stored tree into the structure of `like`.
-    Raises `InputError` if a file is missing, truncated or altered, or its tensors do not fit `like`."""
+
+    Raises:
+        InputError: a file is missing, truncated or altered, or its tensors do not fit `like`.
+    """
     manifest = load_manifest(directory, name)
     path = directory / manifest["tensor_file"]
     if not is_file(path):

@@ -57,7 +57,10 @@ def holds_only(folder: Path, *names: str) -> bool:
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Locks an existing folder until the block or the process ends, and removes partial files of a killed process.
-    Raises `InputError` if another process holds the lock."""
+
+    Raises:
+        InputError: another process holds the lock.
+    """
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)

@@ -42,7 +42,10 @@ def save_uncertainty(directory: str | Path, uncertainty: Uncertainty, **facts: A
 
 def load_uncertainty(directory: Path) -> Uncertainty | None:
     """Loads the uncertainty stored beside a run's model; `None` if there is none.
-    Raises `InputError` if it is damaged, or belongs to other parameters than the model's."""
+
+    Raises:
+        InputError: it is damaged, or belongs to other parameters than the model's.
+    """
     path = directory / f"{UNCERTAINTY}.json"
     if not is_file(path):
         return None

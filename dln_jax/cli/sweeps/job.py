@@ -102,7 +102,10 @@ def run_job(job: Job, environment: Mapping[str, str] | None = None, interrupt: t
 
 def status_of(folder: Path) -> Status:
     """Reads the status of the job in a folder. A job run by other means counts as done if its metrics exist.
-    Raises `InputError` if the status file is damaged, or names a run that is not in the job's folder."""
+
+    Raises:
+        InputError: the status file is damaged, or names a run that is not in the job's folder.
+    """
     path, remedy = folder / STATUS, "remove it, and --resume does the job again"
     if not is_file(path):
         return Status("done" if is_file(folder / "run" / METRICS) else "missing")

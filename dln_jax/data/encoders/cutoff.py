@@ -160,7 +160,10 @@ def spectra(
     values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], *, rate: float
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F k"]]:
     """Positive frequencies, Hz, and power spectra of the channels, unit² / Hz, averaged over segments.
-    Raises `InputError` if no trajectory has sixteen samples."""
+
+    Raises:
+        InputError: no trajectory has sixteen samples.
+    """
     from scipy.signal import welch
 
     parts = [part for part in by_trajectory(values, trajectory) if len(part) >= 16]

@@ -51,7 +51,10 @@ class _Fits(NamedTuple):
 
 def smooth_locally(data: Trajectories) -> LocalRates:
     """Smooths coordinates and estimates their rates from q and t; segments shorter than `SHORTEST` are left out.
-    Raises `InputError` if no segment is long enough."""
+
+    Raises:
+        InputError: no segment is long enough.
+    """
     spread("q", data.q)
     parts = [part for part in segments(data.t, data.trajectory) if len(part) >= SHORTEST]
     if not parts:

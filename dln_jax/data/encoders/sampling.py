@@ -44,7 +44,11 @@ class Timing(NamedTuple):
 
 
 def timing(t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"]) -> Timing:
-    """Computes rate, jitter and gaps. Raises `InputError` if no trajectory has two samples."""
+    """Computes rate, jitter and gaps.
+
+    Raises:
+        InputError: no trajectory has two samples.
+    """
     steps = [np.diff(part) for part in by_trajectory(t, trajectory) if len(part) > 1]
     if not steps:
         raise InputError("no trajectory has two samples, so there is no sampling rate; record longer trajectories")

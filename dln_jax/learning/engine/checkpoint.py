@@ -62,7 +62,10 @@ def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
 
 def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progress]] | None:
     """Returns the stored state and history, or `None` if the run has to start from the beginning.
-    Raises `InputError` if the stored run had other settings or data, or its files are damaged."""
+
+    Raises:
+        InputError: the stored run had other settings or data, or its files are damaged.
+    """
     if checkpoint is None or not checkpoint.resume or not has_checkpoint(checkpoint.directory, checkpoint.name):
         return None
     manifest = checkpoints.load_manifest(checkpoint.directory, checkpoint.name)

@@ -58,7 +58,11 @@ class Lengths(NamedTuple):
 
 
 def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
-    """Returns the single stage of a run. Raises `InputError` if the number of devices does not divide a batch."""
+    """Returns the single stage of a run.
+
+    Raises:
+        InputError: the number of devices does not divide a batch.
+    """
     samples = problem.arrays[0].shape[0]
     batch = min(adam.batch, samples)
     shares(shared.samples, batch, "samples of a batch")

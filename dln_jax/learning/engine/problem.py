@@ -221,7 +221,10 @@ class Sharing(NamedTuple):
 
 def sharing(problem: Problem, mesh: Mesh | None) -> Sharing:
     """Returns what the devices of a mesh share in this problem: seeds or samples.
-    Raises `InputError` for one seed, with a loss that is not the mean of the losses of parts of a batch."""
+
+    Raises:
+        InputError: one seed, with a loss that is not the mean of the losses of parts of a batch.
+    """
     if mesh is None or np.size(problem.seed) > 1:
         return Sharing(mesh, None)
     if problem.loss is not None and not problem.loss_is_mean:

@@ -142,7 +142,10 @@ def frames_of_axes(
 
 def kinematic_prior_from_json(values: Any, d: int, parents: Sequence[int] | None = None) -> KinematicPrior:
     """Builds the prior of d joints from JSON values.
-    Raises `InputError` for unknown fields, a wrong number of rows, or arrays that `frames_of_axes` refuses."""
+
+    Raises:
+        InputError: unknown fields, a wrong number of rows, or arrays that `frames_of_axes` refuses.
+    """
     names = set(values) - set(ROUGHNESS) if isinstance(values, dict) else set()
     if names not in ({"axes", "points"}, {"dh_rows"}):
         raise InputError(f"{EXPECTED}; got {reprlib.repr(values)}")

@@ -97,7 +97,10 @@ def method_of(kind: str) -> Method:
 
 def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:
     """Plans the task of a model, which ends when `time.perf_counter` reads `until`; nothing is written yet.
-    Raises `InputError` for data that the model cannot be fitted to."""
+
+    Raises:
+        InputError: data that the model cannot be fitted to.
+    """
     asked = getattr(options, "objective", None)
     objective = SCALED_TORQUE if kind == AUTO else objective_of(kind, recorded.sets.train, asked)
     if objective is TORQUE and getattr(options, "target", None) is None:

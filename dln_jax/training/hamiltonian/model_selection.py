@@ -93,7 +93,10 @@ def description_of(problem: Problem, model: str, *, precision: str = "f64", **ke
 
 def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
     """Arrangement of the coordinates for a pairwise model: as stated, or the one in which measured forces balance.
-    Raises `InputError` if the order is neither stated nor determined by the measurements."""
+
+    Raises:
+        InputError: the order is neither stated nor determined by the measurements.
+    """
     if problem.name != MEASURED:
         return {} if order is None else {"order": order}
     if set(problem.needs.joints) != {"prismatic"} or not arrangements(problem.needs.degrees_of_freedom):

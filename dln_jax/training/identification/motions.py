@@ -48,7 +48,10 @@ class MotionSets(NamedTuple):
 
 def lightly_filtered(data: Trajectories, filtered: Smoothed | None) -> Trajectories:
     """The log at steps of about `STEP`, with q filtered lightly; without --cutoff, the log itself.
-    Raises `InputError` if the light filter cuts the log into other parts."""
+
+    Raises:
+        InputError: the light filter cuts the log into other parts.
+    """
     if filtered is None:
         return data
     cutoff = min(LIGHTER * filtered.cutoff, NYQUIST * filtered.rate)

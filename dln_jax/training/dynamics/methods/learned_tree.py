@@ -27,7 +27,10 @@ BALL = np.array([2.0, 0, 0, 0, 0.02, 0, 0, 0.02, 0, 0.02])
 
 def needs_of_tree(needs: Needs) -> Needs:
     """Converts the needs to those of a learned tree, whose friction is viscous, dry and an offset per joint.
-    Raises `InputError` for friction laws that a learned tree does not have."""
+
+    Raises:
+        InputError: friction laws that a learned tree does not have.
+    """
     if others := [law for law in needs.joint_friction if law not in USUAL]:
         raise InputError(f"a learned tree has no {others[0]} friction; leave it out of joint_friction")
     return needs._replace(friction=needs.friction or bool(needs.joint_friction), joint_friction=())

@@ -108,7 +108,11 @@ def fit(task: Task, options: NetworkOptions, folder: Path, mesh: Mesh | None) ->
 
 
 def solver_of(task: Task) -> Solver:
-    """Returns the solver from `plan`. Raises `InputError` if another `plan` made the task, and it has no solver."""
+    """Returns the solver from `plan`.
+
+    Raises:
+        InputError: another `plan` made the task, and it has no solver.
+    """
     if task.solver is None:
         raise InputError(f"{task.kind} was planned without an optimiser; plan it with the method of networks")
     return task.solver
