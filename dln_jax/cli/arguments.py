@@ -25,7 +25,7 @@ _rules = ConstructorRegistry()
 
 @_rules.primitive_rule
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Reads int and float, and says what was expected in the words of every other message."""
+    """Reads int and float, with error messages in the style of all others."""
     kinds = {int: "a whole number", float: "a number"}
     if info.type not in kinds:
         return None
@@ -66,8 +66,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 def choice(names: Iterable[str], *, several: bool = False, unstated: bool = False) -> Any:
     """Shows the allowed names of an option in its help, for `Annotated[str, ...]`.
 
-    With `several` the option takes a list of names, by default all. With `unstated` the default is not shown, as for
-    `Unstated`.
+    With `several` the option takes a list of names, by default all; `unstated` hides the default, as for `Unstated`.
     """
     return tyro.conf.arg(
         metavar="{" + ",".join(names) + "}" + "[,...]" * several, help_behavior_hint="" if several or unstated else None
@@ -75,12 +74,12 @@ def choice(names: Iterable[str], *, several: bool = False, unstated: bool = Fals
 
 
 class Variants(NamedTuple):
-    """Options that exist for some choices of a command only, such as those of one model: its attribute `VARIANTS`."""
+    """Options that exist only for some choices of a command, such as one model: its attribute `VARIANTS`."""
 
     chosen: Callable[[Mapping[str, Any]], Sequence[type]]
     """Options that were typed or stored, by name -> dataclasses of further options that they bring."""
     known: Mapping[type, str]
-    """For each of these dataclasses the options that bring it, in words."""
+    """For each of these dataclasses, a description of the options that bring it."""
 
 
 def arguments_for(arguments: type, stated: Mapping[str, Any]) -> type:
@@ -120,10 +119,7 @@ def parse(
     """Parses a command line; `--help` prints the help and exits.
 
     Args:
-        arguments: dataclass of the command.
         prog: the command as the user typed it.
-        description: text above the options.
-        line: words after the command.
         common: dataclass of options that every command has.
 
     Raises:
@@ -170,7 +166,7 @@ def _complaint(event: ParseErrorEvent, arguments: type) -> str:
 
 
 def _unknown(option: str, arguments: type) -> str:
-    """Says what an option needs that exists for other choices of the command only."""
+    """Message on an option that is unknown, or that exists only for other choices of the command."""
     name, known = option.lstrip("-").partition("=")[0].replace("-", "_"), {}
     if (variants := getattr(arguments, "VARIANTS", None)) is not None:
         known = variants.known
@@ -222,9 +218,7 @@ def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive
 
     Args:
         option: name, such as --noise.
-        text: text as typed.
         counts: allowed counts of numbers (default: any).
-        positive: whether all numbers must be positive.
 
     Raises:
         InputError: wrong count, text that is not a number, or a number out of range.

@@ -93,10 +93,7 @@ def _counts() -> dict[str, float]:
 
 
 def _remove_torn(folder: Path) -> None:
-    """Removes programs that a kill left half-written, which lack the access time that JAX writes after a program.
-
-    Next to such a program JAX 0.10 would store no others.
-    """
+    """Removes programs that a kill left half-written, without an access time: beside them JAX 0.10 stores no others."""
     try:
         with FileLock(folder / LOCK, timeout=0):
             for program in folder.glob("*-cache"):

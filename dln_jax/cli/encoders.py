@@ -107,7 +107,6 @@ def checked(
     Args:
         options: those of the command; with a cut-off, checks of the file's own rates (`FILTERED`) are skipped.
         data: unfiltered data of the file.
-        path: the file.
         robot: robot that the log is compared with, if any.
         without: names of checks that do not matter for this command.
 

@@ -60,7 +60,7 @@ class Devices:
     """Devices of one process that share the work."""
 
     devices: Unstated[int] = None
-    """Devices per process (default: 1; of several processes all)."""
+    """Devices per process (default: 1, or all with several processes)."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Checked(Logged):
     """How to treat a log with errors."""
 
     accept_log: bool = False
-    """Go on although the check of the log found errors."""
+    """Continue although the check of the log found errors."""
 
 
 @dataclass(frozen=True)

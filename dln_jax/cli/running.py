@@ -31,15 +31,13 @@ def run(
     from_shell: bool = False,
     joining: int | None = None,
 ) -> None:
-    """Parses the command line and runs `main`; errors and exit statuses as `as_one_line`.
+    """Parses the command line and runs `main`; errors and exit statuses as for `as_one_line`.
 
     Args:
-        main: body of the command.
-        arguments: dataclass of its arguments.
         prog: the command as the user typed it.
         line: words after the command (default: those of this process).
         from_shell: whether the process runs only this command; compiled programs are then kept.
-        joining: seconds that several processes wait for each other to start (default: as `scale.processes`).
+        joining: seconds that several processes wait for each other to start (default: that of `scale.processes`).
     """
     with as_one_line(prog, None):
         common = NoCompilationCache if getattr(arguments, "MEASURES_COMPILATION", False) else CompilationCache
@@ -85,8 +83,8 @@ def run(
 def as_one_line(prog: str, options: Any) -> Iterator[None]:
     """Reports errors in one line and sets the exit status.
 
-    A user's mistake, or memory, a device or disk space that the machine lacks, is 2, a refused fit 1, a lost process 3,
-    an interrupt 130, a closed output pipe 141.
+    The status is 2 for a user's mistake, and for memory, devices or disk space that the machine lacks; 1 for a refused
+    fit, 3 for a lost process, 130 for an interrupt, 141 for a closed output pipe.
     """
     try:
         yield
@@ -139,10 +137,7 @@ def _say(last: str) -> None:
 
 
 def interrupted(command: str, options: Any, folder: Path | None = None) -> str:
-    """Message after an interrupt: how to resume the run, or that its folder is incomplete.
-
-    A command can resume if its arguments have `resume`.
-    """
+    """Message after an interrupt: how to resume (if the arguments have `resume`), or that the folder is incomplete."""
     if folder is None:
         return "interrupted"
     if hasattr(options, "resume") and (folder / "config.json").is_file():

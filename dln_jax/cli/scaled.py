@@ -112,11 +112,7 @@ def wait_for_all(options: Any) -> None:
 
 @contextlib.contextmanager
 def copied_folder(options: Any, resume: bool) -> Iterator[Path]:
-    """Yields a temporary folder for this process, with a copy of the run if it is resumed.
-
-    Raises:
-        InputError: the run's folder cannot be copied.
-    """
+    """Yields a temporary folder for this process, with a copy of a resumed run; `InputError` if it cannot be copied."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if resume:

@@ -66,7 +66,6 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
     A file or folder may have moved, if its content is the same.
 
     Args:
-        typed: arguments on the command line.
         arguments: dataclass of the command, whose choices in the run decide which options exist.
 
     Raises:
@@ -103,11 +102,7 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
 
 
 def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
-    """The arguments of a command in a config.json.
-
-    Raises:
-        InputError: the file is damaged, or a release with other arguments wrote it.
-    """
+    """The arguments of a command in a config.json; `InputError` if it is damaged or of another release."""
     values = {key: value for key, value in values.items() if key not in (CHOSEN, FILES)}
     _checked(path, values, arguments)  # the choices, on which the other options depend
     whole = arguments_for(arguments, values)
@@ -120,7 +115,6 @@ def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) ->
 
 
 def _checked(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
-    """The stored arguments of a dataclass."""
     expected = stored_arguments(arguments())
     if absent := [key for key in expected if key not in values]:
         raise InputError(f"{path}: {absent[0]} is missing; {REMEDY}")

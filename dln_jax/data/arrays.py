@@ -47,9 +47,7 @@ def load_file(
     """Reads the arrays with these keys, if present, and passes them to `from_arrays`, which checks them.
 
     Args:
-        path: path of an npz file.
         from_arrays: converts arrays by key into the result.
-        keys: keys to read.
         readers: readers of other formats, by the ending of the name such as ".csv"; that of folders is `FOLDER`.
 
     Raises:
@@ -155,11 +153,7 @@ def numeric(
 
 
 def on_device(name: str, array: np.ndarray, dtype: Any) -> Array:
-    """Converts an array of samples to a dtype on the device.
-
-    Raises:
-        InputError: the sum of its squares overflows in that dtype.
-    """
+    """Converts an array of samples to a dtype on the device; `InputError` if the sum of its squares overflows."""
     _require_squares(name, array, dtype)
     return jnp.asarray(array, dtype)
 
@@ -168,8 +162,7 @@ def spread(name: str, array: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"
     """Standard deviation of each column, in float64.
 
     Raises:
-        InputError: squares overflow, nonzero numbers are so small that all squares vanish, or some exceed the median by
-            `MOST_TIMES_TYPICAL`.
+        InputError: squares overflow, nonzero squares all vanish, or numbers exceed `MOST_TIMES_TYPICAL` medians.
     """
     _require_squares(name, array, np.float64)
     sizes = np.abs(array[array != 0])

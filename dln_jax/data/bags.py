@@ -6,7 +6,7 @@ series are put on one clock by these rules:
 
 - The clock is that of the slowest series; its stamps are the times of the log.
 - Positions and velocities of other series are interpolated by cubic splines, efforts linearly, since they may jump.
-- A time is left out if a series has no two messages around it that are at most `BRIDGED` of its median steps apart.
+- A time is left out unless every series has two messages around it at most `BRIDGED` of its median steps apart.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,9 +25,9 @@ TYPE = "sensor_msgs/msg/JointState"
 FIELDS = {"position": "q", "velocity": "qd", "effort": "tau"}
 """Fields of a message, and their keys in the schema."""
 BRIDGED = 2.5
-"""Median steps between two messages that are interpolated between: one lost message is bridged."""
+"""Largest distance of two messages for interpolation, in median steps: one lost message is bridged."""
 RESTART = 1_000_000_000
-"""ns by which stamps may run backwards (messages out of order); more is a clock that was set, and is not used."""
+"""Largest backward jump of stamps in ns (messages out of order); after a longer one, stamps are not used."""
 INSTALL = "pip install 'dln-jax[bag]'"
 
 Choose = Callable[[Sequence[str]], Sequence[str]]
@@ -44,10 +44,10 @@ class Series(NamedTuple):
 
 
 class Messages(NamedTuple):
-    """Series of one topic, and what was found about its stamps."""
+    """Series of one topic, and remarks about its stamps."""
 
     series: dict[tuple[str, str], Series]
-    """By field and joint."""
+    """Series by field and joint."""
     remarks: tuple[str, ...]
 
 
@@ -56,13 +56,10 @@ def read(path: Path, *, topics: Sequence[str] = (), choose: Choose = tuple) -> t
 
     Args:
         path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
-        topics: topics to read; where two have the same quantity of a joint, the first counts. Default: the only topic
-            of joint states.
-        choose: selects joints.
+        topics: topics to read; if quantities repeat, the first topic counts. Default: the only topic of joint states.
 
     Raises:
-        InputError: rosbags is missing, the file is no bag, a topic is absent or ambiguous, messages are malformed, or
-            topics do not overlap in time.
+        InputError: no rosbags, no bag, an absent or ambiguous topic, malformed messages, or no overlap in time.
     """
     bags = paths(path)
     parts = []
@@ -135,13 +132,13 @@ def one(path: Path, topics: Sequence[str], choose: Choose) -> dict[str, Any]:
 def on_one_clock(
     series: dict[tuple[str, str], Series],
 ) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray], tuple[str, ...]]:
-    """Stamps of the slowest series, values of all series there, and remarks; the rules are those of the module.
+    """Stamps of the slowest series, values of all series there, and remarks, by the rules of the module.
 
     Raises:
         InputError: the series do not overlap in time.
     """
     steps = {key: np.median(np.diff(one.stamps)) if len(one.stamps) > 1 else np.inf for key, one in series.items()}
-    # Steps that agree to 1 % belong to one rate; of those, the series with the fewest messages.
+    # Steps that agree to 1 % count as one rate; take the series of that rate with the fewest messages.
     slowest = max(steps.values())
     key = min((key for key in series if steps[key] >= 0.99 * slowest), key=lambda key: len(series[key].stamps))
     clock = series[key].stamps
@@ -244,7 +241,7 @@ def _messages(path: Path, topics: Sequence[str]) -> dict[str, Iterator[tuple[int
 
 
 def _wanted(topics: Sequence[str], everywhere: dict[str, str]) -> list[str]:
-    """The topics to read; the messages list those that are there."""
+    """The topics to read; error messages list the available ones."""
     joint_states = [topic for topic, kind in everywhere.items() if kind == TYPE]
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(everywhere.items()))
     listed = f"the bag has {listed or 'no topics'}"

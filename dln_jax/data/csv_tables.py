@@ -72,7 +72,6 @@ def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[
     """Reads a CSV file: the arrays by schema key, in SI units, and the titles of ignored columns.
 
     Args:
-        path: path of the file.
         units: units of titles without one: "si", or "degrees" for angles in degrees and all else in SI.
 
     Raises:
@@ -171,7 +170,6 @@ def _spelled(unit: str) -> str:
 
 
 def _factor(column: Column, stated: str | None) -> float:
-    """Conversion factor to SI."""
     known = UNITS[column.key]
     if not known:
         return 1.0
@@ -233,7 +231,6 @@ def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.nda
 
 
 def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
-    """Describes the first invalid line."""
     rows = _rows(path)
     next(rows)
     for line, cells in rows:

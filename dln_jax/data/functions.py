@@ -62,11 +62,7 @@ def load(path: str | Path) -> FunctionSamples:
 
 
 def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:
-    """Checks arrays against the table above.
-
-    Raises:
-        InputError: names the key, what it holds, what was expected and what to do.
-    """
+    """Checks arrays against the table above; an `InputError` names the key, its content and a remedy."""
     x, y = numeric(arrays, "x"), numeric(arrays, "y")
     for key, array, letter in (("x", x, "n"), ("y", y, "m")):
         if array.ndim != 2 or array.shape[1] == 0:

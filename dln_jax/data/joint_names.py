@@ -24,8 +24,7 @@ def chosen(own: Sequence[str], stated: Sequence[str]) -> Chosen:
 
     Args:
         own: names in the log.
-        stated: entries `LOG=NEW` rename a joint; if any entry is a name alone, only the stated joints are kept, in the
-            stated order; otherwise all are kept.
+        stated: entries `LOG=NEW` rename a joint; if any entry is a name alone, only stated joints are kept, in order.
 
     Raises:
         InputError: an unknown name, an empty one, or two joints with one name.
@@ -88,7 +87,6 @@ def _by_prefix(own: Sequence[str], wanted: Sequence[str]) -> list[dict[str, str]
 
 
 def _common_ending(first: str, second: str) -> int:
-    """Number of equal characters at the end of both."""
     count = 0
     while count < min(len(first), len(second)) and first[-1 - count] == second[-1 - count]:
         count += 1

@@ -1,6 +1,6 @@
 """Mesh files: npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], fixed vertices.
 
-The formats of meshing programs are those of `softbody.mesh.files`.
+`softbody.mesh.files` reads the formats of meshing programs.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ class StoredMesh(NamedTuple):
     held: Int[np.ndarray, " k"] | None
     """Indices of fixed vertices; `None` if the file has none."""
     statements: tuple[str, ...] = ()
-    """What was left out or repaired; an npz file is never repaired."""
+    """Notes on parts that were left out or repaired; an npz file is never repaired."""
 
 
 def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
@@ -35,8 +35,7 @@ def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
         scale: length of the file's unit in m, such as 0.001 for millimetres.
 
     Raises:
-        InputError: the file is missing or of another format, its arrays do not form a mesh, `held` is malformed, or as
-            `read_mesh`.
+        InputError: the file is missing, `read_mesh` refuses it, its arrays do not form a mesh, or `held` is malformed.
     """
     if Path(path).suffix.lower() in SUFFIXES:
         mesh, statements = read_mesh(path, scale=scale)
@@ -47,7 +46,7 @@ def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
 
 
 def from_arrays(arrays: dict[str, Any]) -> StoredMesh:
-    """Checks the arrays of a mesh file; errors as `load`."""
+    """Checks the arrays of a mesh file; errors as for `load`."""
     for name in ("vertices", "elements"):
         if name not in arrays:
             keys = ", ".join(arrays) or "nothing"

@@ -88,7 +88,6 @@ def write_robot(
     place for them: a comment states them.
 
     Args:
-        path: path of the new file.
         original: URDF or MJCF file from which the tree's structure was read; it stays unchanged.
         tree: tree with the joints of that file, by name.
         damping: viscous friction of each joint (or motor) [d], N m s or N s/m; by default unchanged.
@@ -100,7 +99,7 @@ def write_robot(
 
     Raises:
         InputError: the tree has other joints, a link is not physically consistent, an MJCF file includes or repeats
-            elements or has locked joints, `path` is `original`, or as `read_robot`.
+            elements or has locked joints, `path` is `original`, or `read_robot` refuses the original.
     """
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
@@ -231,7 +230,7 @@ def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[dict
 
 
 def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Mapping[str, Any]]) -> None:
-    """Replaces the fixed tendons of coupled motors, by name; others stay, but their inertia is now in the motors'."""
+    """Replaces the fixed tendons of coupled motors, by name; others lose their armature, now part of the motors'."""
     group = root.find("tendon")
     for tendons in root.findall("tendon"):
         for tendon in tendons.findall("fixed"):

@@ -1,8 +1,7 @@
 """Reads the XML of URDF and MJCF files: elements, the inertias of a URDF, and the limits of joints.
 
 Other formats, and files larger than any robot's, are refused. So are malformed limits: MuJoCo treats a range that is
-NaN, empty, swapped or half stated as no range, and a motion designed from such a file would drive the joint into its
-stop.
+NaN, empty, swapped or half stated as no range, and a motion designed with it would drive the joint into its stop.
 """
 
 import xml.etree.ElementTree as ET
@@ -23,7 +22,7 @@ MOST_ELEMENTS = 20_000
 DEEPEST = 3 * MOST_JOINTS
 """Deepest nesting of elements: per joint, MJCF nests a body and perhaps a frame."""
 REPEATING = ("replicate", "composite", "flexcomp")
-"""MJCF elements that stand for many."""
+"""MJCF elements that expand to many."""
 MOVING = ("revolute", "continuous", "prismatic")
 """URDF joint types that move."""
 NUMBERS = {"limit": ("lower", "upper"), "dynamics": ("damping", "friction")}
@@ -56,7 +55,7 @@ class _Elements(ET.TreeBuilder):
 
 
 def parsed(path: Path) -> ET.Element:
-    """The root element of a URDF or MJCF file, comments included; errors as `read_robot`."""
+    """The root element of a URDF or MJCF file, comments included; errors as for `read_robot`."""
     if not is_file(path):
         raise InputError(f"{path}: no such file; give the URDF or MJCF file of a robot")
     try:

@@ -46,7 +46,6 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
     URDF inertias are read as stated, even if they are not physically consistent.
 
     Args:
-        path: path of the file.
         lock: joints to lock, such as those of a gripper: names (locked at zero), or positions by name, rad or m.
             "*finger*" matches all names that contain finger. Bodies behind a locked joint become fixed.
 
@@ -73,7 +72,7 @@ def opened(
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
 
-    For a URDF, shapes and inertias are left out. Errors as `read_robot`.
+    For a URDF, shapes and inertias are left out. Errors as for `read_robot`.
     """
     if root.tag == "mujoco":
         mujoco, model = _compiled(path, root, ())

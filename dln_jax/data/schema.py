@@ -81,19 +81,16 @@ def load(
     """Reads and checks an npz file, a CSV file or a ROS bag; never unpickles.
 
     Args:
-        path: path of the file; CSV if its name ends in .csv (see `data.csv_tables`), a bag if it ends in .db3, .mcap or
-            .bag or is a folder (see `data.bags`).
+        path: .csv for CSV (see `data.csv_tables`); .db3, .mcap, .bag or a folder for a bag (see `data.bags`).
         rate: sampling rate of all trajectories, Hz, for a file without t.
         units: units of CSV titles without one, "si" or "degrees".
         joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joint_names.chosen`).
         topics: topics of joint states in a bag; by default the only one.
         torque_factor: factor of tau, N m per A for currents: one number, one for each joint, or numbers by name.
-        robot: names of the robot's joints. Of a bag, only the joints that match them are read; `splits.with_joints`
-            brings them into this order.
+        robot: names of the robot's joints; of a bag only those are read (`splits.with_joints` orders them).
 
     Raises:
-        InputError: the file is missing, is not of its format, holds pickled objects, breaks the schema, or lacks a
-            stated joint or topic.
+        InputError: the file is missing, damaged or pickled, breaks the schema, or lacks a stated joint or topic.
     """
     stated = {"joints": joints, "topics": topics, "torque_factor": torque_factor, "robot": robot}
     return load_arrays(path, from_arrays, rate=rate, units=units, **stated)
@@ -110,7 +107,7 @@ def load_arrays(
     torque_factor: Any = None,
     robot: Sequence[str] = (),
 ) -> Data:
-    """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors as `load`."""
+    """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors: see `load`."""
     suffix, folder = Path(path).suffix.lower(), is_folder(Path(path))
     if units is not None and suffix != ".csv":
         raise InputError(f"{path!s:.200}: units are for CSV; npz files and bags are in SI units")
@@ -143,11 +140,7 @@ def column(data: Trajectories, key: str) -> np.ndarray:
 
 
 def from_arrays(arrays: dict[str, Any]) -> Trajectories:
-    """Checks arrays against the schema and completes them.
-
-    Raises:
-        InputError: names the key, what it holds, what was expected and what to do.
-    """
+    """Checks arrays against the schema and completes them; an `InputError` names the key, its content and a remedy."""
     q = numeric(arrays, "q")
     if q.ndim != 2 or q.shape[1] == 0:
         raise InputError(f"q has shape {q.shape}; expected [N, d] with d >= 1: one column per coordinate")

@@ -97,8 +97,7 @@ def segments(
 def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tuple[np.ndarray, np.ndarray]:
     """Sample indices [W, T] of consecutive windows, which share their end samples, and the weights of the samples.
 
-    Windows lie within segments. The remainder of a segment is a shorter window, padded with its last sample at weight
-    0.
+    Windows lie within segments. The rest of a segment is a shorter window, padded with its last sample at weight 0.
 
     Raises:
         InputError: a length below 2, or no two samples without a gap between them.
@@ -117,11 +116,7 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
 
 
 def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
-    """At most `most` samples, drawn by the seed and kept in their order.
-
-    Raises:
-        InputError: `most` is not positive, or the seed is out of range.
-    """
+    """At most `most` samples, drawn by the seed and kept in their order; `InputError` if either is out of range."""
     require_positive(samples=most)
     require_seed(seed)
     count = len(data.t)
@@ -223,10 +218,7 @@ def held_out(count: int, share: float, what: str) -> int:
 
 
 def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
-    """Raises `InputError` if a test trajectory is a copy of one in the training data, which would void the test.
-
-    Trajectories of constant state, such as single samples, are not compared.
-    """
+    """Raises `InputError` if a test trajectory is a copy of a training one; motionless ones are not compared."""
 
     def contents(data: Trajectories) -> dict[bytes, int]:
         states = np.hstack([data.q, data.qd, data.qdd, data.tau])

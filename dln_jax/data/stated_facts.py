@@ -1,4 +1,4 @@
-"""Completes the arrays of a file by facts that a user states: joints, torque factors, the sampling rate."""
+"""Completes the arrays of a file with facts that a user states: joints, torque factors, the sampling rate."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]
     """Selects, orders and renames the joints as stated (see `data.joint_names.chosen`).
 
     Raises:
-        InputError: joints are stated, but the file names none; or as `chosen`.
+        InputError: joints are stated, but the file names none, or `chosen` refuses them.
     """
     if not joints:
         return arrays
@@ -22,7 +22,7 @@ def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]
     if names.ndim != 1 or not names.size or names.dtype.kind not in "US":
         raise InputError("--joints needs the joints' names, which the file lacks; add joint_names, or names in titles")
     own = names.tolist()
-    # A bag has been read for the joints of a robot alone.
+    # Of a bag, only the joints of the robot have been read.
     stated = [entry for entry in joints if "remarks" not in arrays or entry.partition("=")[0].strip() in own]
     kept = joint_names.chosen(own, stated)
     places = [own.index(name) for name in kept.own]
@@ -34,11 +34,7 @@ def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]
 
 
 def scaled(arrays: dict[str, Any], torque_factor: Any) -> dict[str, Any]:
-    """Multiplies tau by the stated factors (see `data.joint_names.factors`).
-
-    Raises:
-        InputError: there is no tau, or as `factors`.
-    """
+    """Multiplies tau by the stated factors (see `data.joint_names.factors`); `InputError` if there is no tau."""
     if torque_factor is None:
         return arrays
     if np.ndim(arrays.get("tau")) != 2:

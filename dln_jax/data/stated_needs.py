@@ -12,7 +12,7 @@ from dln_jax.types import InputError, Needs
 
 
 def needs_from_text(text: str) -> Needs:
-    """`Needs` from JSON text; errors as `needs_from_json`, also for text that is not JSON."""
+    """`Needs` from JSON text; errors as for `needs_from_json`, also for text that is not JSON."""
     try:
         stated = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -45,7 +45,6 @@ def needs_from_json(stated: Any) -> Needs:
 
 
 def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] | None:
-    """Reads a matrix with one row per joint."""
     if stated is None:
         return None
     rows: list[tuple[Any, ...]] = []

@@ -101,8 +101,7 @@ def determinacy(unseen: Float[np.ndarray, "K P"]) -> tuple[Determinacy, ...]:
     """Classifies every parameter as identifiable alone, in combination or not at all.
 
     Args:
-        unseen: orthonormal directions that change no force, for columns scaled to unit length; a zero column has a
-            direction of its own.
+        unseen: orthonormal directions that change no force, for columns of unit length; zero columns have one each.
     """
     shares = np.linalg.norm(unseen, axis=0)
     return tuple("alone" if s < SHARE else "not at all" if s > 1 - SHARE else "in combination" for s in shares)

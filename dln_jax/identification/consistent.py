@@ -76,11 +76,7 @@ def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[boo
 
 
 def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
-    """Raises the eigenvalues of a body's pseudo-inertia to at least `SMALLEST` times the largest.
-
-    Raises:
-        InputError: no eigenvalue is positive.
-    """
+    """Raises the eigenvalues of a pseudo-inertia to `SMALLEST` times the largest; `InputError` if none is positive."""
     values, vectors = np.linalg.eigh(pseudo_inertia(np.asarray(theta, float)))
     if not values[-1] > 0:
         raise InputError("a link that is to be identified has no mass; expected a rough value for it")
@@ -104,9 +100,7 @@ def fit_consistent(
         columns: columns of the P parameters; the ten of a body are adjacent.
         known: prior and initial values. An inconsistent body is replaced by `nearest_body`, a zero coefficient by one
             that explains a hundredth of the torque. A body with ten zeros is absent and stays zero.
-        regularisation: cost of a unit of divergence, dimensionless (in squares of the noise); positive, since data
-            never determine all parameters.
-        iterations: upper limit of Newton iterations.
+        regularisation: cost of a unit of divergence, in squares of the noise; positive, as data never determine all.
 
     Raises:
         InputError: `regularisation` is not positive, or a body has no mass.

@@ -86,11 +86,9 @@ def identify(
         rank_tolerance: as for `fit_weighted`.
         consistent: also fit physically consistent parameters.
         regularisation: as for `fit_consistent`.
-        seed: seed of the random states.
 
     Raises:
-        InputError: the data lack torques or have another number of joints than the robot, the model is not linear, or a
-            setting is out of range.
+        InputError: no torques, numbers of joints that differ, a model that is not linear, or a setting out of range.
     """
     d = data.degrees_of_freedom
     joints = ("revolute",) * d if joints is None else joints
@@ -133,8 +131,7 @@ def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy
     lengths = np.linalg.norm(scaled, axis=1)
     _, sizes, right = np.linalg.svd(scaled[lengths > 0] / lengths[lengths > 0, None], full_matrices=False)
     possible = np.sum(right[sizes > ROUNDING * sizes.max(initial=0.0)] ** 2, axis=0)
-    # `unseen` holds the structurally unidentifiable directions and the identifiable ones that the data miss; subtract
-    # the former.
+    # `unseen` holds the structurally unidentifiable directions, subtracted here, and those that the data miss.
     missed = np.sum(fit.unseen**2, axis=0) - (1 - possible)
     shown = possible > ROUNDING
     shares = np.where(shown, missed / np.where(shown, possible, 1.0), 1.0)

@@ -1,6 +1,6 @@
 """Identification by motions: output error over short windows, alone or together with the equations of the torques.
 
-    minimise over theta, delay, and of every window w its start z_w and a constant torque e_w
+    minimise over theta, the delay, and for every window w over its start z_w and a constant torque e_w
 
         sum over samples |(q(t; z_w, theta) - q_measured) / noise_q|² + sum over windows |e_w / noise_tau|²
             + share * |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.weighted`)
@@ -13,7 +13,7 @@ Windows in which something unusual happened, such as a touch, are off by far mor
 is longer than the median counts by the median over its length (Huber), with weights from the previous fit.
 
 The residual is linearised at theta, which gives equations of the same kind as those of torques. The least-squares
-problems with physically consistent bodies are those of `consistent`, one a round; a step is halved until the sum
+problems with physically consistent bodies are those of `consistent`, one per round; a step is halved until the sum
 decreases (consistent bodies form a convex set).
 """
 
@@ -45,7 +45,6 @@ ROUNDS, SETTLED = 12, 1e-4
 CHUNK = 64
 """Windows that are linearised at a time."""
 REWEIGHTINGS = 2
-"""Default number of reweightings."""
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""
 TYPICAL_DELAY = 1e-3
@@ -81,7 +80,7 @@ class MotionFit(NamedTuple):
 
 
 def cut_motions(data: Trajectories, length: int) -> MotionWindows:
-    """Consecutive windows of `length` samples within segments; errors as `data.splits.window_indices`."""
+    """Consecutive windows of `length` samples within segments; errors as for `data.splits.window_indices`."""
     indices, weight = window_indices(data, length)
     slope = np.concatenate(
         [
@@ -142,7 +141,7 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 def distances(
     linearised: Callable, start: Float[np.ndarray, " P"], noise_tau: Float[np.ndarray, " d"], windows: MotionWindows
 ) -> Float[np.ndarray, " d"]:
-    """Root mean square distance of every joint's simulated motion from the measured one, rad or m, by two rounds.
+    """Root mean square distance of every joint's simulated motion from the measured one, rad or m, in two rounds.
 
     The first round has a thousandth of the spread of q as noise; each moves the compromise between starts and torques.
     """
@@ -174,7 +173,6 @@ def fit_motions(
 
     Args:
         model: a model that is linear in its parameters, such as `models.make_rigid_tree`.
-        columns: columns of the parameters.
         prior: values that undetermined directions keep.
         start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
         windows: from `cut_motions`.
@@ -182,8 +180,6 @@ def fit_motions(
         noise_q: standard deviation of q, forces that were not recorded included, rad or m (default: the root mean
             square distance of the motions simulated with the initial parameters).
         torques: triangular factor of the torques' equations in units of noise.
-        share: weight of the torques.
-        delay: whether to fit a delay of the torques.
         regularisation: as for `fit_consistent`.
         reweightings: number of times that windows are weighted by their distance and the fit is repeated.
 

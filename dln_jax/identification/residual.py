@@ -75,13 +75,11 @@ def fit_residual(
     Args:
         rigid: such as `models.make_rigid_tree`.
         parameters: identified parameters, which stay fixed.
-        needs: kinds of the joints.
         train: data from which the tree was identified.
         validation: other motions, used for selection; judge the result on yet others.
         candidates: candidates in order of size, the first without terms.
         iterations: upper limit of Gauss-Newton iterations; the parameters with the lowest validation error are kept.
         seconds: time limit, after which the current network stops training and no other one is tried.
-        seed: seed of the networks.
 
     Raises:
         InputError: the first candidate has terms, or the torques do not vary.
@@ -123,5 +121,4 @@ def fit_residual(
 
 
 def _typical(name: str, values: Float[np.ndarray, "N d"]) -> tuple[float, ...]:
-    """Typical magnitudes by joint, to three digits."""
     return tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, values))

@@ -5,8 +5,7 @@
 Directions that the data do not determine keep their prior values: of all theta that fit equally well, the solution is
 the nearest to the prior, in units of the columns' lengths. The noise is noise_j² = |residual_j|² / (N - share of the
 parameters that joint j determines); fit and noise alternate until the noise converges. The covariance of theta assumes
-independent errors of this size. If residuals are correlated over T samples, T of them count as one
-(`residual_statistics`).
+independent errors of this size; of residuals correlated over T samples, T count as one (`residual_statistics`).
 """
 
 from typing import NamedTuple
@@ -71,7 +70,6 @@ def fit_weighted(
     """Fits the parameters by weighted least squares.
 
     Args:
-        data: equations of the data.
         known: prior values.
         noise: standard deviation of each joint's torque, N m or N; estimated by default, starting from equal noise.
         correlation: correlation time of each joint's residuals in samples; the covariance counts that many as one.
@@ -80,8 +78,7 @@ def fit_weighted(
             as large as all torque would not rise above the noise.
 
     Raises:
-        InputError: noise is not positive, a tolerance is outside [0, 1), tau is zero, or there are fewer samples than
-            parameters.
+        InputError: noise is not positive, a tolerance is outside [0, 1), tau is zero, or samples are too few.
     """
     d, known = len(data.triangles), np.asarray(known, float)
     torque = np.sqrt(np.sum(data.triangles[:, :, -1] ** 2, axis=1) / data.samples)

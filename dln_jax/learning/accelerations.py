@@ -1,4 +1,4 @@
-"""Fits a model's accelerations to those of the data, in coordinates and velocities, with or without torques.
+"""Fits a model to measured accelerations, with or without torques.
 
     residual = (qdd_hat(q, qd, tau) - qdd) / spread of qdd
 
@@ -36,15 +36,13 @@ def problem(
 
     Args:
         model: built from any energies, or from accelerations, with float64 parameters.
-        parameters: initial parameters.
         data: training samples; if there are more than `most_samples`, a random subset is drawn.
         validation: samples that select the parameters.
         gauge: fixes the scale of the energies; needed only for motions without torques.
-        most_samples: largest number of samples to fit.
         seed: seed of the draw and of the order of the samples.
 
     Raises:
-        InputError: motions without torques and without a gauge, or numbers that are too large.
+        InputError: the data have no torques and there is no gauge, or numbers are too large.
     """
     require_positive(most_samples=most_samples)
     check_gauge(gauge, data.tau, data.degrees_of_freedom)

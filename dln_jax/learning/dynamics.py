@@ -12,9 +12,9 @@ a minute of processor time; two numbers are two seeds.
     64 x 64, AdamW, all samples (6,000 steps) 0.062, 0.059        0.023   0.0075
 
 With 15 motions, wider and deeper small networks (16 x 16, 32) reached the same 0.025 more slowly, 8 units reached
-0.056, and a ridge did not help. A step of Gauss-Newton forms JᵀJ in about N d P² operations, and neighbouring samples
-of a motion are redundant: a part of them is enough. Its capacity limits a small network, the information in the motions
-a large one: the number of independent equations decides.
+0.056, and a ridge did not help. A Gauss-Newton step takes about N d P² operations to form JᵀJ, and neighbouring samples
+of a motion are redundant, so a subset is enough. A small network is limited by its capacity, a large one by the
+information in the motions: the number of independent equations decides between them.
 """
 
 from collections.abc import Sequence
@@ -45,24 +45,21 @@ MANY_JOINTS = 4
 WIDTH = 16
 """Width of the hidden layer that mass matrix and potential share."""
 ROWS_PER_PARAMETER = 14
-"""Equations per parameter in a step of Gauss-Newton. For 16 x 16 units, seven did as well."""
+"""Equations per parameter in a Gauss-Newton step. For 16 x 16 units, seven did equally well."""
 MOST_INDEPENDENT = 6
-"""Above this number of independent equations per parameter of the small network, a large one by Adam is better."""
+"""With more independent equations per parameter of the small network, a large one trained with Adam is better."""
 
 
 def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0) -> Problem:
     """Builds the problem of fitting a model to an objective, in the precision of the model.
 
     Args:
-        model: model of `dln_jax.models`.
         sets: samples for training, for selecting the parameters, and for monitoring.
         objective: residual to minimise, from `learning.objectives`.
-        seeds: seeds of the initial parameters and of the order of the samples. Several seeds train in one program, and
-            the results have a leading axis of seeds.
+        seeds: seeds of initial parameters and sample order; several train in one program and add an axis to results.
 
     Raises:
-        InputError: the data cannot determine the model, lack a key of the objective, or overflow in the model's
-            precision.
+        InputError: the data cannot determine the model, lack a key of the objective, or overflow in its precision.
     """
     for seed in (seeds,) if isinstance(seeds, int) else seeds:
         require_seed(seed)
@@ -138,10 +135,7 @@ def suited_network(needs: Needs, train: Trajectories) -> Suited:
 
 
 def independent_equations(data: Trajectories) -> int:
-    """Returns d times the number of effective independent samples, the median over the joints' accelerations.
-
-    It does not change if motions are sampled more often.
-    """
+    """d times the effective sample size of the accelerations (median over joints); independent of the sampling rate."""
     counts = [effective_samples(column - column.mean(), data.trajectory) for column in data.qdd.T]
     return round(data.degrees_of_freedom * float(np.median(counts)))
 

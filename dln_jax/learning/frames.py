@@ -7,9 +7,8 @@
 
 Samples are windows of consecutive frames, k = 0 .. W - 1; x_k holds the frames k and k + 1. The published term is a
 forward difference, z_1 - z_0 = rates(z_0), whose error is quadratic in the frame time. Here RK4 integrates the field
-from a window's first state to all later ones. With a window of two this is the published term without that error;
-longer windows also penalise errors that grow during a motion. The learning rate decays by a cosine; the published one
-is constant.
+from a window's first state to all later ones. A window of two gives the published term without that error; longer
+windows also penalise errors that grow during a motion. The learning rate decays by a cosine; the published is constant.
 
 Latent states have no scale of their own: CC and HNN fall when the latent plane shrinks, and AE does not change. To
 remove that incentive, every error is divided by the variance of its target in the batch (z_p for CC), unless `relative`
@@ -111,8 +110,7 @@ def problem(
 ) -> Problem:
     """Builds the problem of fitting a model to the frames of trajectories, for Adam.
 
-    The validation trajectories select the parameters, by the same loss. The seed decides the initial parameters and the
-    order of the windows.
+    Validation trajectories select the parameters, by the same loss. The seed sets initial parameters and window order.
 
     Raises:
         InputError: settings are out of range, or trajectories are shorter than a window.

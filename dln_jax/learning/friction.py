@@ -76,21 +76,18 @@ def fit_friction(
     All samples are held in memory, N d (11 d + coefficients) numbers: decimate long logs.
 
     Args:
-        tree: tree with known frames.
         data: samples to fit; hold out the trajectories that will judge the result.
         laws: friction laws, as in `mechanics.friction.laws`.
         shape: initial shapes; the defaults of `FrictionShape` if omitted.
         held: names of shapes that stay at their initial value.
         cooling: whether viscous friction depends on the log's temperature; its mean becomes the reference.
         motors, coupled: as for `models.make_rigid_tree`.
-        noise: standard deviations of the joints' torques [d], which weight the samples; the torque's own deviation by
-            default.
+        noise: standard deviations of the joints' torques [d], which weight the samples (default: the torque's own).
         negligible: as for `learning.linear.fit_linear`.
         iterations: largest number of Gauss-Newton iterations.
 
     Raises:
-        InputError: unknown laws, torques that do not vary, a noise that is not positive, or cooling without viscous
-            friction or without a temperature that varies.
+        InputError: unknown laws, constant torques, a noise <= 0, or cooling without viscous friction or a temperature.
     """
     began = time.perf_counter()
     d, terms = tree.degrees_of_freedom, terms_of(laws, shape, held, cooling=cooling, motors=motors, coupled=coupled)

@@ -1,7 +1,7 @@
-"""Terms of a rigid tree's torques that a log may not show: coupled motors, friction by load, and by temperature.
+"""Chooses optional torque terms of a rigid tree: coupled motors, friction that depends on load or on temperature.
 
-Every term lowers the error on the data that it is fitted to, the true plant having it or not. It is therefore kept only
-if it lowers the error in cross-validation over trajectories, or blocks of time, by more than `MARGIN` standard errors.
+Any extra term lowers the error on its own training data, whether or not the plant has it. A term is therefore kept only
+if it lowers the error in cross-validation over trajectories (or blocks of time) by more than `MARGIN` standard errors.
 """
 
 from collections.abc import Sequence
@@ -18,11 +18,9 @@ from dln_jax.learning.model_selection import segments, significantly_better
 from dln_jax.mechanics.trees.description import Tree
 
 FOLDS = 4
-"""Parts of a log that are predicted by fits of the rest."""
 MOST_SAMPLES = 2_000
-"""Largest number of samples of the cross-validation."""
 MARGIN = 2.0
-"""Standard errors by which a term must lower the error: chance does so for about one log in forty."""
+"""Number of standard errors by which a term must lower the error; about one log in forty does so by chance."""
 
 
 class TriedTerm(NamedTuple):
@@ -32,20 +30,17 @@ class TriedTerm(NamedTuple):
     without: float
     """Mean squared error in cross-validation, summed over joints, in units of each torque's variance."""
     within: float
-    """The same with the term."""
+    """The same, with the term."""
     kept: bool
 
 
 def choose_terms(
     tree: Tree, data: Trajectories, terms: Terms, candidates: Sequence[tuple[str, Terms]]
 ) -> tuple[Terms, list[TriedTerm]]:
-    """Adds candidates one after another, and keeps each that lowers the error in cross-validation significantly.
+    """Tries candidates one after another and keeps those that lower the cross-validation error significantly.
 
     Args:
-        tree: tree with known frames.
-        data: training data.
-        terms: terms that are always there.
-        candidates: names and terms, of which each states what it adds to the others.
+        candidates: name of each candidate, and the terms that it adds.
 
     Raises:
         InputError: as for `learning.friction.fit_friction`.
@@ -68,7 +63,7 @@ def choose_terms(
 
 
 def joined(terms: Terms, addition: Terms) -> Terms:
-    """Terms of both; shapes start as those of the first."""
+    """Returns the union of two sets of terms, with the initial shapes of the first."""
     laws, learned, coupled = (
         tuple(dict.fromkeys((*getattr(terms, name), *getattr(addition, name))))
         for name in ("laws", "learned", "coupled")
@@ -89,7 +84,7 @@ def cross_validated(
         squares = np.zeros(len(data.t))
         for held in folds:
             rest = np.flatnonzero(~held)
-            # One number of samples, so that one program serves all folds.
+            # The same number of samples in every fold, so that one compiled program serves all.
             rows = rest[np.linspace(0, len(rest) - 1, fewest).round().astype(int)]
             solution = solve_terms(terms, log.of(rows), equations)
             whole: Log = log._replace(signs=link_signs(terms, log, solution))

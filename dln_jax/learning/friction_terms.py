@@ -1,10 +1,10 @@
-"""Equations of a rigid tree's torques for separable least squares: what they consist of, and columns by shape.
+"""Torques of a rigid tree with friction as a separable least-squares problem.
 
     tau = Phi(q, qd, qdd) theta + Sᵀ F(S qd, T; shape) c
 
-Velocities, slopes and load shares are unknown by their logarithms (a share by that of μ / (1 - μ)), the cooling of
-viscous friction by itself. With load, rows of Phi (at the motors) are multiplied by 1 ± μ tanh(u / v) with the sign of
-tau_link. The sign comes from the previous fit, and the fit is repeated until the signs no longer change.
+The nonlinear unknowns are the logarithms of velocities and slopes, log(μ / (1 - μ)) for a load share μ, and the shift
+of a sigmoid and the cooling of viscous friction themselves. With load, rows of Phi (at the motors) are multiplied by
+1 ± μ tanh(u / v) with the sign of tau_link, which comes from the previous fit; fits repeat until no sign changes.
 """
 
 import functools
@@ -36,7 +36,6 @@ from dln_jax.solvers.separable import SeparableSolution, solve_separable
 from dln_jax.types import FrictionLaw, InputError
 
 FIRST_LOAD = 0.05
-"""Initial share of load."""
 LONGEST_STEP = 1.0
 """Largest change of an unknown per iteration: a factor e for quantities fitted by their logarithm."""
 MOST_ROUNDS = 5
@@ -44,11 +43,11 @@ MOST_ROUNDS = 5
 WARMER = 10.0
 """Unit of temperature in the nonlinear unknowns, K."""
 LEAST_WARMTH = 1.0
-"""Least standard deviation of every joint's temperature from which its effect is fitted, K."""
+"""Smallest standard deviation of each joint's temperature for which the effect of temperature is fitted, K."""
 
 
 class Terms(NamedTuple):
-    """What torques consist of."""
+    """Friction laws, fitted shapes and coupled motors of a torque model."""
 
     laws: tuple[FrictionLaw, ...]
     learned: tuple[str, ...]
@@ -93,16 +92,12 @@ class Log(NamedTuple):
     """[N, d], signs of the link torques at the motors."""
 
     def of(self, samples: Any) -> "Log":
-        """The same quantities of some samples."""
+        """The same quantities for some of the samples."""
         return Log(*(part if name == "weights" else part[samples] for name, part in self._asdict().items()))
 
 
 def reference_temperature(data: Trajectories) -> float:
-    """Mean temperature of a log to 0.1 °C.
-
-    Raises:
-        InputError: the log has no temperature, or that of a joint hardly varies.
-    """
+    """Mean temperature of a log to 0.1 °C; `InputError` if there is none, or that of a joint hardly varies."""
     if data.temperature is None:
         raise InputError("the data have no temperature, on which friction is to depend; add it (°C), or leave that out")
     deviations = data.temperature.std(axis=0)
@@ -116,7 +111,7 @@ def reference_temperature(data: Trajectories) -> float:
 
 
 def log_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None) -> Log:
-    """The known quantities of a log, in float64; arguments and errors as for `fit_friction`."""
+    """Returns the known quantities of a log, in float64; arguments and errors as for `fit_friction`."""
     d = tree.degrees_of_freedom
     require_motors(terms.motors, terms.coupled, d)
     weights = np.asarray(torque_scale(data) if noise is None else np.broadcast_to(noise, d), float)
@@ -196,7 +191,7 @@ def solve_terms(
 
 
 def link_signs(terms: Terms, log: Log, solution: SeparableSolution) -> Any:
-    """Signs of the link torques at the motors, by a fit."""
+    """Signs of the link torques at the motors, as a fit predicts them."""
     links = log.links @ solution.linear[: log.links.shape[2]]
     return jnp.sign(_at_motors(terms.motors, links[..., None])[..., 0])
 
@@ -211,7 +206,7 @@ def _unknown(name: str, start: FrictionShape) -> Any:
 
 
 def shapes_of(learned: tuple[str, ...], unknowns: Any, d: int) -> dict[str, Any]:
-    """Shapes [d] that the unknowns stand for, by name."""
+    """Converts the nonlinear unknowns to shapes [d], by name."""
     inverse = {"sigmoid_shift": lambda x: x, "load": jax.nn.sigmoid, "cooling": lambda x: x / WARMER}
     return {
         name: inverse.get(name, jnp.exp)(unknowns[place * d : (place + 1) * d]) for place, name in enumerate(learned)
@@ -219,6 +214,6 @@ def shapes_of(learned: tuple[str, ...], unknowns: Any, d: int) -> dict[str, Any]
 
 
 def slope_of(name: str, value: np.ndarray) -> np.ndarray:
-    """Derivative of a shape by its unknown."""
+    """Derivative of a shape with respect to its unknown."""
     slopes = {"sigmoid_shift": np.ones_like(value), "cooling": np.full_like(value, 1 / WARMER)}
     return {**slopes, "load": value * (1 - value)}.get(name, value)

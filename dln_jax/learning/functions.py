@@ -38,7 +38,7 @@ LOSSES = ("type1", "type2")
 WIDTHS = (2, 4, 8, 16)
 """Widths of the hidden layers, for `grow_width`."""
 GAUSS_NEWTON = GaussNewton(steps=40, coarse_steps=200, improvement=1e-7)
-"""For networks of `WIDTHS`."""
+"""Optimiser for networks of `WIDTHS`."""
 
 
 class Network(NamedTuple):
@@ -51,7 +51,6 @@ class Network(NamedTuple):
     activation: str = "cos"
     width: int = 128
     depth: int = 1
-    """Hidden layers."""
     members: int = 1
     """Networks in the ensemble, which differ in their initial parameters."""
     precision: str = "f32"
@@ -141,9 +140,7 @@ def train(
     The resulting layers have a leading axis of ensemble members, even if there is only one. With Adam, all members see
     the same batches and share one best step; Gauss-Newton keeps the best step of every member. Reports and history are
     means over the members. Devices of a mesh share the members if Gauss-Newton trains several, otherwise the samples.
-
-    Raises:
-        InputError: raised by `targets` or `fit`.
+    Errors as for `targets` and `fit`.
     """
     together = isinstance(optimiser, Adam)
     members = network.members if together else 1
@@ -158,11 +155,7 @@ def train(
 
 
 def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
-    """Builds the problem of an ensemble: the sum of its members' losses, or (for Gauss-Newton) members as seeds.
-
-    Raises:
-        InputError: raised by `targets`.
-    """
+    """Builds an ensemble's problem: the sum of its members' losses, or for Gauss-Newton members as seeds."""
     ours, theirs = (targets(data, network) for data in sets)
     sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
     layers = ensembles.init(
@@ -192,7 +185,7 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
 def grow_width(
     sets: SampleSplit, network: Network, fit: Callable[[Network], Training], *, widths: Sequence[int] = WIDTHS
 ) -> tuple[Trial, list[Trial]]:
-    """Trains networks of growing width with `fit` and chooses the smallest that no other betters significantly.
+    """Trains networks of growing width with `fit` and chooses the smallest that no other beats significantly.
 
     The outcome of a trial is its `Training`.
     """

@@ -3,9 +3,8 @@
     tau = O L + Phi c + noise,   cov = K + Phi S² Phiᵀ + diag(noise²),   weights = cov⁻¹ tau,   c = S² Phiᵀ weights
 
 O is the Euler-Lagrange operator and K the `torque_covariance` of the samples. Phi is the friction with coefficients c,
-whose prior is normal with deviations S. The noise of the joints is the only regulariser. Scales and noises maximise the
-marginal likelihood of the torques on a subset of the samples (L-BFGS with the exact gradient); the weights solve N d
-equations (Cholesky).
+whose prior is normal with deviations S. The joints' noise is the only regulariser. Scales and noises maximise the
+marginal likelihood of the torques on a subset of the samples (L-BFGS); the weights solve N d equations (Cholesky).
 """
 
 import time
@@ -37,9 +36,8 @@ class KernelFit(NamedTuple):
     parameters: Any
     """Parameters of the catalogue's `trigonometric-kernel`, in float64, for `samples` samples."""
     noise: Float[np.ndarray, " d"]
-    """Standard deviation of the torque noise in the equations, N m or N; it includes torque that no such energy
-    explains. It exceeds the most likely value if the covariance would otherwise not be positive definite to
-    rounding."""
+    """Standard deviation of the torque noise in the equations, N m or N, including torque that no such energy explains.
+    It exceeds the most likely value if rounding would otherwise make the covariance indefinite."""
     likelihood: float
     """Logarithm of the marginal likelihood per torque, over all fitted samples; higher is better."""
     torque_mse: float
@@ -70,14 +68,11 @@ def fit_kernel(
         samples: largest number of samples, evenly spaced; memory is 16 samples² d² bytes, time grows as the cube.
         serial: as for `make_trigonometric_kernel`.
         likelihood_samples: number of these samples used to fit the scales and the noise.
-        iterations: largest number of L-BFGS iterations.
         least_noise: lower bound on a joint's noise, relative to its torque's deviation, for data without noise. If it
-            is too low for the rounding of the equations, it is multiplied by `NOISIER` until it suffices; the result's
-            noise holds the final value.
+            is too low for rounding, it is multiplied by `NOISIER` until it suffices; the result holds the final value.
 
     Raises:
-        InputError: torques that do not vary, a number of joints that differs from the data's, friction by load, or a
-            setting that is not positive.
+        InputError: constant torques, another number of joints than the data's, friction by load, or a setting <= 0.
     """
     from scipy.linalg import cho_solve
 
@@ -89,7 +84,7 @@ def fit_kernel(
     with jax.enable_x64(True):
         unit = np.asarray(torque_scale(train))
         columns = _friction(needs, train.qd)
-        # S of a coefficient: 1 over the root mean square torque of one unit of it, in units of the deviations.
+        # S of a coefficient: 1 / (RMS torque of one unit of it, relative to the torques' deviations).
         sizes = np.sqrt(np.mean(np.sum((columns / unit[:, None]) ** 2, axis=1), axis=0))
         deviations = 1.0 / np.where(sizes > 0, sizes, 1.0)
         every = _equations(train, columns * deviations, samples)
@@ -120,11 +115,8 @@ def choose_kernel(
 ) -> tuple[Trial, list[Trial]]:
     """Fits a serial chain and a model without that assumption; returns the better in validation, and both trials.
 
-    The candidate of a `Trial` is `serial` and its outcome the `KernelFit`. Its errors are squared torques in units of
-    the joints' deviations.
-
-    Raises:
-        InputError: as for `fit_kernel`.
+    The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.
+    Raises as `fit_kernel`.
     """
     trials = []
     for serial in (True, False):
@@ -178,7 +170,6 @@ def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: i
 
 
 def _parameters(needs: Needs, scales: KernelScales, states: States, weights: np.ndarray, friction: np.ndarray) -> Any:
-    """Parameters of the catalogue's model."""
     d = needs.degrees_of_freedom
     own, of_laws = np.split(friction, [d if needs.friction else 0])
     kernel = jax.tree.map(jnp.asarray, KernelParameters(*states, weights, scales, own if needs.friction else None))

@@ -33,7 +33,6 @@ from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 
 LARGEST_DEGREE = 4
-"""Largest degree that is tried."""
 MOST_PARAMETERS = 1_500
 """Largest basis that is tried; a fit takes about N d P² operations."""
 ROUNDING = 1e-10
@@ -54,7 +53,7 @@ class LinearFit(NamedTuple):
     parameter_count: int
     """P, the number of parameters."""
     rank: int
-    """Number of combinations of parameters that the data determine; the solution has no part in the other P - rank."""
+    """Number of combinations of parameters that the data determine; the solution is zero in the other P - rank."""
     condition: float
     """Condition number of the scaled columns that count: the largest amplification of relative errors of the data."""
     torque_mse: float
@@ -74,17 +73,15 @@ def fit_linear(
 ) -> LinearFit:
     """Fits the parameters that minimise the torque error on the data, in float64 whatever the model's dtype.
 
-    It takes about N d P² operations. If the data leave combinations of parameters undetermined, the result is the
-    shortest solution (see `solvers.least_squares`), which predicts the same forces along motions like those of the
-    data.
+    It takes about N d P² operations. If data leave combinations of parameters undetermined, the result is the shortest
+    solution (see `solvers.least_squares`), which predicts the same forces along motions like those of the data.
 
     Args:
         model: linear in its parameters.
         data: trajectories to fit; hold out those that will judge the result.
         ridge: dimensionless, as in `solvers.least_squares.solve`.
         rank_tolerance: as in `solvers.least_squares.solve`; by default rounding alone.
-        negligible: as in `solvers.least_squares.solve`; use about 1e-12 for rigid trees, because some of their columns
-            hold only rounding errors.
+        negligible: as in `solvers.least_squares.solve`; 1e-12 for rigid trees, some of whose columns are rounding.
         chunk_size: samples whose design matrix is in memory at a time.
 
     Raises:
@@ -152,9 +149,9 @@ def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
 def design_chunks(
     linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int, *, even: bool = True
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= chunk_size samples at a time.
+    """Yields Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= chunk_size samples at a time.
 
-    Even chunks waste no work; chunks that are not, of `chunk_size` samples, share one program for any number of them.
+    Even chunks waste no work; chunks of exactly `chunk_size` samples share one program for any number of samples.
     """
     samples = len(data.tau)
     length = -(-samples // -(-samples // chunk_size)) if even else chunk_size

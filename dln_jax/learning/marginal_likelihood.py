@@ -6,8 +6,7 @@ The notation is that of `learning.kernel`. L-BFGS minimises -log p. Its gradient
 
     sum(W dK),   W = (cov⁻¹ - weights weightsᵀ) / 2
 
-so that no factorisation is differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine learning",
-equation 5.9).
+and differentiates no factorisation (Rasmussen and Williams 2006, "Gaussian processes for machine learning", eq. 5.9).
 """
 
 import functools

@@ -7,8 +7,7 @@ energies of `mechanics.equations.dynamics` work. The residual of a window of T s
 
 with the second part only if qd was measured. The fit minimises the sum over windows of |r_w|² over theta and all starts
 z_w. Starts are eliminated window by window: Gauss-Newton solves for z_w(theta), and the derivative of the remaining r_w
-is that of Kaufman (`learning.motions`). The problem's parameters are those of the model alone, for any number of
-windows.
+is Kaufman's (`learning.motions`). The problem's parameters are the model's alone, for any number of windows.
 
 Torque errors drive simulated motions off course. With `Noise.tau` every window has an unknown constant torque e_w and a
 residual e_w / noise_tau: a compromise between matching motions under exact torques and torques of exact motions.
@@ -127,18 +126,15 @@ def problem(
     Args:
         model: built from any energies, or from accelerations, with float64 parameters.
         parameters: initial parameters, for example from `learning.accelerations`.
-        windows: windows to fit.
         validation: windows that select the parameters.
-        noise: standard deviations of the measurements; a loss of d (or 2 d if velocities were measured) is then noise
-            alone, less what the starts take up.
+        noise: standard deviations of the measurements; noise alone then gives a loss of d (2 d if velocities were
+            measured), less what the starts absorb.
         gauge: fixes the scale of the energies; needed only for motions without torques.
         torque: torque between samples.
         substeps: RK4 steps between two samples.
-        seed: seed of the order of the windows.
 
     Raises:
-        InputError: no windows, noise that is not positive, motions without torques and without a gauge, or a gauge of
-            another size.
+        InputError: no windows, noise that is not positive, neither torques nor a gauge, or a gauge of the wrong size.
     """
     require_positive(substeps=substeps)
     d = windows.q.shape[2]
@@ -168,7 +164,7 @@ def problem(
 
 
 def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
-    """Raises `InputError` for motions without torques and gauge, or a gauge of another size or a mass <= 0."""
+    """Raises `InputError` if there are neither torques nor a gauge, or the gauge has a wrong size or a mass <= 0."""
     if gauge is None:
         if not np.any(tau):
             raise InputError("motions without torques fit any multiple of an energy; give a gauge")
@@ -179,7 +175,7 @@ def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
 
 
 def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[Array, " n"]:
-    """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without them."""
+    """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without either."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)
     M = system.mass_matrix(jnp.asarray(gauge.q))

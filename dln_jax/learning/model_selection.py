@@ -134,7 +134,6 @@ class Assessment(NamedTuple):
     reason: str = ""
     """Reason why there is no model."""
     tried: bool = True
-    """Whether a fit was attempted."""
 
 
 class Selection(NamedTuple):
@@ -163,8 +162,7 @@ def select_model(
         candidates: candidates, most structured first; of two equally good ones the first is chosen.
         train: samples to fit; the variances of their torques are the units of the errors.
         validation: other motions.
-        noise: standard deviation of the joints' measured torques, N m or N, if known: the selection ends once the
-            errors equal it.
+        noise: standard deviation of the joints' torque noise, N m or N, if known; the selection ends at such errors.
         seconds: time limit; at least the first candidate that can be fitted is.
         report: called with the result of every candidate.
 

@@ -38,11 +38,7 @@ class MomentumWindows(NamedTuple):
 
 
 def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> MomentumWindows:
-    """Cuts overlapping windows of a length in s, within segments without a gap.
-
-    Raises:
-        InputError: no segment is as long as a window.
-    """
+    """Cuts overlapping windows of a length in s within gapless segments; `InputError` if no segment is long enough."""
     require_positive(window=window)
     pieces = segments(data.t, data.trajectory)
     dt = float(np.median(np.concatenate([np.diff(data.t[piece]) for piece in pieces])))
@@ -85,11 +81,8 @@ def momentum_problem(
 
     Args:
         model: model of energies in coordinates and velocities.
-        parameters: initial parameters.
-        windows: windows to fit.
         validation: windows that select the parameters.
         unit: scale of the joints' residuals [d], N m or N, for example the residuals of another model (`deviations`).
-        seed: seed of the order of the windows.
 
     Raises:
         InputError: a unit that is not positive, or validation windows of another length.
@@ -117,7 +110,6 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     after it. The first torques of a trajectory, before the first command, are zero.
 
     Args:
-        data: recording with commanded torques.
         delay: delay of the commands in samples.
 
     Raises:
@@ -134,7 +126,7 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
 
 
 def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> int:
-    """Estimates the delay of torques in samples: the smallest residual of a model linear in its parameters decides.
+    """Estimates the delay of torques in samples by the smallest residual of a model that is linear in its parameters.
 
     Args:
         model: model that is linear in its parameters, such as `models.make_trigonometric`.

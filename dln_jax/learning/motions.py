@@ -127,11 +127,9 @@ def problem(
     Args:
         model: a phase model with float64 parameters.
         parameters: initial parameters, for example from a fit of rates.
-        windows: windows to fit.
         validation: windows that select the parameters.
         weights: standard deviations that divide the residuals.
         substeps: RK4 steps between two samples.
-        seed: seed of the order of the windows.
 
     Raises:
         InputError: no windows, weights that are not positive, or rates that the windows lack.
@@ -152,7 +150,7 @@ def problem(
 
 
 def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
-    """Returns the arrays that a fit reads of both sets, on the device.
+    """Returns the arrays of both sets that a fit reads, on the device.
 
     Raises:
         InputError: as for `problem`.
@@ -174,11 +172,11 @@ def require_windows(windows: Any, validation: Any, **deviations: tuple[float, ..
 
 
 def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], Array], start: Array) -> Array:
-    """Returns the residual at its nearest start, with Kaufman's derivative by parameters that `frozen` holds constant.
+    """Returns the residual at its nearest start; its derivative in the parameters that `frozen` fixes is Kaufman's.
 
     Args:
         frozen: start -> residual, with constant parameters.
-        residual: the same function, differentiable by the parameters.
+        residual: the same function, differentiable in the parameters.
         start: initial value.
     """
     start, slope = jax.lax.stop_gradient(_descended(frozen, start, START_STEPS))

@@ -33,7 +33,7 @@ class Objective(NamedTuple):
 
     @property
     def of_torques(self) -> bool:
-        """Whether its residuals are those of torques, and of nothing else."""
+        """Whether its residuals are torque errors and nothing else."""
         return self.residual is TORQUE.residual
 
 
@@ -43,8 +43,7 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     A channel that does not vary (a joint without a motor) is scaled by the root mean square of those that do.
 
     Raises:
-        InputError: no channel varies, so that the data cannot distinguish a Lagrangian from its multiples; or the
-            squares of numbers are infinite or zero.
+        InputError: no torque varies, so any multiple of a Lagrangian fits; or squares are infinite or zero.
     """
     message = (
         "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "
@@ -126,8 +125,6 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Ob
     """Returns the objective of a model of the catalogue; a Hamiltonian needs momenta, and otherwise fits torques.
 
     Args:
-        name: name of the model in the catalogue.
-        data: training data.
         stated: name from `STATED` that overrides the model's own objective.
 
     Raises:
@@ -144,11 +141,7 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Ob
 
 
 def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:
-    """Returns the arrays that an objective reads, on the device.
-
-    Raises:
-        InputError: an array is missing, or its squares overflow in that precision.
-    """
+    """Returns the arrays that an objective reads, on the device; `InputError` if one is missing or squares overflow."""
     missing = [key for key in objective.keys if getattr(data, key) is None]
     if missing:
         raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")

@@ -1,4 +1,4 @@
-"""Learning while a robot works: samples accumulate in a replay, and a model is refitted to all of them.
+"""Learning while a robot works: samples accumulate in a replay buffer, and a model is refitted to all of them.
 
     for visit in learn_online(references, drive, refit, model.init(key), empty_replay(2000, 2)): ...
 
@@ -49,11 +49,7 @@ class Replay(NamedTuple):
 
 
 def empty_replay(capacity: int, d: int) -> Replay:
-    """Returns a replay with `capacity` empty places for samples of d joints.
-
-    Raises:
-        InputError: a size that is not positive.
-    """
+    """Returns a replay with `capacity` empty places for samples of d joints; `InputError` unless both are positive."""
     require_positive(capacity=capacity, d=d)
     motion, weight = np.zeros((capacity, d)), np.zeros(capacity)
     return Replay(motion, motion, motion, motion, weight, weight)
@@ -63,7 +59,6 @@ def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int
     """Returns the replay with a further recording in its next empty places.
 
     Args:
-        replay: earlier recordings.
         q, qd, qdd, tau: the recording [n, d], in order of time.
         blocks: number of equal parts of the recording; the middle one is held out, unless there are fewer samples.
 
@@ -101,7 +96,6 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
 
     Args:
         model: model with parameters and energies in float64.
-        rounds: number of rounds.
         iterations: Levenberg-Marquardt iterations per round.
 
     Raises:
@@ -189,7 +183,6 @@ def learn_online(
         drive: (parameters, reference) -> outcome, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
         refit: result of `make_refit` or `make_linear_refit`.
         parameters: parameters that drive the first reference.
-        replay: replay with places for all recordings.
 
     Raises:
         InputError: a recording that `appended` refuses.

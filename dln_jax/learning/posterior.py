@@ -24,7 +24,7 @@ ALONE = 1e-6
 
 
 class Spectrum(NamedTuple):
-    """Singular value decomposition of J D⁻¹, with the parts of the joints."""
+    """Singular value decomposition of J D⁻¹, and its factors by joint."""
 
     scale: Float[np.ndarray, " P"]
     """D."""
@@ -83,13 +83,12 @@ def left_out(
     columns: Float[np.ndarray, "n d P"],
     residual: Float[np.ndarray, "n d"],
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-    """Returns the residuals of some training samples as if they had not been fitted, and the variance by parameters.
+    """Returns the residuals of training samples as if they had not been fitted, and their variance due to parameters.
 
     With U their rows of the orthonormal factor of J, r~ = r + U (1 - UᵀU)⁻¹ Uᵀ r: exact for least squares without a
     ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
 
     Args:
-        spectrum: spectrum of all training data.
         noise: standard deviations from `posterior`.
         columns: Phi D⁻¹ V of the samples.
         residual: tau_hat - tau of the samples.

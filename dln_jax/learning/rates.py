@@ -46,7 +46,7 @@ def problem(
         train: trajectories with p and pd.
         validation: trajectories that select the parameters, with p and pd; `data.splits.hold_out` draws some.
         seed: seed of the initial parameters, of the drawn samples, and of their order.
-        most_samples: largest number of samples to fit, and to validate; larger sets are drawn from.
+        most_samples: largest number of samples to fit, and to validate; larger sets are subsampled at random.
 
     Raises:
         InputError: no p or pd in the data, numbers whose squares overflow, or settings out of range.
@@ -88,11 +88,7 @@ def match_linear(
 
 
 def samples(data: Trajectories, dtype: Any = jnp.float64, chosen: Any = slice(None)) -> tuple[Array, ...]:
-    """q, p, qd, pd of all samples, or of those chosen, on the device.
-
-    Raises:
-        InputError: no p or pd in the data, or numbers whose squares overflow.
-    """
+    """q, p, qd, pd of all samples, or of those chosen, on the device; `InputError` without p or pd, or on overflow."""
     p, pd = momenta(data)
     named = {"q": data.q, "p": p, "qd": data.qd, "pd": pd}
     return tuple(on_device(name, array[chosen], dtype) for name, array in named.items())

@@ -1,6 +1,6 @@
 """Fits models to a recording of q and commanded torques: an identified model and a network.
 
-1. Unless it is known, the delay of the torques is the one with the smallest residual of an identified model.
+1. The delay of the torques, unless known, is the one that gives an identified model the smallest residual.
 2. q is smoothed (`data.encoders`), which also gives qd; torques are not filtered, and held between samples.
 3. The identified model is the trigonometric one, fitted in weak form. Its residuals in the joints' equations are the
    scales of a network's errors, so that joints with and without a motor both count.
@@ -35,14 +35,12 @@ from dln_jax.zoo.descriptions import Description, build, describe
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
 """Friction laws of the models; other friction of the plant, near rest, is not modelled."""
 MOST_DELAY = 4
-"""Largest delay that is tried, in samples."""
 ROUNDS = 2
 """Number of fits; the later ones are weighted by the residuals of the one before."""
 DEGREES = {"revolute": 2, "prismatic": 0}
 """Degrees of the identified model: enough for rigid bodies; displacements along a level rail have no effect."""
 NETWORK = {"width": 8, "depth": 2}
 STEPS = 40
-"""Gauss-Newton iterations."""
 FRICTION_START = 0.02
 """Initial friction coefficients of a network, relative to the deviation of the torques."""
 FLOOR = 0.05
@@ -67,7 +65,7 @@ class PreparedRecording(NamedTuple):
     """A recording that is ready for fits."""
 
     train: Trajectories
-    """With rates, and torques as they acted."""
+    """Episodes to fit, with rates and acting torques."""
     validation: Trajectories
     delay: int
     """Delay of the torques in samples."""
@@ -118,17 +116,12 @@ def _linear(needs: Needs, chain: bool) -> Description:
 
 
 def identified(data: Trajectories, needs: Needs, *, chain: bool = False) -> FittedPlant:
-    """Fits the trigonometric model with viscous and dry friction.
+    """Fits the trigonometric model with viscous and dry friction; errors as for `fit_momentum`.
 
     Args:
-        data: with rates, and torques as they acted.
-        needs: needs of the plant.
+        data: recording with rates and acting torques.
         chain: whether the plant is a chain of rigid bodies on a fixed base, in relative coordinates: its mass matrix
-            does not depend on the first one, and its potential has degree 1 in every angle. Fewer parameters need
-            fewer motions.
-
-    Raises:
-        InputError: as for `fit_momentum`.
+            does not depend on the first coordinate, its potential has degree 1 in every angle; fewer motions suffice.
     """
     description = _linear(needs, chain)
     model, windows = build(description), cut_momentum_windows(data)
@@ -151,10 +144,6 @@ def learned(
     """Trains a structured DeLaN with viscous and dry friction and keeps the parameters that are best in validation.
 
     Args:
-        prepared: the recording.
-        needs: needs of the plant.
-        steps: Gauss-Newton iterations.
-        seed: seed of the initial parameters.
         report: as for `learning.engine.fit`.
         keywords: width, depth and activation, as for `models.make_delan`.
 

@@ -34,7 +34,7 @@ class ObservedMotions(NamedTuple):
     v0: Float[Array, "K n dim"]
     """Velocities at the start, in m/s."""
     controls: Any
-    """Actuation of the steps: an array [K, T, controls], [K, T, 0] for a body without, or a dict of arrays [K, T, ...]
+    """Actuation of the steps: an array [K, T, controls] ([K, T, 0] without actuation), or a dict of arrays [K, T, ...]
     by the names of the actuated terms."""
     x: Float[Array, "K T n dim"]
     """Positions after every step, in m; not finite for vertices that were not seen."""
@@ -48,7 +48,6 @@ class SoftBodyFit(NamedTuple):
     misfit: float
     """Root mean square of the final residuals, in units of the noise; NaN if a step did not converge."""
     iterations: int
-    """Number of Levenberg-Marquardt iterations."""
 
 
 def identify(
@@ -67,7 +66,6 @@ def identify(
         stepper: result of `make_step`.
         params_of: theta -> the scene's parameters.
         guess: initial theta, float64 arrays.
-        motions: observed motions.
         noise: standard deviation of the positions, in m, which divides the residuals.
         iterations: largest number of Levenberg-Marquardt iterations.
         mesh: devices that share the motions; every device simulates its own.
@@ -100,10 +98,7 @@ def design(
     """Finds theta (a rest shape, say) whose equilibrium is closest to the wanted positions.
 
     Held vertices stay where the scene's own rest shape has them; coordinates of `wanted` that are not finite do not
-    count. The other arguments are those of `identify`.
-
-    Raises:
-        InputError: as for `identify`.
+    count. The other arguments, and the errors, are those of `identify`.
     """
     require_positive(noise=noise, iterations=iterations)
 

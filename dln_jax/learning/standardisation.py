@@ -1,7 +1,6 @@
 """Scales data for networks: inputs and outputs of zero mean and unit standard deviation.
 
-A network with the layer rule h W + b absorbs the scales exactly: it is trained in standard units and stored in the
-user's.
+A network with the layer rule h W + b absorbs the scales exactly: it trains in standard units, stored in the user's.
 """
 
 from typing import NamedTuple

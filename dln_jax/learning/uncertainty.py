@@ -8,21 +8,20 @@ them, as `fit_linear` fits them, `ridge=0.0` is exact. A network trained on torq
 (Laplace's approximation) with the ridge of `RIDGES` that makes the validation torques most likely. For networks with
 more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain; the rest counts as known.
 
-Residuals are not white noise only: they contain what the model cannot express, and those of neighbouring samples are
-correlated. Motions that were not fitted therefore scale both parts of the variance of every joint,
+Residuals are not only white noise: they include model errors, and those of neighbouring samples are correlated.
+Held-out motions therefore scale both parts of the variance of every joint,
 
     a noise² + b |phi F|²,   (a, b) = (1, 1), (a, a) or (a, b), of the greatest likelihood.
 
-The simplest form is kept unless another betters it by more than half the logarithm of the effective samples per further
-factor (Schwarz 1978): a few seconds that agree with the training leave it unchanged. These motions are the validation's
-and, for least squares, also the training's, each as if it had been left out (`posterior.left_out`). Both parts are then
-multiplied by the `scatter` of the motions: the model error is larger in some motions than in others, and a new motion
-may be one of the former.
+The simplest form is kept unless another is better by more than half the logarithm of the effective samples per extra
+factor (Schwarz 1978): a few seconds that agree with the training change nothing. The held-out motions are those of the
+validation and, for least squares, also those of the training, each as if it had been left out (`posterior.left_out`).
+Both parts are then multiplied by the `scatter` of the motions, because model errors differ between motions.
 
-A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them.
-A deviation due to parameters below `HARMLESS` of the torque therefore puts no state out of distribution. Above that, a
-state is out of distribution if its deviation exceeds those on the data, or if it leaves the range of the data. For a
-network, every state outside that range is out of distribution.
+A model that is linear in its parameters is right wherever the data determine its torque, even far from the data. No
+state is therefore out of distribution while its deviation due to parameters is below `HARMLESS` of the torque. Above
+that, a state is out of distribution if its deviation exceeds those on the data, or if it leaves the range of the data.
+For a network, every state outside that range is out of distribution.
 """
 
 from typing import NamedTuple
@@ -42,7 +41,6 @@ from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, require_positive
 
 RIDGES = tuple(10.0**power for power in range(-18, 0, 2))
-"""Ridges that are tried for networks."""
 RATIOS = (0.0, *(10.0 ** (power / 4) for power in range(-8, 25)))
 """Ratios b / a that are tried."""
 MOST_PARAMETERS, DIRECTIONS = 1_500, 400
@@ -51,14 +49,13 @@ FOLDS = 10
 MOST_SAMPLES = 2_000
 """Largest number of validation samples, evenly spaced."""
 HARMLESS = 0.01
-"""No state of a linear model is out of distribution if its uncertainty due to parameters is below this share of the
-torque's standard deviation."""
+"""States of linear models whose deviation due to parameters is below this share of the torque's are never flagged."""
 STILL = 1e-3
-"""Range in rad, m, 1/s or 1/s² of a coordinate that rests in all data."""
+"""Lower bound on the range of a coordinate, in rad, m, 1/s or 1/s², for coordinates that rest in all data."""
 CHUNK = 256
 """Samples per call of the program that linearises the model."""
 UPPER = 0.975
-"""Quantile of two-sided bands of 95 %, by which `scatter` widens bands from few motions."""
+"""Quantile of a two-sided 95 % band; `scatter` uses it to widen bands from few motions."""
 TINY = np.finfo(np.float64).tiny
 
 
@@ -90,7 +87,6 @@ def estimate(
 
     Args:
         model: fitted to torques.
-        parameters: fitted parameters.
         train: data of the fit.
         validation: other trajectories, used for model selection at most.
         ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.
@@ -152,8 +148,8 @@ def calibration(
 
     Args:
         residual: residuals of the validation, N m or N.
-        noise: standard deviation, of the training.
-        variance: due to parameters.
+        noise: standard deviation of the torque noise, from the training.
+        variance: variances due to parameters.
         samples: number of independent residuals.
     """
     ratios = np.asarray(RATIOS)[:, None]
@@ -182,9 +178,9 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
 
     The first factor is one standard deviation of a new motion's s above their mean. In the second, t and z are the
     97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one: a variance that
-    motions share unequally is known from M values only, and 1.96 of the result hold 95 %. By chance alone the variance
-    of s is 2 / n for normal residuals, and an estimate of it from M motions has the relative error e; chance is
-    2 / n (1 + 2 e) with
+    97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one, because M motions
+    estimate the variance with few degrees of freedom. By chance alone the variance of s is 2 / n for normal
+    residuals, and an estimate of it from M motions has the relative error e; chance is 2 / n (1 + 2 e) with
 
         e² = 2 / (M - 1) + 12 / (n M)
 

@@ -6,11 +6,11 @@ the rest of the Coriolis forces. Multiplied by a window w(t) that is zero at bot
     - integral w' p dt + integral w s dt = integral w tau dt
 
 (modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987.) Both sides are linear in
-the parameters, with one equation per joint and window. No acceleration appears, whose noise grows with the square of
-the frequency. Both sides pass through the same low-pass, so that dry friction is not distorted, and the result hardly
-depends on the cut-off of q. `fit_form` fits other equations of that kind.
+the parameters, with one equation per joint and window. Accelerations, whose noise grows with the square of the
+frequency, do not appear. Both sides pass through the same low-pass, so that dry friction is not distorted, and the
+result hardly depends on the cut-off of q. `fit_form` fits other equations of that kind.
 
-The windows are sin⁴ (pi t / W), with weights that make plain sums over samples exact to the smoothness of the motion.
+The windows are sin⁴ (pi t / W); plain sums over their samples are as accurate as the motion is smooth.
 """
 
 import functools
@@ -41,7 +41,7 @@ WINDOW = 0.16
 FEWEST = 8
 """Smallest number of steps of a window."""
 OVERLAP = 5
-"""Number of windows that start within the length of one: further windows would be nearly copies."""
+"""Number of windows that start within the length of one; more would be nearly redundant."""
 CHUNK = 4096
 """Samples whose columns are in memory at a time."""
 
@@ -55,7 +55,7 @@ class WeakFit(NamedTuple):
     rank: int
     condition: float
     equations: int
-    """Number of windows, times the number of joints for the momentum."""
+    """Number of windows, times the number of joints for momentum equations."""
     mse: float
     """Mean over windows of the squared error of the mean torque, summed over joints, or of the power; (N m)² or W²."""
     residual: float
@@ -85,16 +85,13 @@ def fit_momentum(
 
     Args:
         model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
-        data: at equal time steps, with smooth velocities and torques as measured, for example from
-            `data.encoders.smooth`.
+        data: at equal time steps, with smooth velocities and measured torques, such as from `data.encoders.smooth`.
         window: length in s, at least `FEWEST` steps.
-        noise: standard deviations of the torques' noise, by which the equations are divided (default: those of the
-            torques themselves).
+        noise: deviations of the torques' noise that divide the equations (default: those of the torques themselves).
         tolerances: ridge, rank_tolerance and negligible of `solvers.least_squares.solve`.
 
     Raises:
-        InputError: steps that are not equal, no segment as long as a window, torques that do not vary, or settings out
-            of range.
+        InputError: unequal steps, no segment as long as a window, torques that do not vary, or settings out of range.
     """
     form = Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
     return fit_form(form, model, data, window=window, noise=noise, **tolerances)

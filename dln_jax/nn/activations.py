@@ -130,14 +130,10 @@ quadratic = _make("quadratic", lambda x: x * x, lambda x: 2 * x, lambda x: jnp.f
 cubic = _make("cubic", lambda x: x * x * x, lambda x: 3 * x * x, lambda x: 6 * x, lambda x: jnp.full_like(x, 6))
 
 ALL: dict[str, Activation] = {g.name: g for g in (relu, softplus, tanh, cos, sin, silu, gelu, linear, quadratic, cubic)}
-"""All activations by name."""
 
 
 def activation(name: str | Activation) -> Activation:
-    """Returns the activation of that name, for example from a command line or a file; or the activation itself.
-
-    Raises InputError for an unknown name.
-    """
+    """Returns the activation of that name, or the activation itself; `InputError` for an unknown name."""
     if isinstance(name, Activation):
         return name
     if not isinstance(name, str) or name not in ALL:

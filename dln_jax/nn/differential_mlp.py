@@ -107,7 +107,7 @@ def value_jacobian_and_hessian(
 
 
 def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
-    """Sweep with the fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
+    """Sweep with fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
     inputs, *widths, outputs = sizes
     if not widths:
         return "forward"
@@ -118,7 +118,7 @@ def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
 
 
 def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
-    """Sweep with the fewer operations for Jacobian and Hessian, without the J_l that both sweeps need.
+    """Sweep with fewer operations for Jacobian and Hessian, without the J_l that both sweeps need.
 
     Counted in multiply-adds. Backward, per output: the adjoint, then per layer n columns to scale and n² products of a
     width. Forward, per pair of inputs: the weights after the first, then three operations per hidden unit.
@@ -201,7 +201,6 @@ def _congruence_jvp(primals, tangents):
 def _derivatives_by_two_sweeps(
     layers: Layers, preactivations: list[Array], activation: Activation
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-    """Jacobian and Hessian, by a backward sweep per output."""
     jacobians = _input_jacobians(layers[:-1], preactivations, activation)
     inputs, width = jacobians[0].shape
     # J_1 = W_1 is the same for all states of a batch: with its products formed first, the term is one matrix product.
@@ -224,7 +223,6 @@ def _derivatives_by_two_sweeps(
 def _derivatives_by_forward_sweep(
     layers: Layers, preactivations: list[Array], activation: Activation
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-    """Jacobian and Hessian, by one forward sweep for all outputs."""
     jacobians = _input_jacobians(layers, preactivations, activation)
     inputs = jacobians[0].shape[0]
     rows, columns = np.triu_indices(inputs)

@@ -3,7 +3,7 @@
 A mesh has one axis. Shared arrays, such as parameters, are replicated on every device; a batch is split along axis 0,
 and a device computes its share. `spread` gathers the results in the order of the batch, so that the rest of a program
 does not depend on the number of devices. A function in `on_devices` calls the collectives `total`, `mean` and `first`
-itself; sums are taken in an order, and so with a rounding, that depends on the number of devices.
+itself; sums are taken in an order, and so with rounding errors, that depend on the number of devices.
 Without a mesh (`None`), all of these return the function or the arrays unchanged.
 """
 
@@ -47,11 +47,7 @@ def batch_mesh(devices: int | None = None) -> Mesh | None:
 
 
 def shares(mesh: Mesh | None, count: int, what: str) -> int:
-    """Returns the number of items per device.
-
-    Raises:
-        InputError: the number of devices does not divide `count`; `what` names the items, in the plural.
-    """
+    """Returns the number of items (`what`, plural) per device; `InputError` if the devices do not divide `count`."""
     devices = 1 if mesh is None else mesh.size
     if count % devices:
         remedy = f"give a multiple of {devices}, or fewer devices"
@@ -125,10 +121,9 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 
 
 def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """Runs a function on every device's share; by `total`, `mean` or `first` it must return the same on all devices.
+    """Runs a function on every device's share; it must return the same on all, by `total`, `mean` or `first`.
 
-    The number of devices must divide the batch. Loops and branches that contain collectives need conditions that are
-    equal on all devices.
+    The number of devices must divide the batch. Conditions of loops and branches with collectives must agree on all.
     """
     if mesh is None:
         return function

@@ -43,11 +43,7 @@ class Membership(NamedTuple):
 
 
 def host_devices(count: int | None) -> None:
-    """Splits the CPU into `count` JAX devices, unless it is None or JAX has already been used.
-
-    Raises:
-        InputError: the number is not positive.
-    """
+    """Splits the CPU into `count` JAX devices, unless it is None or JAX runs already; `InputError` below 1."""
     if count is None:
         return
     if count < 1:

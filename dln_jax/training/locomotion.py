@@ -33,7 +33,6 @@ from dln_jax.zoo.run import MODEL
 GOAL = 5.0
 """Distance in body lengths at which the effort of learning is measured."""
 STEPS = 400_000
-"""Default number of environment steps."""
 FILMED = 160
 """Steps of the film."""
 SHOWN = 3_000_000
@@ -105,12 +104,8 @@ def write_run(
     """Writes model, metrics, figure and GIF (of the first steps) of the best seed; returns the metrics.
 
     Args:
-        folder: where files are written.
-        task: of the policies.
-        policies: at least one of which has a finite distance.
-        settings: of the learning, stored with the model.
-        method: of the learning.
-        figures: whether to draw.
+        policies: trained policies, of which at least one has a finite distance.
+        settings: settings of the training, stored with the model.
 
     Raises:
         InputError: no evaluation converged.

@@ -1,4 +1,4 @@
-"""Stored policies: loads that of a run of `train_locomotion`, and judges it on any ground."""
+"""Loads the policy of a run of `train_locomotion`, and judges it on any ground."""
 
 import math
 from pathlib import Path
@@ -51,7 +51,6 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
     """Loads the policy of a run of `train_locomotion`.
 
     Args:
-        folder: of the run.
         variation: fields of `Variation` for the task, instead of those of the training; `None` for the training's.
 
     Raises:
@@ -79,7 +78,7 @@ def parameters_for(task: LocomotionTask, width: int, folder: Path) -> Parameters
     """Loads the parameters of a stored policy, to train it further on a task.
 
     Raises:
-        InputError: as `load_policy`, or a policy of another creature, width or clock.
+        InputError: `load_policy` refuses the folder, or the policy has another creature, width or clock.
     """
     stored = load_policy(folder)
     policies = ((task, width), (stored.task, stored.width))

@@ -8,26 +8,26 @@ from dln_jax.cli.arguments import Unstated
 
 @dataclass(frozen=True)
 class LocomotionOptions:
-    """What is to be learned."""
+    """Creature, task and training."""
 
     creature: Literal["crawler", "biped", "quadruped", "box-quadruped"] = "crawler"
-    """Which body."""
+    """Body of the creature."""
     seed: int = 0
-    """The first seed, 0 to 4294967295."""
+    """First seed, 0 to 4294967295."""
     seeds: int = 1
-    """How many seeds, one after the other."""
+    """Number of seeds, trained one after the other."""
     steps: Unstated[int] = None
     """Environment steps of each seed (default: 400000)."""
     until: Unstated[float] = None
-    """Body lengths at which a seed ends (default: no limit)."""
+    """Distance in body lengths at which the training of a seed ends (default: no limit)."""
     upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
     speed: float = 0.04
-    """Speed far above which is hardly rewarded, body lengths per step; 0 for no limit."""
+    """Speed at which the reward saturates, body lengths per step; 0 for no limit."""
     clock_period: float = 16.0
-    """Steps of 0.033 s of one turn of the policy's clock; 0 for no clock."""
+    """Period of the policy's clock, in steps of 0.033 s; 0 for no clock."""
     episode: int = 400
-    """Steps of 0.033 s."""
+    """Length of an episode, in steps of 0.033 s."""
     start: float = 0.01
     """Standard deviation of the vertices' initial positions, m; of their velocities, 10 times as much in m/s."""
     slope: float = 0.0
@@ -37,8 +37,8 @@ class LocomotionOptions:
     push: float = 0.0
     """Change of velocity by the pushes, m/s."""
     window: Unstated[int] = None
-    """Steps that gradients go back (default: 32)."""
+    """Number of steps that gradients go back (default: 32)."""
     width: int = 64
     """Hidden units of the policy."""
     lanes: Unstated[int] = None
-    """Creatures side by side, which devices share (default: 4)."""
+    """Number of creatures simulated side by side, which devices share (default: 4)."""

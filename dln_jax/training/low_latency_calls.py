@@ -1,4 +1,4 @@
-"""Time single calls of a trained run in low-latency mode, in a process of its own: the mode is settled as JAX starts.
+"""Time single calls of a trained run in low-latency mode, in a separate process: JAX fixes the mode when it starts.
 
 Reads states from standard input, an npy array [samples, arguments, d], and prints one line of JSON, in microseconds.
 """
@@ -35,9 +35,9 @@ class Arguments:
     run: Path
     """Folder of a run of train_delan or train_hnn."""
     function: Literal["inverse_dynamics", "rates"] = "inverse_dynamics"
-    """Of the dynamics, or of the phase field that train_hnn_task trains."""
+    """Function to time, of the dynamics or of the phase field that train_hnn_task trains."""
     calls: int = 5000
-    """Calls that are timed."""
+    """Number of calls to time."""
 
 
 def main(options: Arguments) -> None:

@@ -23,7 +23,7 @@ from dln_jax.zoo.run import save
 
 
 class Fitted(NamedTuple):
-    """A fitted model, and whatever the kind's own `judge` needs of the fit."""
+    """A fitted model, and the record that the kind's own `judge` needs."""
 
     description: Description
     """Description of the model, final choices included."""
@@ -33,14 +33,13 @@ class Fitted(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """What is known of a fitted model once it has been evaluated."""
+    """Evaluation of a fitted model."""
 
     metrics: dict[str, float | int]
     """Contents of metrics.json, apart from those that are still being measured."""
     rows: Callable[[dict[str, float | int]], Iterable[Sequence[str]]]
     """All metrics -> rows of the printed table."""
     title: str
-    """Title of the table."""
     columns: tuple[str, ...] = ("quantity", "value", "unit")
     measured: Callable[[], dict[str, float]] = dict
     """Waits for metrics that another process measures while the figures are drawn."""

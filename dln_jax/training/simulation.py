@@ -60,7 +60,7 @@ class PreparedScene(NamedTuple):
     """Time step, s."""
     steps: int
     statements: tuple[str, ...]
-    """What the reader of the mesh left out or repaired."""
+    """Notes on what the reader of the mesh left out or repaired."""
 
 
 def simulate_all(options: Any) -> None:

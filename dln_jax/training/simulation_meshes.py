@@ -17,15 +17,14 @@ from dln_jax.types import InputError
 INNER = "inner"
 """Name of the walls of all closed cavities."""
 OPTIONS = ("scale", "pin", "youngs_modulus_of", "pressure", "load")
-"""Options that only a mesh of one's own has."""
+"""Options that exist only with --mesh."""
 
 
 def own_mesh(options: Any, youngs_modulus: float) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Returns the arguments of a scene that --mesh and its options set, and statements about the file.
 
     Args:
-        options: of the command line.
-        youngs_modulus: of the elements that --youngs-modulus-of does not name, in Pa.
+        youngs_modulus: modulus of the elements that --youngs-modulus-of does not name, Pa.
 
     Raises:
         InputError: an option without --mesh, a file that cannot be read, or a set that does not exist.
@@ -43,7 +42,7 @@ def own_mesh(options: Any, youngs_modulus: float) -> tuple[dict[str, Any], tuple
         if options.youngs_modulus_of is not None:
             choices["youngs_modulus"] = values_by_set(mesh, youngs_modulus, _moduli(options.youngs_modulus_of))
         pressures, forces = _numbers("pressure", options.pressure, ",", 1), _forces(mesh, options.load)
-        # The scene may turn the mesh into a quadratic one, in which loads are others.
+        # The scene may turn the mesh into a quadratic one, for which the loads differ.
         choices["loads"] = lambda mesh: _loads(mesh, pressures, forces)
         choices["loads"](mesh)
     except InputError as error:
@@ -73,7 +72,7 @@ def _forces(mesh: Mesh, text: str | None) -> dict[str, list[float]]:
 
 
 def _numbers(option: str, text: str | None, separator: str, count: int) -> dict[str, list[float]]:
-    """Numbers by set, so many each."""
+    """Parses `count` numbers for each set."""
     values = {}
     for item in filter(None, map(str.strip, (text or "").split(separator))):
         name, _, numbers = item.rpartition("=")

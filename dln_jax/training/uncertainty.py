@@ -36,12 +36,10 @@ def store_uncertainty(
     """Estimates the uncertainty of a model fitted to torques, and stores it in the run's folder.
 
     Args:
-        folder: folder of the run, with its model.
         model: the model in float64.
-        parameters: fitted parameters.
         train: data that the parameters were fitted to.
         validation: data that calibrate the bands.
-        torque: the torques that the bands are of, in words.
+        torque: description of the torques that the bands refer to.
         options: as for `learning.uncertainty.estimate`.
     """
     try:
@@ -63,11 +61,7 @@ def uncertainty_metrics(
     Empty for a run without uncertainty.
 
     Args:
-        folder: folder of the run.
-        model: its model in float64.
-        test: test data.
-        predicted: the model's torques on them [N, d].
-        name: name of the model in the figure.
+        predicted: the model's torques on the test data [N, d].
     """
     run = load(folder)
     if run.uncertainty is None:
@@ -83,10 +77,7 @@ def uncertainty_metrics(
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations of the torques [N, d], and whether the samples are out of distribution [N].
-
-    Reuses the program that the estimate compiled to linearise the torques; `Run.torque_std` would compile it again.
-    """
+    """Deviations of the torques [N, d] and out-of-distribution flags [N], by the program that the estimate compiled."""
     parts, first = [], 0
     with jax.enable_x64(True):
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)

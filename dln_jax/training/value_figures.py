@@ -14,7 +14,7 @@ from dln_jax.training.values import ValueRun
 from dln_jax.types import JointKind
 
 SHOWN, POINTS = 12, 121
-"""Runs that are drawn, and nodes of a side of the plane."""
+"""Number of runs drawn, and of nodes along each side of the plane."""
 
 
 def _runs(run: ValueRun) -> Returns:
@@ -22,7 +22,6 @@ def _runs(run: ValueRun) -> Returns:
 
 
 def _described(plant: ValuePlant, own: OwnProblem | None) -> tuple[tuple[JointKind, ...], tuple[str, ...]]:
-    """Kinds and names of the coordinates."""
     if own is not None:
         return own.joints, own.names
     d = len(plant.problem.goal) // 2

@@ -1,4 +1,4 @@
-"""Plants of value functions: published ones by name, one's own from a robot's file or the run folder of a model."""
+"""Plants of value functions: published ones by name, a user's own from a robot file or the run folder of a model."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,13 +28,13 @@ from dln_jax.zoo.run import load
 
 OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
 FILES = (".xml", ".mjcf", ".urdf")
-"""Suffixes of robots' files."""
+"""Suffixes of robot files."""
 OWN = "own"
-"""Name of one's own plant in a value's manifest."""
+"""Name of a user's own plant in the manifest of a value function."""
 
 
 class OwnModel(NamedTuple):
-    """Model of one's own plant: what its run folder stores."""
+    """Model of a user's own plant, as its run folder stores it."""
 
     description: Description
     parameters: Parameters
@@ -50,13 +50,13 @@ class Chosen(NamedTuple):
     altered: Callable[[Array], Field]
     """Factors of the plant's uncertain numbers -> its field."""
     uncertain: tuple[str, ...]
-    """What the factors multiply."""
+    """Names of the numbers that the factors multiply."""
     own: OwnModel | None = None
     lines: tuple[str, ...] = ()
 
 
 class Wishes(NamedTuple):
-    """What a user states of a plant; `None` for the usual."""
+    """What a user states about a plant; `None` for the defaults."""
 
     actuated: Sequence[str] = ()
     control: Any = None
@@ -86,7 +86,7 @@ def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
 
 
 def is_file_of_plant(plant: str) -> bool:
-    """Whether the name of a plant is that of a file."""
+    """Whether a plant is named by a file."""
     return Path(plant).suffix.lower() in FILES or Path(plant).is_file()
 
 
@@ -102,7 +102,7 @@ def of_file(path: Path, wishes: Wishes) -> Chosen:
     """The plant of an MJCF or URDF file: its tree of rigid bodies with viscous friction.
 
     Raises:
-        InputError: as `read_robot`, `layout_of_file` and `own_problem`.
+        InputError: raised by `read_robot`, `layout_of_file` and `own_problem`.
     """
     robot = read_robot(path)
     robot_layout = layout_of_file(path, wishes.actuated, control=wishes.control, goal=wishes.goal)
@@ -123,8 +123,7 @@ def of_run(folder: Path, wishes: Wishes) -> Chosen:
     """The plant of a learned or identified model in a run folder.
 
     Raises:
-        InputError: as `load` and `own_problem`; a model without dynamics, or limits, motors or a goal that have to be
-            stated.
+        InputError: as for `load` and `own_problem`; or the model has no dynamics, or lacks limits, motors or a goal.
     """
     run = load(folder)
     if not isinstance(run.model, Model) or isinstance(run.energies, PhaseRates) or "needs" not in run.description:
@@ -177,14 +176,14 @@ def _own(
 
 
 def rebuilt(name: str, own: OwnModel, lines: Sequence[str] = ()) -> Chosen:
-    """One's own plant from what its folder stores."""
+    """Rebuilds a user's own plant from what its folder stores."""
     description, parameters, numbers = own
     make, B = dynamics_of(description), np.asarray(numbers.actuation)
     plant, (d, m) = own_plant(make(parameters), numbers), B.shape
     masses = d if "tree" in description else 0
 
     def altered(p: Array) -> Field:
-        """Inertias of the bodies of a tree and strengths of the motors are multiplied."""
+        """Multiplies the inertias of a tree's bodies and the strengths of the motors."""
         changed = parameters
         if masses:
             changed = parameters._replace(inertias=parameters.inertias * p[:masses, None])

@@ -37,9 +37,9 @@ from dln_jax.training.values import (
 from dln_jax.types import InputError, require_positive, require_seed
 
 FAILED = 0.9
-"""Share of the hanging starts that have to end up; a law below it is refused."""
+"""Share of the hanging starts that must end upright; a law below it is refused."""
 OF_OWN = ("actuated", "control", "positions", "effort", "weights", "box")
-"""Options of one's own plant."""
+"""Options of a user's own plant."""
 
 
 class Case(NamedTuple):
@@ -122,7 +122,7 @@ def announce(case: Case) -> Iterator[str]:
 
 
 def fit(case: Case, options: Any, folder: Path, mesh: Mesh | None) -> Fitted:
-    """Trains once per seed and keeps the best by validation; a stored value function is taken as it is."""
+    """Trains once per seed and keeps the best by validation; a stored value function stays unchanged."""
     if case.family is None or case.stored is not None:
         return Fitted({}, None, (case.stored, {}))
     trained = trainings(case, case.family, options, folder, mesh)
@@ -173,7 +173,7 @@ def over_seeds(trained: Sequence[Trained]) -> dict[str, float]:
 
 
 def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
-    """Returns of the law in the evaluation, whether its starts end up, and figures."""
+    """Returns of the law in the evaluation, whether its starts end upright, and figures."""
     run, numbers = fitted.outcome
     run = ValueRun(run.name, run.plant, run.network, with_float64(run.parameters), run.own)
     measures = measured(case.chosen, run.law, count=options.starts, share=case.robust)
@@ -198,7 +198,7 @@ def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
 
 
 def verdict_of(numbers: dict[str, float], count: int) -> Verdict:
-    """Verdict on a law by the starts that end up."""
+    """Verdict on a law by the share of starts that end upright."""
     down, anywhere = numbers["down_up_share"], numbers["uniform_up_share"]
     reason = f"{down:.0%} of {count} hanging starts end up, and {anywhere:.0%} of those anywhere at rest"
     if (altered := [numbers.get(f"{name}_up_share") for name in ("heavy_weak", "light_strong")])[0] is not None:

@@ -1,4 +1,4 @@
-"""Trains value functions of published and of one's own plants, and saves, resumes and loads their run folders."""
+"""Trains value functions of published plants and of a user's own; saves, resumes and loads their run folders."""
 
 import dataclasses
 import functools
@@ -56,14 +56,14 @@ class Family:
 
 @dataclass(frozen=True)
 class Stored:
-    """What the manifest of a value function states."""
+    """Manifest of a value function."""
 
     plant: str
     goal: tuple[float, ...] | None
     network: Family
     dtype: Literal["float32", "float64"]
     own: OwnProblem | None = None
-    """Problem of one's own plant, whose model is in the same folder."""
+    """Problem of a user's own plant, whose model is in the same folder."""
 
 
 class Trained(NamedTuple):
@@ -85,7 +85,7 @@ class ValueRun:
     network: ValueNetwork
     parameters: Any
     own: Chosen | None = None
-    """One's own plant and its model."""
+    """A user's own plant and its model."""
 
     @property
     def problem(self) -> ControlProblem:
@@ -118,7 +118,7 @@ def usual(chosen: Chosen, method: str) -> ValueSettings:
 
 
 def worst_of(chosen: Chosen, share: float) -> Disturbance | None:
-    """The worst error of the plant's uncertain numbers up to a share of each; `None` for none.
+    """Worst-case errors of the plant's uncertain numbers, up to a share of each; `None` for a share of 0.
 
     Raises:
         InputError: a share that is not between 0 and 1.
@@ -174,10 +174,7 @@ def by_equation(
     *,
     disturbance: Disturbance | None = None,
 ) -> list[Trained]:
-    """Fits value functions by the residual of the Hamilton-Jacobi-Bellman equation, one per seed.
-
-    Devices of a mesh share the samples.
-    """
+    """Fits one value function per seed by the Hamilton-Jacobi-Bellman residual; devices of a mesh share the samples."""
     network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
     stages = len(discounts) - 1 + ROUNDS
     trained: list[Trained] = []
@@ -201,7 +198,7 @@ def by_equation(
 def measured(chosen: Chosen, law: Law, *, count: int = 100, seed: int = 0, share: float = 0.0) -> dict[str, float]:
     """Returns of a law from both kinds of starts; a failed start counts as NaN.
 
-    With a share also on plants whose masses are larger and motors weaker by it, and the other way round.
+    With a share, also on plants with masses larger and motors weaker by that share, and vice versa.
     """
     numbers: dict[str, float] = {}
     where: Where
@@ -231,7 +228,7 @@ def summary(evaluation: Returns) -> dict[str, float]:
 def save_value(
     folder: Path, plant: str, goal: Sequence[float] | None, family: Family, parameters: Any, own: OwnModel | None = None
 ) -> None:
-    """Writes value.json and value.safetensors, and the model of one's own plant."""
+    """Writes value.json and value.safetensors, and the model of a user's own plant."""
     if own is not None:
         save(folder, own.description, own.parameters)
     facts = {

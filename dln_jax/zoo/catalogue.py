@@ -67,7 +67,7 @@ class Entry(NamedTuple):
     model for other needs, of `needs`, and of keywords of its own."""
 
     def make(self, **keywords: Any) -> Any:
-        """Makes the model, additions included, from their keywords; without `dtype` in that of the factory."""
+        """Makes the model, additions included, from their keywords; `dtype` defaults to that of the factory."""
         default = inspect.signature(self.factory).parameters.get("dtype")
         own = {} if default is None else {"dtype": default.default}
         return assembled((*self.additions, self.factory), {**own, **keywords})

@@ -42,8 +42,7 @@ def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any
         model: a name of the catalogue; a factory of your own, which must be passed again to load the model; or
             "package.module:function", which is imported and stored, so that `load(folder, trust=True)` finds it.
         precision: f32 or f64, the factory's `dtype`.
-        keywords: keywords of the factory, in Python or as JSON (an activation or its name, `Needs` or their
-            dictionary).
+        keywords: keywords of the factory, in Python or as JSON (an activation or its name, `Needs` or a dictionary).
 
     Raises:
         InputError: an unknown name or keyword, a missing keyword, or a value that cannot be stored as JSON.
@@ -61,11 +60,7 @@ def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any
 def describe_for(
     name: str, data: Trajectories, needs: Needs, *, precision: str, pooled: bool = False, **keywords: Any
 ) -> Description:
-    """Describes a model of the catalogue for training data, with the typical sizes of these data.
-
-    Raises:
-        InputError: as `describe` and `typical_sizes`.
-    """
+    """Describes a model with the typical sizes of training data; errors as for `describe` and `typical_sizes`."""
     sizes = typical_sizes(name, data, pooled=pooled)
     return describe(name, precision=precision, **{"needs": needs, **keywords, **sizes})
 
@@ -74,10 +69,8 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
     """Typical sizes by which a model divides, to three digits: standard deviations of the data.
 
     Args:
-        name: name in the catalogue.
-        data: training data.
-        pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have the
-            arrays; otherwise missing arrays leave the factory's default.
+        pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have all
+            the arrays; otherwise missing arrays leave the factory's default.
 
     Raises:
         InputError: numbers so large or small that their squares overflow or vanish, or missing momenta.
@@ -136,11 +129,7 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
 def functions_of(
     name: str, factory: Callable[..., Any] | None = None, *, trust: bool = False
 ) -> tuple[Callable[..., Any], ...]:
-    """The functions that make the model of a name: additions and factory of the catalogue, or a factory of one's own.
-
-    Raises:
-        InputError: as `build`.
-    """
+    """Functions that make a named model: additions and factory of the catalogue, or a user's; errors as for `build`."""
     module, colon, function = name.partition(":")
     if not colon and name != OWN:
         entry = entry_of(name)
@@ -166,7 +155,6 @@ def functions_of(
 
 
 def _parameters(functions: tuple[Callable[..., Any], ...]) -> dict[str, inspect.Parameter]:
-    """Parameters that a description stores."""
     variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     return {
         key: parameter

@@ -41,9 +41,7 @@ def make_differential_network(
 
     Args:
         sizes: (inputs n, hidden widths ..., outputs m).
-        activation: activation of the hidden layers.
         members: number of networks in the ensemble.
-        dtype: dtype of the parameters.
 
     Raises:
         InputError: invalid sizes, too large a network, or no members.

@@ -52,16 +52,13 @@ def make_image_model(
 
     Args:
         field: kind of dynamics in the latent plane.
-        pixels: pixels n per image.
-        components: principal components per image.
         field_width: hidden units per layer of the latent dynamics.
         field_depth: hidden layers of the latent dynamics.
         width: hidden units per layer of encoder and decoder.
         momentum_scale: typical latent momentum, for a typical coordinate of 1.
 
     Raises:
-        InputError: an unknown field, a size that is not positive, or more than `MOST_NUMBERS` entries in the
-            components.
+        InputError: an unknown field, a size that is not positive, or components of more than `MOST_NUMBERS` entries.
     """
     require_positive(pixels=pixels, components=components)
     if pixels * components > MOST_NUMBERS:
@@ -103,6 +100,6 @@ def make_image_model(
 
 
 def with_components(components: Components, parameters: Any, dtype: DTypeLike = jnp.float32) -> Any:
-    """The parameters of a `ImageModel`, from those of the model of its coefficients."""
+    """The parameters of an `ImageModel`, from those of the model of its coefficients."""
     arrays = {"mean": components.mean, "basis": components.basis, "scale": components.scale}
     return {"parameters": parameters, "components": {name: jnp.asarray(array, dtype) for name, array in arrays.items()}}

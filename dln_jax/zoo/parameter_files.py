@@ -31,7 +31,7 @@ class Shape(TypedDict):
 
 
 class Manifest(msgspec.Struct):
-    """What every manifest states."""
+    """Entries that every manifest has."""
 
     schema_version: int
     tensor_file: str
@@ -87,11 +87,7 @@ def require_fitting(tree: Any, like: Any) -> None:
 
 
 def load_manifest(directory: Path, name: str) -> dict[str, Any]:
-    """Reads the manifest `name.json` and checks its schema version.
-
-    Raises:
-        InputError: it is missing, no JSON object, or of another schema.
-    """
+    """Reads the manifest `name.json`; `InputError` if it is missing, no JSON object, or of another schema version."""
     path = directory / f"{name}.json"
     if not is_file(path):
         raise InputError(f"{path}: no such file; give the folder of a run that has written one")

@@ -36,7 +36,7 @@ class Run:
     """A trained model with jitted functions of one state.
 
     The functions take arrays or lists of numbers and compute in the precision of the training. To continue training, to
-    differentiate by parameters or to extend the model, use `model` and `parameters`:
+    differentiate in parameters or to extend the model, use `model` and `parameters`:
     `mechanics.equations.dynamics(run.model.energies(parameters))`.
     """
 
@@ -75,17 +75,14 @@ class Run:
 
     @functools.cached_property
     def images(self) -> LatentPhase:
-        """Encoder, decoder, and flow of the latent plane. Raises InputError unless the model is one of images."""
+        """Encoder, decoder and flow of the latent plane. Raises InputError for a model that is not of images."""
         system = self._of("images", ImageModel).images(self.parameters)
         encode, decode = (_jitted(function, self.dtype) for function in (system.encode, system.decode))
         return LatentPhase(encode, decode, compiled(system.field, self.dtype))
 
     @functools.cached_property
     def torque_std(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
-        """(q, qd, qdd) -> standard deviation [d] of a measured torque about the model's, N m or N.
-
-        Raises InputError for a run without uncertainty.
-        """
+        """(q, qd, qdd) -> deviation [d] of a measured torque, N m or N; `InputError` for a run without uncertainty."""
         factor, noise, inflation, _ = self._known_uncertainty
         return _jitted(predictive(self._of("torque_std", Model), self.parameters, factor, noise, inflation), self.dtype)
 
@@ -137,9 +134,7 @@ def save_model(
     """Writes `model.safetensors` and `model.json` into an existing folder, for `load`; public as `dln_jax.save`.
 
     Args:
-        directory: folder of the run.
         description: from `describe`.
-        parameters: parameters of the described model.
         overwrite: replace the model in the folder and discard the uncertainty of its parameters.
 
     Raises:
@@ -154,11 +149,7 @@ def save_model(
 
 
 def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
-    """Like `save_model`, but replaces the model in the folder of a run that is being trained.
-
-    Raises:
-        InputError: parameters of another model.
-    """
+    """Like `save_model`, but replaces the model of a run in training; `InputError` for parameters of another model."""
     name = description.get("name")
     if name == OWN or ":" in str(name):
         like = jax.tree.map(np.asarray, parameters)  # the factory is the user's, so only the structure is known
@@ -178,9 +169,8 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
         trust: import the factory that the file names. Use it only for files that you have written: importing runs code.
 
     Raises:
-        InputError: the folder has no model, or one that is damaged, altered or of another schema; a factory outside the
-            catalogue is neither passed nor trusted; or the model is in double precision while JAX computes in single
-            (the message names the line to add).
+        InputError: the folder has no model, or a damaged or altered one or one of another schema; a factory outside the
+            catalogue is neither passed nor trusted; or the model needs double precision (the message names the line).
     """
     directory = Path(directory)
     description = read_description(directory)

@@ -20,8 +20,7 @@ LOCK = ".lock"
 def run_folder(out: Path | None, default: str, *, resume: bool = False, resumable: bool = False) -> Iterator[Path]:
     """Yields the locked folder of a run: `out`, or the first free number after `runs/default`.
 
-    If an `InputError` occurs while the folder holds nothing but the arguments, the folder is removed, so that the same
-    command can be repeated.
+    After an `InputError`, a folder that holds only the arguments is removed, so that the command can be repeated.
 
     Args:
         out: the folder, which may exist if it is free.

@@ -21,7 +21,6 @@ def save_uncertainty(directory: str | Path, uncertainty: Uncertainty, **facts: A
     """Stores the uncertainty of the model in a run's folder, in the precision of the model.
 
     Args:
-        directory: folder of a run, with its model.
         uncertainty: uncertainty of the model's parameters, from `learning.uncertainty.estimate`.
         facts: JSON values on how it was estimated.
 

@@ -1,9 +1,8 @@
 """Evaluate a stored policy of a soft creature on any ground: how often it falls, and how far it goes.
 
-Runs episodes from perturbed starts, on the steepest slopes, up and down, that --slope allows. Ground that is not stated
+Runs episodes from perturbed starts, on the steepest slopes, up and down, that --slope allows; ground that is not stated
 is that of the training. Prints the episodes without a fall, the distances before a fall, and a verdict: good from 95 %
-without a fall, if none of them goes backwards, and refused below 50 %. Writes metrics.json. The exit status is 1 if the
-policy is refused.
+without a fall, if none of them goes backwards, and refused below 50 %, with exit status 1. Writes metrics.json.
 """
 
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ class Arguments(Folder):
     push: Unstated[float] = None
     """Change of velocity by the pushes, m/s (default: the training's)."""
     starts: int = 100
-    """Episodes."""
+    """Number of episodes."""
     steps: int = 2000
     """Steps of an episode, 0.033 s each."""
     seed: int = 1_000_000

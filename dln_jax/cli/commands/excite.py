@@ -1,10 +1,10 @@
 """Design motions that show a robot's parameters: Fourier series within its limits, the best by gradients.
 
-Each motion starts and ends at rest and may be repeated. Several to identify from, each the best beside those before it,
-and one to validate on; predicted torques are those of the file's inertias and friction, and of a payload. Writes a run
-folder: excitation.npz (the schema of trajectories), a CSV file for each motion (t, q, qd), motions.json (the series),
-excitation.png, metrics.json and config.json. Limits are those of the file; options take their place. A list of numbers
-has one for each joint.
+Each motion starts and ends at rest and may be repeated. Several are for identification, each optimised to complement
+those before it, and one is for validation. Predicted torques come from the file's inertias and friction, and from a
+payload. Writes a run folder: excitation.npz (the schema of trajectories), a CSV file for each motion (t, q, qd),
+motions.json (the series), excitation.png, metrics.json and config.json. Limits are those of the file unless options
+state them. A list of numbers has one for each joint.
 """
 
 from dataclasses import dataclass
@@ -22,17 +22,17 @@ class Arguments(Folder, Drawn):
     """Robot, motions and limits."""
 
     robot: Path
-    """URDF or MJCF file; meshes need not be there."""
+    """URDF or MJCF file; its meshes may be missing."""
     seconds: float = 20.0
-    """Length of each motion, its period, s."""
+    """Length of each motion, which is its period, s."""
     harmonics: int = 5
     """Harmonics of the series; the highest frequency is harmonics / seconds, Hz."""
     rate: float = 100.0
     """Sampling rate of the written motions, Hz."""
     trajectories: int = 3
-    """Motions to identify from; one more is to validate on."""
+    """Number of motions for identification; one more is for validation."""
     starts: int = 4
-    """Random motions from which each is optimised."""
+    """Number of random motions from which each motion is optimised."""
     criterion: Annotated[str, choice(("information", "condition"))] = "information"
     """information: minimise the product of the parameters' errors; condition: the regressor's condition number."""
     friction: bool = True
@@ -40,7 +40,7 @@ class Arguments(Folder, Drawn):
     velocity_scale: float = 0.05
     """Velocity at which dry friction has 76 % of its force, rad/s or m/s."""
     share: float = 0.9
-    """Share of every limit that is used; the rest is for the controller."""
+    """Share of every limit to use; the rest is left to the controller."""
     position: Unstated[str] = None
     """Half the range of positions about zero, rad or m (default: the file's)."""
     velocity: Unstated[str] = None
@@ -50,8 +50,8 @@ class Arguments(Folder, Drawn):
     torque: Unstated[str] = None
     """Torque limits, N m or N (default: the file's)."""
     allow_unlimited: Unstated[str] = None
-    """Joints that may lack limits of position and torque, comma separated; "*wheel*" names all with wheel in their
-    name. Positions then go pi to either side. (default: such joints are refused)"""
+    """Comma-separated joints that may lack limits of position and torque; "*wheel*" matches all names that contain
+    wheel. Positions are then limited to pi on either side (default: such joints are refused)."""
     noise: str = "1"
     """Standard deviation of the torque's noise; only the ratios of joints matter."""
     height: Unstated[float] = None

@@ -38,7 +38,7 @@ class Arguments:
     casadi: bool = False
     """Add NAME_casadi.c: the functions with exact derivatives for CasADi's external and for acados."""
     finite: bool = False
-    """Arguments are finite: skip the zeros of a derivative's structure. A NaN may then not reach all results."""
+    """Assume finite arguments and skip the structural zeros of derivatives; a NaN may then not reach all results."""
     overwrite: bool = False
     """Replace the files of an earlier export (files of a run are never replaced)."""
 

@@ -5,10 +5,10 @@ time, which show what the implicit step damps), moments.png, metrics.json, repor
 1000 kg/m³; in the plane they are 1 m thick.
 
 Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1)
-and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra are a body in space, triangles in a plane
-z = const one in the plane; physical groups are named sets, which --pin holds. The command prints what it left out or
-repaired. An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0)
-and, for the beam, optionally `held` [k] (vertices; by default those of the smallest x).
+and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with constant
+z a body in the plane; physical groups become named sets, for --pin. The command prints what it left out or repaired.
+An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the
+beam, optionally `held` [k] (vertices; by default those of the smallest x).
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Arguments(Folder, Drawn):
     """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp,
     average-vector-field (second order) keeps the energy."""
     halvings: int = 0
-    """Take steps that do not converge again in parts, of --dt / 2^halvings at the shortest; not with bdf2."""
+    """Repeat steps that do not converge in shorter parts, down to --dt / 2^halvings; not with bdf2."""
     dt: Unstated[float] = None
     """Time step in s."""
     seconds: Unstated[float] = None
@@ -67,8 +67,7 @@ class Arguments(Folder, Drawn):
     """--mesh: total force in N on named sets, as tip=0,-5 or tip=0,-5;side=2,0: two components in the plane, three in
     space, spread over the area of the set, or over its vertices if it covers no part of the surface."""
     contact: bool = False
-    """beam, twist, drop: keep the bodies of the mesh apart, and each from itself, with friction 0.3; backward-euler or
-    bdf2."""
+    """beam, twist, drop: keep bodies apart, and each from itself, with friction 0.3; backward-euler or bdf2."""
     vtu: bool = False
     """Also write motion.pvd and its .vtu files, for ParaView (extra [mesh])."""
     precision: Literal["f32", "f64"] = "f64"

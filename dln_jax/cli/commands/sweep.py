@@ -1,10 +1,10 @@
 """Run one command over a grid of its options, each combination as a job of its own, here, by Slurm or by Ray.
 
-The grid is for example 'width=8,16 seed=0:10 data=a.npz,b.npz': values by commas, a:b and a:b:step for whole numbers
-without b, and all combinations of them. Options are checked before anything starts. A sweep's folder gets a folder for
-each job, table.csv with all their metrics, sweep.json and sweep.png: error against seconds, and the best by validation
-alone. Jobs that fail are listed with their error message, and the exit status is 1; --resume runs only the jobs that
-are not done. slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
+The grid is for example 'width=8,16 seed=0:10 data=a.npz,b.npz': commas separate values, a:b and a:b:step are whole
+numbers without b, and all combinations run. Options are checked before anything starts. A sweep's folder gets a folder
+for each job, table.csv with all their metrics, sweep.json and sweep.png: error against seconds, and the best by
+validation alone. Jobs that fail are listed with their error message, and the exit status is 1; --resume runs only the
+jobs that are not done. slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
 """
 
 from dataclasses import dataclass

@@ -21,7 +21,7 @@ from dln_jax.cli.options import Drawn, Folder
 from dln_jax.errors import InputError
 
 FILES = (".xml", ".mjcf", ".urdf")
-"""Suffixes of robots' files."""
+"""Suffixes of robot files."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,7 @@ class Arguments(Folder, Drawn):
     plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta", "FILE"))] = "rotary-pendulum"
     """The plant; furuta is another name of the rotary pendulum. FILE is the path of an MJCF or URDF file."""
     actuated: Unstated[str] = None
-    """Joints of the file with a motor, by name or number from 0, with commas between them (default: those on which an
-    actuator acts)."""
+    """Joints of the file with a motor, comma-separated names or numbers from 0 (default: those with an actuator)."""
     control: Unstated[float] = None
     """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
     model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None

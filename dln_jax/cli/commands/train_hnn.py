@@ -19,7 +19,7 @@ class Arguments(Options):
 
     VARIANTS: ClassVar = VARIANTS
     model: Literal["structured-hnn", "black-box-hnn"] = "structured-hnn"
-    """What is learned."""
+    """Model to learn."""
 
 
 def main(options: Arguments) -> None:

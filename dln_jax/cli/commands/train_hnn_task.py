@@ -2,10 +2,10 @@
 
 Tasks are the published spring, pendulum, real-pendulum (--data), two-body and three-body; damped-spring,
 damped-pendulum, henon-heiles and double-pendulum; and measured: any --data in the npz schema, with q, qd or only q,
-whose windows never cross a gap. Models: auto (what suits the scene), separable-hnn (T(p) + V(q)), structured-hnn,
-black-box-hnn, pairwise-hnn (bodies), polynomial-hamiltonian (one least-squares problem), phase-network (a network
-gives the rates) and helmholtz-hnn (the gradients of two networks do, friction included). Friction is learned where the
-needs state it. Load the model with dln_jax.load.
+whose windows never cross a gap. Models: auto (the one that suits the scene), separable-hnn (T(p) + V(q)),
+structured-hnn, black-box-hnn, pairwise-hnn (bodies), polynomial-hamiltonian (one least-squares problem), phase-network
+(a network gives the rates) and helmholtz-hnn (the gradients of two networks give them, friction included). Friction is
+learned where the needs state it. Load the model with dln_jax.load.
 """
 
 from dataclasses import dataclass

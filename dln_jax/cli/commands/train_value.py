@@ -28,13 +28,11 @@ class TrainingOptions:
     run: Unstated[Path] = None
     """Folder of a learned or identified model that is the plant (default: --plant)."""
     actuated: Unstated[str] = None
-    """Own plant: joints with a motor, by name or number from 0, with commas between them (default: those of the file's
-    actuators, or of the model)."""
+    """Own plant: joints with a motor, comma-separated names or numbers from 0 (default: the file's or the model's)."""
     control: Unstated[str] = None
     """Own plant: largest force of the motors, N m or N, one for all or one each (default: as stated in the file)."""
     positions: Unstated[str] = None
-    """Own plant: LOW:HIGH or free for every joint, rad or m, with commas between them (default: the file's; of a model,
-    free)."""
+    """Own plant: LOW:HIGH or free for each joint, rad or m, comma separated (default: the file's; of a model, free)."""
     weights: Unstated[str] = None
     """Own plant: weights of the squared deviations of coordinates and rates (default: by the plant's scales)."""
     effort: Unstated[float] = None
@@ -52,7 +50,7 @@ class TrainingOptions:
     depth: Unstated[int] = None
     """Hidden layers (default: 3; residual: 2)."""
     members: Unstated[int] = None
-    """Number of networks, of which V is the mean (default: 1)."""
+    """Number of networks, whose mean is V (default: 1)."""
     iterations: Unstated[int] = None
     """Iterations of value iteration (default: 48 or 80 by the plant), or of Gauss-Newton per discount (15)."""
     seed: int = 0
@@ -72,7 +70,7 @@ class Arguments(Scaled, Drawn, Resumable):
 
     VARIANTS: ClassVar = Variants(options_of, {TrainingOptions: "a training, without --stored"})
     starts: int = 100
-    """Starts of the evaluation, hanging and anywhere each."""
+    """Number of starts in the evaluation, both hanging and anywhere."""
     stored: Unstated[Path] = None
     """Folder of a run whose value function is evaluated on its plant; nothing is trained (default: train one)."""
 

@@ -1,4 +1,4 @@
-"""The order of a sweep: checks, jobs, table and figure."""
+"""Runs a sweep: checks, jobs, table and figure."""
 
 import importlib
 import shlex

@@ -40,7 +40,6 @@ def run(
 
     Args:
         jobs: the jobs; the executor's processes must see their folders.
-        submit: submits one job.
         together: context of the submissions, for executors that start all jobs at once.
         report: called with the number of jobs that have ended, and how many of these are not done.
     """

@@ -1,4 +1,4 @@
-"""From the text of a grid, such as `width=8,16 seed=0:10`, to jobs: one for each combination of the values.
+"""Turns the text of a grid, such as `width=8,16 seed=0:10`, into jobs, one for each combination of the values.
 
 Options and values are checked against the command's own arguments before anything starts.
 """
@@ -90,15 +90,10 @@ def jobs_of(
     """The jobs of a grid, in folders jobs/0000, jobs/0001, ... of `folder`; the last option changes fastest.
 
     Args:
-        command: name of the command.
-        arguments: its dataclass of arguments.
-        grid: values by option.
         fixed: values of the options common to all jobs.
-        folder: folder of the sweep.
 
     Raises:
-        InputError: an option that the command lacks or that the sweep sets itself, a value of the wrong type, or a
-            missing file.
+        InputError: an option that the command lacks or the sweep sets itself, a wrong value, or a missing file.
     """
     # Options that only some choices read, such as a model's, are those of the first job.
     stated = {**fixed, **{name: texts[0] for name, texts in grid.items()}}

@@ -69,7 +69,6 @@ def run_job(job: Job, environment: Mapping[str, str] | None = None, interrupt: t
     starts again in another folder. If two processes call the same job, the second waits for the first.
 
     Args:
-        job: what to run.
         environment: environment variables of the command; default: those of this process.
         interrupt: ends the command when it is set.
     """

@@ -28,7 +28,6 @@ PROBLEM = (
 WIDTH = 200
 """Width of tables in columns. A narrow terminal wraps their lines, since truncated numbers would be useless."""
 MOST_ROWS = 200
-"""Largest number of rows of a printed table."""
 MOST_PANELS = 6
 """Largest number of problems drawn in panels of their own."""
 
@@ -61,7 +60,6 @@ class Results(NamedTuple):
 
     entries: list[Entry]
     metrics: list[str]
-    """Names of all metrics."""
     validation: str | None
     error: str | None
     seconds: str | None
@@ -88,11 +86,9 @@ def compared(
     """Compares all jobs.
 
     Args:
-        jobs: the jobs, done or not.
         over: options that medians are taken over.
         metric: metric that chooses the best job; default: the first of `VALIDATION` that jobs have.
         error: metric that is shown beside it; default: the first of `ERRORS`.
-        largest: whether the largest metric is the best.
 
     Raises:
         InputError: jobs have metrics, but none has the requested one.
@@ -187,7 +183,6 @@ def _print_jobs(results: Results, title: str) -> None:
 
 
 def _print_groups(results: Results) -> None:
-    """Prints the median and worst metrics of the groups."""
     rows = []
     for group in results.groups:
         medians = {name: group.medians.get(name) for name in results.shown}
@@ -267,5 +262,4 @@ def _short(text: str) -> str:
 
 
 def _spaced(name: str) -> str:
-    """A metric's or option's name as words."""
     return " ".join(word.upper() if word in ("mse", "nmse") else word for word in name.split("_"))

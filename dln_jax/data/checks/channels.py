@@ -20,7 +20,7 @@ WEAK = 0.03
 COARSE = 3e-4
 """rad: smallest encoder step reported, 1/20000 of a turn."""
 RUN = 4
-"""Samples at exactly the same extreme value that make a flat top."""
+"""Samples at exactly the same extreme value that count as a flat top."""
 SHARE = 2e-3
 """Fraction of samples in flat tops above which a channel counts as saturated."""
 SPIKE = 4.0
@@ -134,8 +134,7 @@ def _saturated(data: Trajectories, key: str, word: str, remedy: str) -> list[Fin
 def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
     """Fraction of samples in runs at the largest or smallest value that are entered or left abruptly.
 
-    A smooth extreme is approached ever more slowly and a joint at rest does not move, whereas a limit cuts a motion
-    off.
+    A smooth extreme is approached ever more slowly and a joint at rest does not move; a limit cuts a motion off.
     """
     size = np.ptp(channel)
     if size == 0:

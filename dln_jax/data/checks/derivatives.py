@@ -32,7 +32,7 @@ class Match(NamedTuple):
     """Delay of the measured signal in samples."""
     correlation: Float[np.ndarray, " d"]
     gained: Float[np.ndarray, " d"]
-    """Squared error at no delay over that at `delay`."""
+    """Squared error without delay, divided by that at `delay`."""
 
 
 def match(
@@ -76,7 +76,7 @@ def away_from_ends(part: Int[np.ndarray, " N"], farthest: int) -> Int[np.ndarray
 
 
 def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
-    """Checks that qd is the rate of q, and qdd that of qd, if the file has them; `even` is smooth(data, trim=0)."""
+    """Checks that qd is the rate of q, and qdd the rate of qd, if the file has them; `even` is smooth(data, trim=0)."""
     findings = []
     moves = data.q.std(axis=0) > 0
     derived = {"qd": (even.data.qd, "dq/dt"), "qdd": (even.data.qdd, "d²q/dt²")}

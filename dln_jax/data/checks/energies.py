@@ -80,9 +80,7 @@ def covariances(
 
     Args:
         states, others: q, qd and qdd [n, d].
-        joints: kinds of the joints.
-        sizes: magnitudes of inertias [d]: W = diag(sizes) for an arbitrary energy, their mean for every joint of a
-            body.
+        sizes: magnitudes of inertias [d]: W = diag(sizes) for an arbitrary energy, their mean for joints of a body.
     """
     relative = np.sqrt(sizes / sizes.max())
     ranges = np.maximum(np.ptp(states[0], axis=0), 1e-9)

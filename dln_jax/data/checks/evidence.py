@@ -34,7 +34,6 @@ class Explanation(NamedTuple):
     weights: Float[np.ndarray, " w"]
     """Variance of every part, every factor, and every joint's noise."""
     inverse: Float[np.ndarray, "a a"]
-    """Inverse of the covariance."""
     pull: Float[np.ndarray, " a"]
     """inverse (y - mean)."""
     densities: Float[np.ndarray, " B"]

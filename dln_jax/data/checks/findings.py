@@ -19,9 +19,8 @@ class Finding(NamedTuple):
     check: str
     """Stable lower-case name of the check."""
     observation: str
-    """What was observed, with numbers."""
+    """The observation, with numbers."""
     remedy: str
-    """Recommended action."""
     joints: tuple[int, ...] = ()
     """Joints concerned, counted from 0; empty if the finding concerns the whole log."""
 

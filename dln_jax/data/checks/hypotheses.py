@@ -2,8 +2,7 @@
 
 A hypothesis is accepted if it predicts left-out blocks of time much better than the log as recorded, in nearly all
 blocks. Without a robot, the torques have the prior of an arbitrary energy with friction (`energies`), valid for arms
-of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the
-search is repeated.
+of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the next.
 """
 
 import functools
@@ -21,7 +20,7 @@ from dln_jax.data.checks.evidence import Explanation, Prior
 from dln_jax.data.schema import Trajectories
 
 DECISIVE = 15.0
-"""Log likelihood ratio over all blocks that decides: odds of three million to one."""
+"""Log likelihood ratio over all blocks that is required to decide: odds of three million to one."""
 MOST_BLOCKS = 0.8
 """Fraction of blocks that must agree."""
 BETTER = 0.8
@@ -53,7 +52,7 @@ class Log(NamedTuple):
     delay: float = 0.0
     """Delay of the torques in samples."""
     speed: float = 1.0
-    """True speed of the joints relative to that by t."""
+    """True speed of the joints, relative to the speed that t implies."""
     gravity: np.ndarray | None = None
     """m/s² [3]; `None` for the stated gravity."""
 
@@ -110,7 +109,7 @@ class Torques(NamedTuple):
 
     @property
     def gain(self) -> str:
-        """What the repairs gain, in words."""
+        """Gain of the repairs, as text."""
         before, after = (way.unexplained.mean() for way in (self.explanation, self.repaired))
         return f"unexplained in left-out blocks: {before:.2%} now, {after:.2%} if repaired"
 
@@ -134,7 +133,6 @@ def examine_torques(
         equations: number n d of equations used.
         ambiguous: whether the prior fits any robot. It then allows negative inertias, so the common sign of all torques
             is tested too, and couples joints so weakly that a fault is judged by the joints it concerns.
-        faults: whether to search for faults at all.
         others: proposes further faults, as logs in which they are repaired.
     """
     d = data.degrees_of_freedom

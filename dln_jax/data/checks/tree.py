@@ -22,7 +22,6 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import JointKind
 
 MOST = 800
-"""Number of samples used."""
 PADDED = 200
 """Batches are padded to a multiple of this number of samples."""
 RELATED = 0.5
@@ -33,7 +32,7 @@ measured on the other side of the gear."""
 TILTED = 4.0
 """Degrees between the data's gravity and the description's, above which a tilt is tested."""
 PACE = 0.03
-"""Log ratio of the speeds by the robot and by t, above which a wrong clock is tested."""
+"""Log ratio of the speeds that the robot and t imply, above which a wrong clock is tested."""
 LENGTH = 0.1
 """m: uncertainty of a body's centre of mass relative to its file."""
 ILL = 1000.0
@@ -70,7 +69,6 @@ def against_tree(
 
     Args:
         data: samples in the robot's joint order.
-        robot: the robot's description.
         names: joint names of the data, if stated.
         driven: whether there are torques.
         farthest: largest delay tried, in samples.
@@ -222,9 +220,9 @@ def _determined(
 
 
 def _without_friction(forces: np.ndarray, friction: np.ndarray) -> np.ndarray:
-    """What friction does not explain of forces [n, d, 5] -> [d, n, 5], joint by joint.
+    """Part of the forces [n, d, 5] that friction does not explain, joint by joint [d, n, 5].
 
-    Forces are inertial and Coriolis, those of 1 m/s² gravity along each axis, and measured, each over the standard
+    The forces are inertial with Coriolis, gravity of 1 m/s² along each axis, and measured, all divided by the standard
     deviation of the joint's torque.
     """
     basis = np.linalg.qr(friction)[0]

@@ -1,4 +1,4 @@
-"""Reads a log tolerantly, runs all checks on it, and formats what they found as a page of text."""
+"""Reads a log tolerantly, runs all checks on it, and formats the findings as a page of text."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,10 +70,7 @@ def as_recording(data: Trajectories) -> Recording:
 
 
 def read(path: str | Path, **stated: Any) -> Recording:
-    """Reads a file in the schema; arguments and errors as `schema.load`.
-
-    Samples out of order and duplicates, which `schema.load` refuses, are repaired and reported.
-    """
+    """Reads a file as `schema.load` does, but repairs and reports samples out of order and duplicates."""
     return schema.load_arrays(path, _from_arrays, **stated)
 
 
@@ -109,7 +106,7 @@ def _in_order(arrays: dict[str, Any]) -> tuple[dict[str, Any], tuple[Finding, ..
 
 
 def quick(data: Trajectories, robot: Robot | None = None) -> list[Finding]:
-    """Runs all checks on fewer torques, in a few seconds; arguments as `examine`."""
+    """Runs all checks on fewer torques, in a few seconds; arguments as for `examine`."""
     equations = max(FEWER, FEWER_EACH * data.degrees_of_freedom)
     return examine(as_recording(data), robot, equations=equations).findings
 
@@ -118,12 +115,11 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
     """Runs all checks.
 
     Args:
-        recording: the log.
         robot: description of the robot, with the joints of the data.
         equations: number of torques, over all joints, used to search for faults of sign, order and delay.
 
     Raises:
-        InputError: the robot has another number of joints than the data.
+        InputError: the robot and the data have different numbers of joints.
     """
     data = recording.data
     d, needs = data.degrees_of_freedom, data.needs

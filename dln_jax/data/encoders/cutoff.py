@@ -1,6 +1,6 @@
 """Chooses the cut-off frequency that minimises the expected error of accelerations.
 
-The spectrum of a coordinate is that of its motion, S(f), above a noise floor N, which is white. A filter of gain H
+The spectrum of a coordinate is the sum of that of its motion, S(f), and a white noise floor N. A filter of gain H
 removes the fraction 1 - H of the motion's acceleration and passes the fraction H of the noise's:
 
     E(cutoff) = sum over joints of  integral (2 pi f)^4 [(1 - H)² S + H² N] df  /  integral (2 pi f)^4 S df
@@ -29,7 +29,6 @@ SEGMENT = 8.0
 SEEN = 1.5
 """A smoothed spectrum above this multiple of the floor belongs to the motion."""
 CANDIDATES = 200
-"""Number of cut-offs tried."""
 TOP = 0.45
 """Highest cut-off tried, as a fraction of the sampling rate."""
 MOVES = 2.0
@@ -74,7 +73,6 @@ def choose_cutoff(
 
     Args:
         q: coordinates at equal steps.
-        trajectory: trajectory of every sample.
         rate: Hz.
         noise: standard deviation of the noise of every coordinate.
 

@@ -8,9 +8,8 @@ without a time shift, ½ at the cut-off. It is linear, so it commutes with a mod
 F(Phi theta) = F(Phi) theta: if the torques pass `low_pass`, so must the columns of Phi. Columns of a filtered q are not
 filtered columns if a force has a wider band than the motion, such as dry friction.
 
-At the ends the filter knows one side only. It extends the signal there by reflection, after a slow polynomial is
-subtracted. This makes accelerations at the end 2 to 40 times more accurate; from 1.5 periods on they are as accurate as
-elsewhere.
+At the ends the filter knows one side only. It extends the signal by reflection, after subtracting a slow polynomial,
+which makes accelerations there 2 to 40 times more accurate; from 1.5 periods on they are as accurate as elsewhere.
 
 Derivatives are those of the quintic spline through the filtered samples. A second derivative is exact to 0.02 % at a
 tenth of the rate and to 1.3 % at a quarter, where central differences taken twice lose 12 % and 60 %.
@@ -27,8 +26,7 @@ ORDER = 4
 PERIODS = 3
 """Length of the reflected extension at both ends of a segment, in periods of the cut-off."""
 END_PERIODS, END_DEGREE = 1.0, 5
-"""Length of the end fit in periods of the cut-off, and degree of its polynomial, from which value, slope and curvature
-at an end are estimated."""
+"""Length in periods of the cut-off, and degree, of the polynomial from which values at an end are estimated."""
 
 
 def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
@@ -95,11 +93,7 @@ def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"
 def derivatives(
     q: Float[np.ndarray, "n k"], *, rate: float
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-    """qd and qdd of one segment at equal steps, from the quintic spline through its samples.
-
-    Raises:
-        InputError: fewer than six samples.
-    """
+    """qd and qdd of one segment at equal steps, from its quintic spline; `InputError` for fewer than six samples."""
     require_positive(rate=rate)
     if len(q) < 6:
         raise InputError(f"a segment has {len(q)} samples; its rates take at least 6: record longer motions")

@@ -26,7 +26,6 @@ SHORTEST = DEGREE + 2
 GROWTH = 1.3
 """Ratio of successive numbers of neighbours tried."""
 MOST_POINTS = 401
-"""Largest number of neighbours tried."""
 
 
 class LocalRates(NamedTuple):
@@ -46,7 +45,6 @@ class _Fits(NamedTuple):
     qd: np.ndarray
     qdd: np.ndarray
     left_out: np.ndarray
-    """Leave-one-out errors."""
     variance: np.ndarray
     """Noise variance estimated from the residual of every sample."""
 

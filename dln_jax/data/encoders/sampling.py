@@ -78,7 +78,7 @@ def even(
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
-    """Standard deviation of the white noise of every channel, in its unit, at least that of its steps, step / √12.
+    """Standard deviation of the white noise of every channel, in its unit, at least its quantisation noise, step / √12.
 
     Samples are at equal steps except for gaps, which are rare; trajectories of fewer than seven samples are ignored.
     Zero for a constant channel, infinite if there are no such trajectories.

@@ -76,7 +76,6 @@ def smooth(
     """Estimates derivatives and smooths a log's q, t and tau for learning; existing rates are not used.
 
     Args:
-        data: the log.
         cutoff: Hz, infinite for none (default: chosen from the data, see `cutoff`).
         rate: rate of the equal steps, Hz (default: the median of the data).
         filter_torque: whether to filter tau as well (default: only if samples are dropped).
@@ -84,8 +83,7 @@ def smooth(
         trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
 
     Raises:
-        InputError: settings out of range, a decimation to less than twice the cut-off, or no segment that is long
-            enough.
+        InputError: settings out of range, a decimation below twice the cut-off, or no segment that is long enough.
     """
     require_positive(decimate=decimate)
     if trim is not None and not trim >= 0:
@@ -151,7 +149,6 @@ def smooth(
 def _filtered(
     q: np.ndarray, tau: np.ndarray, rate: float, cutoff: float, *, filter_torque: bool
 ) -> tuple[np.ndarray, ...]:
-    """q, qd, qdd and tau of one segment."""
     q = low_pass(q, rate=rate, cutoff=cutoff)
     return q, *derivatives(q, rate=rate), low_pass(tau, rate=rate, cutoff=cutoff) if filter_torque else tau
 

@@ -21,7 +21,7 @@ FINER = 10
 MARGIN = 1e-3
 """Margin kept to every limit at the checked samples (relative; m for clearances) to cover the times between them."""
 DRAWS = 50
-"""Failed draws, per motion found, after which drawing is given up."""
+"""Number of failed draws per motion found after which drawing stops."""
 SMALLEST, BISECTIONS = 0.05, 8
 """Smallest amplitude to which a motion is shrunk, relative to the original, and the number of bisection steps."""
 

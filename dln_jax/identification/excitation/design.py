@@ -1,7 +1,6 @@
 """Optimal excitation: gradient-based design of informative motions within a robot's limits.
 
-The unknowns are the Fourier coefficients of the joints. The criterion is a function of A, the information of a sample
-(`excitation.task`):
+The unknowns are the joints' Fourier coefficients. The criterion is a function of A (`excitation.task`):
 
     information    log det A: the product of all parameters' errors, independent of units (D-optimal)
     condition      largest over smallest singular value of the regressor with columns of unit length
@@ -74,7 +73,6 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
     """Makes an optimiser that is compiled once for all starts.
 
     Args:
-        task: limits, model and series.
         criterion: function of the information, such as one of `CRITERIA`.
         rounds: upper limit of rounds of the augmented Lagrangian.
         iterations: L-BFGS iterations per round.
@@ -120,9 +118,7 @@ def best_design(
     """The best design among the optimised starts and the starts themselves.
 
     Args:
-        task: task of the starts.
         optimise: from `make_optimiser`, for the same task and criterion.
-        criterion: criterion of the selection.
         starts: such as `random_designs`.
         known: information already available from other motions [B, B].
 
@@ -152,9 +148,7 @@ def design_set(
     """Designs motions for identification, each complementing those before it, and a separate one for validation.
 
     Args:
-        task: limits, model and series.
         drawn: starts such as `random_designs`, divided equally among the motions.
-        trajectories: number of motions for identification.
         criterion: a name in `CRITERIA`.
         say: called with the number of finished motions and the last result as text.
 
@@ -199,10 +193,6 @@ def as_trajectories(
     """Samples motions from rest to rest at equal steps, with the torques of the nominal model.
 
     Args:
-        designs: designs of one period.
-        labels: a name for each design.
-        model: model of the parameters.
-        parameters: nominal parameters.
         rate: samples per second.
         needs: `Needs` of the dataset; its torques include friction if the model does.
 

@@ -4,8 +4,7 @@
 
 after Swevers, Ganseman, Tukel, De Schutter and Van Brussel (1997, IEEE T-RA 13, "Optimal robot excitation and
 identification"). Rates are exact, the spectrum is known, and a motion can be repeated indefinitely. Velocity and
-acceleration vanish at both ends exactly if sum k s_k = 0 and sum k² c_k = 0. `rest_basis` spans the solutions of these
-two equations per joint.
+acceleration vanish at both ends if sum k s_k = 0 and sum k² c_k = 0, whose solutions `rest_basis` spans.
 """
 
 from typing import Any, NamedTuple

@@ -89,8 +89,7 @@ def limits_of_robot(
         velocity: 1/s or m/s.
         acceleration: 1/s² or m/s².
         force: N m or N, in either direction.
-        allow_unlimited: names of joints that may lack limits of position (revolute ones) and force, with the wildcards
-            * and ?.
+        allow_unlimited: names (with * and ?) of joints that may lack limits of position (revolute ones) and force.
 
     Raises:
         InputError: a joint that is not in `allow_unlimited` lacks a limit, a limit of velocity or of a prismatic
@@ -145,11 +144,7 @@ def heights_above(tree: Tree, height: float) -> Clearance | None:
 
 
 def used(limits: MotionLimits, share: float) -> MotionLimits:
-    """Limits reduced to a share in (0, 1]; ranges shrink towards their middles.
-
-    Raises:
-        InputError: the share is outside (0, 1].
-    """
+    """Limits reduced to a share in (0, 1], else `InputError`; ranges shrink towards their middles."""
     if not 0 < share <= 1:
         raise InputError(f"share is {share}; expected a number in (0, 1], of the limits that may be used")
     middle = limits.position.mean(axis=1, keepdims=True)

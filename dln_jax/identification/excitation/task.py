@@ -1,6 +1,6 @@
 """Excitation task: the information that a motion gives on a model's parameters, and the robot's limits.
 
-Phi is the derivative of the model's force by its parameters, restricted to independent columns ("base parameters").
+Phi is the derivative of the model's force in its parameters, restricted to independent columns ("base parameters").
 Rows are weighted by the noise of their joint. The mean information of one sample is
 
     A = 1 / N sum over samples of Phiᵀ diag(1 / noise²) Phi,   so that least squares has the covariance A⁻¹ / N
@@ -27,8 +27,8 @@ from dln_jax.types import InputError, require_positive, require_seed
 SAMPLES = 20
 """Samples per shortest period on the design grid."""
 DEPENDENT = 1e-2
-"""The design ignores columns whose part that others do not explain is below this fraction of them: right angles that a
-file writes as 1.57 leave 8e-4 each."""
+"""The design ignores columns whose residual after projection on the others is below this fraction of the largest:
+right angles that a file writes as 1.57 leave 8e-4."""
 STATES = 300
 """Number of random states from which the independent columns are found."""
 
@@ -67,9 +67,7 @@ def make_task(
     Smooth any friction that has a step at rest, on a scale of velocities that motions pass slowly.
 
     Args:
-        model: model to identify.
         parameters: nominal parameters, which give the forces to compare with their limits.
-        limits: limits of the joints.
         period: period of the motions, s.
         harmonics: harmonics of the series, at least 2.
         clearance: q -> [K], m, that must stay positive.
@@ -111,8 +109,8 @@ def make_task(
 def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Array], Float[np.ndarray, " P"]]:
     """(q, qd, qdd) -> Phi [d, P], and theta, with tau = Phi theta.
 
-    The gradient of a function of Phi by the state equals that of d forces whose parameters are the function's gradients
-    by the rows of Phi. This custom rule makes the program a third as large as derivatives of derivatives.
+    The gradient of a function of Phi in the state equals that of d forces whose parameters are the function's gradients
+    in the rows of Phi. This custom rule makes the program a third as large as derivatives of derivatives.
     """
     theta, unravel = ravel_pytree(parameters)
 

@@ -36,10 +36,7 @@ class Checkpoint(NamedTuple):
 
 
 def identity(optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any) -> dict[str, Any]:
-    """Returns the identity of a run: its optimiser, a fingerprint of its data, and all settings that decide its result.
-
-    The time limit is not part of it: a run may continue with more time.
-    """
+    """Returns the identity of a run: optimiser, data fingerprint, settings, but not the time limit, which may grow."""
     stated = {"optimiser": type(optimiser).__name__, **optimiser._asdict(), **settings}
     return {"settings": stated, "data": fingerprint(arrays)}
 
@@ -86,9 +83,6 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
     """Returns the rows under a key of a manifest.
 
     Args:
-        path: path of the manifest, for messages.
-        manifest: JSON values.
-        key: key of the rows.
         row: type of a row, such as `tuple[int, float | None]`.
 
     Raises:

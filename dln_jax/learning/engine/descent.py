@@ -44,8 +44,7 @@ class AdamState(NamedTuple):
     """[] steps done."""
     best: Best
     failed_step: Array
-    """[] number of steps before the first loss that was not finite, -1 if there was none. On failure, the rest of the
-    state is that before the dispatch."""
+    """[] steps before the first loss that was not finite, or -1. If it is set, the rest is as before the dispatch."""
 
 
 class Lengths(NamedTuple):
@@ -53,7 +52,7 @@ class Lengths(NamedTuple):
 
     batch: int
     batches: int
-    """Batches of an epoch. The rest of its permutation, shorter than a batch, is not used in that epoch."""
+    """Batches per epoch; samples that do not fill a last batch are left out of that epoch."""
     epochs: int
     epochs_per_dispatch: int
 
@@ -163,7 +162,7 @@ def _permutation(key: Array, count: int) -> Array:
     """Returns a random order of 0..count-1.
 
     Up to 2^16 it sorts single words twice, with random bits above the index: four times as fast as
-    `jax.random.permutation`. Ties in one sort keep the order of the other; at 2^16, about half a pair ties in both.
+    `jax.random.permutation`. Ties in one sort keep the order of the other; at 2^16, about 0.5 pairs tie in both.
     """
     place_bits = max(1, (count - 1).bit_length())
     if place_bits > 16:

@@ -19,10 +19,7 @@ from dln_jax.types import InputError, require_positive
 
 
 class _Run(NamedTuple):
-    """State of a training run; resuming from it is exact."""
-
     state: Any
-    """State of the optimiser."""
     stage: Array
     """[] index of the stage."""
 
@@ -49,8 +46,7 @@ def fit(
         must_start: whether an initial loss that is not finite raises an error; otherwise it is a result.
         mesh: devices that share the training. Several seeds are split over them, and every device trains its own. With
             one seed the samples are split: those of a step's batch for Adam, all of them for Gauss-Newton; every device
-            computes the whole score. Checkpoints do not depend on the devices, so a run may continue on others. Results
-            equal those of one device to rounding, which long trainings amplify.
+            computes the whole score. Checkpoints do not depend on the devices; results do only by rounding.
 
     Raises:
         InputError: settings are out of range, the initial loss is not finite, the checkpoint belongs to another run, or

@@ -10,7 +10,7 @@ from dln_jax.solvers.normal_equations import count, jacobian_bytes
 from dln_jax.types import InputError, require_positive
 
 MOST_PARAMETERS = 2_000
-"""Above this number P of parameters an iteration's P³ costs more than a thousand steps of Adam; `suited` takes Adam."""
+"""With more parameters P, the P³ of one iteration costs more than a thousand steps of Adam, so `suited` takes Adam."""
 MOST_BYTES = 2**31
 """Largest memory that `suited` allows for the normal equations and a chunk of the Jacobian."""
 

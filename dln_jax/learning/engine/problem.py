@@ -1,4 +1,4 @@
-"""Inputs, stages and results of a training, for any model and optimiser, and what devices share of it."""
+"""Inputs, stages and results of a training run, for any model and optimiser, and how devices share the work."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -85,11 +85,7 @@ def selected_by(
 
 
 def arrays_of(record: Any, keys: Iterable[str] | None = None, dtype: Any = jnp.float64) -> tuple[Array, ...]:
-    """Returns fields of a record of NumPy arrays on the device, all of them by default.
-
-    Raises:
-        InputError: squares of numbers overflow in that dtype.
-    """
+    """Returns fields of a record of NumPy arrays on the device (default: all); `InputError` if squares overflow."""
     return tuple(on_device(key, getattr(record, key), dtype) for key in keys or record._fields)
 
 
@@ -99,10 +95,7 @@ def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def require_finite_start(problem: Problem, arrays: tuple[Any, ...]) -> None:
-    """Raises `InputError` unless the initial loss on these arrays is finite (with several seeds, that of the first).
-
-    This compiles the loss.
-    """
+    """Raises `InputError` unless the initial loss on these arrays (of the first seed) is finite; compiles the loss."""
     parameters = jax.tree.map(lambda leaf: leaf[0], problem.parameters) if problem.several else problem.parameters
     options = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
     if not np.isfinite(jax.jit(loss_of(problem), compiler_options=options)(parameters, arrays)):
@@ -206,10 +199,7 @@ Dispatch = Callable[[Any], tuple[Any, Array]]
 
 
 class Stage(NamedTuple):
-    """Part of a training with one compiled program, as the loop in `fit` sees it.
-
-    States are those of the optimiser; the loop reads only their `step` and `best`.
-    """
+    """Part of a training with one compiled program; the loop in `fit` reads only `step` and `best` of its states."""
 
     name: str
     start: Callable[[Any], Any]

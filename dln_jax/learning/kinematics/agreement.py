@@ -1,8 +1,7 @@
-"""Whether two fitted trees are the same arm: their joint axes in space at q = 0, up to what torques cannot determine.
+"""Compares two fitted trees: are their joint axes at q = 0 the same, up to what torques cannot determine?
 
 The axes of one arm are moved onto those of the other by a rotation and a shift, with or without a mirror. A point may
-slide along its axis, and the axes of prismatic joints have directions only. Gravity, if there is any, is one more
-direction.
+slide along its axis, axes of prismatic joints have directions only, and gravity, if any, is one more direction.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from dln_jax.learning.kinematics.frames import Frames, mirrored
 from dln_jax.learning.kinematics.projection import LENGTH, Structure
 
 SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
-"""Largest differences of two arms that count as the same, rad and m."""
+"""Largest angle and distance between the axes of two arms that count as the same, rad and m."""
 SAME_ERROR = 0.1
 """Largest relative difference of the validation errors of two descents that agree."""
 TURNS = 8
@@ -34,7 +33,7 @@ class Difference(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Of both, in units of those that count as the same."""
+        """Sum of both, in units of the limits."""
         return self.angle / SAME_ANGLE + self.length / SAME_LENGTH
 
     @property
@@ -44,10 +43,10 @@ class Difference(NamedTuple):
 
 
 class Twin(NamedTuple):
-    """Another descent to the lowest loss, refined alike."""
+    """Another descent to the lowest loss, refined in the same way."""
 
     error: float
-    """Its validation error relative to that of the fit, or its training error without validation."""
+    """Its validation error (without validation, training error) relative to that of the fit."""
     off: Difference
 
     @property
@@ -67,7 +66,7 @@ class Lines(NamedTuple):
     """Joint axes in space at q = 0."""
 
     directions: Float[np.ndarray, "n 3"]
-    """Of all joints, then of gravity."""
+    """Directions of all joint axes, then of gravity."""
     points: Float[np.ndarray, "d 3"]
 
 
@@ -111,6 +110,6 @@ def _aligned(one: Lines, other: Lines, turning: np.ndarray) -> Difference:
     starts = [Rotation.from_rotvec(2 * np.pi * k / TURNS * axes[-1]) * first for k in range(TURNS)]
     solutions = [least_squares(residual, np.append(start.as_rotvec(), np.zeros(3))) for start in starts]
     directions, across = errors(min(solutions, key=lambda solution: solution.cost).x)
-    # The chord of a small angle is the angle.
+    # Angle between unit vectors from the length of the chord between them.
     angle = 2 * np.arcsin(np.minimum(np.linalg.norm(directions, axis=1).max() / 2, 1.0))
     return Difference(float(angle), float(np.linalg.norm(across, axis=1).max(initial=0.0)))

@@ -32,10 +32,9 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Needs, require_positive
 
 FINALISTS, NEAR = 3, 2.0
-"""Largest number of local minima that are refined and compared by validation, and the largest ratio of their loss to
-the lowest."""
+"""Largest number of local minima to refine and compare by validation, and largest ratio of their loss to the lowest."""
 ROUNDS = 2
-"""Rounds of weighting the joints by their unexplained torques; further rounds change the weights by percents."""
+"""Rounds of weighting the joints by their unexplained torques; more rounds change the weights by a few per cent."""
 CHUNK = 4096
 """Samples whose columns are in memory at a time."""
 LEAST_NOISE = 1e-7
@@ -62,11 +61,11 @@ class TreeFit(NamedTuple):
     losses: Float[np.ndarray, " K"]
     """Final losses of all descents, lowest first: mean squares in units of the torques' standard deviations."""
     agreeing: int
-    """Descents that ended at the lowest loss."""
+    """Number of descents that ended at the lowest loss."""
     agreement: int
-    """Descents that the search required to agree (`Search.agreement`)."""
+    """Number of descents that the search required to agree (`Search.agreement`)."""
     twin: Twin | None
-    """Comparison with another descent to the same loss; `None` if there is none, or none was asked for."""
+    """Comparison with another descent to the same loss; `None` without one, or if not requested."""
     seconds: float
     """Duration of the whole call, compilation included."""
 
@@ -93,7 +92,6 @@ def fit_tree(
     arbitrary. The search goes on until another descent to the same loss has found the same arm (`agreement`).
 
     Args:
-        needs: kinds of joints, gravity, friction.
         train: samples to fit, with accelerations.
         validation: samples that choose the local minimum; the training error chooses without them.
         parents: parent link of every link; a serial chain by default.
@@ -106,8 +104,7 @@ def fit_tree(
         report: called with lines of text about the search.
 
     Raises:
-        InputError: torques that do not vary, a number of joints that differs from the data's, or a setting out of
-            range.
+        InputError: torques that do not vary, a number of joints unlike the data's, or a setting out of range.
     """
     require_positive(ridge=ridge, most_samples=most_samples, samples=settings.samples)
     if needs.degrees_of_freedom != train.degrees_of_freedom:
@@ -152,7 +149,7 @@ def fit_tree(
                 report(f"two descents to this tree's loss found {twin.words}")
             if (twin is not None and twin.same) or searched.starts >= settings.starts or time.perf_counter() > until:
                 break
-            # One more wave of starts, whatever agrees already.
+            # One more wave of starts, however many agree already.
             wanted = settings._replace(agreement=agreeing(descents) + 1)
         losses = np.array([float(descent.at.loss) for descent in descents])
         frames, solution = best.state.frames, best.solution
@@ -175,13 +172,13 @@ def fit_tree(
 
 
 class _Finished(NamedTuple):
-    """A descent, refined, with its linear parameters and mean squared errors by joint."""
+    """A refined descent with its linear parameters and mean squared errors by joint."""
 
     state: Descent
     solution: least_squares.LeastSquaresSolution
     trained: Float[np.ndarray, " d"]
     judged: Float[np.ndarray, " d"]
-    """On validation samples, or those of training without them."""
+    """On the validation samples, or on the training samples if there are none."""
 
 
 def _some(data: Trajectories, most: int, seed: int) -> Samples:
@@ -237,7 +234,6 @@ def _solved(
 
 
 def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
-    """Mean squared error of every joint's torque."""
     chunks = design_chunks(columns, frames, data, CHUNK)
     return np.sum([np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, _, tau in chunks], axis=0) / len(data.tau)
 
@@ -252,7 +248,6 @@ def _columns(structure: Structure) -> Callable:
 
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
-    """Parameters of the model."""
     armature, *friction = linear[len(structure.inertial) :].reshape(-1, len(structure.joints))
     turns = np.array([rotation_vector(R) for R in np.asarray(frames.rotations)])
     inertias = inertias_of(structure, jnp.asarray(linear))

@@ -57,9 +57,8 @@ def rough_frames(kinematic_prior: Frames, random: np.random.Generator, *, angle:
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:
     """Indices into a flat step [d, 6] of the coordinates that torques may identify; the others are gauges.
 
-    A link's frame may rotate about its own z and slide along it, which leaves four coordinates: two tilts of the axis
-    and two shifts across it. The axis of a prismatic joint, and of a joint on the base, has a direction but no
-    position.
+    A link's frame may rotate about its own z and slide along it, which leaves two tilts of the axis and two shifts
+    across it. The axis of a prismatic joint, and of a joint on the base, has a direction but no position.
     """
     places = []
     for link, (parent, kind) in enumerate(zip(parents, joints, strict=True)):
@@ -77,7 +76,7 @@ def displaced(frames: Frames, step: Float[Array, "d 6"]) -> Frames:
 def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
     """Returns the same arm at q = 0 with one joint's direction of motion reversed.
 
-    Where gravity dominates, torques hardly distinguish the two arms, and descents end in either.
+    Where gravity dominates, torques hardly distinguish the two arms, and descents end at either.
     """
     half = np.diag([1.0, -1.0, -1.0])
     rotations, positions = map(np.array, frames)
@@ -120,11 +119,11 @@ def frames_of_axes(
 
     Args:
         axes: directions of the joints in space at q = 0, of any length.
-        points: on the axes, m.
+        points: one point on each axis, m.
         parents: parent link of every link, -1 for the ground; a serial chain by default.
 
     Raises:
-        InputError: arrays of another shape or not finite, or an axis of length zero.
+        InputError: arrays with a wrong shape or values that are not finite, or an axis of length zero.
     """
     d = len(points)
     axes, points = finite_array("axes", axes, (d, 3)), finite_array("points", points, (d, 3))
@@ -145,7 +144,7 @@ def kinematic_prior_from_json(values: Any, d: int, parents: Sequence[int] | None
     """Builds the prior of d joints from JSON values.
 
     Raises:
-        InputError: unknown fields, another number of rows, or arrays that `frames_of_axes` refuses.
+        InputError: unknown fields, a wrong number of rows, or arrays that `frames_of_axes` refuses.
     """
     names = set(values) - set(ROUGHNESS) if isinstance(values, dict) else set()
     if names not in ({"axes", "points"}, {"dh_rows"}):

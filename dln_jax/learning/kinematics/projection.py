@@ -6,8 +6,8 @@ For fixed frames, inertias and friction solve a linear problem and are eliminate
 
 y holds the scaled torques, Phi is scaled likewise, and U spans its columns. J is Kaufman's (1975) simplification of
 Golub and Pereyra's derivative: its gradient Jᵀr is exact, and it needs no derivative of U. The columns are those of a
-minimal parametrisation (the parent link takes up the others: Khalil and Dombre 2002, section 9.4), scaled to length
-one. The ridge, relative to them, decides directions that the data leave undetermined. Only sums over samples are
+minimal parametrisation (the parent link absorbs the others: Khalil and Dombre 2002, section 9.4), scaled to length
+one. The ridge, relative to these, fixes directions that the data leave undetermined. Only sums over samples are
 formed, so that a step takes milliseconds; `fit` solves the final linear problem to full precision.
 """
 
@@ -30,18 +30,17 @@ LENGTH = 0.3
 LARGEST_STEP = 0.6
 """Largest step of a coordinate, in rad, and in units of `LENGTH` for positions: longer steps are scaled down."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e3
-"""Initial, smallest and largest damping, relative to the mean of the normal matrix' diagonal; a descent ends at the
-largest."""
+"""Initial, smallest and largest damping, relative to the mean diagonal of JᵀJ; a descent ends at the largest."""
 FEWER, MORE = 0.2, 5.0
-"""Factors of the damping after a step that descends, and after one that does not."""
+"""Factors on the damping after a step that lowers the loss, and after one that does not."""
 CHUNK = 10
 """Iterations per dispatch."""
 SETTLED = 1e-4
 """A descent ends when the loss decreases by less than this fraction over a chunk."""
 OF_REVOLUTE = np.array([1, 2, 4, 5, 6, 8, 9])
-"""Inertial parameters of a revolute link; the parent link takes up m, h_z and I_yy."""
+"""Inertial parameters of a revolute link; the parent link absorbs m, h_z and I_yy."""
 OF_PRISMATIC = np.array([0, 1, 2, 3])
-"""Inertial parameters of a prismatic link; the parent link takes up its moments."""
+"""Inertial parameters of a prismatic link; the parent link absorbs its moments."""
 
 
 class Structure(NamedTuple):
@@ -73,7 +72,7 @@ class Structure(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Descents and torques, as arrays [N, d]."""
+    """States and torques, as arrays [N, d]."""
 
     q: Any
     qd: Any
@@ -119,9 +118,6 @@ def project(
     """Eliminates the linear parameters and returns the normal equations of a step of the frames.
 
     Args:
-        structure: known properties of the tree.
-        frames: current frames.
-        samples: states and measured torques.
         unit: scale of the joints' torques, N m or N.
         ridge: added to the diagonal of the Gram matrix of the columns, scaled to length one.
     """
@@ -162,7 +158,7 @@ def project(
 
 
 class Descent(NamedTuple):
-    """Descent of a descent."""
+    """State of a descent."""
 
     frames: Frames
     at: Projection

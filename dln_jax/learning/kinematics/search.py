@@ -19,7 +19,7 @@ from dln_jax.learning.kinematics.projection import Descent, Program, Samples, St
 from dln_jax.types import require_positive, require_seed
 
 WAVE = 8
-"""Starts between two tests of agreement; it is independent of the number of threads, and so are the results."""
+"""Starts between two tests of agreement. It does not depend on the number of threads, so neither do the results."""
 ALIKE = 0.02
 """Largest relative difference of two losses that count as the same local minimum."""
 
@@ -40,7 +40,6 @@ class Search(NamedTuple):
     confirm: bool = True
     """Whether to search until two descents end at the same arm, with the same validation error."""
     seed: int = 0
-    """Seed of the starts and of the samples."""
     threads: int = 2
     kinematic_prior: Frames | None = None
     """Kinematic prior: frames near which to start, for example from a drawing with link lengths and rough axes."""
@@ -72,11 +71,7 @@ def search(
     """Descends from random starts, and from moves of the best, until enough descents agree on the lowest loss.
 
     Args:
-        structure: known properties of the tree.
         program: descent of the structure, from `compiled`.
-        samples: samples of the data for the search.
-        unit: scale of the joints' torques.
-        settings: limits of the search.
         until: reading of `time.perf_counter` at which the search ends.
         before: an earlier search, which another wave of starts continues.
 

@@ -1,4 +1,4 @@
-"""Options of the commands that train dynamics: those of every model, and those of each way of fitting.
+"""Options of the commands that train dynamics, for every model and for each way of fitting.
 
 Importing this module does not import JAX, so that `--help` is quick.
 """
@@ -16,25 +16,25 @@ from dln_jax.cli.options import Devices, Drawn, Filtered, Limited, Resumable, Sc
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
 Precision = Literal["f32", "f64"]
 NETWORK, AUTO = "structured-delan", "auto"
-"""The default model of the embedded data, and the model selection that is the default for files."""
+"""Default model for the embedded data; model selection, the default for files."""
 
 
 @dataclass(frozen=True)
 class Plant:
-    """What is learned, from which data."""
+    """Model and data."""
 
     model: str | None = None
-    """What is learned."""
+    """Model to learn."""
     data: Unstated[Path] = None
     """Trajectories, npz, CSV or ROS bag (default: the embedded letters, or states of --scene)."""
     test: Unstated[str] = None
-    """Test trajectories: labels, comma separated; last:30% of every trajectory; or blocks, of ten blocks of time
-    (default: e,q,v, else every sixth, else blocks of time)."""
+    """Test trajectories: comma-separated labels; last:30% for the end of every trajectory; or blocks, for ten blocks of
+    time in each (default: e,q,v, else every sixth, else blocks of time)."""
     scene: Unstated[str] = None
-    """Textbook scene whose needs the data have, such as cart-pole or chain-3; without --data, the scene to sample."""
+    """Textbook scene that states the needs of the data, such as cart-pole or chain-3; sampled if there is no --data."""
     needs: Unstated[str] = None
-    """What the plant needs, such as '{"joints": ["revolute"], "friction": true}' (default: as scene or file, else
-    revolute joints, gravity and friction)."""
+    """Joints and terms of the plant, such as '{"joints": ["revolute"], "friction": true}' (default: those of the scene
+    or file, else revolute joints, gravity and friction)."""
     velocity_scale: Unstated[float] = None
     """Velocity below which dry friction is smooth, rad/s or m/s (default: 0.01)."""
     seed: int = 0
@@ -51,7 +51,7 @@ class Options(SingleCalls, Drawn, Resumable, Filtered, Plant):
 
 @dataclass(frozen=True)
 class Objective:
-    """Precision and errors of a fit of one model."""
+    """Precision and objective of a fit."""
 
     precision: Unstated[Precision] = None
     """Floating-point type (default: f64; f32 for adam)."""
@@ -66,17 +66,17 @@ class NetworkOptions(Objective, Limited, Scaled):
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """gauss-newton is far more accurate for small networks."""
     width: Unstated[int] = None
-    """Hidden units per layer (default: 8 structured, 16 others, 64 adam; by the data from four joints on)."""
+    """Hidden units per layer (default: structured 8, others 16, adam 64; chosen from the data for 4 joints or more)."""
     depth: Unstated[int] = None
     """Hidden layers (default: 2)."""
     activation: Unstated[ActivationName] = None
     """Activation of the hidden layers (default: tanh)."""
     steps: Unstated[int] = None
-    """Iterations (default: 150, adam 20000; from four joints on 40 and 6000)."""
+    """Iterations (default: 150, adam 20000; for 4 joints or more 40 and 6000)."""
     seeds: int = 1
     """Number of seeds in one program; the best in cross-validation is kept."""
     folds: int = 3
-    """Folds of that cross-validation (1: validation motions alone)."""
+    """Folds of the cross-validation over seeds (1: use the validation motions alone)."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class GaussNewtonOptions:
     """Levenberg-Marquardt."""
 
     samples: Unstated[int] = None
-    """Training samples that are drawn and fitted (default: all; from four joints on, 14 equations per parameter)."""
+    """Number of training samples to draw and fit (default: all; for 4 joints or more, 14 equations per parameter)."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class TrigonometricOptions(Objective):
     """A basis of trigonometric polynomials."""
 
     degree: Unstated[int] = None
-    """Degree of the polynomials in every joint (default: for each joint what validation asks for)."""
+    """Degree of the polynomials in every joint (default: chosen for each joint by validation)."""
 
 
 @dataclass(frozen=True)
@@ -122,14 +122,14 @@ class KernelOptions:
     """The trigonometric energies in kernel form."""
 
     samples: Unstated[int] = None
-    """Largest number of samples that the kernel is made of (default: 600)."""
+    """Largest number of samples in the kernel (default: 600)."""
     precision: Unstated[Precision] = None
     """Floating-point type of the model (default: f64)."""
 
 
 @dataclass(frozen=True)
 class ArmOptions:
-    """What is known of an arm whose joint frames are searched."""
+    """Prior knowledge of an arm whose joint frames are searched."""
 
     parents: Unstated[str] = None
     """Parent joint of every joint, counted from 1, with 0 for the ground, such as 0,1,2,1 (default: a chain)."""
@@ -152,9 +152,9 @@ class SelectionOptions(ArmOptions, Limited, Devices):
     """Model selection by validation."""
 
     robot: Unstated[Path] = None
-    """URDF or MJCF file, whose kinematics is the first candidate."""
+    """URDF or MJCF file of the robot, whose tree is the first candidate."""
     lock: Unstated[str] = None
-    """Joints of --robot that do not move, comma separated; "*finger*" names all with finger in their name."""
+    """Comma-separated joints of --robot that do not move; "*finger*" matches all names that contain finger."""
 
 
 class Fit(NamedTuple):
@@ -196,14 +196,14 @@ def options_of(stated: Mapping[str, Any]) -> tuple[type, ...]:
 
 
 def model_of(stated: Mapping[str, Any]) -> str:
-    """The model of a command line: for files model selection, unless an option of networks is stated."""
+    """Model that a command line selects; for files, model selection unless an option of networks is stated."""
     if stated.get("model"):
         return stated["model"]
     return NETWORK if stated.get("data") is None or network_option(stated) else AUTO
 
 
 def network_option(stated: Mapping[str, Any]) -> str | None:
-    """An option that only networks have and that is stated, if there is one."""
+    """Returns a stated option that only networks have, or `None`."""
     shared = {field.name for field in dataclasses.fields(SelectionOptions)}
     for kind in (NetworkOptions, AdamOptions, GaussNewtonOptions, GrownOptions):
         for field in dataclasses.fields(kind):

@@ -50,7 +50,6 @@ class Recorded(NamedTuple):
     robot: Robot | None
     """The robot that moved, if its file was stated."""
     parents: tuple[int, ...] | None
-    """Parent link of every link, if stated."""
     kinematic_prior: KinematicPrior | None
     torque: str = "measured torques"
     """The torques that models are fitted to and uncertainty bands refer to."""

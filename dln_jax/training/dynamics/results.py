@@ -73,7 +73,7 @@ MEANINGS = {
 
 
 class Evaluation(NamedTuple):
-    """What a stored model of dynamics does on the test."""
+    """Results of a stored model of dynamics on the test."""
 
     metrics: dict[str, float | int]
     judged: TorqueVerdict
@@ -168,10 +168,7 @@ def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dic
 
 
 def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:
-    """Test rollouts under interpolated torques, and valid prediction times with the true plant's as the upper bound.
-
-    Empty for independent states, which are no motion.
-    """
+    """Test rollouts under interpolated torques, and prediction times with the true plant's; none for single states."""
     test = task.sets.test
     if len(np.unique(test.trajectory)) == len(test.t):
         return [], {}
@@ -205,13 +202,13 @@ def figures_of(
 
 
 def columns(metrics: dict[str, float | int]) -> tuple[str, ...]:
-    """Columns of the printed table; a known true plant has one."""
+    """Columns of the printed table, with one for the true plant if it is known."""
     known = any(ceiling in metrics for ceiling in CEILINGS.values())
     return ("quantity", "value", *["true plant"] * known, "unit")
 
 
 def rows(metrics: dict[str, float | int], task: Task) -> list[tuple[str, ...]]:
-    """Rows of the printed table; next to rollout metrics stand the true plant's values."""
+    """Rows of the printed table; rollout metrics also show the true plant's values."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
     units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
     units |= {key: "1" for key in metrics if key.endswith("_nmse")}

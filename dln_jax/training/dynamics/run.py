@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
 
 
 def run(options: Any, command: str) -> None:
-    """Trains, evaluates and writes a run folder; errors as `training.pipeline.train`."""
+    """Trains, evaluates and writes a run folder; errors as for `training.pipeline.train`."""
     model = model_of(vars(options))
     if options.model is None and model == NETWORK and options.data is not None:
         option = network_option(vars(options))
@@ -116,7 +116,7 @@ def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
 
 
 def store_bands(folder: Path, task: Task, model: Model, parameters: Parameters) -> None:
-    """Stores the uncertainty of a model fitted to torques alone, with as many parameters as its structure asks for."""
+    """Stores the uncertainty of a model fitted to torques alone; for other models, prints why there is none."""
     properties = CATALOGUE[task.kind].properties
     if not task.objective.of_torques:
         print(f"no uncertainty is stored: a {task.kind} is not fitted to torques alone")

@@ -1,4 +1,4 @@
-"""A task of dynamics: the data, what they need, the model, and how it is trained."""
+"""A task of dynamics: the data, their `Needs`, the model and its training."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -81,7 +81,7 @@ class Task(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A way of fitting, `METHOD` of its module in `methods`."""
+    """A way of fitting: the `METHOD` of a module in `methods`."""
 
     plan: Callable[[Any, str, Recorded, Objective], tuple[dict[str, Any], Solver | None]]
     """(options, model, data, objective) -> description of the model, and its solver if it has one; refuses options that
@@ -91,12 +91,12 @@ class Method(NamedTuple):
 
 
 def method_of(kind: str) -> Method:
-    """The way of fitting a model."""
+    """Returns the way of fitting a model."""
     return FITS[kind].method()
 
 
 def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:
-    """The task of a model, which ends at `until` by `time.perf_counter`; nothing is written yet.
+    """Plans the task of a model, which ends when `time.perf_counter` reads `until`; nothing is written yet.
 
     Raises:
         InputError: data that the model cannot be fitted to.
@@ -107,7 +107,7 @@ def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:
         objective = SCALED_TORQUE
     description, solver = method_of(kind).plan(options, kind, recorded, objective)
     if description:
-        build(description)  # refuses what no model can be made of
+        build(description)  # refuses descriptions of which no model can be built
     return Task(recorded, kind, description, objective, solver, seeds_of(options), until)
 
 

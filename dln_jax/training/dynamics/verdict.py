@@ -46,7 +46,6 @@ def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) ->
     """The most severe verdict from test motions, validation motions and the search for joint frames.
 
     Args:
-        task: the task with its data.
         on_test: the model's torques on the test motions [N, d].
         on_validation: the model's torques on the validation motions.
     """
@@ -86,10 +85,8 @@ def searched(
     """Verdict and metrics of a search for joint frames: agreement of its descents, and their errors over the noise.
 
     Args:
-        losses: losses of all descents.
         agreeing: number of descents that reached the lowest loss.
         agreement: number of agreeing descents that the search aims for.
-        errors: errors on held-out motions.
         twin: comparison of two of these descents.
     """
     numbers: dict[str, float | int] = {"descents": len(losses), "descents_agreeing": agreeing}

@@ -13,10 +13,10 @@ NAMES = ("sin", "cos_sin")
 
 @dataclass(frozen=True)
 class Learned:
-    """What is learned, and by which network."""
+    """The function to learn, and the network."""
 
     function: Annotated[str, choice((*NAMES, "FILE.npz"))] = "sin"
-    """An npz file has x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
+    """Function to learn; an npz file has x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
     loss: Literal["type1", "type2"] = "type1"
     """type1 fits value and gradient, type2 the value only."""
     activation: Annotated[
@@ -51,7 +51,7 @@ class NewtonOptions:
     steps: Unstated[int] = None
     """Iterations on all samples per network (default: at most 40)."""
     coarse_steps: Unstated[int] = None
-    """Iterations before those on 2,048 of the samples (default: at most 200; 0 for none)."""
+    """Earlier iterations on 2,048 of the samples (default: at most 200; 0 for none)."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,13 @@ class SampledOptions:
     """Samples of a named function."""
 
     samples: Unstated[int] = None
-    """Samples that are drawn (default: 25600)."""
+    """Number of samples to draw (default: 25600)."""
     noise: Unstated[float] = None
     """Standard deviation of the noise on x, f, gradient and Hessian (default: 0.001)."""
 
 
 def options_of(stated: Mapping[str, Any]) -> tuple[type, ...]:
-    """Options of the optimiser, and those of a named function."""
+    """Options of the optimiser and of a named function."""
     named = (SampledOptions,) if stated["function"] in NAMES else ()
     return (*named, AdamOptions if stated["optimizer"] == "adam" else NewtonOptions)
 

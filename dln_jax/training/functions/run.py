@@ -167,7 +167,7 @@ UNITS = {
     "spread_outside": "y",
     "validation_loss": "units of the fit",
 }
-"""Units of metrics, in those of the data."""
+"""Units of metrics, from the units x and y of the data."""
 
 
 FUNCTIONS = Kind(prepare, announce, fit, judge)

@@ -36,8 +36,7 @@ FREE_OF_NOISE = 1e-3
 LEAST_RATE_NOISE = 0.01
 """Lower limit of the noise of measured rates, relative to their spread, since no model has them exactly."""
 ANCHOR = 30.0
-"""Noise assigned to estimated momenta, in units of their spread. They are noisy, but without any weight a model is free
-to choose its own momentum."""
+"""Noise of estimated momenta, in units of their spread: without any weight, a model could choose its own momentum."""
 SURVEYED = 1_500
 """Approximate number of samples used to estimate noise; this gives its standard deviation to 2 %."""
 WINDOW = {REAL: 30, MEASURED: 30}
@@ -48,8 +47,7 @@ class Stated(NamedTuple):
     """Facts about measurements that the user states in addition to their file."""
 
     needs: Needs | None = None
-    """`Needs` of the plant. Default: those in the file, else bodies whose forces balance, else revolute joints with a
-    potential and friction."""
+    """`Needs` of the plant (default: the file's, else bodies if forces balance, else revolute joints with friction)."""
     test: str | None = None
     """Labels of the test trajectories, separated by commas, or an npz file with test trajectories."""
     noise: tuple[float, ...] | None = None
@@ -121,10 +119,7 @@ def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[
 
 def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Trajectories, Noise]:
     """Adds velocities and accelerations from local polynomials if they were not measured, and estimates the noise.
-
-    Raises:
-        InputError: noise for another number of coordinates, or segments that are too short.
-    """
+    Raises `InputError` for noise of another number of coordinates, or segments that are too short."""
     d = data.degrees_of_freedom
     if noise is not None and len(noise) not in (1, d):
         raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates")
@@ -149,10 +144,7 @@ def with_momenta(data: Trajectories) -> Trajectories:
 
 def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | None:
     """Weights of data with momenta from stated or estimated noise; `None` if all segments are too short.
-
-    Raises:
-        InputError: noise for another number of coordinates, or noise stated for segments that are too short.
-    """
+    Raises `InputError` for noise of another number of coordinates, or noise stated for segments that are too short."""
     d, own = data.degrees_of_freedom, "p" not in data.estimated
     if noise is not None and len(noise) not in ((1, d, 2 * d) if own else (1, d)):
         more = f", or {2 * d} of q and then p" if own else ""

@@ -35,8 +35,7 @@ FRICTION_WIDTH = 4
 VALIDATION_SHARE = 0.15
 """Fraction of the training trajectories used for validation."""
 EXACT = 1e-8
-"""Target error, relative to the mean square of the measured rates, below which neither another model nor a fit of
-motions is needed."""
+"""Error, relative to the mean square of measured rates, below which no other model and no fit of motions is needed."""
 TRIED_DEGREES = (2, 4)
 """Degrees of the polynomial candidates in model selection."""
 TRIAL_STEPS = 20
@@ -62,8 +61,7 @@ class Candidate(NamedTuple):
 def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
     """Description of a model for a task; "auto" selects the one that suits the scene.
 
-    `keywords` (width, depth, activation, degree, coordinates, order) override the recipe. For measurements "auto" calls
-    `choose_model`.
+    `keywords` (width, depth, activation, degree, coordinates, order) override the recipe; see also `choose_model`.
     """
     recipe = RECIPES[problem.name]
     if model == "auto" and problem.name == MEASURED:
@@ -94,7 +92,7 @@ def description_of(problem: Problem, model: str, *, precision: str = "f64", **ke
 
 
 def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
-    """How a pairwise model reads the coordinates: as stated, or as balances the measured forces.
+    """Arrangement of the coordinates for a pairwise model: as stated, or the one in which measured forces balance.
 
     Raises:
         InputError: the order is neither stated nor determined by the measurements.
@@ -113,7 +111,7 @@ def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
 
 
 def polynomial_degree(problem: Problem) -> int:
-    """The smallest sufficient degree by validation trajectories."""
+    """The smallest sufficient degree, chosen by validation trajectories."""
     fitted, validation = hold_out(problem.fitted, VALIDATION_SHARE, 0)
 
     def fit(degree: int):
@@ -184,9 +182,8 @@ def rates_are_biased(problem: Problem) -> bool:
 def candidates(problem: Problem, networks: bool) -> list[Candidate]:
     """Candidate models for measurements, in order of size.
 
-    Bodies with balanced forces get pairwise models. Models of accelerations are compared for data without momenta,
-    models of rates for data with momenta. Noisy states rule out the comparison: they bias all fits, the more flexible
-    models the least.
+    Bodies with balanced forces get pairwise models. Data without momenta compare models of accelerations, others
+    models of rates. Noisy states rule out the comparison: they bias all fits, those of flexible models the least.
     """
     needs, d = problem.needs, problem.needs.degrees_of_freedom
     free = needs._replace(friction=False)

@@ -16,15 +16,15 @@ GENERATED = (
 """Tasks whose data are generated: the names of `scenes.datasets.hamiltonian_tasks.PROTOCOLS`."""
 POLYNOMIAL = "polynomial-hamiltonian"
 DIRECT = (POLYNOMIAL, "trigonometric", "planar-chain")
-"""Models that are no networks."""
+"""Models without a network."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What moves, and what is learned."""
+    """The system that moves, and the model to learn."""
 
     task: Annotated[str, choice((*GENERATED, REAL, MEASURED))] = "spring"
-    """What moves; measured: any --data."""
+    """System that moves; measured stands for any --data."""
     model: Literal[
         "auto",
         "separable-hnn",
@@ -38,8 +38,8 @@ class Motion:
         "trigonometric",
         "planar-chain",
     ] = "auto"
-    """What is learned; auto: what suits the task, for measured the smallest model whose validation error no other
-    betters. The last three are for measured."""
+    """Model to learn; auto: the one that suits the task, for measured the smallest whose validation error no other
+    beats. The last three are for measured."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """auto: gauss-newton."""
     steps: Unstated[int] = None
@@ -74,13 +74,13 @@ class MeasuredOptions(RecordedOptions):
     """Recorded motions of any plant."""
 
     needs: Unstated[str] = None
-    """What the plant needs, such as '{"joints": ["revolute"], "friction": true}' (default: as the file, else revolute
-    joints, a potential and friction)."""
+    """Joints and terms of the plant, such as '{"joints": ["revolute"], "friction": true}' (default: those of the file,
+    else revolute joints, a potential and friction)."""
     test: Unstated[str] = None
-    """Labels of test trajectories, an npz file of them, last:30% of every trajectory, or blocks, of ten blocks of time
-    (default: every sixth, or the last fifth)."""
+    """Test trajectories: labels, an npz file, last:30% for the end of every trajectory, or blocks, for ten blocks of
+    time in each (default: every sixth, or the last fifth)."""
     noise: Unstated[str] = None
-    """Standard deviations of q, and with p in the file of q and p: one number or one each (default: estimated)."""
+    """Standard deviations of q, or of q and p if the file has p: one number or one each (default: estimated)."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class BodiesOptions:
     """Bodies that attract each other in pairs."""
 
     order: Unstated[Literal["bodies", "axes"]] = None
-    """Order of the coordinates: x1, y1, x2, y2 or x1, x2, y1, y2 (default: that in which forces balance)."""
+    """Order of the coordinates: x1, y1, x2, y2 or x1, x2, y1, y2 (default: the order in which forces balance)."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class ChainOptions:
     """Planar chain."""
 
     coordinates: Unstated[Literal["relative", "absolute"]] = None
-    """Angles of joints, or from the vertical (default: relative)."""
+    """relative: joint angles; absolute: angles from the vertical (default: relative)."""
 
 
 @dataclass(frozen=True)

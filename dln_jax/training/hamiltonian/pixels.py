@@ -1,8 +1,7 @@
 """The pixel pendulum: data, models, training, errors and images, as a kind of the pipeline.
 
 Models: black-box-hnn (an energy in the latent plane) and phase-network (a network for the rates there), with the same
-autoencoder, loss and budget. The data are those of seed 0; a seed determines the parameters and the order of the
-samples.
+autoencoder, loss and budget. The data are those of seed 0; a seed sets parameters and the order of samples.
 """
 
 from collections.abc import Callable, Iterator
@@ -56,8 +55,8 @@ from dln_jax.zoo.images import with_components
 
 MATCHING = Matching(weights=TermWeights(field=10.0))
 """The same for both models. Weight, components and training length were chosen with seed 0 by validation films.
-Matching one step at a time, as published, was chosen over windows of ten steps, for which both models were alike (1e-6
-J² over a hundred frames, their decoder's error), with test films in view."""
+Matching single steps, as published, was chosen over windows of ten steps with test films in view; with windows both
+models had the same error (1e-6 J² over a hundred frames, that of their decoder)."""
 STEPS = 12_000
 COMPONENTS = 32
 """Principal components of a frame. They keep all but 3e-7 of the variance, and training on them takes half the time."""

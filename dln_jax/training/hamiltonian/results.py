@@ -81,7 +81,7 @@ MEANINGS = {
     "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),
     "validation_error": ("validation loss of the last stage", "see training.png"),
 }
-"""Labels and units by the prefix of a metric's name; an energy error of 0 is that of the true plant."""
+"""Labels and units by the prefix of a metric's name; the true plant has an energy error of 0."""
 ENDINGS = {
     **{"_standard_error": ": its standard error over starts", "_median": ": its median over starts"},
     **{"_seconds": "", "_median_seconds": ": its median", "_lyapunov": ", in Lyapunov times of the model"},

@@ -41,22 +41,18 @@ KEYWORDS = ("width", "depth", "activation", "degree", "coordinates", "order", "f
 
 
 class Case(NamedTuple):
-    """A phase space to learn, and how."""
+    """A phase space to learn, with its model and optimiser."""
 
     problem: Problem
     description: dict[str, Any]
     optimiser: Optimiser
     findings: list[str]
-    """Findings about the log."""
     until: float
     """Deadline by `time.perf_counter`."""
 
 
 def prepare(options: Any) -> Case:
-    """Resolves the options into the problem, the model's description and the optimiser.
-
-    Everything is checked before anything is written, and the log before models are compared on it.
-    """
+    """Resolves options into problem, description and optimiser, and checks them and the log; writes nothing."""
     until = deadline(options.seconds)
     require_seed(options.seed)
     require_positive_if_given(options, ["width", "depth", "degree", "steps", "trajectories", "seconds"])
@@ -89,7 +85,7 @@ def prepare(options: Any) -> Case:
 
 
 def refuse_iterations(options: Any, problem: Problem, description: dict[str, Any]) -> None:
-    """Refuses options of iterations for the polynomial model, whose fit of rates is one least-squares problem."""
+    """Refuses iteration options for the polynomial model, whose fit of rates is one least-squares problem."""
     if options.optimizer == "adam":
         raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
     for name in ("steps", "seconds", "processes"):

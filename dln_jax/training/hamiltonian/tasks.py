@@ -72,11 +72,9 @@ class Problem(NamedTuple):
     tests: MeasuredWindows | None = None
     """Recordings to predict, across their gaps, with starts fitted to their first `WINDOW` samples."""
     trust: Trust | None = None
-    """Trust in measurements, in coordinates and momenta."""
     assumed: bool = False
     """Whether the needs are not stated, so that the data decide between candidates."""
     gaps: int = 0
-    """Number of gaps in the test recordings."""
 
 
 def problem_of(
@@ -88,7 +86,6 @@ def problem_of(
         name: from `TASKS`.
         trajectories: number of generated trajectories, in place of the task's own.
         data: npz or CSV file; required for measurements, refused otherwise.
-        stated: further facts about measured motions.
 
     Raises:
         InputError: an unknown name, too few trajectories, or a file that is missing or unsuitable.

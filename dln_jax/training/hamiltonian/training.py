@@ -2,8 +2,7 @@
 
 Spring and pendulum have noise on the states and none on the rates: models are fitted to rates first and then to
 trajectories with free starts, which removes the bias due to the noise. The other generated tasks have no noise and are
-fitted to rates alone. Measured rates are usually noisy or estimated and serve for a first fit; the result is then the
-fit to trajectories.
+fitted to rates alone. Measured rates, usually noisy or estimated, serve for a first fit before that to trajectories.
 """
 
 import math
@@ -33,7 +32,6 @@ from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.zoo.descriptions import build
 
 RATES, MOTIONS = "rates", "motions"
-"""The stages of a training."""
 OUT_OF_TIME = "out of time"
 WINDOWS_OF_A_STEP = 64
 """Batch size of Adam, in windows, for the fit of motions."""
@@ -114,8 +112,7 @@ def train(
 
     `seconds` limits both fits together, compilation included. The fit of rates is the result if the time left is too
     short to compile the next program, or if the fit of motions is not finite at its start. `keep` is called with it
-    before motions are fitted. Motions are not fitted if measured rates are exact. Devices of a mesh share the samples
-    of both fits.
+    before motions are fitted. Motions are not fitted if measured rates are exact. Devices share samples in both fits.
     """
     began = time.perf_counter()
     recipe, model = RECIPES[problem.name], build(description)

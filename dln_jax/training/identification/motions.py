@@ -1,10 +1,10 @@
 """Identification by motions as a part of `identify`: windows of the log, the fit, and prediction times.
 
-Motions need no accelerations. With --cutoff, their q is filtered `LIGHTER` times as high as that of torques, since the
+Motions need no accelerations. With --cutoff, the cut-off of their q is `LIGHTER` times that of torques, since the
 output error does not amplify noise.
 
 The length of the windows is chosen by inner splits: fits to some trajectories (or blocks) of the training data predict
-the others. The parameters by torques take part, and are kept if none predicts longer.
+the others. The parameters fitted to torques are a candidate too, and are kept if no window predicts longer.
 """
 
 from typing import Any, NamedTuple
@@ -28,15 +28,15 @@ WINDOWS = (0.3, 1.0)
 FOLDS = 3
 """Inner splits, each with a third of the trajectories held out."""
 PUSH = 0.1
-"""Standard deviation of a window's constant torque over that of a sample's torque error, which cancels in part."""
+"""Standard deviation of a window's constant torque error over that of a sample's, which partly averages out."""
 LIGHTER, NYQUIST, STEP = 5.0, 0.4, 0.01
-"""Cut-off of the motions' q over that of the torques', its limit over the sampling rate, and their time step, s."""
+"""Cut-off of q for motions over that for torques, its largest share of the sampling rate, and their time step, s."""
 HORIZON, EVERY = 2.2, 0.5
 """Length of a predicted segment and interval of starts, s; shorter if a held-out motion is shorter."""
 TOGETHER = 32
-"""Segments that are predicted at a time."""
+"""Number of segments predicted at a time."""
 FITTED = 0.1
-"""Part of a segment that its initial state is fitted to, s."""
+"""Length of the part of a segment to which its initial state is fitted, s."""
 
 
 class MotionSets(NamedTuple):
@@ -47,7 +47,7 @@ class MotionSets(NamedTuple):
 
 
 def lightly_filtered(data: Trajectories, filtered: Smoothed | None) -> Trajectories:
-    """The log at steps of about `STEP`, with q filtered little; without --cutoff, the log itself.
+    """The log at steps of about `STEP`, with q filtered lightly; without --cutoff, the log itself.
 
     Raises:
         InputError: the light filter cuts the log into other parts.
@@ -66,13 +66,13 @@ class Chosen(NamedTuple):
     """A choice between torques and motions by inner splits."""
 
     window: float | None
-    """Length of the windows, s; `None` keeps the parameters by torques."""
+    """Length of the windows, s; `None` keeps the parameters fitted to torques."""
     seconds: dict[str, float]
     """Mean valid prediction time on inner held-out motions, by "torques" and length; empty without inner splits."""
 
     @property
     def line(self) -> str:
-        """What was chosen, and why."""
+        """The choice and its reason, as text."""
         shown = ", ".join(f"{name} {value:.3g} s" for name, value in self.seconds.items())
         kept = "parameters by torques" if self.window is None else f"windows of {self.window:g} s"
         return f"chosen by inner splits of the training data: {kept} (prediction times: {shown})"
@@ -82,14 +82,12 @@ def fit_by(
     by: str, model: Model, known: Parameters, solution: Identification, train: Trajectories, sets: MotionSets,
     window: float | None, **options: Any,
 ) -> tuple[Identification, MotionFit | None, Chosen]:  # fmt: skip
-    """The solution with parameters that fit motions, or motions and torques, the record of that fit, and the choice.
+    """Refits the solution to motions, or to motions and torques; also returns the record of that fit and the choice.
 
     Args:
         by: "motions" or "both".
-        model: the rigid tree.
-        known: its parameters in the robot's file.
+        known: parameters of the rigid tree in the robot's file.
         solution: consistent fit of the torques.
-        train: its training data.
         sets: motions; those of `sets.train` have the trajectories of `train`.
         window: length of the windows, s (default: chosen from `WINDOWS` by inner splits).
         options: of `identify`, for the fits of torques in inner splits.
@@ -130,7 +128,7 @@ def fitted(
 def chosen_window(
     by: str, model: Model, known: Parameters, train: Trajectories, motions: Trajectories, **options: Any
 ) -> Chosen:
-    """Chooses by the mean valid prediction time of inner held-out trajectories, or blocks of time of a single one.
+    """Chooses by the mean valid prediction time of inner held-out trajectories, or of blocks of a single trajectory.
 
     A length is left out if its motions are not finite. If all predict equally long, the first length is taken.
     """
@@ -199,7 +197,7 @@ def prediction_metrics(
 
 
 def motion_lines(by: str, fit: MotionFit | None, choice: Chosen, numbers: dict[str, float | int]) -> list[str]:
-    """What the fit to motions did, in a few lines."""
+    """Summary of the fit to motions, in a few lines."""
     lines = [choice.line] if choice.seconds else []
     if fit is not None:
         lines.append(

@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
     residual: ResidualFit | None
     seconds: float
     motions: MotionFit | None
-    """Fit to motions, whose parameters are those of `solution`, if asked for and chosen."""
+    """Fit to motions, if requested and chosen; its parameters are those of `solution`."""
     choice: Chosen | None
     by_torques: np.ndarray
     """Parameters of the fit of torques alone."""

@@ -54,7 +54,6 @@ class Case(NamedTuple):
     noise: np.ndarray | None
     """Noise of the torques, if stated."""
     locked: tuple[str, ...]
-    """Names of the locked joints."""
     lines: tuple[str, ...]
     """Lines for the user: the origin of the rates, and findings about the log."""
     torque: str = "measured torques"
@@ -113,7 +112,7 @@ def prepare(options: Options) -> Case:
 
 
 def with_description(case: Case, **changes: Any) -> Case:
-    """The case with changed keywords of its model, which is built again."""
+    """The case with changed keywords of its model, which is rebuilt."""
     description = {**case.description, **changes}
     model = build(description)
     known = model.init(jax.random.key(0))
@@ -125,7 +124,7 @@ def with_description(case: Case, **changes: Any) -> Case:
 
 
 def with_terms(velocity_scale: float | None, case: Case) -> tuple[Case, FrictionFit | None]:
-    """The case with the terms that cross-validation keeps and fitted shapes of friction, and their fit, if any.
+    """Adds the terms that cross-validation keeps and fits shapes of friction; returns the case and that fit, if any.
 
     The velocity scale is fitted unless it is stated.
     """

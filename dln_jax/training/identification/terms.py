@@ -31,11 +31,7 @@ class Wanted(NamedTuple):
 
 
 def wanted(options: Any, laws: tuple[FrictionLaw, ...], data: Trajectories) -> Wanted:
-    """Parses and checks the options.
-
-    Raises:
-        InputError: motors or pairs that are no such, or a temperature that the data lack.
-    """
+    """Parses and checks the options; `InputError` for invalid motors or pairs, or a temperature that the data lack."""
     rows, pairs, d = None, [], data.degrees_of_freedom
     if options.motors is not None:
         rows = tuple(numbers_of("--motors", row, [d]) for row in options.motors.split(";"))
@@ -64,7 +60,7 @@ def chosen(
     wanted: Wanted, tree: Tree, train: Trajectories, laws: tuple[FrictionLaw, ...], start: FrictionShape,
     held: tuple[str, ...],
 ) -> tuple[Terms, list[str]]:  # fmt: skip
-    """Terms that cross-validation asks for, and lines on those tried."""
+    """Terms that cross-validation keeps, and lines on all that were tried."""
     plain: tuple[FrictionLaw, ...] = tuple(law for law in laws if law != "load")
     options: dict[str, Any] = {"cooling": False, "motors": wanted.motors, "coupled": ()}
     terms, lines, candidates = terms_of(plain, start, held, **options), [], []
@@ -83,7 +79,7 @@ def chosen(
 
 
 def line_on(term: TriedTerm) -> str:
-    """What cross-validation said about a term."""
+    """Line on a term that cross-validation tried."""
     verdict = "kept" if term.kept else "left out"
     return f"{term.name}: {verdict}; cross-validation error {term.within:.4g} with it, {term.without:.4g} without"
 

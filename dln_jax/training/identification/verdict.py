@@ -34,8 +34,6 @@ def judged(
     """The verdict on an identified robot, and its entries of metrics.json.
 
     Args:
-        case: the robot and its data.
-        solution: the fit.
         predict: torques by parameters.
         torques: torques on the held-out motions [N, d], by "file", "least_squares" and `kept`.
         kept: key of the torques of the model that the run keeps.

@@ -1,4 +1,4 @@
-"""The route of a swing-up for any plant: explore, learn, tune, and try from many starts."""
+"""Swing-up of any plant: explore, learn, tune, and try from many starts."""
 
 import time
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from dln_jax.types import InputError, require_positive
 SECONDS = 10.0
 """Duration of a trial, s."""
 BAND = 10.0
-"""Factor of the filter's torque band, for the errors of a model that a short log does not show."""
+"""Factor that widens the filter's torque band, for model errors that a short log does not show."""
 
 
 class Learned(NamedTuple):
@@ -49,11 +49,10 @@ def learn_to_swing_up(
     """Explores a plant, learns its model and tunes its law.
 
     Args:
-        plant: any; it is guarded.
-        exploration: settings.
+        plant: plant to swing up; exploration guards it.
         estimator: one of `plants.ESTIMATORS`, from which the law gets its states.
-        seed: of the noise and of the trials.
-        say: is told every step in a line.
+        seed: seed of the noise and of the trials.
+        say: called with a line of text after every step.
 
     Raises:
         InputError: as for `explore`, `prepare`, `identified`, `from_log` and `tune`, or an unknown estimator.
@@ -96,17 +95,12 @@ def model_of(recording: Trajectories) -> Dynamics:
 def try_plant(
     make: Callable[[int], Plant], tuned: Tuned, *, starts: int = 100, seed: int = 1000, seconds: float = SECONDS
 ) -> tuple[Trials, list[PlantRun]]:
-    """Swings up plants from many starts, in step.
+    """Swings up plants from many starts, in step; errors as for `run`.
 
     Args:
         make: seed -> a simulated plant with its own start and noise.
-        tuned: the controller.
-        starts: number of plants.
-        seed: of the first plant; the others follow.
-        seconds: duration.
-
-    Raises:
-        InputError: as for `run`.
+        seed: seed of the first plant; the others follow.
+        seconds: duration of a trial, s.
     """
     require_positive(starts=starts)
     plants = [make(seed + number) for number in range(starts)]

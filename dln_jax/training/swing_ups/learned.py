@@ -20,7 +20,7 @@ from dln_jax.training.swing_ups.any_plant import model_of
 from dln_jax.types import InputError
 
 MODELS = ("delan", "identified", "analytic", "known")
-"""Learned; linear in its parameters; the nominal dimensions without friction; the plant itself."""
+"""A learned network; a fit linear in its parameters; nominal dimensions without friction; the plant itself."""
 TEST_SEED = 500
 """Offset of the seed for test motions."""
 
@@ -87,7 +87,7 @@ def errors_along(plant: DesktopPlant, model: Dynamics, runs: ClosedLoopRun) -> E
 
 
 def recorded(plant: DesktopPlant, *, seconds: float, seed: int) -> Trajectories:
-    """An exploration, as of any plant."""
+    """Recording of an exploration of the plant."""
     return explore(simulated_plant(plant, seed=seed), model_of, Exploration(seconds=seconds), seed=seed).recording
 
 

@@ -1,4 +1,4 @@
-"""Swings up a plant that is given as a file, with a model learned from its motions and gains chosen by trials."""
+"""Swings up a plant given as a file, with a model learned from its motions and gains chosen by trials."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
 
 ENCODER_STEP = 2 * np.pi / 4096
-"""Resolution of the simulated encoders, rad; 0.1 mm of a rail has the size of a thousandth of a turn."""
+"""Resolution of the simulated encoders of revolute joints, rad; that of prismatic joints is 0.1 mm."""
 
 
 class FileTask(NamedTuple):
@@ -43,7 +43,7 @@ def asked(
     seed: int,
     estimator: str = "extended",
 ) -> FileTask:
-    """Checks the arguments of a command before anything is written; raises as `mujoco_plant`."""
+    """Checks the arguments of a command before anything is written; errors as for `mujoco_plant`."""
     require_positive(starts=starts)
     require_seed(seed)
     if not LEAST_SECONDS <= seconds_of_data < np.inf:
@@ -98,7 +98,7 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
 
 
 def _traces(runs: Sequence[PlantRun], plant: Plant):
-    """Figure of some runs; the measurements stand for the states."""
+    """Figure of some runs, with measurements in place of the states."""
     layout, d = plant.layout, len(plant.layout.joints)
     y = np.stack([one.y for one in runs])
     x = np.concatenate([y, np.zeros_like(y)], axis=2)

@@ -1,4 +1,4 @@
-"""What fits without an optimiser share: their history of one step, and Gauss-Newton for another objective."""
+"""For fits without an optimiser: their one-step history, and refinement by Gauss-Newton for other objectives."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def training_of(task: Task, parameters: Parameters, loss: float, seconds: float)
 
 
 def refined_if_asked(task: Task, training: Training) -> Training:
-    """Returns the direct fit, which is to torques; for another objective Gauss-Newton starts from it."""
+    """Returns the fit unchanged if the objective is that of torques; otherwise refines it by Gauss-Newton."""
     return training if task.objective.of_torques else refined(task, training)
 
 

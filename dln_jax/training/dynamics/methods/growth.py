@@ -30,7 +30,7 @@ DEPTHS = (1, 2)
 
 
 class Candidate(NamedTuple):
-    """A network that was trained, with its error and speed."""
+    """A trained network with its error and speed."""
 
     width: int
     depth: int
@@ -93,7 +93,6 @@ def grow_to_target(
 def _try(
     task: Task, optimiser: Optimiser, folder: Path, *, resume: bool, mesh: Mesh | None
 ) -> tuple[Candidate, Task, Training]:
-    """Trains one candidate and measures it."""
     model, wanted = build(task.description), task.description
     networks = 1 if wanted["shared_trunk"] else 2
     name = f"checkpoint_{wanted['width']}x{wanted['depth']}_{networks}"

@@ -1,4 +1,4 @@
-"""The trigonometric energies as a Gaussian process; validation chooses between two orders of the bodies."""
+"""Fits the trigonometric energies as a Gaussian process; validation chooses between a serial chain and any order."""
 
 import time
 from pathlib import Path
@@ -17,11 +17,11 @@ from dln_jax.training.dynamics.task import Method, Task
 from dln_jax.zoo.descriptions import describe_for
 
 SAMPLES = 600
-"""Largest number of samples that the kernel is made of, unless stated."""
+"""Default for the largest number of samples in the kernel."""
 
 
 def plan(options: KernelOptions, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
-    """The kernel of at most the stated number of samples."""
+    """Plans a kernel with at most the stated number of samples."""
     require_positive_if_given(options, ["samples"])
     sizes = resolved(options, {"samples": SAMPLES})
     precision = options.precision or "f64"

@@ -1,4 +1,4 @@
-"""Trees of unknown joint frames: the frames by a search from random starts, everything else by elimination."""
+"""Fits trees of unknown joint frames: a search from random starts finds the frames, elimination everything else."""
 
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ def needs_of_tree(needs: Needs) -> Needs:
 
 
 def plan(options: TreeOptions, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
-    """The tree with the stated parents of its joints."""
+    """Plans the tree with the stated parents of its joints."""
     needs = needs_of_tree(recorded.needs)
     stated = {"parents": recorded.parents, "velocity_scale": needs.velocity_scale}
     return describe_for(
@@ -46,7 +46,7 @@ def plan(options: TreeOptions, kind: str, recorded: Recorded, objective: Objecti
 
 
 def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """Joint frames by Gauss-Newton from random starts, or near the stated kinematics; all else by elimination."""
+    """Searches joint frames by Gauss-Newton, from random starts or near a prior, and eliminates everything else."""
     needs, kinematic_prior = needs_of_tree(task.needs), task.recorded.kinematic_prior
     near = (
         {}
@@ -78,9 +78,9 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
 
 
 def refined_by_motions(task: Task, parameters: SerialTreeParameters) -> SerialTreeParameters:
-    """Bodies and friction on the same axes by motions, if they predict validation motions longer than torques do.
+    """Refits bodies and friction on the same axes to motions; keeps them if they predict validation motions longer.
 
-    The bodies start as balls and are made physically consistent by a fit of torques.
+    The bodies start as balls, and a fit of torques first makes them physically consistent.
     """
     needs, description = needs_of_tree(task.needs), task.description
     tree = tree_of(parameters, needs, parents=description["parents"], acceleration=description["acceleration"])

@@ -1,4 +1,4 @@
-"""Models that are linear in their parameters: one least-squares problem for each choice of degrees."""
+"""Fits models that are linear in their parameters: one least-squares problem for each choice of degrees."""
 
 import time
 from pathlib import Path
@@ -19,7 +19,7 @@ from dln_jax.zoo.descriptions import build, describe_for
 def plan(
     options: TrigonometricOptions, kind: str, recorded: Recorded, objective: Objective
 ) -> tuple[dict[str, Any], None]:
-    """The model with the stated degree, or degree 1 until validation chooses others."""
+    """Plans the model with the stated degree, or with degree 1 until validation chooses others."""
     degree = 1 if options.degree is None else options.degree
     precision = options.precision or "f64"
     return describe_for(kind, recorded.sets.train, recorded.needs, precision=precision, degree=degree), None

@@ -30,7 +30,7 @@ OF_ADAM = tuple(AdamOptions.__dataclass_fields__)
 
 
 def plan(options: Any, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], Solver]:
-    """The network and its optimiser: as stated, or as the size of the model and the data suggest."""
+    """Plans the network and its optimiser: as stated, or as the sizes of model and data suggest."""
     check(options)
     needs, sets, optimizer = recorded.needs, recorded.sets, options.optimizer
     suited = suited_to_many_joints(options, kind, recorded)
@@ -95,7 +95,7 @@ def posed(
 
 
 def fit(task: Task, options: NetworkOptions, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """Trains the network; of several seeds cross-validation prefers one; --target grows networks."""
+    """Trains the network; cross-validation selects one of several seeds, and --target grows networks."""
     solver, resume = solver_of(task), getattr(options, "resume", False)
     if (target := getattr(options, "target", None)) is not None:
         return grow_to_target(task, solver.optimiser, target, folder, resume=resume, mesh=mesh)
@@ -108,7 +108,7 @@ def fit(task: Task, options: NetworkOptions, folder: Path, mesh: Mesh | None) ->
 
 
 def solver_of(task: Task) -> Solver:
-    """The solver that `plan` has made.
+    """Returns the solver from `plan`.
 
     Raises:
         InputError: another `plan` made the task, and it has no solver.

@@ -46,7 +46,7 @@ BESIDE = "-residual"
 
 
 def plan(options: SelectionOptions, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
-    """No description: the selected model brings its own."""
+    """Plans no description, because the selected model brings its own."""
     require_positive_if_given(options, ["seconds"])
     require_scales(recorded.sets.train)
     return {}, None
@@ -64,7 +64,7 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
     train_set, validation, _ = recorded.sets
     needs = recorded.needs
     if needs.friction:
-        # All models get the same friction, so that none is better for that alone.
+        # All models get the same friction, so that none wins by friction alone.
         laws = needs.joint_friction or USUAL
         recorded = recorded._replace(needs=needs._replace(friction=False, joint_friction=laws))
         print(f"friction of every model: {', '.join(laws)} in each joint")
@@ -162,7 +162,7 @@ def _candidates(options: Any, recorded: Recorded, folder: Path, mesh: Mesh | Non
 
 
 def _too_large(size: int | None) -> Callable[[float], str]:
-    """A candidate without a model, and the reason."""
+    """Returns the fit of a candidate that is too large: it gives only the reason."""
     number = "too many" if size is None else f"{size:,}"
     return lambda left: f"its basis has {number} coefficients; at most {MOST_PARAMETERS:,} are tried"
 
@@ -216,7 +216,6 @@ def _with_network(recorded: Recorded, base: FittedModel | None, left: float) -> 
 
 
 def _as_rigid(learned: FittedModel, recorded: Recorded) -> FittedModel:
-    """Converts a learned tree to a tree with known frames."""
     task: Task = learned.outcome[0]
     needs, stated, solution = needs_of_tree(recorded.needs), task.description, learned.parameters
     tree = tree_of(solution, needs, parents=stated["parents"], acceleration=stated["acceleration"])
