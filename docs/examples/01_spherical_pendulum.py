@@ -2,8 +2,8 @@
 A pendulum in space, from its energy
 ====================================
 
-Nothing is learned here: write a Lagrangian as a function of one state, and get its equations of motion.
-A mass hangs on a rod and swings in all directions; q = (polar angle from the downward vertical, azimuth).
+You write a Lagrangian as a function of one state, and get its equations of motion. Nothing is learned here. A mass
+hangs on a rod and swings in all directions; q = (polar angle from the downward vertical, azimuth).
 """
 
 import jax
@@ -23,7 +23,7 @@ SECONDS = 10
 # %%
 # The energy
 # ----------
-# Kinetic minus potential energy, in J. Any differentiable function will do.
+# The Lagrangian is kinetic minus potential energy, in J. Any differentiable function will do.
 
 
 def lagrangian(q, qd):
@@ -35,9 +35,9 @@ def lagrangian(q, qd):
 pendulum = dynamics(LagrangianSystem(lagrangian))
 
 # %%
-# What it gives
-# -------------
-# On a cone of polar angle a the pendulum turns steadily at sqrt(g / (l cos a)), and needs no torque for it.
+# A steady rotation
+# -----------------
+# On a cone of polar angle a, the pendulum turns steadily at sqrt(g / (l cos a)) without any torque.
 
 cone = 0.7
 turning = jnp.sqrt(GRAVITY / (LENGTH * jnp.cos(cone)))
@@ -49,7 +49,7 @@ assert jnp.abs(tau).max() < 1e-12
 # %%
 # A free motion
 # -------------
-# `rollout` steps any state; the forward model is its rate. The whole motion is one compiled program.
+# `rollout` integrates any state; here its rate comes from the forward model. The whole motion is one compiled program.
 
 start = jnp.array([1.2, 0.0]), jnp.array([0.0, 1.5])
 times = jnp.linspace(0, SECONDS, 100 * SECONDS + 1)
@@ -72,7 +72,7 @@ print(f"largest relative change: energy {drift[0]:.1e}, angular momentum {drift[
 assert max(drift) < 1e-7
 
 # %%
-# The mass moves between two circles of latitude; its shadow on the floor is a rosette.
+# The mass moves between two circles of latitude, and its shadow on the floor is a rosette.
 
 x, y = LENGTH * jnp.sin(q[:, 0]) * jnp.stack([jnp.cos(q[:, 1]), jnp.sin(q[:, 1])])
 path = np.stack([x, y, -LENGTH * jnp.cos(q[:, 0])])

@@ -2,8 +2,8 @@
 Train the arm, and look inside
 ==============================
 
-A two-link arm writes letters. A structured Lagrangian network sees angles, rates, accelerations and torques, and
-nothing of the arm's masses, lengths or equations. Its inertial, Coriolis and gravity forces follow without being shown.
+A two-link arm writes letters. A structured Lagrangian network sees angles, rates, accelerations and torques, but not
+the arm's masses, lengths or equations. It separates inertial, Coriolis and gravity forces, although it never sees them.
 """
 
 import jax
@@ -28,8 +28,8 @@ ITERATIONS = 60
 # %%
 # The data
 # --------
-# Twenty letters, outlines of a font and not the published recordings. Three of them are the test, which training never
-# sees. The best parameters are chosen on validation letters, which are drawn from the other seventeen.
+# The arm writes twenty letters, which are outlines of a font and not the published recordings. Training never sees the
+# three test letters. The best parameters are chosen on validation letters, which are drawn from the other seventeen.
 
 scene = two_link_arm()
 data = default_data(scene)._replace(needs=scene.needs)
@@ -39,8 +39,8 @@ print({name: len(part.t) for name, part in sets._asdict().items()}, scene.needs)
 # %%
 # The model
 # ---------
-# `Needs` says that there are two revolute joints, gravity and no friction: the network gets cosines and sines of the
-# angles and a potential, and no dissipation. Two layers of 8 units, 260 parameters, by Gauss-Newton.
+# `Needs` states two revolute joints and gravity, but no friction. The network therefore gets cosines and sines of the
+# angles and a potential, but no dissipation. Gauss-Newton trains two layers of 8 units (260 parameters).
 
 model = make_delan(scene.needs, width=8, depth=2, activation=tanh, dtype=jnp.float64)
 training = fit(problem(model, sets), GaussNewton(steps=ITERATIONS))
@@ -59,7 +59,7 @@ assert error < 1e-5
 # %%
 # Writing with learned torques
 # ----------------------------
-# The true arm writes a test letter. Feedforward torques are the model's, and weak feedback corrects the rest.
+# The true arm writes a test letter. The model gives the feedforward torques, and weak feedback corrects the rest.
 
 letter = test.trajectory == test.trajectory[0]
 t, *reference = (np.asarray(array[letter]) for array in (test.t, test.q, test.qd, test.qdd))
@@ -91,8 +91,8 @@ axes.set_axis_off()
 # %%
 # Mass matrix and parts of the torque
 # -----------------------------------
-# Both follow from the learned energy, without having been shown. (Torques alone determine M completely, since they are
-# linear in the accelerations.)
+# Both follow from the learned energy. Torques alone determine M completely, because they are linear in the
+# accelerations.
 
 learned = jax.jit(jax.vmap(arm.mass_matrix))(test.q)
 exact = jax.jit(jax.vmap(plant.mass_matrix))(test.q)

@@ -31,7 +31,7 @@ ITERATIONS = 15
 # %%
 # The measurement
 # ---------------
-# Six recordings of 6 s at 20 Hz. The file says only what was measured: `t`, `q` and which recording it was.
+# There are six recordings of 6 s at 20 Hz. The file has only the measurements: `t`, `q` and the index of the recording.
 
 times = np.arange(0, 6, 0.05)
 starts = np.random.default_rng(0).uniform(0.3, 2.0, 6)
@@ -56,7 +56,7 @@ np.savez(
 # %%
 # Training
 # --------
-# In a terminal this is
+# In a terminal, the same command is
 #
 # `dln-jax train_hnn_task --task measured --data pendulum.npz --needs '{"joints": ["revolute"], "friction": true}'`
 #
@@ -79,7 +79,8 @@ flow = dln_jax.load(folder / "run").flow
 # %%
 # Friction takes the energy
 # -------------------------
-# dH/dt = -2 D, where D is the Rayleigh function. Here the learned model swings from a start that was not measured.
+# The energy falls by dH/dt = -2 D, where D is the Rayleigh function. Here the learned model swings from a start that
+# was not measured.
 
 start = jnp.array([1.5]), jnp.array([0.0])
 q, p = jax.jit(lambda start: rollout(rk4(lambda t, state: flow.rates(*state)), start, times, substeps=4))(start)
@@ -92,7 +93,8 @@ print(f"a new swing of 6 s: root mean square error {error:.4f} rad; the noise of
 assert error < 5 * NOISE
 
 # %%
-# The first swing as the camera would see it: learned rods from pale to dark, and the true positions as rings.
+# The first figure shows the first swing as the camera would see it, with learned rods from pale to dark and the true
+# positions as rings.
 
 swing_back = slice(0, int(np.argmin(true_q[0][:40])) + 1)
 figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
@@ -107,7 +109,7 @@ axes.set_axis_off()
 style.legend(axes, loc="lower right")
 
 # %%
-# The whole motion, and the learned energy along it.
+# The second figure shows the whole motion, and the learned energy along it.
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
 style.prepare(above, below)

@@ -2,9 +2,9 @@
 Two bodies that attract each other
 ==================================
 
-A Hamiltonian network learns gravity between two bodies from samples of a few motions. Knowing that bodies interact in
-pairs, by their distance alone, is worth more than any number of units: the network then keeps the energy of an orbit
-that it has not seen.
+A Hamiltonian network learns gravity between two bodies from samples of a few motions. It is told that bodies interact
+in pairs, by their distance alone. This helps more than any number of units: the network conserves the energy of an
+orbit that it has not seen.
 """
 
 import jax
@@ -29,7 +29,7 @@ TRAJECTORIES, ITERATIONS, SECONDS = 60, 60, 40
 # %%
 # The data
 # --------
-# States (q, p) along orbits, and their rates: four coordinates, two for each body.
+# The data are states (q, p) along orbits, and their rates. There are four coordinates, two for each body.
 
 task = two_body(trajectories=TRAJECTORIES)
 print(f"{len(task.train.data.t)} samples for training")
@@ -37,8 +37,8 @@ print(f"{len(task.train.data.t)} samples for training")
 # %%
 # The model
 # ---------
-# H = sum of p² / 2 m + sum over pairs of V(distance), with V a network of one layer of 8 units, by Gauss-Newton on the
-# rates.
+# H = sum of p² / 2 m + sum over pairs of V(distance), where V is a network with one layer of 8 units. Gauss-Newton fits
+# it to the rates.
 
 model = make_pairwise_hamiltonian(Needs(("prismatic",) * 4), width=8, depth=1, activation=tanh, dtype=jnp.float64)
 train, validation = hold_out(task.train.data, 0.1, seed=0)

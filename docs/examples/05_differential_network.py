@@ -2,8 +2,8 @@
 A function, its gradient and its Hessian
 ========================================
 
-A differential network gives value, Jacobian and Hessian in one pass, by exact layer rules. Here it learns a landscape
-of your own from values and gradients. Its Hessian is right as well, although the data contain none.
+A differential network returns value, Jacobian and Hessian in one pass, by exact layer rules. Here it learns your own
+function from values and gradients. Its Hessian is accurate as well, although the data contain none.
 """
 
 import jax
@@ -25,8 +25,8 @@ SAMPLES, ITERATIONS = 2_000, 80
 # %%
 # Your own function
 # -----------------
-# Samples are rows: `x [N, n]`, `y [N, m]`, and the Jacobians `dy [N, m, n]` where you have them. The same arrays in an
-# npz file are what `dln-jax train_diffnet --function mine.npz` reads.
+# Samples are rows: `x [N, n]`, `y [N, m]`, and the Jacobians `dy [N, m, n]` if you have them. The command
+# `dln-jax train_diffnet --function mine.npz` reads the same arrays from an npz file.
 
 
 def landscape(x):
@@ -40,7 +40,7 @@ data = from_arrays({"x": x, "y": np.asarray(values)[:, None], "dy": np.asarray(g
 # %%
 # Training
 # --------
-# One hidden layer of 16 units, by Gauss-Newton on all samples at once. Loss "type1" reads values and gradients.
+# Gauss-Newton trains one hidden layer of 16 units on all samples at once. Loss "type1" uses values and gradients.
 
 network = Network(loss="type1", width=16, activation="tanh", precision="f64")
 training = train(split(data), network, GaussNewton(steps=ITERATIONS))
@@ -63,7 +63,8 @@ for name, error in errors.items():
 assert jnp.abs(errors["value"]).max() < 0.01 and jnp.abs(errors["Hessian"]).max() < 0.5
 
 # %%
-# The learned landscape with its gradients on the ground. The colour is the learned curvature (trace of the Hessian).
+# The first figure shows the learned function as a landscape, with its gradients on the ground. The colour is the
+# learned curvature (trace of the Hessian).
 
 side = np.linspace(-2, 2, 60)
 places = np.stack(np.meshgrid(side, side), axis=-1)
@@ -82,7 +83,7 @@ axes.set(xlabel="$x_1$", ylabel="$x_2$", zlim=(-1.8, 1.2), zticks=[])
 axes.view_init(elev=30, azim=-60)
 
 # %%
-# Slope and curvature along a line.
+# The second figure shows slope and curvature along a line.
 
 line = np.stack([np.linspace(-2, 2, 200), np.zeros(200)], axis=1)
 _, dy, d2y = answers(line)

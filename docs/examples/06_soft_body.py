@@ -2,7 +2,7 @@
 A soft body falls, and its gradient
 ===================================
 
-A disc of rubber is thrown on the ground. Each time step minimises inertia plus energies; the whole fall is
+A disc of rubber is thrown onto the ground. Each time step minimises inertia plus energies. The whole fall is
 differentiable with respect to material, friction, masses and the shape at rest.
 """
 
@@ -53,7 +53,7 @@ figure = moments_figure([Moments("thrown to the right", mesh, above_ground, 0.01
 # %%
 # The gradient
 # ------------
-# The derivative of the distance with respect to the coefficient of friction, checked by a difference quotient.
+# A difference quotient checks the derivative of the distance with respect to the coefficient of friction.
 
 
 def distance(params):

@@ -2,7 +2,7 @@
 A gait in a minute
 ==================
 
-A soft creature with 24 muscles learns to crawl. Gradients go back through the simulator, including friction and
+A soft creature with 24 muscles learns to crawl. Training uses gradients through the simulator, including friction and
 contact.
 """
 
@@ -22,7 +22,7 @@ STEPS = 60_000  # environment steps, at most
 # %%
 # The task
 # --------
-# Go as far along x as you can within 400 steps, and do not fall.
+# The creature has to go as far along x as it can within 400 steps, without a fall.
 
 task = make_task(creature_named("crawler"))
 print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, body length {task.length:.2f} m")
@@ -30,8 +30,8 @@ print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles
 # %%
 # Learning
 # --------
-# The policy is a network with one hidden layer, from observations of the body and a clock to the
-# actuation of the muscles, which follows by at most 0.3 a step.
+# The policy is a network with one hidden layer. It observes the body and a clock, and commands the actuation of the
+# muscles, which changes by at most 0.3 per step.
 
 records = []
 trained = train(
@@ -47,7 +47,7 @@ assert trained.best.distance > 1.0
 # %%
 # The gait
 # --------
-# The creature in the middle of its walk; contracted muscles are red.
+# The first figure shows the creature in the middle of its walk; contracted muscles are red.
 
 seen = shown_walk(task, trained.policy, trained.best.parameters, task.episode)
 assert seen.converged.all()
@@ -57,7 +57,7 @@ frame = soft_body_frame(
 )
 
 # %%
-# Its mean position, and the lengths of all muscles over time.
+# The second figure shows its mean position, and the lengths of all muscles over time.
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
 style.prepare(above)

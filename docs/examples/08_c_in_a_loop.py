@@ -2,7 +2,7 @@
 C in a loop
 ===========
 
-A model identified from data becomes C99 without dependencies and is called once a millisecond: computed torque control
+A model identified from data becomes C99 without dependencies. Computed torque control calls it once per millisecond and
 moves the tip of the two-link arm along a circle.
 """
 
@@ -30,7 +30,7 @@ TICKS = 1_000  # of 1 ms
 # %%
 # The model
 # ---------
-# For revolute joints alone the energy is linear in its parameters: one least-squares problem, and no network.
+# If all joints are revolute, the energy is linear in its parameters. One least-squares problem replaces a network.
 
 scene = two_link_arm()
 model = make_trigonometric(scene.needs)
@@ -40,9 +40,9 @@ print(f"{fitted.parameter_count} parameters, rank {fitted.rank}, torque MSE {fit
 # %%
 # The C
 # -----
-# Any function of small arrays becomes a header and a source that need `<math.h>` alone, with a demo and a CMake file:
-# here the inverse model, and its derivative by the angles. `load_c` compiles them with the compiler at hand and calls
-# them from Python; on a robot you compile them into your controller.
+# Here we export the inverse model and its derivative with respect to the angles, as a header and a source with a demo
+# and a CMake file. `load_c` compiles them with your C compiler and calls them from Python. For a robot, compile them
+# into your controller.
 
 state = np.array([0.3, 1.2]), np.array([0.5, -1.0]), np.array([2.0, 0.1])
 inverse = dynamics(model.energies(fitted.parameters)).inverse_dynamics
@@ -58,8 +58,8 @@ assert np.abs(arm.inverse_dynamics(*state) - exact).max() < 1e-9
 # %%
 # The loop
 # --------
-# Computed torque: the inverse model of the reference acceleration, corrected by the errors of position and rate. The
-# plant is the textbook arm, in one JAX function; the controller is the C.
+# The torque is the inverse model of the reference acceleration, which is corrected by the errors of position and rate.
+# The plant is the textbook arm in JAX; the controller is the C.
 
 plant = jax.jit(dynamics(scene.energies).forward_dynamics)
 STEP = 1e-3  # s
@@ -88,7 +88,8 @@ print(f"error {errors[0]:.3f} rad at first, {errors[-1]:.1e} rad at last; {np.me
 assert errors[-1] < 0.02 and errors[-1] < errors[0]
 
 # %%
-# The arm on its circle, and the times of the calls of C from Python beside those of the compiled JAX function.
+# The figure shows the arm on its circle, and the times of calls from Python: of the C, and of the compiled JAX
+# function.
 
 compiled, in_jax = jax.jit(inverse), []
 for q, qd, qdd in zip(*path, strict=True):

@@ -2,8 +2,8 @@
 Fine-tune a loaded run
 ======================
 
-The arm that yesterday's model was trained on was changed overnight. Load the run and start from its parameters: a few
-samples of the new arm are enough.
+Yesterday you trained a model of an arm, and overnight the arm was changed. Load the run and start from its parameters:
+a few samples of the new arm are enough.
 """
 
 import tempfile
@@ -32,7 +32,7 @@ ITERATIONS, FINE_STEPS = 20, 400
 # %%
 # Yesterday
 # ---------
-# A run of the command line, whose folder holds everything that is needed to rebuild the model.
+# The command line makes a run, whose folder has everything needed to rebuild the model.
 
 folder = Path(tempfile.mkdtemp()) / "run"
 options = arguments_of(train_delan.Arguments, steps=ITERATIONS, out=folder, figures=False, low_latency=False)
@@ -44,8 +44,8 @@ print(f"{run.description['name']} with {count} parameters")
 # %%
 # Today
 # -----
-# Heavier links increase all torques by a fifth, and a flywheel at the shoulder adds inertia. Three letters of the
-# changed arm were recorded, and one more for a test.
+# Heavier links increase all torques by a fifth, and a flywheel at the shoulder adds inertia. We record three letters of
+# the changed arm, and one more for a test.
 
 scene = two_link_arm()
 letters = default_data(scene)
@@ -96,7 +96,7 @@ assert after < 0.1 * before
 # %%
 # Writing, before and after
 # -------------------------
-# The new arm writes the test letter with the torques of each model and weak feedback.
+# The new arm writes the test letter, with the torques of each model and weak feedback.
 
 plant = dynamics(scene.energies)
 letter = letters.trajectory == names.index("e")

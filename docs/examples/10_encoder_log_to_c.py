@@ -2,8 +2,9 @@
 From an encoder log to C
 ========================
 
-The log of a three-axis arm with known frames has noisy encoders, noisy torques, dry friction and no rates. The steps:
-filtering, identification with friction, uncertainty of the torques, and C for the control loop.
+The log of a three-axis arm with known frames has noisy encoders, noisy torques, dry friction and no rates. This example
+filters it, identifies the arm with its friction, estimates the uncertainty of the torques, and exports C for the
+control loop.
 """
 
 import tempfile
@@ -32,7 +33,8 @@ random = np.random.default_rng(0)
 # %%
 # The arm
 # -------
-# Denavit-Hartenberg rows describe the frames; the links have unknown masses. The true arm has motors and friction.
+# Denavit-Hartenberg rows describe the frames. The masses of the links are unknown. The true arm has motors and
+# friction.
 
 rows = [[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0], [0, 0.4, 0, 0]]  # alpha, a, d, theta
 guess = trees.serial(*trees.dh_frames(rows), [trees.inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))] * 3)
@@ -46,7 +48,8 @@ plant = dln_jax.dynamics(dln_jax.tree_system(true, friction))
 # %%
 # The log
 # -------
-# Five motions of 6 s at 125 Hz. Encoders have 0.1 mrad of noise, torques 0.2 N m; velocities are not logged.
+# The log has five motions of 6 s at 125 Hz. Encoders have 0.1 mrad of noise, torques 0.2 N m; velocities are not
+# logged.
 
 
 def motion(amplitudes, phases, t):
@@ -77,8 +80,8 @@ train, validation, test = (select(data, which) for which in ([0, 1, 2], [3], [4]
 # %%
 # Identification
 # --------------
-# First the velocity scale of dry friction; then inertias, armature and friction, weighted by the joints' noise, with
-# physically consistent links.
+# The first fit gives the velocity scale of dry friction. The second gives inertias, armature and friction, with joints
+# weighted by their noise and physically consistent links.
 
 laws = ("viscous", "coulomb", "offset")
 scales = fit_friction(guess, train, laws).shape["velocity_scale"]
@@ -93,7 +96,7 @@ assert np.abs(arm.coulomb - np.array([0.8, 1.0, 0.4])).max() < 0.1
 # %%
 # Uncertainty
 # -----------
-# A standard deviation for the torque of any state, calibrated on held-out motions.
+# The fit gives a standard deviation for the torque of any state, which is calibrated on held-out motions.
 
 estimate = uncertainty.estimate(model, arm, train, validation, ridge=0.0, unit=identified.fit.noise, negligible=1e-12)
 bands = estimate.uncertainty
@@ -107,7 +110,7 @@ assert covered > 0.9
 # %%
 # C
 # -
-# Both functions, for a loop at 1 kHz.
+# We export both functions, for a loop at 1 kHz.
 
 state = test.q[0], test.qd[0], test.qdd[0]
 folder = Path(tempfile.mkdtemp()) / "arm"
@@ -117,7 +120,8 @@ assert np.abs(in_c.inverse_dynamics(*state) - inverse(*state)).max() < 1e-10
 assert np.abs(in_c.torque_std(*state) - std(*state)).max() < 1e-10
 
 # %%
-# The arm on its unseen motion: the colour of the path is the torque that the model predicts for the second joint.
+# The first figure shows the arm on its unseen motion. The colour of the path is the torque that the model predicts for
+# the second joint.
 
 REACH = np.array([0.3, 0.0, 0.0])  # from the third joint to the tip, m
 
@@ -138,7 +142,7 @@ axes.locator_params(nbins=4)
 axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", zlabel="z, m")
 
 # %%
-# Its torques with 95 % bands.
+# The second figure shows its torques with 95 % bands.
 
 figure, axes = plt.subplots(3, 1, figsize=(7, 6), sharex=True, layout="constrained")
 style.prepare(*axes)

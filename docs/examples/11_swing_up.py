@@ -2,8 +2,8 @@
 A swing-up in a minute
 ======================
 
-A motor turns an arm, and a free pole hangs at its end. The energy of the machine alone yields a law that swings the
-pole up, a regulator that holds it there, and the set of states from which the regulator may take over.
+A motor turns an arm, and a free pole hangs at its end. The energy of the machine is all you need for a law that swings
+the pole up, a regulator that holds it there, and the set of states from which the regulator can take over.
 """
 
 import tempfile
@@ -27,7 +27,7 @@ LIMIT = 0.05  # N m
 # %%
 # The machine
 # -----------
-# The coordinates are the angles of the arm and of the pole, the latter from upright; only the arm is driven.
+# The coordinates are the angle of the arm and the angle of the pole from upright. Only the arm is driven.
 
 scene = rotary_pendulum(friction=1e-5)
 plant, B, joints = dln_jax.dynamics(scene.energies), np.array(scene.needs.actuation), scene.needs.joints
@@ -36,7 +36,8 @@ field, goal = control.field_of(plant, B), jnp.zeros(4)
 # %%
 # Holding it up
 # -------------
-# A linear-quadratic regulator, and by simulation with the motor's limit the largest ellipsoid that it stabilises.
+# A linear-quadratic regulator holds the pole. Simulations with the motor's limit give the largest ellipsoid that it
+# stabilises.
 
 at = control.linearise(jax.jit(field), goal, control.holding_controls(plant, goal[:2], B))
 regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
@@ -50,7 +51,7 @@ print(f"the regulator stabilises states whose value is below {region.level:.3g}"
 # %%
 # Swinging it up
 # --------------
-# The law drives the energy of the pole to that of the upright posture; the regulator takes over within its region.
+# The law drives the energy of the pole to that of the upright posture. The regulator takes over within its region.
 
 swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
 law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, joints), region.level)
@@ -71,7 +72,7 @@ assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
 # %%
 # The film and the phase plane
 # ----------------------------
-# The first run at four moments, with the trace of its tip.
+# The figure shows the first run at four moments, with the trace of the pole's tip.
 
 folder, t, torque = Path(tempfile.mkdtemp()), np.asarray(runs.t[0, :-1]), np.asarray(runs.u[:, :, 0])
 drawing = rotary_pendulum_drawing(0.085, 0.129)
@@ -92,7 +93,7 @@ write_closed_loop_gif(
 print(f"the film is in {folder}")
 
 # %%
-# Grey levels are the pole's energy with the arm at rest; on the dashed level the pole comes up by itself.
+# Grey levels show the pole's energy with the arm at rest. On the dashed level the pole comes up by itself.
 
 angles, rates = np.linspace(-np.pi, np.pi, 121), np.linspace(-30, 30, 101)
 resting = jax.vmap(lambda angle, rate: plant.energy(jnp.array([0.0, angle]), jnp.array([0.0, rate])))
@@ -107,7 +108,7 @@ portrait = phase_portrait(
 )
 
 # %%
-# Angles and torques over time, of all starts.
+# The last figure shows angles and torques over time, for all starts.
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4), sharex=True, layout="constrained")
 style.prepare(above, below)

@@ -2,9 +2,9 @@
 A plan through a stiff plant
 ============================
 
-A driven cart pulls a second one, which carries a free pole, by a nearly rigid spring. The motion is slow, but an
+A driven cart pulls a second cart, which carries a free pole, by a nearly rigid spring. The motion is slow, but an
 explicit integrator has to follow the spring: it needs 200 steps or more where the plan has 40. Multiple shooting plans
-through an implicit integrator, from a guess that is not a motion.
+the motion through an implicit integrator, from a guess that does not satisfy the dynamics.
 """
 
 import jax
@@ -27,7 +27,8 @@ STIFFNESS = 2e4  # N/m
 # %%
 # The plant
 # ---------
-# The spring has the fastest motion; a classical Runge-Kutta step is stable up to 2.8 of its radians.
+# The spring has the fastest motion. A classical Runge-Kutta step is stable if the spring turns by at most 2.8 rad in
+# it.
 
 scene = flexible_cart_pole(stiffness=STIFFNESS)
 plant, B = dln_jax.dynamics(scene.energies), np.array(scene.needs.actuation)
@@ -40,8 +41,9 @@ assert abs(modes).max() * DT > 2.8
 # %%
 # The plan
 # --------
-# Swing up within 1.6 s. The guess is a straight line from hanging to upright without a force. Its defects are the
-# differences between its states and the steps from the states before. The cost of the angle is 2 (1 - cos).
+# The pole has to swing up within 1.6 s. The guess is a straight line from hanging to upright without a force. Its
+# defects are the differences between its states and the steps from the states before. The cost of the angle is 2 (1 -
+# cos).
 
 
 def off(x):
@@ -64,8 +66,8 @@ assert solution.converged
 # %%
 # The truth
 # ---------
-# 2000 classical steps a second, with the plan's own feedback u + K (x - plan) at its samples, within the limits.
-# Classical steps as long as the plan's diverge.
+# We simulate the plant with 2000 classical steps per second, and with the plan's own feedback u + K (x - plan) at its
+# samples, within the limits. Classical steps as long as the plan's diverge.
 
 many = jax.jit(control.integrated(field, DT, method=CLASSICAL, substeps=int(2000 * DT)))
 few = jax.jit(control.integrated(field, DT, method=CLASSICAL))
@@ -79,7 +81,8 @@ print(f"cart and pole stay within {apart:.3f} of the plan; explicit steps of {DT
 assert apart < 0.2 and not np.abs(diverged).max() < 1e3
 
 # %%
-# The true motion, from top to bottom: the driven cart, the spring, the carried cart and its pole.
+# The first figure shows the true motion from top to bottom, with the driven cart, the spring, the second cart and its
+# pole.
 
 motion = np.asarray(jnp.stack(true))
 figure, axes = plt.subplots(figsize=(6, 6), layout="constrained")
@@ -98,7 +101,7 @@ axes.set(aspect="equal", xlim=(-1.2, 1.2))
 axes.set_axis_off()
 
 # %%
-# Plan, truth and guess over time.
+# The second figure shows plan, truth and guess over time.
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
 style.prepare(above, below)

@@ -2,8 +2,8 @@
 Your own mesh
 =============
 
-A coil spring from a mesh file in millimetres hangs from its upper end. Its lower half is of a softer rubber. The named
-sets of the file say which vertices are held and where each material is.
+A coil spring hangs from its upper end, and its lower half is of a softer rubber. It comes from a mesh file in
+millimetres, whose named sets state which vertices are held and where each material is.
 """
 
 import tempfile
@@ -30,8 +30,8 @@ folder = Path(tempfile.mkdtemp())
 # %%
 # The file
 # --------
-# Any mesher writes such a file: Gmsh, or anything that saves .vtk, .vtu, .obj or TetGen's .ele. This one is Gmsh's
-# format 2.2: nodes, tetrahedra, and the physical group of each, "clamp", "stiff" or "soft".
+# Gmsh writes such a file, and so does any mesher that saves .vtk, .vtu, .obj or TetGen's .ele. This file is in Gmsh's
+# format 2.2. It has nodes, tetrahedra, and the physical group of each tetrahedron: "clamp", "stiff" or "soft".
 
 length = TURNS * SEGMENTS
 positions, tetrahedra = lattice([(i, j, k) for i in range(length) for j in range(2) for k in range(2)])
@@ -52,7 +52,7 @@ cells = [f"{i} 4 2 {group[i - 1]} 1 {' '.join(map(str, cell + 1))}" for i, cell 
 # %%
 # The body
 # --------
-# `read_mesh` returns the mesh in metres and statements about what it left out or repaired.
+# `read_mesh` returns the mesh in metres, and a line for everything that it left out or repaired.
 
 mesh, statements = read_mesh(folder / "coil.msh", scale=1e-3)
 for name, part in mesh.sets.items():
@@ -67,8 +67,8 @@ scene = make_scene(mesh, terms, held=vertices_in(mesh, ["clamp"]))
 # %%
 # The motion
 # ----------
-# The spring is let go. `motion.pvd` opens in ParaView, with velocities, volume ratios and the named sets. In the
-# picture the clamp is dark, the stiff half blue and the soft one orange.
+# The spring is let go. You can open `motion.pvd` in ParaView; it has velocities, volume ratios and the named sets. In
+# the picture the clamp is dark, the stiff half blue and the soft half orange.
 
 init, step = make_step(scene, DT)
 observe = lambda state, info: (state.x, state.v, info.converged)  # noqa: E731

@@ -3,7 +3,7 @@ Bodies that touch
 =================
 
 A soft band is let go above a round peg. It drapes over the peg, and its ends land on the ground, fold and slide.
-Barriers keep all surfaces apart, which the example checks in exact arithmetic.
+Barriers keep all surfaces apart. The example checks this in exact arithmetic.
 """
 
 from functools import partial
@@ -27,8 +27,8 @@ DT = 0.01  # s
 # %%
 # The scene
 # ---------
-# The band is a mesh in contact with itself. The peg and the ground are rigid obstacles, with friction. All distances
-# below 8 mm are resisted.
+# The band is a mesh in contact with itself. The peg and the ground are rigid obstacles with friction. Surfaces repel
+# each other at distances below 8 mm.
 
 mesh = beam(1.2, 0.03, CELLS, 1)
 mesh = mesh._replace(vertices=mesh.vertices + np.array([-0.5, 0.45]))
@@ -44,7 +44,7 @@ scene = make_scene(mesh, terms, contacts=contacts)
 # %%
 # The motion
 # ----------
-# Each step says whether it converged, how near surfaces came, and whether the lists of near pairs sufficed.
+# Each step reports whether it converged, how near surfaces came, and whether the lists of near pairs were long enough.
 
 init, step = make_step(scene, DT)
 observe = lambda state, info: (state.x, info.converged, info.least_distance, info.overflow)  # noqa: E731
@@ -55,7 +55,7 @@ assert converged.all() and not overflow.any()
 assert not any(crossings(mesh, at) for at in x)
 
 # %%
-# The band at four moments.
+# The figure shows the band at four moments.
 
 figure, panels = plt.subplots(2, 2, figsize=(7, 4.2), sharex=True, sharey=True, layout="constrained")
 every = np.concatenate([mesh.vertices[None], x])

@@ -48,8 +48,8 @@ LOWERED, CLOSED, LIFTED = 0.4, 0.9, 1.4  # s
 # %%
 # The bodies
 # ----------
-# A finger is a strip, 80 mm long and 4 mm thick, with six chambers on its outer side. The ball of soft foam lies on the
-# ground, y = 0. Masses and forces are those of a slice of 1 m.
+# A finger is a strip, 80 mm long and 4 mm thick, with six chambers on its outer side. A ball of soft foam lies on the
+# ground, y = 0. Masses and forces are those of a body 1 m deep.
 
 length = 6 * CHAMBERS + 4
 strip = [(i, j) for i in range(2) for j in range(length)]
@@ -72,8 +72,8 @@ roots, of_ball = vertices_where(mesh, lambda x: x[:, 1] > top - CELL / 2), np.ar
 # %%
 # The scene
 # ---------
-# `inner_surface` finds the walls of all chambers. Their pressure has no value here, so it is the control of the steps.
-# The fingers stick to the ball better than to the ground.
+# `inner_surface` finds the walls of all chambers. Their pressure gets no value here, so it is the control of the steps.
+# The friction between fingers and ball is higher than that on the ground.
 
 terms = [
     elastic(mesh, stable_neo_hookean, youngs_modulus=3e5, poisson_ratio=0.4),
@@ -91,7 +91,8 @@ scene = make_scene(mesh, terms, masses=masses, held=roots, contacts=contacts)
 # %%
 # The motion
 # ----------
-# The palm holds the upper ends of the fingers. It lowers them, the pressure rises, and the palm lifts them and waits.
+# The palm holds the upper ends of the fingers. It lowers them, the pressure rises, and the palm lifts them and holds
+# them.
 
 
 def ramp(t, start, end):
@@ -132,8 +133,8 @@ assert converged.all()
 assert not any(crossings(mesh, x[k]) for k in shown)
 
 # %%
-# The ball rises with the palm, and a little more as the fingers close below its middle. At the end all is nearly at
-# rest, so that the forces by which the palm holds the fingers are the weights of the fingers and of the ball.
+# The ball rises with the palm, and a little more because the fingers close below its middle. At the end everything is
+# nearly at rest, so the palm carries the weights of the fingers and of the ball.
 
 lifted = (x[-1] - x[0])[of_ball, 1].mean()
 forces = jax.jit(jax.grad(lambda x: potential(scene, x, scene.params, PRESSURE)))(x[-1])
@@ -144,7 +145,8 @@ assert UP < lifted < UP + 5e-3
 assert abs(carried / weight - 1) < 0.03
 
 # %%
-# The film. Darker parts of the fingers are stretched more, and the orange of the chambers deepens with their pressure.
+# In the film, darker parts of the fingers are stretched more, and the orange of the chambers deepens with their
+# pressure.
 
 
 def largest_stretch(corners, rest):
@@ -192,7 +194,7 @@ write_slab_film(
 )
 
 # %%
-# The same at five moments.
+# The figure shows the same at five moments.
 
 figure, panels = plt.subplots(1, 5, figsize=(7.5, 2.9), sharex=True, sharey=True, layout="constrained")
 for axes, k in zip(panels, shown, strict=True):

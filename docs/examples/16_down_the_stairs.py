@@ -2,8 +2,8 @@
 Down the stairs
 ===============
 
-A body from a mesh file falls down stairs. The stairs are rigid boxes with friction, and the body is in contact with
-them and with itself, by barriers that no step crosses.
+A body from a mesh file falls down stairs. The stairs are rigid boxes with friction. Barriers, which no step crosses,
+keep the body away from the stairs and from itself.
 
 .. figure:: /stairs.gif
    :alt: A soft ellipse tumbles down stairs
@@ -46,7 +46,7 @@ print(*statements, sep="\n")
 # %%
 # The stairs
 # ----------
-# Each stair is a box down to the ground. Vertices are kept out of the boxes by 8 mm or more, softly.
+# Each stair is a box down to the ground. The boxes repel vertices at distances below 8 mm.
 
 near = {"distance": 8e-3, "stiffness": 1e4, "friction": 0.3}
 tops = [(COUNT - k) * RISE for k in range(COUNT + 1)]  # the last is the ground
@@ -67,7 +67,7 @@ scene = make_scene(mesh, terms, contacts=[body_contact(mesh, **near), *stairs])
 # %%
 # The motion
 # ----------
-# It starts with 1.5 m/s to the right.
+# The body starts at 1.5 m/s to the right.
 
 init, step = make_step(scene, DT)
 observe = lambda state, info: (state.x, info.converged, info.least_distance)  # noqa: E731
@@ -98,7 +98,7 @@ write_slab_film(
 )
 
 # %%
-# Four moments of the fall, the earliest palest, with the shadows on the stairs.
+# The figure shows four moments of the fall, the earliest palest, with the shadows on the stairs.
 
 figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
 for left, right, top in zip(lefts, rights, tops, strict=True):

@@ -2,8 +2,8 @@
 Stiffness from a motion
 =======================
 
-A soft tail is clamped at one end and let go. The stiffness of its two halves is found from the observed motion, by
-least squares through the time steps, and a motion that was not fitted is predicted.
+A soft tail is clamped at one end and let go. Least squares through the time steps finds the stiffness of its two halves
+from the observed motion. The result predicts a motion that was not fitted.
 """
 
 from functools import partial
@@ -29,7 +29,7 @@ TRUTH = np.array([2e5, 4e4])  # Pa: near the clamp, and at the tip
 # %%
 # The scene
 # ---------
-# Every element belongs to one half.
+# Each half of the tail has its own Young's modulus.
 
 mesh = beam(0.5, 0.06, 10, 1)
 tip = mesh.vertices[mesh.elements].mean(axis=1)[:, 0] > 0.25
@@ -53,7 +53,7 @@ def motion(theta, state):
 # %%
 # Observation and fit
 # -------------------
-# The positions have noise of 1 mm. The fit begins at 1e5 Pa for both halves.
+# The positions have noise of 1 mm. The fit starts at 1e5 Pa for both halves.
 
 start, other = stepper.init(), stepper.init(v=np.where(mesh.vertices[:, :1] > 0, [[0.0, 2.0]], 0.0))
 x, converged = motion(jnp.log(TRUTH), start)
@@ -70,7 +70,7 @@ print(f"error of a motion that was not fitted: {1e3 * errors[0]:.1f} mm before, 
 assert errors[1] < NOISE
 
 # %%
-# The unseen motion: the tail at three moments, and the height of its tip.
+# The figure shows the unseen motion: the tail at three moments, and the height of its tip.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.4), layout="constrained", width_ratios=(1, 1))
 for k, alpha in zip(np.linspace(STEPS // 5, STEPS - 1, 3).astype(int), (0.35, 0.65, 1.0), strict=True):

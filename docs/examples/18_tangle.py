@@ -2,8 +2,8 @@
 A tangle
 ========
 
-Soft strips fall into a bin, onto each other, and bend into a heap. Barriers keep all of them apart, and each from
-itself, which the example checks in exact arithmetic.
+Soft strips fall into a bin, onto each other, and bend into a heap. Barriers keep strips from crossing each other and
+themselves. The example checks this in exact arithmetic.
 
 .. figure:: /tangle.gif
    :alt: Five soft strips fall into a bin and fold into a heap
@@ -33,7 +33,7 @@ DT, WIDTH = 0.01, 0.3  # s, m
 # %%
 # The scene
 # ---------
-# The strips are longer than the bin is wide, so that they must bend. Bin and ground are rigid obstacles.
+# The strips are longer than the bin is wide, so they have to bend. Bin and ground are rigid obstacles.
 
 strip = beam(0.5, 0.02, 20, 1)
 random = np.random.default_rng(1)
@@ -71,7 +71,7 @@ assert converged.all() and not overflow.any()
 assert not any(crossings(mesh, at) for at in x[::10])
 
 # %%
-# The film: every strip has a colour of its own. Walls are drawn as high as strips touch them.
+# In the film every strip has its own colour, and walls are drawn as high as strips touch them.
 
 every = np.concatenate([mesh.vertices[None], x])
 colours = plt.get_cmap("viridis")(np.linspace(0.1, 0.9, STRIPS))[:, :3]
@@ -92,7 +92,7 @@ write_slab_film(
 )
 
 # %%
-# The heap at four moments.
+# The figure shows the heap at four moments.
 
 figure, panels = plt.subplots(1, 4, figsize=(9, 4.4), sharey=True, layout="constrained")
 for axes, k in zip(panels, np.linspace(0, STEPS, 4).astype(int), strict=True):
