@@ -170,10 +170,9 @@ def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("optimizer", ["adam", "gauss-newton"])
-def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(workplace, capsys, optimizer):
-    options = ("--optimizer", optimizer, "--width", "3", "--depth", "1", *BRIEF, "--scene", "pendulum")
-    folder = workplace / f"late-{optimizer}"
+def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(workplace, capsys):
+    options = ("--optimizer", "adam", "--width", "3", "--depth", "1", *BRIEF, "--scene", "pendulum")
+    folder = workplace / "late"
     command(train_delan, *options, "--steps", "400", "--seconds", "1e-6", "--out", folder)
     assert "out of time at step" in capsys.readouterr().out
     early = json.loads((folder / "metrics.json").read_text())
