@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 SECONDS = 300
 """After which a program is ended."""
 SERVER = """
+import gc
 import json
 import os
 import runpy
@@ -25,6 +26,7 @@ import scipy.signal
 
 import dln_jax
 
+gc.set_threshold(200_000, 20, 100)  # as in the tests: collecting among what was traced is in vain
 for line in sys.stdin:
     children = []
     for program in json.loads(line):

@@ -32,10 +32,12 @@ MOST_WORDS = 900
 BARE = "--no-figures --no-low-latency"
 SMALL = {
     "train_delan": f"--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 {BARE}",
-    "train_hnn_task": f"--steps 2 {BARE}",
+    "train_hnn_task": f"--optimizer adam --steps 2 {BARE}",
     "export_c": "",
 }
 """Put behind what a page gives, so that a command runs for a second: what is printed there stays as it is."""
+QUICKLY = "__import__('dln_jax.compilation').compilation._OPTIONS = {}; "
+"""Leaves XLA's options to the tests, whose programs compile sooner; in this process a fixture does so."""
 NOT_RUN = (("pip", "install"), ("python", "-m", "pytest"))
 """What installs, and what checks this very repository."""
 
@@ -131,6 +133,7 @@ def run_fresh():
     told = {
         "JAX_COMPILATION_CACHE_DIR": os.environ[PROGRAMS],
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": SHORTEST_COMPILATION,
+        "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0",
     }
     with interpreters({**os.environ, **told}) as run_programs:
         yield run_programs
@@ -141,10 +144,13 @@ def run_fresh():
     slow_among(blocks("python"), lambda block: block.page != "README.md"),
     ids=lambda block: f"{block.page}:{block.text.split()[-1][:30]}",
 )
-def test_a_python_block_runs_in_a_fresh_interpreter_and_says_something(block, workplace, run_fresh, tmp_path):
+def test_a_python_block_runs_in_a_fresh_interpreter_and_says_something(
+    block, workplace, run_fresh, tmp_path, pytestconfig
+):
     if "import casadi" in block.text:
         pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
-    (tmp_path / "block.py").write_text(block.text)
+    # On the first line, so that tracebacks have the page's numbers of lines.
+    (tmp_path / "block.py").write_text(("" if pytestconfig.getoption("--optimised") else QUICKLY) + block.text)
     (result,) = run_fresh(tmp_path, Program(tmp_path / "block.py", folder=workplace, environment=dict(os.environ)))
     assert result.returncode == 0, result.stderr
     assert re.search(r"\d\.\d", result.stdout) and not re.search("nan|inf", result.stdout), result.stdout

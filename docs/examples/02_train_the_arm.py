@@ -63,7 +63,7 @@ assert error < 1e-5
 
 letter = test.trajectory == test.trajectory[0]
 t, *reference = (np.asarray(array[letter]) for array in (test.t, test.q, test.qd, test.qdd))
-plant = dynamics(scene.energies)
+plant = dynamics(scene.closed_form)
 
 
 def accelerate(time, q, qd):

@@ -35,7 +35,9 @@ ITERATIONS, FINE_STEPS = 20, 400
 # The command line makes a run, whose folder has everything needed to rebuild the model.
 
 folder = Path(tempfile.mkdtemp()) / "run"
-options = arguments_of(train_delan.Arguments, steps=ITERATIONS, out=folder, figures=False, low_latency=False)
+options = arguments_of(
+    train_delan.Arguments, steps=ITERATIONS, out=folder, figures=False, low_latency=False, uncertainty=False
+)
 train_delan.main(options)
 run = dln_jax.load(folder)
 count = sum(leaf.size for leaf in jax.tree.leaves(run.parameters))
@@ -61,6 +63,7 @@ def recorded(wanted):
 train, test = recorded(("a", "b", "c")), recorded(("e",))
 
 
+@jax.jit
 def loss(parameters, data):
     q, qd, qdd, tau = data
     predicted = jax.vmap(dynamics(run.model.energies(parameters)).inverse_dynamics)(q, qd, qdd)
@@ -98,7 +101,7 @@ assert after < 0.1 * before
 # -------------------------
 # The new arm writes the test letter, with the torques of each model and weak feedback.
 
-plant = dynamics(scene.energies)
+plant = dynamics(scene.closed_form)
 letter = letters.trajectory == names.index("e")
 t, *reference = (np.asarray(array[letter]) for array in (letters.t, letters.q, letters.qd, letters.qdd))
 

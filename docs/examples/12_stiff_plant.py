@@ -31,7 +31,7 @@ STIFFNESS = 2e4  # N/m
 # it.
 
 scene = flexible_cart_pole(stiffness=STIFFNESS)
-plant, B = dln_jax.dynamics(scene.energies), np.array(scene.needs.actuation)
+plant, B = dln_jax.dynamics(scene.closed_form), np.array(scene.needs.actuation)
 field, goal = jax.jit(control.field_of(plant, B)), np.zeros(6)
 start = np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0])
 modes = np.linalg.eigvals(control.linearise(field, start, np.zeros(1)).A)

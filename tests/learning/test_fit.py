@@ -201,6 +201,15 @@ def test_seeds_in_one_program_equal_single_runs():
         assert together.best_step[seed] == alone.best_step
 
 
+def test_seeds_of_adam_in_one_program_equal_single_runs():
+    together, (given, optimiser) = unbroken("adam, seeds"), TRAINED["adam, seeds"]
+    for seed in range(2):
+        alone = fit(line(parameters=given.parameters[seed], seed=seed), optimiser)
+        assert together.validation[seed] == pytest.approx(alone.validation, rel=1e-6)
+        assert together.best_step[seed] == alone.best_step
+        np.testing.assert_allclose(together.parameters[seed], alone.parameters, rtol=1e-6)
+
+
 def test_the_best_of_some_samples_starts_the_stage_on_all(monkeypatch):
     started = []
     solver = newton.levenberg_marquardt.init
@@ -300,14 +309,12 @@ def pendulum_sets():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("friction", [True, False])
-def test_training_learns_a_plant_and_misfit_shows_what_the_model_lacks(pendulum_sets, friction):
-    needs = Needs(("revolute",), friction=friction)
+def test_training_learns_a_plant(pendulum_sets):
+    needs = Needs(("revolute",), friction=True)
     model = make_delan(needs, width=16, depth=1, dtype=jnp.float64)
     training = fit(problem(model, pendulum_sets), Adam(steps=1500, batch=64, learning_rate=1e-2))
     # The friction torque 0.5 qd, uniform within ±3 /s, has a mean square of 0.75.
-    validation = min(at.validation for at in training.history)
-    assert validation < 1e-2 if friction else 0.4 < validation < 1.2
+    assert min(at.validation for at in training.history) < 1e-2
     assert training.stop.reason == "finished" and training.train_seconds > 0
 
 

@@ -11,15 +11,13 @@ from jax.flatten_util import ravel_pytree
 from dln_jax.data import schema
 from dln_jax.data.encoders import smooth_locally
 from dln_jax.data.splits import select
-from dln_jax.learning import accelerations, measured_motions, rates
+from dln_jax.learning import accelerations, measured_motions
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, prediction_metrics
-from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.planar_chain import PlanarChainParameters, make_planar_chain
-from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.types import InputError, Needs
 from tests.standard_errors import SURE, statistics
 
@@ -117,18 +115,6 @@ def test_motions_are_predicted_as_by_the_true_model(passive):
     )
     assert found["vpt_seconds"] > 0.9 * exact["vpt_seconds"] and found["energy_drift"] < 1e-4
     assert found["vpt_seconds"] >= first["vpt_seconds"]
-
-
-@pytest.mark.slow
-def test_momenta_of_the_model_beat_velocities_in_their_place(passive):
-    fitted, validation, _ = parts(passive.data)
-    before = make_structured_hamiltonian(NEEDS, width=8, depth=1, dtype=jnp.float64)
-    as_momenta = (part._replace(p=part.qd, pd=part.qdd) for part in (fitted, validation))
-    velocities = fit(rates.problem(before, *as_momenta), GaussNewton(20)).parameters
-    model = make_trigonometric(NEEDS, degree=1)
-    task = accelerations.problem(model, model.init(jax.random.key(0)), fitted, validation, gauge=GAUGE)
-    better = predicted_for(model, fit(task, GaussNewton(20)).parameters, passive.data)
-    assert better["vpt_seconds"] > 1.5 * predicted_for(before, velocities, passive.data, momenta=True)["vpt_seconds"]
 
 
 def test_torques_tell_the_scale():

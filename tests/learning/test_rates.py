@@ -8,7 +8,7 @@ from motions import quick_motion
 
 from dln_jax.data.splits import hold_out
 from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.rates import match_linear, problem
 from dln_jax.mechanics.dynamics import PlainFlow
 from dln_jax.mechanics.equations import dynamics, flow
@@ -106,16 +106,13 @@ def test_the_polynomial_recovers_the_pendulum(swing):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("optimiser", "below"), [(GaussNewton(20), 1e-3), (Adam(400, batch=32), 0.7)])
-def test_networks_learn_the_field(swing, optimiser, below):
+def test_networks_learn_the_field(swing):
     model = make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL)
-    training = fit(problem(model, *hold_out(swing.train.data, 0.1, 0)), optimiser)
+    training = fit(problem(model, *hold_out(swing.train.data, 0.1, 0)), GaussNewton(20))
     found = phase_metrics.field_errors(model, training.parameters, swing.test)
     assert found["loss"] == pytest.approx(found["clean_field_mse"])
     # A field of zero has an error of 5.
-    assert found["clean_field_mse"] < below
-    if isinstance(optimiser, Adam):
-        return
+    assert found["clean_field_mse"] < 1e-3
     data = swing.test.data
     predicted = phase_metrics.predict(model, training.parameters, data.q[:1], data.p[:1], swing.t)
     truth = phase_metrics.Motions(swing.t, data.q[None, :45], data.p[None, :45])

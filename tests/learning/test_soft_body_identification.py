@@ -10,8 +10,7 @@ import pytest
 from dln_jax.learning.soft_body_identification import ObservedMotions, design, identify
 from dln_jax.rollout import rollout
 from dln_jax.softbody.equilibrium import static_solve
-from dln_jax.softbody.mesh.mesh import make_mesh, vertices_where
-from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.step import make_step, positions_and_convergence
 from dln_jax.softbody.terms.contact import plane_contact
@@ -19,7 +18,6 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import muscles
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.softbody.terms.tendons import tendon_of_length
 from dln_jax.types import InputError
 
 MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [1, 3, 2]])
@@ -74,38 +72,6 @@ def test_material_friction_and_muscle_are_recovered_from_a_motion(slider):
     found = {name: float(result.parameters[name] * scale[name]) for name in TRUTH}
     for name, value in TRUTH.items():
         np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
-
-
-@pytest.mark.slow
-def test_modulus_and_tendon_are_recovered_from_a_driven_motion_and_predict_another():
-    mesh = beam(0.2, 0.04, 5, 1)
-    path = np.stack([np.linspace(0, 0.2, 6), np.full(6, 0.036)], axis=1)
-    terms = (elastic(mesh, stable_neo_hookean), tendon_of_length(mesh, path, stiffness=1.0), gravity(mesh))
-    scene = make_scene(mesh, terms, held=vertices_where(mesh, lambda x: x[:, 0] == 0))
-    stepper = make_step(scene, 0.02, tolerance=1e-9)
-    state, t = stepper.init(), 0.02 * jnp.arange(1, 11)
-    lengths = jnp.stack([0.2 - 0.01 * t / 0.2, 0.2 - 0.012 * jnp.sin(8 * t) ** 2])
-    truth, scale = jnp.log(jnp.array([1.6, 0.5])), jnp.array([5e4, 1e4])
-
-    def with_theta(theta):
-        E, k = scale * jnp.exp(theta)
-        return with_parameters(scene.params, elastic={"youngs_modulus": E}, tendon={"stiffness": k})
-
-    @jax.jit
-    def motion(theta, control):
-        step = functools.partial(stepper.step, with_theta(theta))
-        return rollout(step, state, {"tendon": control}, observe=positions_and_convergence)[1]
-
-    x, converged = motion(truth, lengths[0])
-    assert converged.all()
-    noise = 1e-4
-    seen = x + noise * jax.random.normal(jax.random.key(0), x.shape)
-    motions = ObservedMotions(state.x[None], state.v[None], {"tendon": lengths[:1]}, seen[None])
-    result = identify(stepper, with_theta, jnp.zeros(2), motions, noise=noise)
-    np.testing.assert_allclose(jnp.exp(result.parameters - truth), 1, atol=0.02)
-    predicted, actual = motion(result.parameters, lengths[1])[0], motion(truth, lengths[1])[0]
-    error = jnp.sqrt(jnp.mean(jnp.sum((predicted - actual) ** 2, axis=-1)))
-    assert error < noise and jnp.abs(actual - state.x).max() > 30 * noise
 
 
 @pytest.mark.slow

@@ -15,12 +15,11 @@ from dln_jax.mechanics import closed_form, lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.scenes.pendulums import chain, double_pendulum, pendulum, two_link_arm
+from dln_jax.scenes.pendulums import chain, double_pendulum, pendulum
 from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 
 SCENES = [
-    two_link_arm(),
     pendulum(acceleration=0.0, friction=0.3),
     double_pendulum(friction=0.2),
     cart_pole(),
@@ -60,7 +59,7 @@ def natural_twin(scene: Scene) -> Dynamics:
 
 @pytest.fixture(
     scope="module",
-    params=slow_among(SCENES, lambda scene: scene.name in ("chain-4", "two-link-arm")),
+    params=slow_among(SCENES, lambda scene: scene.name == "chain-4"),
     ids=lambda scene: scene.name + scene.needs.friction * "-friction",
 )
 def answers(request):

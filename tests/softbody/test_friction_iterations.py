@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.softbody import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, MIDPOINT, make_scene, make_step, with_parameters
+from dln_jax.softbody import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, make_scene, make_step, with_parameters
 from dln_jax.softbody.contact import body_contact, half_space, obstacle_contact
 from dln_jax.softbody.contact.barrier import normal_force
 from dln_jax.softbody.mesh.mesh import make_mesh
@@ -101,32 +101,29 @@ def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_
     contact = body_contact(mesh, distance=0.01, stiffness=1e5, friction=MU)
     terms = [elastic(mesh, stable_neo_hookean, youngs_modulus=1e6, poisson_ratio=0.3)]
     scene = make_scene(mesh, terms, held=np.flatnonzero(~above), contacts=[contact])
-    barrier, errors = contact.energies[:1], {}
-    for iterations in (0, 12):
-        init, step = make_step(scene, 0.002, tolerance=1e-9, friction_iterations=iterations)
-        step, state = jax.jit(step), init(v=np.where(above[:, None], [2.0, -2.0], 0.0))
-        errors[iterations] = []
-        for _ in range(8):
-            before, (state, info) = state, step(scene.params, state)
-            assert info.converged
-            x, data = state.x, prepare_contacts(scene, scene.params, state.x)[:1]
-            lists = lists_between(barrier, x, jnp.zeros_like(x), data)
-            pushed = -np.asarray(moving_gradient(barrier, x, lists, data)[1])[above].sum(axis=0)
-            change = (np.asarray(scene.params.masses)[:, None] * np.asarray(state.v - before.v))[above].sum(axis=0)
-            pairs = barrier[0].describe(x, lists[0], data[0])
-            size, normal, _ = jax.vmap(normal_force)(x[lists[0].indices], pairs)
-            # The normal of a pair points from its edge to its vertex; the upper body slides to the right.
-            turned = np.sign(np.asarray(normal)[:, 1:]) * np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-            expected = MU * (np.asarray(size)[:, None] * turned).sum(axis=0)
-            if (largest := np.linalg.norm(expected)) > 1.0:
-                errors[iterations].append(np.linalg.norm(change / 0.002 - pushed - expected) / largest)
-    assert len(errors[12]) > 4 and max(errors[12]) < 1e-6
-    assert max(errors[0]) > 0.1
+    barrier, errors = contact.energies[:1], []
+    init, step = make_step(scene, 0.002, tolerance=1e-9, friction_iterations=12)
+    step, state = jax.jit(step), init(v=np.where(above[:, None], [2.0, -2.0], 0.0))
+    for _ in range(8):
+        before, (state, info) = state, step(scene.params, state)
+        assert info.converged
+        x, data = state.x, prepare_contacts(scene, scene.params, state.x)[:1]
+        lists = lists_between(barrier, x, jnp.zeros_like(x), data)
+        pushed = -np.asarray(moving_gradient(barrier, x, lists, data)[1])[above].sum(axis=0)
+        change = (np.asarray(scene.params.masses)[:, None] * np.asarray(state.v - before.v))[above].sum(axis=0)
+        pairs = barrier[0].describe(x, lists[0], data[0])
+        size, normal, _ = jax.vmap(normal_force)(x[lists[0].indices], pairs)
+        # The normal of a pair points from its edge to its vertex; the upper body slides to the right.
+        turned = np.sign(np.asarray(normal)[:, 1:]) * np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+        expected = MU * (np.asarray(size)[:, None] * turned).sum(axis=0)
+        if (largest := np.linalg.norm(expected)) > 1.0:
+            errors.append(np.linalg.norm(change / 0.002 - pushed - expected) / largest)
+    assert len(errors) > 4 and max(errors) < 1e-6
 
 
 @pytest.mark.parametrize(
     "integrator",
-    [BACKWARD_EULER, *(pytest.param(other, marks=pytest.mark.slow) for other in (MIDPOINT, AVERAGE_VECTOR_FIELD))],
+    [BACKWARD_EULER, pytest.param(AVERAGE_VECTOR_FIELD, marks=pytest.mark.slow)],
 )
 def test_every_iteration_leaves_less_than_a_tenth_of_the_error(integrator):
     mesh = block(1e-4)
@@ -158,11 +155,10 @@ def gradient_errors(outcome, at, changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("iterations", [1, 10])
-def test_derivatives_through_iterated_friction_with_a_moving_obstacle_agree_with_differences(iterations):
+def test_derivatives_through_iterated_friction_with_a_moving_obstacle_agree_with_differences():
     """They are those of the iterations that were taken, hence exact before the forces have stopped changing, too."""
     scene = on_ground(block(0.012))
-    init, step = make_step(scene, DT, tolerance=1e-11, friction_iterations=iterations)
+    init, step = make_step(scene, DT, tolerance=1e-11, friction_iterations=2)
     ground = scene.params.terms["ground"]
 
     def outcome(values):

@@ -114,7 +114,7 @@ def cylinder_error(cells, nu, kind):
 
 @pytest.mark.parametrize(
     "case",
-    slow_among(itertools.product([0.3, 0.4999], KINDS), lambda case: case[0] == 0.3 and case[1] == "mixed"),
+    [(0.3, "quadratic"), (0.4999, "quadratic"), (0.4999, "mixed")],
 )
 def test_displacements_of_a_pressurised_cylinder_converge_with_order_3(case):
     """Also with one pressure per element, because the pressure of Lamé's solution is uniform."""
@@ -176,9 +176,8 @@ def test_quadratic_elements_on_a_split_mesh_keep_order_3_near_incompressibility(
 @pytest.mark.slow
 def test_mixed_tetrahedra_do_not_lock():
     """A clamped cube, where no theorem says so; errors with nu = 0.3 for comparison."""
-    errors = {kind: clamped_error(5, 0.4999, kind, dimension=3) for kind in ("linear", "quadratic", "mixed")}
-    assert errors["linear"] > 0.99 and errors["quadratic"] > 0.5
-    assert errors["mixed"] < 1.3 * clamped_error(5, 0.3, "mixed", dimension=3)
+    assert clamped_error(5, 0.4999, "quadratic", dimension=3) > 0.5
+    assert clamped_error(5, 0.4999, "mixed", dimension=3) < 1.3 * clamped_error(5, 0.3, "mixed", dimension=3)
 
 
 def tip_over_beam_theory(mesh, nu, kind, length=1.0, height=0.01):
@@ -195,13 +194,8 @@ def tip_over_beam_theory(mesh, nu, kind, length=1.0, height=0.01):
     return float((mesh.vertices - x)[tip, up].mean()) / theory
 
 
-@pytest.mark.parametrize(
-    ("nu", "split"), [(0.3, False), pytest.param(0.4999, True, marks=pytest.mark.slow)], ids=["nu-0.3", "nu-0.4999"]
-)
-def test_a_slender_beam_bends_with_one_element_through_the_thickness(nu, split):
-    mesh = beam(1.0, 0.01, 50, 1)
-    mesh = quadratic(barycentric_split(mesh) if split else mesh)
-    assert tip_over_beam_theory(mesh, nu, "quadratic") == pytest.approx(1.0, abs=0.03)
+def test_a_slender_beam_bends_with_one_element_through_the_thickness():
+    assert tip_over_beam_theory(quadratic(beam(1.0, 0.01, 50, 1)), 0.3, "quadratic") == pytest.approx(1.0, abs=0.03)
 
 
 @pytest.mark.slow
@@ -229,8 +223,7 @@ def test_uniform_strain_has_the_energy_of_linear_elements(case):
     assert values[1] == pytest.approx(values[0], rel=1e-9 if exact else 5e-3)
 
 
-@pytest.mark.parametrize("kind", slow_among(KINDS, "quadratic".__eq__))
-def test_patch_of_irregular_curved_triangles_is_exact(kind):
+def test_patch_of_irregular_curved_triangles_is_exact():
     random = np.random.default_rng(0)
     mesh = quadratic(beam(1.0, 1.0, 3, 3))
     outside = boundary_vertices(mesh)
@@ -239,7 +232,7 @@ def test_patch_of_irregular_curved_triangles_is_exact(kind):
     vertices = mesh.vertices.copy()
     vertices[inside] += random.uniform(-0.02, 0.02, vertices[inside].shape)
     mesh = mesh._replace(vertices=vertices)
-    scene = solid(mesh, kind, 0.45, held=outside)
+    scene = solid(mesh, "mixed", 0.45, held=outside)
     affine = vertices @ (np.eye(2) + random.uniform(-0.2, 0.2, (2, 2)))
     start = affine.copy()
     start[inside] += random.uniform(-0.01, 0.01, start[inside].shape)
@@ -265,10 +258,9 @@ def test_curved_sides_count_in_volumes_and_ratios():
     np.testing.assert_allclose(volume_ratios(2 * mesh.vertices, mesh.vertices, mesh.nodes), 4.0)
 
 
-@pytest.mark.parametrize("kind", slow_among(KINDS, "quadratic".__eq__))
-def test_derivatives_in_material_and_rest_shape_equal_differences(kind):
+def test_derivatives_in_material_and_rest_shape_equal_differences():
     mesh = quadratic(beam(1.0, 0.5, 2, 1))
-    material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e4, poisson_ratio=0.45, mixed=kind == "mixed")
+    material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e4, poisson_ratio=0.45, mixed=True)
     held = vertices_where(mesh, lambda x: x[:, 0] == 0)
     scene = make_scene(mesh, [material, gravity(mesh)], held=held, density=100.0)
     tip = int(np.argmax(mesh.vertices.sum(axis=1)))

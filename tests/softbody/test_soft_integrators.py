@@ -145,7 +145,7 @@ def test_halvings_of_a_method_of_two_steps_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", [BACKWARD_EULER, BDF2, AVERAGE_VECTOR_FIELD])
+@pytest.mark.parametrize("integrator", [BDF2, AVERAGE_VECTOR_FIELD])
 def test_a_bouncing_body_raises_no_false_alarm(integrator):
     example = drop()
     init, step = driven_step(example, example.dt, integrator)

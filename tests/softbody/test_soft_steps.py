@@ -147,19 +147,6 @@ def test_segments_change_the_memory_and_not_the_motion_or_its_gradient():
     np.testing.assert_allclose(again, gradient, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_mapping_over_parameters_equals_one_at_a_time():
-    scene = held_body()
-    moduli = jnp.array([1e4, 1e6])
-
-    def moved(E):
-        return program()(with_parameters(scene.params, elastic={"youngs_modulus": E}), stepper().init())[0].x
-
-    together = jax.jit(jax.vmap(moved))(moduli)
-    for E, x in zip(moduli, together, strict=True):
-        np.testing.assert_allclose(x, moved(E), atol=1e-10)
-
-
 def test_single_precision_follows_double():
     scene = held_body()
     single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (scene.params, stepper().init()))

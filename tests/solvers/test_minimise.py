@@ -192,15 +192,6 @@ def test_second_derivatives_nest(sag):
     np.testing.assert_allclose(curvature, (slope(0.11 + 1e-5) - slope(0.11 - 1e-5)) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_mapping_equals_one_at_a_time():
-    stiffness = jnp.array([5.0, 50.0, 5e4])
-    together, info = jax.jit(jax.vmap(lambda k: hanging_chain(k, *ARGUMENTS[1:])))(stiffness)
-    assert info.converged.all()
-    for k, x in zip(stiffness, together, strict=True):
-        np.testing.assert_allclose(x, solved("dense")(k, *ARGUMENTS[1:])[0], atol=1e-9)
-
-
 def test_an_unfinished_search_says_so_and_has_no_derivative():
     unfinished = functools.partial(hanging_chain, iterations=1)
     x, info = jax.jit(unfinished)(*ARGUMENTS)

@@ -63,7 +63,7 @@ def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log, tmp_path, 
 def test_training_filters_when_it_is_asked_to_and_says_so_when_it_does_not(log, tmp_path, capsys):
     errors = {}
     for name, options in (("raw", []), ("filtered", ["--cutoff", "auto"])):
-        out = ["--out", tmp_path / name, "--no-figures", "--no-low-latency"]
+        out = ["--out", tmp_path / name, "--no-figures", "--no-low-latency", "--no-uncertainty"]
         command(train_delan, "--data", log, "--model", "trigonometric", "--degree", "1", "--test", "d", *options, *out)
         said = capsys.readouterr().out
         assert ("raw finite differences, which amplify noise: --cutoff auto" in said) == (name == "raw")

@@ -214,9 +214,14 @@ OWN = ("--task", "measured", "--data", "positions.npz", "--needs", '{"joints": [
 
 
 @pytest.mark.slow
-def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
+def test_own_positions_train_and_resume_to_the_same_model(positions, capsys, monkeypatch):
+    """A recipe's time is that of the table: it does not end the fit."""
+    slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}
+    monkeypatch.setattr(hnn_models, "RECIPES", slow)
     command(train_hnn_task, *OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out", "whole")
-    assert "finite differences" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "finite differences" in out and "out of time" not in out
+    assert "2/2 steps  rates: loss" in out and "2/2 steps  motions: loss" in out
     folder = positions.parent / "whole"
     metrics = json.loads((folder / "metrics.json").read_text())
     assert {"rollout_mse", "train_seconds", "one_step_p50_us", "validation_error"} <= set(metrics)
@@ -282,15 +287,10 @@ def test_options_and_models_of_other_commands_are_refused(positions, capsys):
 
 
 @pytest.mark.slow
-def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch):
-    """A recipe's time is that of the table; out of time, the fit of rates is the result, in a folder like any other."""
-    slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}
-    monkeypatch.setattr(hnn_models, "RECIPES", slow)
-    options = (*OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out")
-    command(train_hnn_task, *options, "patient")
-    out = capsys.readouterr().out
-    assert "2/2 steps  rates: loss" in out and "2/2 steps  motions: loss" in out and "out of time" not in out
-    command(train_hnn_task, *options, "hurried", "--seconds", "1e-6")
+def test_out_of_time_the_fit_of_rates_is_the_result(positions, capsys):
+    """In a folder like any other."""
+    options = (*OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--seconds", "1e-6")
+    command(train_hnn_task, *options, "--out", "hurried")
     assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
     assert np.isfinite(json.loads((positions.parent / "hurried" / "metrics.json").read_text())["validation_error"])
     assert isinstance(load(positions.parent / "hurried").flow, Flow)

@@ -133,15 +133,6 @@ def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_motions_are_left_out_where_they_could_not_be_compiled_in_time(files):
-    """A fit whose next program would compile past the limit ends before it, with the fit of rates."""
-    own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
-    description = description_of(own, "separable-hnn")
-    trained = train(own, description, seed=0, steps=3, seconds=0.01)
-    assert list(trained.fits) == ["rates"] and "motions were not fitted" in trained.stopped
-
-
-@pytest.mark.slow
 def test_the_fit_of_motions_ends_where_it_is_flat(files):
     """At the floor of the noise iterations bring nothing: the fit stops by itself, and says that it has finished."""
     own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))

@@ -4,10 +4,9 @@ import json
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import refused
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
@@ -15,14 +14,12 @@ from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
 from dln_jax.training.dynamics.methods import learned_tree, selection
 from dln_jax.training.dynamics.recorded import read
 from dln_jax.training.dynamics.run import prepare
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
-from dln_jax.zoo.run import load
 
 LINK = inertial_parameters(2.0, [0.1, 0.05, 0.2], np.diag([0.03, 0.04, 0.02]))
 ROWS = [[0.4, 0, 0.1, 0], [1.2, 0.2, 0.1, 0]]
@@ -30,7 +27,6 @@ ARM = serial(*dh_frames(ROWS), [LINK] * 2, armature=np.array([0.1, 0.2]))
 RUBBED = tree_system(ARM, joint_dissipation([0.4, 0.2]))
 AUTO = ("--model", "auto", "--data", "rigid.npz")
 TREE = ("--model", "learned-tree", "--data", "rigid.npz")
-QUIET = ("--no-figures", "--no-low-latency", "--no-uncertainty")
 PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'
 
 
@@ -50,21 +46,11 @@ def motions():
     return {"t": t, **dict(zip(("q", "qd", "qdd"), states, strict=True)), "tau": tau, "trajectory": trajectory}
 
 
-def sprung_states():
-    """Independent states of the same arm, exact, with a spring between its joints that is not of rigid bodies."""
-    states = np.random.default_rng(1).normal(size=(3, 300, 2))
-    spring = Residual(potential=lambda q: 1.5 * jnp.cos(q[0] - 2 * q[1]))
-    tau = torques(with_residual(RUBBED, spring), states)
-    arrays = dict(zip(("q", "qd", "qdd"), states, strict=True))
-    return {"t": np.zeros(300), **arrays, "tau": tau, "trajectory": np.arange(300)}
-
-
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
-    """Logs of the arm with and without the spring, its file with other masses, and a kinematic prior of it."""
+    """A log of the arm, its file with other masses, and a kinematic prior of it."""
     folder = tmp_path_factory.mktemp("selection")
     np.savez(folder / "rigid.npz", **motions())
-    np.savez(folder / "spring.npz", **sprung_states())
     free = np.tile([-np.inf, np.inf], (2, 1))
     rough = ARM._replace(inertias=0.8 * ARM.inertias)
     (folder / "arm.xml").write_text(mjcf(Robot(rough, np.zeros(2), np.zeros(2), free, free)))
@@ -86,19 +72,6 @@ def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workpla
     found = dynamics(build(task.description).energies(training.parameters))
     state = (np.array([0.3, -0.5]), np.array([0.7, 0.4]), np.array([1.0, -2.0]))
     np.testing.assert_allclose(found.inverse_dynamics(*state), dynamics(RUBBED).inverse_dynamics(*state), atol=0.05)
-
-
-@pytest.mark.slow
-def test_a_potential_of_no_rigid_body_is_found_by_the_basis_that_has_it(workplace, capsys):
-    needs = ("--needs", PLAIN)
-    command(train_delan, "--model", "auto", "--data", "spring.npz", *needs, "--out", "spring", *QUIET)
-    stored = json.loads((workplace / "spring" / "model_selection.json").read_text())
-    assert stored["kept"] == "trigonometric" and stored["ended"] == "trigonometric is exact"
-    assert len(stored["candidates"][0]["validation_nmse_joints"]) == 2
-    assert "trigonometric: validation nMSE" in capsys.readouterr().out
-    config = json.loads((workplace / "spring" / "config.json").read_text())
-    assert len(config["chosen"]["validation_units"]) == 2 and config["model"] == "auto"
-    assert load(workplace / "spring").description["name"] == "trigonometric"
 
 
 def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monkeypatch):

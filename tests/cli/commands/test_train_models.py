@@ -5,7 +5,6 @@ import json
 import re
 import subprocess
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,10 +12,6 @@ from calls import command, refused
 
 from dln_jax.cli.commands import train_delan, train_hnn
 from dln_jax.data import schema
-from dln_jax.data.splits import split
-from dln_jax.learning.dynamics import problem
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
@@ -24,7 +19,6 @@ from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 from dln_jax.training import low_latency_calls
 from dln_jax.training.dynamics.methods import growth as dynamics_growth
-from dln_jax.zoo.descriptions import build, describe_for
 from dln_jax.zoo.run import load
 
 QUICK = ("--data", "swing.npz", "--width", "3", "--depth", "1", "--steps", "6", "--no-figures", "--no-low-latency")
@@ -107,7 +101,7 @@ def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, 
     q, qdd = random.uniform(-3, 3, (2, 60, 1))
     moving = {"q": q, "qd": np.zeros((60, 1)), "qdd": qdd, "tau": -np.cos(q) * qdd}
     np.savez("negative.npz", t=np.zeros(60), trajectory=np.arange(60), **moving)
-    options = ("--data", "negative.npz", "--model", "trigonometric", "--no-figures", "--out")
+    options = ("--data", "negative.npz", "--model", "trigonometric", *BRIEF, "--out")
     command(train_delan, *options, "negative", "--degree", "1")
     assert re.search(r"not positive definite at \d\d\.\d%", capsys.readouterr().out)
     assert metrics_of(workplace / "negative")["share_not_definite"] > 0.3
@@ -115,7 +109,7 @@ def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, 
 
 @pytest.mark.slow
 def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_their_spread(workplace, capsys):
-    command(train_delan, *QUICK, "--seeds", "2", "--out", "seeds")
+    command(train_delan, *QUICK, "--no-uncertainty", "--seeds", "2", "--out", "seeds")
     metrics = metrics_of(workplace / "seeds")
     assert metrics["torque_mse_largest"] >= metrics["torque_mse_median"] > 0
     assert metrics["torque_mse_standard_deviation"] > 0
@@ -132,19 +126,20 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
 
 @pytest.mark.slow
 def test_black_box_models_report_their_mass_matrix(workplace, capsys):
-    command(train_delan, *QUICK, "--model", "black-box-delan", "--out", "black-box")
+    brief = (*QUICK, "--no-uncertainty", "--model")
+    command(train_delan, *brief, "black-box-delan", "--out", "black-box")
     metrics = metrics_of(workplace / "black-box")
     assert 0 <= metrics["share_not_definite"] <= 1 and "smallest_mass_eigenvalue" in metrics
-    command(train_delan, *QUICK, "--model", "feed-forward", "--out", "feed-forward")
+    command(train_delan, *brief, "feed-forward", "--out", "feed-forward")
     assert isinstance(load(workplace / "feed-forward").dynamics, PlainDynamics)
 
 
 @pytest.mark.slow
 def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
-    command(train_hnn, *QUICK, "--out", "hamiltonian")
+    command(train_hnn, *QUICK, "--no-uncertainty", "--out", "hamiltonian")
     assert "structured-hnn" in capsys.readouterr().out
     assert np.isfinite(load(workplace / "hamiltonian").flow.energy([1.0], [1.0]))
-    command(train_hnn, "--data", "bare.npz", *QUICK[2:], "--out", "bare")
+    command(train_hnn, "--data", "bare.npz", *QUICK[2:], "--no-uncertainty", "--out", "bare")
     assert "no momenta p in the data" in capsys.readouterr().out
 
 
@@ -166,24 +161,6 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     assert "--target is an option of --model structured-delan" in line
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("optimiser", [Adam(12, batch=32), GaussNewton(12)])
-def test_seeds_in_one_program_equal_single_runs(workplace, optimiser):
-    sets = split(schema.load("swing.npz"))
-    description = describe_for(
-        "structured-delan", sets.train, sets.train.needs, precision="f64", width=3, depth=1, activation="tanh"
-    )
-    model = build(description)
-    together = fit(problem(model, sets, seeds=(4, 7)), optimiser)
-    for index, seed in enumerate((4, 7)):
-        alone = fit(problem(model, sets, seeds=seed), optimiser)
-        assert np.ravel(together.best_step)[index] == alone.best_step
-        assert together.validation[index] == pytest.approx(alone.validation, rel=1e-6)
-        ours = jax.tree.map(lambda leaf, index=index: leaf[index], together.parameters)
-        for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(alone.parameters), strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7)
-
-
 def test_an_objective_vanishes_for_the_plant_and_follows_the_data(workplace):
     data = schema.load("swing.npz")
     assert objective_of("structured-hnn", data) is CANONICAL
@@ -203,7 +180,7 @@ def test_a_table_has_the_plant_beside_the_model_and_a_test_that_stands_still_is_
     torque = np.random.default_rng(0).normal(size=data.tau.shape)
     data = data._replace(tau=data.tau + 1e-3 * torque)
     schema.save("swings.npz", data)
-    options = ("--width", "3", "--depth", "1", "--steps", "2", "--no-figures", "--scene", "pendulum", "--data")
+    options = ("--width", "3", "--depth", "1", "--steps", "2", *BRIEF, "--scene", "pendulum", "--data")
     command(train_delan, *options, "swings.npz", "--out", "swings")
     out = capsys.readouterr().out
     assert "true plant" in out and re.search(r"valid prediction time, torque held +│ +[\d.]+ │ +[\d.]+ │ s", out)

@@ -50,7 +50,6 @@ def test_the_trigonometric_model_finds_friction_by_its_linear_fit(workplace, cap
     "script, model, optimizer",
     [
         (train_delan, "structured-delan", "adam"),
-        (train_delan, "black-box-delan", "gauss-newton"),
         (train_hnn, "structured-hnn", "gauss-newton"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

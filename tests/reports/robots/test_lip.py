@@ -13,10 +13,3 @@ def test_three_joints_are_at_the_floor():
     learned, known = (rows[f"{case}/{name}", "nmse_mean_median"].value for name in ("learned-tree", "known-kinematics"))
     assert learned < 1e-5 and known < 1e-5
     assert rows[f"{case}/learned-tree", "nmse_mean_median"].reference == pytest.approx(known)
-
-
-@pytest.mark.slow
-def test_a_kernel_is_near_without_knowing_of_trees():
-    rows = {row.quantity: row for row in lip.kernel_rows("panda-3", friction=False, every=125, tests=(101,))}
-    assert rows["nmse_mean_median"].value < 1e-3
-    assert rows["nmse_joint_1"].case == "lip/panda-3/frictionless/40/kernel"

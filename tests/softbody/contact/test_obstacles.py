@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.softbody import make_scene, make_step, with_parameters
+from dln_jax.softbody import make_scene, make_step
 from dln_jax.softbody.contact import box, capsule, half_space, heightfield, obstacle_contact, sphere
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.terms.elasticity import elastic
@@ -73,24 +73,6 @@ def test_a_block_comes_to_rest_and_the_ground_carries_its_weight(falling):
     _, slopes = jax.vmap(energy.gradient)(state.x[elements.indices], energy.describe(state.x, elements, data))
     weight = float(scene.params.masses.sum()) * 9.81
     assert -float(slopes[..., 1].sum()) == pytest.approx(weight, rel=1e-4)
-
-
-@pytest.mark.slow
-def test_the_derivative_by_the_height_of_the_ground_agrees_with_differences(falling):
-    scene, init, step = falling
-    ground = scene.params.terms["ground"]
-
-    def height(offset):
-        shape = ground.shape._replace(offset=offset)
-        params = with_parameters(scene.params, ground={"shape": shape})
-        state, info = jax.lax.scan(lambda state, _: step(params, state), init(v=[0.3, -2.0]), None, length=8)
-        return jnp.sum(state.x[:, 1] ** 2), info.converged
-
-    (_, converged), slope = jax.jit(jax.value_and_grad(height, has_aux=True))(0.0)
-    assert converged.all()
-    change = 1e-6
-    value = jax.jit(lambda offset: height(offset)[0])
-    assert float(slope) == pytest.approx(float(value(change) - value(-change)) / (2 * change), rel=1e-6)
 
 
 def test_a_body_inside_an_obstacle_is_refused():
