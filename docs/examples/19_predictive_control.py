@@ -137,7 +137,8 @@ def between_walls(axis, q, trail):
     for side in (-1, 1):
         axis.axvspan(side * RAIL, side * (RAIL + 0.6), color=style.VERMILLION, alpha=0.12, linewidth=0)
         axis.axvline(side * RAIL, color=style.VERMILLION, linewidth=1.5)
-    axis.text(RAIL + 0.02, -1.2 * LENGTH, "end of the rail", color=style.VERMILLION, fontsize=7, rotation=90)
+    axis.lines[0].set_xdata([-RAIL, RAIL])
+    axis.text(RAIL + 0.02, 1.38 * LENGTH, "end of\nthe rail", color=style.VERMILLION, fontsize=7, va="top")
     (path,) = axis.plot([], [], "--", color=style.BLUE, linewidth=1.0, alpha=0.7)
     ghosts = [axis.plot([], [], color=style.BLUE, linewidth=3, alpha=alpha)[0] for alpha in (0.3, 0.22, 0.15)]
     blow = axis.annotate(

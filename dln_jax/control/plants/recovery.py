@@ -1,7 +1,8 @@
 """Swing-up and recovery of a plant by receding plans, from numbers in the natural scales of its model.
 
 Plans are those of `planned` with a cost of the way to the goal, so that they do not put it off, and with any number of
-turns of the passive joints. They start from three first guesses: no control, and swings of half the motors' limits that begin to either side.
+turns of the passive joints. They start from three first guesses: no control, and swings of half the motors' limits that
+begin to either side.
 """
 
 from typing import Any

@@ -26,7 +26,7 @@ from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.runs import HELD, TOLERANCE
 from dln_jax.control.plants.scales import circle, scales_of
 from dln_jax.control.plants.simulated import spread_of
-from dln_jax.control.plants.ways import RECOVERIES, Way
+from dln_jax.control.plants.ways import RECOVERIES, Way, require_recovery
 from dln_jax.control.regulators import Regulator
 from dln_jax.control.state_space import error
 from dln_jax.control.swing_up import upright_of
@@ -99,8 +99,7 @@ def tune(
     require_seed(seed)
     if not seconds > HELD:
         raise InputError(f"seconds is {seconds}; expected more than the {HELD:g} s for which a plant has to stay up")
-    if recover not in RECOVERIES:
-        raise InputError(f"recover is {recover!r:.40}; choose from {', '.join(RECOVERIES)}")
+    require_recovery(recover)
     lower, upper = layout.limits.control.T
     upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
     scales, estimator = scales_of(upright, layout), estimator or by_differences(layout)

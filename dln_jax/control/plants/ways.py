@@ -14,6 +14,7 @@ from dln_jax.control.plants.scales import RANGES, Scales, swing_up_numbers
 from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.regulators import Regulator
 from dln_jax.control.swing_up import Upright, law_at
+from dln_jax.types import InputError
 
 PLANS = 8
 """Number of plans, at most, that are tried with feedback."""
@@ -94,6 +95,12 @@ RECOVERIES: Mapping[str, tuple[Callable[..., Way], ...]] = {
     "plans": (by_receding_plans,),
 }
 """Ways that are tried, by how the plant comes up again after a push: as from hanging, or by plans from there."""
+
+
+def require_recovery(name: str) -> None:
+    """Raises `InputError` for a name that is not one of `RECOVERIES`."""
+    if name not in RECOVERIES:
+        raise InputError(f"recover is {name!r:.40}; choose from {', '.join(RECOVERIES)}")
 
 
 def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:

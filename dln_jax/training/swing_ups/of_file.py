@@ -11,6 +11,7 @@ from dln_jax.control.plants.exploring import Exploration
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun
+from dln_jax.control.plants.ways import require_recovery
 from dln_jax.data import schema
 from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
@@ -48,6 +49,7 @@ def asked(
     push: float = 0.0,
 ) -> FileTask:
     """Checks the arguments of a command before anything is written; raises as `mujoco_plant`."""
+    require_recovery(recover)
     require_positive(starts=starts)
     require_seed(seed)
     if not LEAST_SECONDS <= seconds_of_data < np.inf:

@@ -25,6 +25,7 @@ from dln_jax.control.estimate import from_log
 from dln_jax.control.plants.estimators import ESTIMATORS, Estimator, estimator_of
 from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.scales import scales_of
+from dln_jax.control.plants.ways import require_recovery
 from dln_jax.control.swing_up import SwingUp
 from dln_jax.control.tracking import without_friction
 from dln_jax.data import schema
@@ -78,6 +79,7 @@ def asked(
         raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
+    require_recovery(recover)
     require_positive(starts=starts)
     require_seed(seed)
     if not LEAST_SECONDS <= seconds_of_data < np.inf:
