@@ -29,7 +29,7 @@ jax.config.update("jax_enable_x64", True)
 
 SECONDS, FRAMES_PER_SECOND = 6.5, 25.0  # s, 1/s
 DT, STEPS = 0.02, 60  # s; 1.2 s ahead
-LIMIT, RAIL, LENGTH = 8.0, 0.5, 0.3  # N, m, m
+LIMIT, RAIL, LENGTH = 6.0, 0.5, 0.4  # N, m, m
 BLOWS = {2.5: 0.02, 4.0: -0.35}  # N s, by the time in s
 
 # %%
@@ -45,7 +45,7 @@ wall = np.array([RAIL - 0.02, np.inf, np.inf, np.inf])
 
 
 def away(x):
-    return 4 * x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * x[2] ** 2 + 0.01 * x[3] ** 2
+    return x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * x[2] ** 2 + 0.01 * x[3] ** 2
 
 
 problem = control.TrajectoryProblem(
