@@ -64,6 +64,15 @@ class ClosedLoopRun(NamedTuple):
     """Measurements that the controller received."""
 
 
+class Push(NamedTuple):
+    """A push: a jump of the rates, as after a short blow."""
+
+    seconds: float
+    """Its time, s."""
+    rates: Any
+    """What is added to the rates [d], 1/s or m/s."""
+
+
 def stateless(law: Law) -> Controller:
     """Returns a controller without memory: y -> u."""
     return Controller((), lambda memory, t, y: (memory, law(y)))
@@ -103,6 +112,7 @@ def simulate(
     hardware: Hardware = Hardware(),  # noqa: B008
     key: Array | None = None,
     substeps: int = 1,
+    push: Push | None = None,
 ) -> ClosedLoopRun:
     """Simulates the closed loop from a state; traceable and differentiable.
 
@@ -116,6 +126,7 @@ def simulate(
         hardware: limits, noise, delay.
         key: of the noise; required if there is any.
         substeps: integrator steps per sample.
+        push: before the measurement of its sample; by default none.
 
     Raises:
         InputError: settings out of range, or noise without a key.
@@ -127,6 +138,9 @@ def simulate(
 
     def sample(carry: tuple[Array, Any], number: Array) -> tuple[tuple[Array, Any], tuple[Array, Array, Array]]:
         x, loop = carry
+        if push is not None:
+            rates = jnp.where(number == round(push.seconds * rate), jnp.asarray(push.rates, x.dtype), 0.0)
+            x = x.at[len(x) // 2 :].add(rates)
         loop, u, y = act(loop, x, number)
         x = step(x, u)
         return (x, loop), (x, u, y)

@@ -15,13 +15,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, hanging_starts, outcomes, simulate
+from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, Push, hanging_starts, outcomes, simulate
 from dln_jax.control.energy_shaping import EnergyGains
 from dln_jax.control.plants.estimators import Estimator, by_differences
 from dln_jax.control.plants.plant import Layout, Plant, layout
 from dln_jax.control.plants.simulated import plant_of
 from dln_jax.control.state_space import field_of
-from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, swing_up
+from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, Upright, swing_up, upright_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
@@ -139,13 +139,24 @@ def simulated_plant(plant: DesktopPlant, *, seed: int = 0) -> Plant:
 
 def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, estimator: Estimator | None = None) -> SwingUp:
     """Returns the plant's swing-up by a model, by default with rates by differences; raises as `swing_up`."""
-    angle = np.linspace(-np.pi, np.pi, POSTURES)
     needs, hardware = plant.scene.needs, plant.hardware
     return swing_up(
-        model, needs.actuation, needs.joints, np.zeros(2), plant.numbers,
-        postures=np.stack([np.zeros(POSTURES), angle], axis=1), lower=hardware.lower, upper=hardware.upper,
-        estimator=estimator or by_differences(plant.layout),
+        model, needs.actuation, needs.joints, np.zeros(2), plant.numbers, postures=_circle(), lower=hardware.lower,
+        upper=hardware.upper, estimator=estimator or by_differences(plant.layout),
     )  # fmt: skip
+
+
+def upright_for(plant: DesktopPlant, model: Dynamics | PlainDynamics) -> Upright:
+    """The model, checked, with its equilibrium near the goal; raises as `swing_up`."""
+    return upright_of(
+        model, plant.scene.needs.actuation, np.zeros(2), postures=_circle(), lower=plant.hardware.lower,
+        upper=plant.hardware.upper,
+    )  # fmt: skip
+
+
+def _circle() -> np.ndarray:
+    angle = np.linspace(-np.pi, np.pi, POSTURES)
+    return np.stack([np.zeros(POSTURES), angle], axis=1)
 
 
 def motion_of(
@@ -154,6 +165,7 @@ def motion_of(
     *,
     seconds: float = SECONDS,
     estimator: Estimator | None = None,
+    push: Push | None = None,
 ) -> Callable[[Array, Array], ClosedLoopRun]:
     """(initial state [4], key of the noise) -> a run of the true plant with the model's law; as for `law_of`."""
     controller = law_of(plant, model, estimator).controller
@@ -163,7 +175,7 @@ def motion_of(
     def run(x: Array, key: Array) -> ClosedLoopRun:
         return simulate(
             field, controller, x, seconds=seconds, rate=plant.rate, controls=B.shape[1],
-            hardware=plant.hardware, key=key, substeps=plant.substeps,
+            hardware=plant.hardware, key=key, substeps=plant.substeps, push=push,
         )  # fmt: skip
 
     return run
@@ -177,9 +189,10 @@ def try_starts(
     seed: int = 0,
     seconds: float = SECONDS,
     estimator: Estimator | None = None,
+    push: Push | None = None,
 ) -> Tried:
-    """Runs swing-ups from random states near hanging, with independent noise; `estimator` as for `motion_of`."""
-    run = motion_of(plant, model, seconds=seconds, estimator=estimator)
+    """Runs swing-ups from random states near hanging, with independent noise; the rest as for `motion_of`."""
+    run = motion_of(plant, model, seconds=seconds, estimator=estimator, push=push)
     held = min(round(HOLDING * plant.rate), round(seconds * plant.rate))
 
     def extremes(x: Array, key: Array) -> tuple[Array, Array, Array]:

@@ -52,7 +52,7 @@ def feedback(problem: TrajectoryProblem, plan: Plan, x: Any) -> Array:
 
 
 def prepare(
-    problem: TrajectoryProblem, plan: Plan, x: Any, *, barrier: Any = BARRIER, iterations: int = 1,
+    problem: TrajectoryProblem, plan: Plan, x: Any, *, barrier: Any = BARRIER, iterations: Any = 1,
     step_lengths: Any = STEP_LENGTHS,
 ) -> Plan:  # fmt: skip
     """Returns the plan for the next sample, after `feedback` at a state [n] was applied.
@@ -62,12 +62,13 @@ def prepare(
         plan: that gave the control.
         x: measured state.
         barrier, step_lengths: as for `improve`.
-        iterations: number of iterations.
+        iterations: number of iterations; it may be traced.
 
     Raises:
         InputError: as for `improve`.
     """
-    require_positive(iterations=iterations)
+    if not isinstance(iterations, Tracer):
+        require_positive(iterations=iterations)
     x = jnp.asarray(x, float)
     now, later = (
         problem._replace(knots=jax.tree.map(lambda rows, part=part: rows[part], problem.knots))
@@ -80,9 +81,10 @@ def prepare(
         u=jnp.concatenate([u[1:], u[-1:]]), x=jnp.concatenate([states[1:], last[None]]),
         K=jnp.concatenate([plan.K[1:], plan.K[-1:]]),
     )  # fmt: skip
-    for _ in range(iterations):
-        moved = improve(later, moved, barrier=barrier, step_lengths=step_lengths)
-    return moved
+    again = lambda _, plan: improve(later, plan, barrier=barrier, step_lengths=step_lengths)  # noqa: E731
+    # A loop of a single turn would only be more code.
+    single = not isinstance(iterations, Tracer) and iterations == 1
+    return again(0, moved) if single else jax.lax.fori_loop(0, iterations, again, moved)
 
 
 def mpc(

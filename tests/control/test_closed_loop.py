@@ -9,6 +9,7 @@ from dln_jax.control import (
     Controller,
     Gains,
     Hardware,
+    Push,
     Reference,
     feed_forward,
     field_of,
@@ -31,6 +32,14 @@ def test_controls_are_held_and_integrated_exactly():
     np.testing.assert_allclose(run.u[:, 0], np.arange(1, 21))
     np.testing.assert_allclose(run.x[1:, 1], 0.01 * np.cumsum(np.arange(1, 21)), rtol=1e-12)
     np.testing.assert_allclose(run.t, 0.01 * np.arange(21))
+
+
+def test_a_push_adds_to_the_rates_once():
+    still = stateless(lambda x: jnp.zeros(1))
+    run = simulate(FIELD, still, [0.0, 0.5], push=Push(0.1, [2.0]), **SETTINGS)
+    np.testing.assert_allclose(run.x[:, 1], np.where(run.t <= 0.1 + 1e-9, 0.5, 2.5))
+    np.testing.assert_allclose(run.x[-1, 0], 0.1 * 0.5 + 0.1 * 2.5)
+    np.testing.assert_array_equal(run.y[9:11, 1], [0.5, 2.5])  # it is measured at its own sample
 
 
 def test_limits_and_delay():

@@ -30,6 +30,8 @@ REDUCED = {
     "16_down_the_stairs": {"STEPS": 60, "COUNT": 1},
     "17_stiffness_from_a_motion": {},
     "18_tangle": {"STEPS": 40, "STRIPS": 3},
+    "19_predictive_control": {"SECONDS": 2.0, "FRAMES_PER_SECOND": 2.0},
+    "20_state_estimation": {"SECONDS": 1.0, "WINDOW": 2},
 }
 """Constants of the examples, and what they are here."""
 

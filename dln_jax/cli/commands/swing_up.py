@@ -38,6 +38,11 @@ class Arguments(Folder, Drawn):
     """The model from which the controller is designed (default: delan; of a file, identified)."""
     estimator: Annotated[str, choice(("extended", "unscented", "differences"))] = "extended"
     """Where the law's states come from: a Kalman filter of the encoders' readings, or their differences."""
+    recover: Annotated[str, choice(("swing-up", "plans"))] = "swing-up"
+    """How the plant comes up again after a push: as from hanging, or by plans from the state after the push, which are
+    improved on the way."""
+    push: float = 0.0
+    """Jump of the passive joints' rates in the middle of every run, 5 s after its start, rad/s (default: no push)."""
     seconds_of_data: float = 30.0
     """Seconds of motion to learn from, at least 12, including an episode for validation."""
     starts: int = 100
@@ -57,7 +62,8 @@ def main(options: Arguments) -> None:
             raise InputError(f"--actuated and --control belong to a file; --plant is {options.plant!r:.40}")
         model = options.model or "delan"
         task = run.asked(
-            options.plant, model, options.seconds_of_data, options.starts, options.seed, options.estimator
+            options.plant, model, options.seconds_of_data, options.starts, options.seed, options.estimator,
+            options.recover, options.push,
         )  # fmt: skip
         with command_folder(options, "swing_up") as folder:
             run.swing_up(task, folder, figures=options.figures)
@@ -68,7 +74,7 @@ def main(options: Arguments) -> None:
     actuated = options.actuated.split(",") if options.actuated else ()
     of_plant = of_file.asked(
         file, actuated, options.control, options.seconds_of_data, options.starts, options.seed,
-        options.estimator,
+        options.estimator, options.recover, options.push,
     )  # fmt: skip
     with command_folder(options, "swing_up") as folder:
         of_file.swing_up_file(of_plant, folder, figures=options.figures)

@@ -108,4 +108,4 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
             stop(f"the controls are {u.tolist()}, outside {limits.control.tolist()}")
         plant.act(u)
 
-    return Plant(layout, reset, read, act, plant.time)
+    return plant._replace(reset=reset, read=read, act=act)

@@ -122,7 +122,10 @@ def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, ha
         if any(data.warning[kind].number for kind in warnings):
             data.qpos[:] = np.nan
 
-    return simulated(described, begin, lambda: data.qpos, advance, hardware=hardware, seed=seed)
+    def kick(rates: np.ndarray) -> None:
+        data.qvel[:] += rates
+
+    return simulated(described, begin, lambda: data.qpos, advance, kick=kick, hardware=hardware, seed=seed)
 
 
 def _model(source: Any) -> tuple[Any, Any]:

@@ -23,7 +23,7 @@ from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.scales import Scales, swing_up_numbers
 from dln_jax.control.real_time import improve
 from dln_jax.control.regulators import Regulator, lqr, regulated, time_varying_lqr, value
-from dln_jax.control.state_space import Field, error, field_of, integrated, linearise
+from dln_jax.control.state_space import Field, circular, error, field_of, integrated, linearise
 from dln_jax.control.swing_up import SwingUpNumbers, Upright
 from dln_jax.control.tracking import friction_compensation, without_friction
 from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan
@@ -69,30 +69,65 @@ class Followed(NamedTuple):
     hanging: Regulator
 
 
+def plan_problem(
+    upright: Upright,
+    layout: Layout,
+    scales: Scales,
+    effort: Any,
+    *,
+    every: int,
+    share: float = SHARE,
+    at_end: float = AT_END,
+    soon: float = 0.0,
+) -> TrajectoryProblem:
+    """Returns the problem of plans to the goal.
+
+    Args:
+        upright: the model; friction of its driven joints is left to the compensation.
+        layout: of the plant.
+        scales: of the model.
+        effort: weight of the controls; it may be traced.
+        every: samples in a step.
+        share: of the motors' limits.
+        at_end: weight of the errors at the end.
+        soon: weight of the coordinates away from the goal on the way. If it is not zero, passive joints may reach the
+            goal after any number of turns.
+    """
+    d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
+    dt, goal, units = every / layout.rate, np.asarray(upright.at.x), _units(scales)
+    low, high = INSIDE * layout.limits.position.T
+    # Motors do not turn on: their cables might not.
+    free = circular(layout.joints, 2 * d) & np.isin(np.arange(2 * d), upright.parts.passive) & (soon > 0)
+
+    def off(x: Array) -> Array:
+        return jnp.where(free, 2 * jnp.sin((x - goal) / 2), x - goal) / units
+
+    def cost(x: Array, u: Array) -> Array:
+        away = off(x)[np.array(upright.parts.active)]
+        beyond = jnp.maximum(x[:d] - high, 0.0) + jnp.maximum(low - x[:d], 0.0)
+        running = effort * jnp.sum((u / size) ** 2) + RATES * jnp.sum((x[d:] / units[d:]) ** 2)
+        running += POSTURE * jnp.sum(away**2)
+        if soon:
+            running += soon * jnp.sum(off(x)[:d] ** 2)
+        return dt * scales.fall * running + BEYOND * jnp.sum((beyond / units[:d]) ** 2)
+
+    def end(x: Array) -> Array:
+        return at_end * jnp.sum(off(x) ** 2)
+
+    step = integrated(_compensated(upright), dt, substeps=2)
+    return TrajectoryProblem(step, cost, end, lower=-share * size, upper=share * size)
+
+
 def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0) -> list[Plan]:
     """Plans from hanging to the goal that arrive, the least sensitive first; raises `InputError` if none does."""
     d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
-    every = steps_of(layout, scales)
-    dt, goal, units = every / layout.rate, np.asarray(upright.at.x), _units(scales)
-    step = integrated(_compensated(upright), dt, substeps=2)
-    low, high = INSIDE * layout.limits.position.T
-
-    def end(x: Array) -> Array:
-        return AT_END * jnp.sum(((x - goal) / units) ** 2)
-
+    every, goal, units = steps_of(layout, scales), np.asarray(upright.at.x), _units(scales)
     start = np.concatenate([layout.hanging, np.zeros(d)])
 
     @jax.jit
     @jax.vmap
-    def solved(u: Array, weight: Array) -> Plan:
-        def cost(x: Array, u: Array) -> Array:
-            away = ((x - goal) / units)[np.array(upright.parts.active)]
-            beyond = jnp.maximum(x[:d] - high, 0.0) + jnp.maximum(low - x[:d], 0.0)
-            running = weight * jnp.sum((u / size) ** 2) + RATES * jnp.sum((x[d:] / units[d:]) ** 2)
-            running += POSTURE * jnp.sum(away**2)
-            return dt * scales.fall * running + BEYOND * jnp.sum((beyond / units[:d]) ** 2)
-
-        problem = TrajectoryProblem(step, cost, end, lower=-SHARE * size, upper=SHARE * size)
+    def solved(u: Array, effort: Array) -> Plan:
+        problem = plan_problem(upright, layout, scales, effort, every=every)
         again = lambda _, plan: improve(problem, plan, step_lengths=LENGTHS)  # noqa: E731
         return jax.lax.fori_loop(0, ITERATIONS, again, first_plan(problem, start, u))
 
@@ -100,7 +135,8 @@ def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0)
     sizes = np.geomspace(0.03, 0.5, GUESSES)[:, None, None]
     nearest = np.inf
     for duration in DURATIONS:
-        guesses = sizes * size * random.normal(size=(GUESSES, round(duration / scales.fall / dt), len(size)))
+        steps = round(duration / scales.fall * layout.rate / every)
+        guesses = sizes * size * random.normal(size=(GUESSES, steps, len(size)))
         plans = jax.tree.map(np.asarray, solved(guesses, np.resize(EFFORTS, GUESSES)))
         off = np.abs((plans.x[:, -1] - goal) / units).max(axis=1)
         largest = np.abs(plans.K * units / size[:, None]).max(axis=(1, 2, 3))
@@ -113,9 +149,9 @@ def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0)
     )
 
 
-def steps_of(layout: Layout, scales: Scales) -> int:
+def steps_of(layout: Layout, scales: Scales, fineness: float = FINENESS) -> int:
     """Samples in a step of a plan."""
-    return max(1, round(layout.rate / (FINENESS * scales.fall)))
+    return max(1, round(layout.rate / (fineness * scales.fall)))
 
 
 def followed(

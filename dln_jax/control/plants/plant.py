@@ -59,6 +59,8 @@ class Plant(NamedTuple):
     """Controls u [m] -> nothing, at the time of the next sample."""
     time: Callable[[], float]
     """() -> time in s, by the plant's clock."""
+    kick: Callable[[Any], None] | None = None
+    """Adds to the rates [d], as a push does; `None` for plants that cannot."""
 
 
 def layout(

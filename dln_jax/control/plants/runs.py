@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dln_jax.control.closed_loop import Controller
+from dln_jax.control.closed_loop import Controller, Push
 from dln_jax.control.plants.guarded import Stopped, guarded
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.state_space import saturated
-from dln_jax.types import require_positive
+from dln_jax.types import InputError, require_positive
 
 TOLERANCE = 0.2
 """Largest distance of every angle from the goal that counts as up, rad."""
@@ -45,7 +45,9 @@ def compiled(controller: Controller, layout: Layout) -> Act:
     return jax.jit(jax.vmap(act, in_axes=(0, None, 0)))
 
 
-def run(plants: Sequence[Plant], act: Act, memories: Any, *, seconds: float) -> list[PlantRun]:
+def run(
+    plants: Sequence[Plant], act: Act, memories: Any, *, seconds: float, push: Push | None = None
+) -> list[PlantRun]:
     """Resets plants of one layout and runs them in step.
 
     Args:
@@ -53,11 +55,14 @@ def run(plants: Sequence[Plant], act: Act, memories: Any, *, seconds: float) -> 
         act: of `compiled`.
         memories: of the controller before the first sample, one for each plant along the leading axis.
         seconds: duration.
+        push: on every plant that still runs; by default none.
 
     Raises:
-        InputError: a start outside the limits, or an answer of another shape.
+        InputError: a start outside the limits, an answer of another shape, or a push on plants without `kick`.
     """
     require_positive(seconds=seconds)
+    if push is not None and any(plant.kick is None for plant in plants):
+        raise InputError("the plant has no kick and cannot be pushed; leave the push out, or simulate the plant")
     layout, safe = plants[0].layout, [guarded(plant) for plant in plants]
     d, m = layout.actuation.shape
     samples, count = round(seconds * layout.rate), len(plants)
@@ -67,6 +72,9 @@ def run(plants: Sequence[Plant], act: Act, memories: Any, *, seconds: float) -> 
         plant.reset()
     going = list(range(count))
     for k in range(samples):
+        if push is not None and k == round(push.seconds * layout.rate):
+            for i in going:
+                plants[i].kick(np.asarray(push.rates, float))  # type: ignore[misc]
         going = _each(going, k, lengths, reasons, lambda i: y[k].__setitem__(i, safe[i].read()))  # noqa: B023
         if not going:
             break

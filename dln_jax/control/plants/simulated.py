@@ -24,6 +24,7 @@ def simulated(
     coordinates: Callable[[], Any],
     advance: Callable[[np.ndarray], None],
     *,
+    kick: Callable[[np.ndarray], None] | None = None,
     hardware: Hardware = Hardware(),  # noqa: B008
     seed: int = 0,
 ) -> Plant:
@@ -34,6 +35,7 @@ def simulated(
         begin: (posture [d]) -> nothing; puts the simulator there, at rest.
         coordinates: () -> the true q [d].
         advance: (controls that act [m]) -> nothing; advances the simulator by a sample.
+        kick: (rates [d]) -> nothing; adds them to those of the simulator.
         hardware: noise, resolution and delay; its limits are not read.
         seed: of the starts and the noise.
     """
@@ -58,7 +60,7 @@ def simulated(
         advance(queue.popleft() + hardware.control_noise * random.normal(size=m))
         count[0] += 1
 
-    return Plant(layout, reset, read, act, lambda: count[0] / layout.rate)
+    return Plant(layout, reset, read, act, lambda: count[0] / layout.rate, kick)
 
 
 def spread_of(layout: Layout) -> np.ndarray:
@@ -92,6 +94,9 @@ def plant_of(
     def advance(u: np.ndarray) -> None:
         state[0] = np.asarray(step(state[0], u))
 
+    def kick(rates: np.ndarray) -> None:
+        state[0] = state[0] + np.concatenate([np.zeros_like(rates), rates])
+
     return simulated(
-        layout, begin, lambda: state[0][: len(layout.joints)], advance, hardware=hardware, seed=seed
+        layout, begin, lambda: state[0][: len(layout.joints)], advance, kick=kick, hardware=hardware, seed=seed
     )  # fmt: skip

@@ -9,6 +9,7 @@
 4. Plans with feedback (`planned`) are tried first, and taken if they stand every error. Otherwise energy laws are tried
    as well, with right models in the first round, because few sets work. One with a margin of `LEAST` or more is taken:
    it acts in any state, and a wrong model costs it time where it throws a plan off. Else the larger margin decides.
+   For a plant that has to recover from pushes by plans, receding plans are tried instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,7 +26,7 @@ from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.runs import HELD, TOLERANCE
 from dln_jax.control.plants.scales import circle, scales_of
 from dln_jax.control.plants.simulated import spread_of
-from dln_jax.control.plants.ways import Way, by_energy, by_plan
+from dln_jax.control.plants.ways import RECOVERIES, Way, require_recovery
 from dln_jax.control.regulators import Regulator
 from dln_jax.control.state_space import error
 from dln_jax.control.swing_up import upright_of
@@ -51,7 +52,7 @@ class Tuned(NamedTuple):
     controller: Controller
     """Of the measurements."""
     way: str
-    """"energy" or "plan"."""
+    """"energy", "plan" or "receding plans"."""
     numbers: Mapping[str, float]
     """What was chosen, in SI units."""
     regulator: Regulator
@@ -76,6 +77,7 @@ def tune(
     seconds: float = 6.0,
     substeps: int = 1,
     seed: int = 0,
+    recover: str = "swing-up",
 ) -> Tuned:
     """Chooses all settings of a swing-up by trials.
 
@@ -88,19 +90,21 @@ def tune(
         seconds: duration of a trial, within which a plant has to be up and stay for a second.
         substeps: Runge-Kutta steps a sample.
         seed: of the sets, the starts and the noise.
+        recover: "plans" for a law that plans again from where a push leaves the plant, or "swing-up".
 
     Raises:
-        InputError: a model that `swing_up` refuses, or of which no set swings it up.
+        InputError: a model that `swing_up` refuses, or of which no set swings it up; another recovery.
     """
     require_positive(sets=sets, substeps=substeps)
     require_seed(seed)
     if not seconds > HELD:
         raise InputError(f"seconds is {seconds}; expected more than the {HELD:g} s for which a plant has to stay up")
+    require_recovery(recover)
     lower, upper = layout.limits.control.T
     upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
     scales, estimator = scales_of(upright, layout), estimator or by_differences(layout)
     results, refused = [], []
-    for make in (by_plan, by_energy):
+    for make in RECOVERIES[recover]:
         try:
             way = make(upright, layout, scales, seed)
             trial = trial_of(

@@ -1,4 +1,4 @@
-"""Ways of swinging up whose settings trials choose: by plans with feedback, and by energy laws."""
+"""Ways of swinging up whose settings trials choose: by plans with feedback, by receding plans, and by energy laws."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -9,10 +9,12 @@ import numpy as np
 from dln_jax.control.closed_loop import Controller, stateless
 from dln_jax.control.plants.planned import followed, follower, plans_of
 from dln_jax.control.plants.plant import Layout
+from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.scales import RANGES, Scales, swing_up_numbers
 from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.regulators import Regulator
 from dln_jax.control.swing_up import Upright, law_at
+from dln_jax.types import InputError
 
 PLANS = 8
 """Number of plans, at most, that are tried with feedback."""
@@ -68,6 +70,37 @@ def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
         return {"seconds": len(settings.u) / layout.rate, "level": float(settings.level)}, settings.goal
 
     return Way("plan", draw, lambda settings: follower(upright, layout, plain, settings), numbers, (0.15, -0.15))
+
+
+def by_receding_plans(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
+    """Receding plans, which also recover from pushes, and a regulator."""
+    plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
+
+    def draw(random: np.random.Generator, count: int) -> list[Any]:
+        settings = [swing_up_numbers(upright, layout, scales, one) for one in _draws(random, count)]
+        return [(jax.tree.map(np.asarray, regulator), np.asarray(one.level)) for one, regulator in settings]
+
+    def controller(settings: Any) -> Controller:
+        return recovering(upright, layout, scales, plain, *settings)
+
+    def numbers(settings: Any) -> tuple[dict[str, float], Regulator]:
+        regulator, level = settings
+        return {"level": float(level)}, regulator
+
+    return Way("receding plans", draw, controller, numbers, (0.15, -0.15))
+
+
+RECOVERIES: Mapping[str, tuple[Callable[..., Way], ...]] = {
+    "swing-up": (by_plan, by_energy),
+    "plans": (by_receding_plans,),
+}
+"""Ways that are tried, by how the plant comes up again after a push: as from hanging, or by plans from there."""
+
+
+def require_recovery(name: str) -> None:
+    """Raises `InputError` for a name that is not one of `RECOVERIES`."""
+    if name not in RECOVERIES:
+        raise InputError(f"recover is {name!r:.40}; choose from {', '.join(RECOVERIES)}")
 
 
 def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.control.closed_loop import Hardware
+from dln_jax.control.closed_loop import Hardware, Push
 from dln_jax.control.estimate import from_log
 from dln_jax.control.plants.estimators import ESTIMATORS, estimator_of
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
-from dln_jax.control.plants.plant import Plant
+from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
 from dln_jax.control.plants.tuning import Tuned, tune
 from dln_jax.data.encoders import noise_of
@@ -44,6 +44,7 @@ def learn_to_swing_up(
     *,
     estimator: str = "extended",
     seed: int = 0,
+    recover: str = "swing-up",
     say: Callable[[str], None] = lambda _: None,
 ) -> Learned:
     """Explores a plant, learns its model and tunes its law.
@@ -52,6 +53,7 @@ def learn_to_swing_up(
         plant: plant to swing up; exploration guards it.
         estimator: one of `plants.ESTIMATORS`, from which the law gets its states.
         seed: seed of the noise and of the trials.
+        recover: as for `tune`.
         say: called with a line of text after every step.
 
     Raises:
@@ -77,7 +79,7 @@ def learn_to_swing_up(
     hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=prepared.delay)
     wide = process._replace(disturbance=BAND * band)
     make = estimator_of(estimator, plant.layout, wide, delay=prepared.delay)
-    tuned = tune(fitted.dynamics, plant.layout, hardware, estimator=make, seed=seed)
+    tuned = tune(fitted.dynamics, plant.layout, hardware, estimator=make, seed=seed, recover=recover)
     say(
         f"tuned by {tuned.way}: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin "
         f"{tuned.margin:.0%}, up in {tuned.seconds:.2f} s"
@@ -92,8 +94,19 @@ def model_of(recording: Trajectories) -> Dynamics:
     return identified(prepare(recording, chain=True).train, recording.needs, chain=True).dynamics
 
 
+def push_at_half(layout: Layout, rate: float) -> Push | None:
+    """A push on the passive joints in the middle of a run, rad/s or m/s; `None` for zero."""
+    return Push(SECONDS / 2, np.where((layout.actuation != 0).any(axis=1), 0.0, rate)) if rate else None
+
+
 def try_plant(
-    make: Callable[[int], Plant], tuned: Tuned, *, starts: int = 100, seed: int = 1000, seconds: float = SECONDS
+    make: Callable[[int], Plant],
+    tuned: Tuned,
+    *,
+    starts: int = 100,
+    seed: int = 1000,
+    seconds: float = SECONDS,
+    push: Push | None = None,
 ) -> tuple[Trials, list[PlantRun]]:
     """Swings up plants from many starts, in step; errors as for `run`.
 
@@ -101,10 +114,11 @@ def try_plant(
         make: seed -> a simulated plant with its own start and noise.
         seed: seed of the first plant; the others follow.
         seconds: duration of a trial, s.
+        push: push on every plant.
     """
     require_positive(starts=starts)
     plants = [make(seed + number) for number in range(starts)]
     layout = plants[0].layout
     act = compiled(tuned.controller, layout)
-    runs = run(plants, act, start_of(tuned.controller, starts), seconds=seconds)
+    runs = run(plants, act, start_of(tuned.controller, starts), seconds=seconds, push=push)
     return judged_runs(runs, layout, seconds=seconds), runs

@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.control.closed_loop import ClosedLoopRun, Hardware
+from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Push
 from dln_jax.control.plants.exploring import Exploration
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun
+from dln_jax.control.plants.ways import require_recovery
 from dln_jax.data import schema
 from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
-from dln_jax.training.swing_ups.any_plant import SECONDS, learn_to_swing_up, try_plant
+from dln_jax.training.swing_ups.any_plant import SECONDS, learn_to_swing_up, push_at_half, try_plant
 from dln_jax.training.swing_ups.run import LEAST_SECONDS
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
@@ -32,6 +33,8 @@ class FileTask(NamedTuple):
     estimator: str
     starts: int
     seed: int
+    recover: str
+    push: Push | None
 
 
 def asked(
@@ -42,8 +45,11 @@ def asked(
     starts: int,
     seed: int,
     estimator: str = "extended",
+    recover: str = "swing-up",
+    push: float = 0.0,
 ) -> FileTask:
     """Checks the arguments of a command before anything is written; errors as for `mujoco_plant`."""
+    require_recovery(recover)
     require_positive(starts=starts)
     require_seed(seed)
     if not LEAST_SECONDS <= seconds_of_data < np.inf:
@@ -53,9 +59,11 @@ def asked(
     def make(number: int) -> Plant:
         return mujoco_plant(file, actuated, control=control, hardware=hardware, seed=number)
 
-    slides = np.array([kind == "prismatic" for kind in make(0).layout.joints])
+    layout = make(0).layout
+    slides = np.array([kind == "prismatic" for kind in layout.joints])
     hardware = hardware._replace(encoder_step=np.where(slides, 1e-4, ENCODER_STEP))
-    return FileTask(make, Exploration(seconds=seconds_of_data), estimator, starts, seed)
+    pushed = push_at_half(layout, push)
+    return FileTask(make, Exploration(seconds=seconds_of_data), estimator, starts, seed, recover, pushed)
 
 
 def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, float]:
@@ -64,12 +72,16 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
     layout = plant.layout
     driven = [name for name, row in zip(layout.names, layout.actuation, strict=True) if row.any()]
     print(f"joints {', '.join(layout.names)}, motor at {', '.join(driven)}; goal {np.round(layout.goal, 4).tolist()}")
-    learned = learn_to_swing_up(plant, task.exploration, estimator=task.estimator, seed=task.seed, say=print)
+    learned = learn_to_swing_up(
+        plant, task.exploration, estimator=task.estimator, seed=task.seed, recover=task.recover, say=print
+    )  # fmt: skip
     for reason in learned.explored.stopped:
         print(f"stopped: {reason}")
     schema.save(folder / "data.npz", learned.explored.recording)
     save(folder, *learned.fitted)
-    trials, runs = try_plant(task.make, learned.tuned, starts=task.starts, seed=task.seed + 1000)
+    trials, runs = try_plant(
+        task.make, learned.tuned, starts=task.starts, seed=task.seed + 1000, push=task.push
+    )  # fmt: skip
     seconds, tuned = trials.seconds[trials.up], learned.tuned
     median, worst = (float(np.median(seconds)), float(np.max(seconds))) if len(seconds) else (np.inf, np.inf)
     metrics = {
@@ -87,9 +99,10 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
         folder / "law.json",
         {"way": tuned.way, **tuned.numbers, "K": np.asarray(tuned.regulator.K).tolist()},
     )
+    pushed = "" if task.push is None else f", pushed after {task.push.seconds:g} s"
     print(
-        f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s: median {median:.2f} s, worst "
-        f"{worst:.2f} s"
+        f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s{pushed}: median {median:.2f} "
+        f"s, worst {worst:.2f} s"
     )
     complete = [one for one in runs if not one.stopped][:MOST_SHOWN]
     if figures and complete:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dln_jax.cli.progress import progress
 from dln_jax.control import parts_of, passive_energy
-from dln_jax.control.closed_loop import ClosedLoopRun, hanging_starts
+from dln_jax.control.closed_loop import ClosedLoopRun, Push, hanging_starts
 from dln_jax.control.desktop_plants import (
     NAMES,
     SECONDS,
@@ -19,9 +19,14 @@ from dln_jax.control.desktop_plants import (
     law_of,
     motion_of,
     try_starts,
+    upright_for,
 )
 from dln_jax.control.estimate import from_log
 from dln_jax.control.plants.estimators import ESTIMATORS, Estimator, estimator_of
+from dln_jax.control.plants.recovery import recovering
+from dln_jax.control.plants.scales import scales_of
+from dln_jax.control.plants.ways import require_recovery
+from dln_jax.control.swing_up import SwingUp
 from dln_jax.control.tracking import without_friction
 from dln_jax.data import schema
 from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
@@ -30,6 +35,7 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.sizes import require_memory
+from dln_jax.training.swing_ups.any_plant import push_at_half
 from dln_jax.training.swing_ups.learned import MODELS, Obtained, errors_along, obtain, recorded, test_motions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
@@ -53,23 +59,34 @@ class SwingUpTask(NamedTuple):
     estimator: str
     starts: int
     seed: int
+    recover: str
+    push: Push | None
 
 
 def asked(
-    plant: str, model: str, seconds_of_data: float, starts: int, seed: int, estimator: str = "extended"
-) -> SwingUpTask:  # fmt: skip
+    plant: str,
+    model: str,
+    seconds_of_data: float,
+    starts: int,
+    seed: int,
+    estimator: str = "extended",
+    recover: str = "swing-up",
+    push: float = 0.0,
+) -> SwingUpTask:
     """Checks the arguments of a command before anything is written; errors are one line."""
     chosen = desktop_plant(plant)
     if model not in MODELS:
         raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
+    require_recovery(recover)
     require_positive(starts=starts)
     require_seed(seed)
     if not LEAST_SECONDS <= seconds_of_data < np.inf:
         raise InputError(f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: six episodes")
     require_memory(f"{seconds_of_data:.3g} s of motion at 500 Hz", 1000.0 * 500 * seconds_of_data)
-    return SwingUpTask(chosen, NAMES[plant], model, seconds_of_data, estimator, starts, seed)
+    pushed = push_at_half(chosen.layout, push)
+    return SwingUpTask(chosen, NAMES[plant], model, seconds_of_data, estimator, starts, seed, recover, pushed)
 
 
 def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, float]:
@@ -91,7 +108,11 @@ def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, flo
         process = from_log(got.dynamics, recording, actuation=plant.layout.actuation, delay=late).process
     estimator = estimator_of(task.estimator, plant.layout, process, delay=late)
     law = law_of(plant, got.dynamics, estimator)
-    tried = try_starts(plant, got.dynamics, starts=task.starts, seed=task.seed, estimator=estimator)
+    if task.recover == "plans":
+        estimator = by_receding_plans(plant, got.dynamics, law, estimator)
+    tried = try_starts(
+        plant, got.dynamics, starts=task.starts, seed=task.seed, estimator=estimator, push=task.push
+    )  # fmt: skip
     metrics = {
         "learning_seconds": got.seconds,
         "torque_nmse": errors.torque_nmse,
@@ -104,6 +125,14 @@ def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, flo
     if figures:
         draw(task, got.dynamics, estimator, folder)
     return metrics
+
+
+def by_receding_plans(plant: DesktopPlant, model: Dynamics, law: SwingUp, estimator: Estimator) -> Estimator:
+    """The estimator, with receding plans and the law's regulator in place of any law."""
+    layout, upright = plant.layout, upright_for(plant, model)
+    settings = plant.numbers
+    states = recovering(upright, layout, scales_of(upright, layout), settings, law.regulator, settings.level)
+    return lambda _: estimator(states)
 
 
 def metrics_of(tried: Tried) -> dict[str, float]:
@@ -136,8 +165,9 @@ def summarise(task: SwingUpTask, got: Obtained, metrics: dict[str, float]) -> No
         f"{metrics['equilibrium_offset_rad']:.2g} rad off"
     )
     failed = f", {metrics['not_finite']:.0f} not finite" if metrics["not_finite"] else ""
+    pushed = "" if task.push is None else f", pushed after {task.push.seconds:g} s"
     print(
-        f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s{failed}: median "
+        f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s{pushed}{failed}: median "
         f"{metrics['median_seconds']:.2f} s, worst {metrics['worst_seconds']:.2f} s"
     )
 
@@ -145,7 +175,7 @@ def summarise(task: SwingUpTask, got: Obtained, metrics: dict[str, float]) -> No
 def draw(task: SwingUpTask, model: Dynamics, estimator: Estimator, folder: Path) -> None:
     """Writes a figure of some runs, and an animation of the first."""
     plant, lab = task.plant, task.plant.hardware
-    runs = some_runs(plant, model, estimator, min(task.starts, MOST_SHOWN), task.seed)
+    runs = some_runs(task, model, estimator, min(task.starts, MOST_SHOWN))
     unit, limits = UNITS[task.name], (lab.lower, lab.upper)
     energy = passive_energy(without_friction(model), parts_of(plant.scene.needs.actuation), np.zeros(2))
     of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
@@ -159,15 +189,16 @@ def draw(task: SwingUpTask, model: Dynamics, estimator: Estimator, folder: Path)
         drawing = rotary_pendulum_drawing(sizes["arm_length"], sizes["pole_length"])
     else:
         drawing = cart_pole_drawing(sizes["length"])
-    last = int(np.searchsorted(t, FILMED))
+    last = int(np.searchsorted(t, FILMED if task.push is None else task.push.seconds + FILMED))
     write_closed_loop_gif(
         folder / "swing-up.gif", drawing, t[:last], runs.x[0, :last, :2], runs.u[0, :last, 0],
         limits=limits, unit=unit,
     )  # fmt: skip
 
 
-def some_runs(plant: DesktopPlant, model: Dynamics, estimator: Estimator, count: int, seed: int) -> ClosedLoopRun:
+def some_runs(task: SwingUpTask, model: Dynamics, estimator: Estimator, count: int) -> ClosedLoopRun:
     """The first `count` of the runs that were tried, [count, N]."""
-    run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0, estimator=estimator)))
+    plant, seed, seconds = task.plant, task.seed, 6.0 if task.push is None else SECONDS
+    run = jax.jit(jax.vmap(motion_of(plant, model, seconds=seconds, estimator=estimator, push=task.push)))
     runs = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))
     return jax.tree.map(np.asarray, runs)

@@ -1,8 +1,7 @@
 """Recovery of the board's plants by model predictive control, whose model is identified on the way.
 
-The plan from hanging is followed first. Then, every `every` samples, `control.mpc` improves plans over the coming
-seconds from the present state, each from its own first guess, and the one with the lowest cost acts. A regulator holds
-the goal where its value is below a level.
+The plan from hanging is followed first. Then `control.receding` plans from three first guesses, every `every` samples,
+and a regulator holds the goal where its value is below a level.
 
 Nine numbers determine the motion of two links: with the known length l1,
 
@@ -27,7 +26,7 @@ from dln_jax.control import (
     error,
     field_of,
     first_plan,
-    mpc,
+    receding,
     sampled_lqr,
     saturated,
     with_differences,
@@ -80,6 +79,14 @@ class Replanning(NamedTuple):
     """Amplitudes of the first guesses, N m: torques with the frequency of a small swing."""
     identified: bool = True
     """Whether the model is identified on the way."""
+
+
+class Model(NamedTuple):
+    """What is identified on the way: cost to go and gains of the regulator, and the nine numbers."""
+
+    S: Array
+    K: Array
+    p: Array
 
 
 class Estimate(NamedTuple):
@@ -199,40 +206,36 @@ def replanning(
     planned, last = follower(motor, weights, plan), OF_PLAN * len(plan.u)
     centre, size = nominal()
     driven = {"shoulder": 0, "elbow": 1}[motor]
-    start = first_plans(problem(field_for(jnp.asarray(centre), B), numbers), numbers)
+    off = lambda x: error(x, jnp.asarray(GOAL), joints)  # noqa: E731
 
-    def again(plans: Plan, x: Array, p: Array) -> tuple[Plan, Array]:
-        act = mpc(problem(field_for(p, B), numbers), step_lengths=0.5 ** np.arange(5))
-        u, plans = jax.vmap(act, in_axes=(None, 0))(x, plans)
-        best = jnp.argmin(jnp.where(jnp.isfinite(plans.cost), plans.cost, jnp.inf))
-        return plans, u[best]
+    def near(x: Array, model: Model) -> Array:
+        friction = model.p[6 + driven] * jnp.arctan(100 * x[2 + driven]) * numbers.identified
+        return saturated(friction - model.K @ off(x), -LIMIT, LIMIT)
 
-    def riccati(S: Array, p: Array) -> tuple[Array, Array]:
-        """One iteration towards the sampled regulator of the identified model: S and K."""
+    again = receding(
+        lambda model: problem(field_for(model.p, B), numbers), first_plans(problem(known, numbers), numbers), near,
+        lambda x, model: off(x) @ model.S @ off(x), numbers.level, rate=RATE, every=numbers.every,
+        parameters=Model(jnp.asarray(regulator.S), jnp.asarray(regulator.K), jnp.asarray(centre)),
+    )  # fmt: skip
+
+    def renewed(model: Model, p: Array) -> Model:
+        """One iteration towards the sampled regulator of the identified model."""
         smooth = field_for(jnp.concatenate([p[:6], jnp.zeros(2), p[8:]]), B)
         step = lambda x, u: runge_kutta(CLASSICAL, lambda t, x: smooth(x, u))(0.0, x, 1 / RATE)  # noqa: E731
         A, b = jax.jacfwd(step, (0, 1))(jnp.asarray(GOAL), jnp.zeros(1))
-        R = control_cost / RATE + b.T @ S @ b
-        K = (b.T @ S @ A) / R
-        return STATE_COST / RATE + A.T @ S @ (A - b @ K), K
+        R = control_cost / RATE + b.T @ model.S @ b
+        K = (b.T @ model.S @ A) / R
+        return Model(STATE_COST / RATE + A.T @ model.S @ (A - b @ K), K, p)
 
     def act(memory: tuple[Any, ...], t: Array, y: Array) -> tuple[tuple[Any, ...], Array]:
-        inner, number, plans, held, S, p = memory
+        number, inner, later = memory
         inner, by_plan = planned.act(inner, t, y)
-        due = (number >= last) & (number % numbers.every == 0)
-        plans, held = jax.lax.cond(due, again, lambda plans, y, p: (plans, held), plans, y, p)
-        S, K = riccati(S, p) if numbers.identified else (S, regulator.K)
-        off = error(y, jnp.asarray(GOAL), joints)
-        friction = p[6 + driven] * jnp.arctan(100 * y[2 + driven]) * numbers.identified
-        near = friction - K @ off
-        u = jnp.where(number < last, by_plan, jnp.where(off @ S @ off <= numbers.level, near, held))
-        u = saturated(u, -LIMIT, LIMIT)
-        return (inner, number + 1, plans, held, S, p), u
+        begun = number >= last
+        later, u = jax.lax.cond(begun, again.act, lambda later, t, y: (later, by_plan), later, t, y)
+        return (number + 1, inner, later), saturated(u, -LIMIT, LIMIT)
 
-    inside = Controller(
-        (planned.start, jnp.asarray(0), start, jnp.zeros(1), jnp.asarray(regulator.S), jnp.asarray(centre)), act
-    )
     step = lambda x, u: runge_kutta(MIDPOINT, lambda t, x: known(x, u))(0.0, x, 1 / RATE)  # noqa: E731
+    inside = Controller((jnp.asarray(0), planned.start, again.start), act)
     predicting = with_prediction(inside, step, states=4, controls=1, max_delay=LONGEST)
     seeing = with_differences(predicting, 2, rate=RATE, cutoff=CUTOFF, order=2)
 
@@ -240,8 +243,9 @@ def replanning(
         estimate, u, (rates, late) = memory
         if numbers.identified:
             estimate = updated(motor, estimate, y[:2], u, late.delay, late.moved)
-            p = jnp.asarray(centre) + size * estimate.numbers
-            late = late._replace(inner=(*late.inner[:-1], p))
+            *before, later = late.inner
+            model = renewed(later.parameters, jnp.asarray(centre) + size * estimate.numbers)
+            late = late._replace(inner=(*before, later._replace(parameters=model)))
         inner, u = seeing.act((rates, late), t, y[:2])
         return (estimate, u, inner), u
 

@@ -33,6 +33,8 @@ def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
         (("--model", "feed-forward"), "choose from"),
         (("--seconds-of-data", 1), "expected at least 12 s"),
         (("--estimator", "luenberger"), "choose from"),
+        (("--recover", "never"), "choose from swing-up, plans"),
+        (("--push", "inf"), "--push is inf; expected a finite number"),
         (("--starts", 0), "starts is 0"),
         (("--seed", -1), "seed is -1"),
     ],

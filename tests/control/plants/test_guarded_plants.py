@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from dln_jax.control import Controller, Push
 from dln_jax.control.plants import Plant, Stopped, guarded, hardware_plant, layout
-from dln_jax.control.plants.runs import PlantRun, judged_runs
+from dln_jax.control.plants.runs import PlantRun, compiled, judged_runs, run, start_of
 from dln_jax.types import InputError
 
 HALF_PI = np.pi / 2
@@ -156,3 +157,17 @@ def test_up_is_near_the_goal_for_the_last_second_without_a_stop():
     trials = judged_runs(runs, plant, seconds=5.0)
     np.testing.assert_array_equal(trials.up, [True, False, False, False])
     assert trials.seconds[0] == pytest.approx(2.0) and trials.stopped == ("rail",)
+
+
+def test_a_push_reaches_the_plant_at_its_sample():
+    puppet, still = Puppet(), Controller(np.zeros(()), lambda memory, t, y: (memory, np.zeros(1)))
+    kicks = []
+    plant = Plant(puppet.layout, lambda: None, lambda: puppet.q, puppet.act, lambda: puppet.t)
+    kicked = plant._replace(kick=lambda rates: kicks.append((puppet.t, rates)))
+    act, push = compiled(still, puppet.layout), Push(0.05, [0.0, 3.0])
+    run([kicked], act, start_of(still, 1), seconds=0.1, push=push)
+    ((t, rates),) = kicks
+    assert t == pytest.approx(0.05)
+    np.testing.assert_array_equal(rates, [0.0, 3.0])
+    with pytest.raises(InputError, match="no kick"):
+        run([plant], act, start_of(still, 1), seconds=0.1, push=push)

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.closed_loop import Hardware, simulate
+from dln_jax.control.closed_loop import Hardware, Push, simulate
 from dln_jax.control.plants import layout
 from dln_jax.control.plants.planned import INSIDE, SHARE, followed, follower, plans_of
+from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.scales import USUAL, circle, scales_of, swing_up_numbers
 from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.state_space import field_of
@@ -73,3 +74,21 @@ def test_a_plant_that_was_not_at_rest_hangs_first_and_then_swings_up(planned):
         run = simulated(planned, start)
         assert np.abs(np.remainder(run.x[-100:, 1] + np.pi, 2 * np.pi) - np.pi).max() < 0.05
         assert np.abs(run.x[:, 0]).max() < 0.6
+
+
+@pytest.mark.slow
+def test_receding_plans_swing_up_and_recover_within_the_rail():
+    plant = rail(8.0)
+    upright, scales = scaled(plant)
+    settings, regulator = swing_up_numbers(upright, plant, scales, USUAL)
+    controller = recovering(upright, plant, scales, settings, regulator, settings.level)
+    push = Push(3.0, [0.0, 12.0])
+    run = jax.jit(
+        lambda x: simulate(
+            field_of(MODEL, plant.actuation), controller, x, seconds=6.0, rate=100.0, controls=1,
+            hardware=Hardware(-8.0, 8.0), push=push,
+        )
+    )(jnp.array([0.0, np.pi + 0.1, 0.0, 0.0]))  # fmt: skip
+    away = np.abs(np.remainder(run.x[:, 1] + np.pi, 2 * np.pi) - np.pi)
+    assert away[250:300].max() < 0.05 and away[300:450].max() > 2 and away[-50:].max() < 0.05
+    assert np.abs(run.x[:, 0]).max() < 0.6

@@ -123,3 +123,8 @@ def test_a_plant_is_identified_from_motions_that_no_model_planned():
     assert np.abs(recording.q[:, 0]).max() <= 0.8
     truth = model().mass_matrix(jnp.zeros(2))
     np.testing.assert_allclose(fit(recording).mass_matrix(jnp.zeros(2)), truth, rtol=0.05)
+
+
+def test_an_unknown_recovery_is_refused():
+    with pytest.raises(InputError, match="choose from swing-up, plans"):
+        tune(model(), rail(), recover="never")

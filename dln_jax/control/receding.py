@@ -1,0 +1,104 @@
+"""Receding plans: recovery from any state, such as after a push, by predictive control that plans again on the way.
+
+Where the regulator's cost to go is below a level, the regulator acts and nothing is planned. Elsewhere a set of plans
+is improved in every step of the horizon by `real_time.prepare`, and the cheapest acts: its control and its gains,
+about the states that it expects within the step. When the state leaves the region, all plans start again from there
+with the controls of their first guesses; a plan that is not finite starts again in any step.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from dln_jax.control.closed_loop import Controller
+from dln_jax.control.real_time import feedback, prepare
+from dln_jax.control.state_space import where_finite
+from dln_jax.control.trajectories import Plan, first_plan
+from dln_jax.types import require_positive
+
+LENGTHS = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Step lengths of an iteration."""
+DAMPING = (1e-5, 10.0)
+"""Range of the damping before an iteration: a plan that moves with the plant cannot wait until a smaller one grows."""
+RENEWING = 5
+"""Iterations on plans that start again where the regulator's region ends."""
+
+
+class Receding(NamedTuple):
+    """Memory of a controller by receding plans."""
+
+    near: Bool[Array, ""]
+    """Whether the regulator acts."""
+    plans: Plan
+    """For the next step, along a leading axis."""
+    acting: tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " n"], Float[Array, " n"]]
+    """Control and gains of the present step, and the states expected at its start and its end."""
+    parameters: Any
+
+
+def receding(
+    problem: Any,
+    plans: Plan,
+    near: Callable[..., Array],
+    cost: Callable[..., Array],
+    level: Any,
+    *,
+    rate: float,
+    every: int,
+    parameters: Any = None,
+) -> Controller:
+    """Returns the controller x [n] -> u [m].
+
+    Args:
+        problem: over the horizon, in steps of `every` samples.
+        plans: first guesses along a leading axis, such as of `jax.vmap(first_plan)`; their controls count.
+        near: x -> u of the regulator.
+        cost: x -> cost to go, such as `value(regulator, goal, joints)`.
+        level: cost to go up to which the regulator acts.
+        rate: of the samples, Hz.
+        every: samples in a step.
+        parameters: tree of arrays that another controller changes on the way, in the memory; by default none. With it,
+            `problem` is a function of them, and `near` and `cost` take them as a last argument.
+
+    Raises:
+        InputError: a rate or a number that is not positive, or a problem that `improve` refuses.
+    """
+    require_positive(rate=rate, every=every)
+
+    def planned(memory: Receding, x: Array) -> Receding:
+        now = problem if memory.parameters is None else problem(memory.parameters)
+        fresh = jax.vmap(lambda u: first_plan(now, x, u))(plans.u)
+        going = memory.plans._replace(damping=jnp.clip(memory.plans.damping, *DAMPING))
+        again = memory.near | ~(jnp.isfinite(going.cost) & jnp.isfinite(going.K).all(axis=(1, 2, 3)))
+        chosen = jax.vmap(lambda again, *pair: jax.tree.map(lambda new, old: jnp.where(again, new, old), *pair))
+        started = chosen(again, fresh, going)
+        controls = jax.vmap(lambda plan: feedback(now, plan, x))(started)
+        # A number in place of a condition: under `vmap` it is one unless a lane starts again.
+        turns = jnp.where(memory.near, RENEWING, 1)
+        after = jax.vmap(lambda plan: prepare(now, plan, x, iterations=turns, step_lengths=LENGTHS))(started)
+        best = jnp.argmin(jnp.where(jnp.isfinite(after.cost), after.cost, jnp.inf))
+        acting = controls[best], started.K[best, 0], x, after.x[best, 0]
+        return memory._replace(near=jnp.zeros_like(memory.near), plans=after, acting=acting)
+
+    def act(memory: Receding, t: Array, x: Array) -> tuple[Receding, Array]:
+        last = () if memory.parameters is None else (memory.parameters,)
+        now = problem if memory.parameters is None else problem(memory.parameters)
+        within = cost(x, *last) <= level
+        # By the time, which all lanes of a `vmap` share: with a counter in the memory they would plan at every sample.
+        number = jnp.round(t * rate).astype(int) % every
+        # The regulator takes over at any sample, and a plan at the start of a step.
+        kept = lambda memory, x: memory  # noqa: E731
+        if_away = lambda memory, x: jax.lax.cond(within, kept, planned, memory, x)  # noqa: E731
+        memory = jax.lax.cond(number == 0, if_away, kept, memory, x)
+        memory = memory._replace(near=memory.near | within)
+        u, K, begin, end = memory.acting
+        along = u + K @ (x - begin - number / every * (end - begin))
+        u = jnp.where(memory.near, near(x, *last), jnp.clip(along, now.lower, now.upper))
+        return memory, where_finite(u, x)
+
+    x, u, K = plans.x[0, 0], plans.u[0, 0], plans.K[0, 0]
+    return Controller(Receding(jnp.asarray(True), plans, (u, K, x, x), parameters), act)
