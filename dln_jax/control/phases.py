@@ -20,7 +20,8 @@ from dln_jax.control.interior_point import Search, Trial, search, started
 from dln_jax.solvers.ending import Ending
 
 RESTORING = 1e-6
-"""Weight of the cost where violations are minimised: it decides between points of equal violation."""
+"""Weight of the cost where violations are minimised: it decides between points of equal violation. Constraints whose
+multipliers are below its inverse are met if they can be."""
 PRICE = 10.0
 """Price of the limits of states in the sum of violations; that of other constraints is one."""
 STATIONARY = 1e-6

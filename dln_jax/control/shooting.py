@@ -79,22 +79,28 @@ def shoot(
 ) -> Shooting:
     """Returns a locally optimal trajectory near a guess, by multiple shooting; traceable.
 
+    Saddles are left, and where the search gives up outside hard constraints, another one restores them or shows that
+    the problem is locally infeasible (see `control.phases`). The plan of `Ending.INFEASIBLE` has the least violation
+    nearby; its residuals and multipliers are those of the sum of violations.
+
     Args:
         problem: to solve.
         x: initial state [n].
         states: guess [N+1, n], whose first is replaced by the initial state; it need not be a motion.
         u: guess [N, m].
-        iterations: largest number of iterations.
+        iterations: largest number of iterations of a search; leaving a saddle and restoring constraints are searches
+            of their own.
         tolerance: of stationarity, feasibility and complementarity, with the cost scaled so that its derivatives at the
             guess are at most 100. Stationarity and complementarity are divided by a hundredth of the mean multiplier
             if that is above one.
-        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton, which
+            does not recognise saddles.
         starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: the
             least cost within the constraints, or else the least violation.
 
     Raises:
-        InputError: shapes that do not agree, settings that are not positive, crossed limits, or a start outside the
-            limits of the states or their constraints.
+        InputError: shapes that do not agree, settings that are not positive, crossed limits, a start outside the limits
+            of the states or their constraints, or a linear constraint of the end that these limits exclude.
     """
     if starts is not None:
 
@@ -133,9 +139,9 @@ def optimise(
         problem: to solve.
         x: initial state [n].
         u: initial controls [N, m].
-        iterations: largest number of iterations.
+        iterations: as for `shoot`.
         tolerance: as for `shoot`.
-        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        exact: as for `shoot`.
         starts: more guesses [G, N, m], as for `shoot`.
 
     Raises:
