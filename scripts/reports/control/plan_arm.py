@@ -1,17 +1,21 @@
 """A seven-axis arm for plans, its axes alternating between z and y, as formulas for JAX and for CasADi alike.
 
-Masses are points: the motors of the elbow, the middle of the forearm, the wrist, and a tool beside the last axis.
+Masses are points: elbow, wrist, and a tool beside the last axis.
 """
 
+from collections.abc import Callable
 from typing import Any
+
+import jax
+import jax.numpy as jnp
 
 GRAVITY = 9.81
 LINKS = (0.34, 0.40, 0.40, 0.126)
 """Lengths between base, shoulder, elbow, wrist and tip, m."""
 AXES = "zyzyzyz"
-MASSES = ((2, 3.5, (0.0, 0.0, LINKS[1])), (4, 1.5, (0.0, 0.0, LINKS[2] / 2)), (4, 2.0, (0.0, 0.0, LINKS[2])),
-          (7, 1.5, (0.05, 0.0, LINKS[3])))  # fmt: skip
-"""Number of joints before a mass, kg, and its place in their frame, m."""
+PAIRS = ((LINKS[0], 3.5, 0.0, LINKS[1]), (LINKS[1], 3.0, 0.0, LINKS[2]), (LINKS[2], 0.0, 0.0, 0.0),
+         (0.0, 1.5, 0.05, LINKS[3]))  # fmt: skip
+"""For an axis z and the next axis y: length between them, m; mass, kg, and its x and z in their frame, m."""
 TORQUES = (3.0, 30.0, 12.0, 12.0, 2.0, 2.0, 0.6)
 """Limits of the torques, N m."""
 OBSTACLE, RADIUS = (0.55, 0.0, 0.45), 0.16
@@ -49,12 +53,6 @@ def turned(frame: list[Vector], axis: str, c: Any, s: Any) -> list[Vector]:
     return [add(scaled(c, x), scaled(-s, z)), y, add(scaled(c, z), scaled(s, x))]
 
 
-def placed(frame: list[Vector], place: Any) -> Vector:
-    """A vector of a frame in the frame of the base."""
-    x, y, z = (scaled(p, axis) for p, axis in zip(place, frame, strict=True))
-    return add(add(x, y), z)
-
-
 def points(f: Any, q: Any) -> list[Vector]:
     """Elbow, wrist and tip."""
     frame, at, ends = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [0.0, 0.0, LINKS[0]], []
@@ -79,38 +77,54 @@ def tip_error(f: Any, x: Any) -> Any:
     return dot(d, d)
 
 
+def repeated(f: Any, step: Callable[..., tuple[Any, Any]], state: Any, rows: list[list[Any]]) -> list[Any]:
+    """The outputs of (state, row) -> state, output for some rows: by a scan in JAX, so that it is compiled once."""
+    if f is jnp:
+        state = jax.tree.map(lambda number: jnp.asarray(number, float), state)
+        columns = jnp.stack([jnp.stack([jnp.asarray(number, float) for number in row]) for row in rows])
+        outputs = jax.lax.scan(step, state, columns)[1]
+        return [jax.tree.map(lambda numbers, k=k: numbers[k], outputs) for k in range(len(rows))]
+    outputs = []
+    for row in rows:
+        state, output = step(state, row)
+        outputs.append(output)
+    return outputs
+
+
 def torques(f: Any, x: Any, qdd: Any) -> list[Any]:
     """The torques of accelerations, by Newton's and Euler's equations from the base to the tip."""
-    frame, at = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [0.0, 0.0, 0.0]
-    # The base accelerates upwards: that is weight.
-    turn, spin, moved = [0.0] * 3, [0.0] * 3, [0.0, 0.0, GRAVITY]
 
-    def away(r: Vector) -> Vector:
+    def away(turn: Vector, spin: Vector, moved: Vector, r: Vector) -> Vector:
         return add(moved, add(cross(spin, r), cross(turn, cross(turn, r))))
 
-    joints, loads = [], []
-    for i, axis in enumerate(AXES):
-        if i in (1, 3, 5):  # shoulder, elbow and wrist
-            r = scaled(LINKS[i // 2], frame[2])
-            moved, at = away(r), add(at, r)
-        w = frame[2] if axis == "z" else frame[1]
-        joints.append((w, at))
-        spin = add(spin, add(scaled(qdd[i], w), cross(turn, scaled(x[7 + i], w))))
-        turn = add(turn, scaled(x[7 + i], w))
-        frame = turned(frame, axis, f.cos(x[i]), f.sin(x[i]))
-        for number, mass, place in MASSES:
-            if number == i + 1:
-                r = placed(frame, place)
-                force = scaled(mass, away(r))
-                loads.append((i, force, cross(add(at, r), force)))
-    tau = []
-    for j, (w, at) in enumerate(joints):
-        force, moment = [0.0] * 3, [0.0] * 3
-        for i, one, about in loads:
-            if i >= j:
-                force, moment = add(force, one), add(moment, about)
-        tau.append(dot(w, add(moment, scaled(-1, cross(at, force)))))
-    return tau
+    def pair(state: Any, row: Any) -> tuple[Any, Any]:
+        frame, at, turn, spin, moved = state
+        length, mass, side, ahead, *motion = [row[i] for i in range(10)]
+        output = []
+        for axis, i in (("z", 0), ("y", 1)):
+            w = frame[2] if axis == "z" else frame[1]
+            output.append((w, at))
+            spin = add(spin, add(scaled(motion[4 + i], w), cross(turn, scaled(motion[2 + i], w))))
+            turn = add(turn, scaled(motion[2 + i], w))
+            frame = turned(frame, axis, f.cos(motion[i]), f.sin(motion[i]))
+            if axis == "z":
+                r = scaled(length, frame[2])
+                moved, at = away(turn, spin, moved, r), add(at, r)
+        r = add(scaled(side, frame[0]), scaled(ahead, frame[2]))
+        force = scaled(mass, away(turn, spin, moved, r))
+        return (frame, at, turn, spin, moved), (output, force, cross(add(at, r), force))
+
+    # The last axis has no partner.
+    motion = [[*(column[i] for i in range(7)), 0.0] for column in (x, [x[7 + i] for i in range(7)], qdd)]
+    rows = [[*numbers, *(column[2 * k + i] for column in motion for i in (0, 1))] for k, numbers in enumerate(PAIRS)]
+    base = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    # The base accelerates upwards: that is weight.
+    start = base, [0.0] * 3, [0.0] * 3, [0.0] * 3, [0.0, 0.0, GRAVITY]
+    tau, force, moment = [], [0.0] * 3, [0.0] * 3
+    for axes, one, about in reversed(repeated(f, pair, start, rows)):
+        force, moment = add(force, one), add(moment, about)
+        tau += [dot(w, add(moment, scaled(-1, cross(at, force)))) for w, at in reversed(axes)]
+    return tau[:0:-1]
 
 
 def beyond_torques(f: Any, x: Any, qdd: Any) -> list[Any]:
