@@ -108,13 +108,13 @@ def shoot(
             return shoot(problem, x, states, u, iterations=iterations, tolerance=tolerance, exact=exact)
 
         return _best(jax.vmap(one)(*_with_first((states, u), starts)), tolerance)
-    given = x
+    start = x
     x, states, u = (jnp.asarray(array, float) for array in (x, states, u))
     if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
         raise InputError(
             f"x has shape {x.shape}, states {states.shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]"
         )
-    require_start(problem, given)
+    require_start(problem, start)
     inside = _inside(states, problem.lower_x, problem.upper_x, "states")
     first = x if problem.free is None else jnp.where(jnp.asarray(problem.free), inside[0], x)
     u = _inside(u, problem.lower, problem.upper, "controls")
