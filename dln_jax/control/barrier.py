@@ -21,10 +21,10 @@ class Inequalities(NamedTuple):
     """Masks [M] and weights of the inequalities."""
 
     present: Array
-    elastic: Array | None
-    """Those that are soft; None if none is."""
-    linear: Any = 0.0
-    square: Any = 0.0
+    elastic: Array
+    """Those that are soft."""
+    linear: Any
+    square: Any
 
 
 class Iterate(NamedTuple):
@@ -61,18 +61,15 @@ def gaps(of: Inequalities, at: Iterate, values: Values) -> Array:
 def measure(of: Inequalities, at: Iterate, values: Values, barrier: Array) -> tuple[Array, Array]:
     """Sum of the violations, and barrier function, infinite where it is not finite."""
     violation = jnp.sum(jnp.abs(jnp.concatenate([values.defects.ravel(), values.h, gaps(of, at, values)])))
+    price = of.linear * at.t + of.square * at.t**2 / 2 - barrier * jnp.log(at.t)
     phi = values.cost - barrier * jnp.sum(jnp.where(of.present, jnp.log(at.s), 0.0))
-    if of.elastic is not None:
-        price = of.linear * at.t + of.square * at.t**2 / 2 - barrier * jnp.log(at.t)
-        phi = phi + jnp.sum(jnp.where(of.elastic, price, 0.0))
+    phi = phi + jnp.sum(jnp.where(of.elastic, price, 0.0))
     return violation, jnp.where(jnp.isfinite(phi), phi, jnp.inf)
 
 
 def slope(of: Inequalities, at: Iterate, slopes: Slopes, step: Iterate, barrier: Array) -> Array:
     """Derivative of the barrier function along a step."""
     fall = along(slopes, step.x, step.u)[0] - barrier * jnp.sum(jnp.where(of.present, step.s / at.s, 0.0))
-    if of.elastic is None:
-        return fall
     return fall + jnp.sum(jnp.where(of.elastic, (of.linear + of.square * at.t - barrier / at.t) * step.t, 0.0))
 
 
@@ -82,10 +79,8 @@ def residuals(
     """Residuals at a barrier, plain and divided by a hundredth of the mean multiplier where that is above one."""
     gradient = stationarity(slopes, at.prices, at.z, at.nu, free)
     products = jnp.where(of.present, at.s * at.z - barrier, 0.0)
-    if of.elastic is not None:
-        by_t = jnp.where(of.elastic, of.linear + of.square * at.t - at.z - at.y, 0.0)
-        gradient = jnp.append(gradient, by_t)
-        products = jnp.append(products, jnp.where(of.elastic, at.t * at.y - barrier, 0.0))
+    gradient = jnp.append(gradient, jnp.where(of.elastic, of.linear + of.square * at.t - at.z - at.y, 0.0))
+    products = jnp.append(products, jnp.where(of.elastic, at.t * at.y - barrier, 0.0))
     unmet = jnp.concatenate([values.defects.ravel(), values.h, gaps(of, at, values)])
     plain = Residuals(*(jnp.max(jnp.abs(r), initial=0.0) for r in (gradient, unmet, products)))
     of_rows, number = jnp.sum(at.z) + jnp.sum(at.y), jnp.maximum(jnp.sum(of.present), 1)
@@ -102,11 +97,9 @@ def newton(
     """Returns the step that removes the residuals of the constraints, as a solution and as a change of the iterate."""
     stiff = at.z / at.s
     drive = jnp.where(of.present, barrier / at.s, 0.0) - at.z + stiff * gap
-    give, off = jnp.zeros_like(at.t), jnp.zeros_like(at.t)
-    if of.elastic is not None:
-        give = jnp.where(of.elastic, 1 / (of.square + at.y / at.t), 0.0)
-        off = jnp.where(of.elastic, of.linear + of.square * at.t - at.z - barrier / at.t, 0.0)
-        drive, stiff = (drive + stiff * give * off) / (1 + stiff * give), stiff / (1 + stiff * give)
+    give = jnp.where(of.elastic, 1 / (of.square + at.y / at.t), 0.0)
+    off = jnp.where(of.elastic, of.linear + of.square * at.t - at.z - barrier / at.t, 0.0)
+    drive, stiff = (drive + stiff * give * off) / (1 + stiff * give), stiff / (1 + stiff * give)
     horizon = program(slopes, curvatures, at.z + drive, stiff, unmet.defects, damping)
     horizon = horizon._replace(
         end_gradient=horizon.end_gradient + slopes.h.T @ (at.nu + unmet.h / END_COMPLIANCE),
@@ -116,9 +109,7 @@ def newton(
     _, of_c, of_h = along(slopes, change.dx, change.du)
     dz = drive + stiff * of_c
     dt = give * (dz - off)
-    dy = jnp.zeros_like(dt)
-    if of.elastic is not None:
-        dy = jnp.where(of.elastic, (barrier - at.y * dt) / at.t - at.y, 0.0)
+    dy = jnp.where(of.elastic, (barrier - at.y * dt) / at.t - at.y, 0.0)
     prices, nu = change.multipliers - at.prices, (unmet.h + of_h) / END_COMPLIANCE
     return change, Iterate(change.dx, change.du, prices, nu, dt - gap - of_c, dz, dt, dy)
 
@@ -126,8 +117,8 @@ def newton(
 def to_boundary(of: Inequalities, at: Iterate, step: Iterate, share: Array) -> tuple[Array, Array]:
     """Longest lengths, at most one, that keep a share of the distance of s and t, and of z and y, from zero."""
 
-    def longest(*pairs: tuple[Array, Array, Array | None]) -> Array:
-        fastest = [jnp.max(jnp.where(mask, -d / v, 0.0), initial=0.0) for v, d, mask in pairs if mask is not None]
+    def longest(*pairs: tuple[Array, Array, Array]) -> Array:
+        fastest = [jnp.max(jnp.where(mask, -d / v, 0.0), initial=0.0) for v, d, mask in pairs]
         return jnp.minimum(1.0, share / jnp.maximum(jnp.max(jnp.stack(fastest)), 1e-30))
 
     return (
@@ -138,13 +129,9 @@ def to_boundary(of: Inequalities, at: Iterate, step: Iterate, share: Array) -> t
 
 def inside(of: Inequalities, values: Values, x: Array, u: Array, margin: float) -> Iterate:
     """The first iterate: slacks of at least a margin, multipliers one."""
-    s = jnp.where(of.present, jnp.maximum(-values.c, margin), 1.0)
-    t, z = jnp.zeros_like(s), jnp.where(of.present, 1.0, 0.0)
-    y = jnp.zeros_like(s)
-    if of.elastic is not None:
-        t = jnp.where(of.elastic, jnp.maximum(values.c, 0.0) + margin, 0.0)
-        s = jnp.where(of.elastic, jnp.maximum(t - values.c, margin), s)
-        y = jnp.where(of.elastic, jnp.maximum(of.linear + of.square * t - z, 1.0), 0.0)
+    t = jnp.where(of.elastic, jnp.maximum(values.c, 0.0) + margin, 0.0)
+    s, z = jnp.where(of.present, jnp.maximum(t - values.c, margin), 1.0), jnp.where(of.present, 1.0, 0.0)
+    y = jnp.where(of.elastic, jnp.maximum(of.linear + of.square * t - z, 1.0), 0.0)
     return Iterate(x, u, jnp.zeros_like(values.defects), jnp.zeros_like(values.h), s, z, t, y)
 
 
@@ -154,5 +141,4 @@ def guarded(of: Inequalities, at: Iterate, barrier: Array, spread: float) -> Ite
     def within(z: Array, s: Array, mask: Array) -> Array:
         return jnp.where(mask, jnp.clip(z, barrier / (spread * s), spread * barrier / s), 0.0)
 
-    at = at._replace(z=within(at.z, at.s, of.present))
-    return at if of.elastic is None else at._replace(y=within(at.y, at.t, of.elastic))
+    return at._replace(z=within(at.z, at.s, of.present), y=within(at.y, at.t, of.elastic))

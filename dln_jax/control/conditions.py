@@ -3,7 +3,8 @@
     L = sum_k l(x_k, u_k) + l_N(x_N) + sum_k λ_{k+1}·(f(x_k, u_k) - x_{k+1}) + z·c + ν·h(x_N),   c <= 0, h = 0
 
 c stacks limits of controls, path constraints, limits of states and constraints on states, first of the steps, then of
-the end. The limits and constraints of a fixed first state are left out: no control changes them.
+the end. The limits and constraints of a fixed first state are left out: no control changes them. h and -h follow as
+rows that take the place of h = 0 where violations are minimised.
 """
 
 from collections.abc import Callable
@@ -27,7 +28,7 @@ class Values(NamedTuple):
 
     cost: Float[Array, ""]
     c: Float[Array, " M"]
-    """Inequalities, negative inside."""
+    """Inequalities, negative inside, then h and -h."""
     defects: Float[Array, "N n"]
     h: Float[Array, " q"]
     """Equations of the end."""
@@ -50,6 +51,8 @@ class Kinds(NamedTuple):
     present: Bool[Array, " M"]
     """Limits that are finite, at states that are unknowns."""
     soft: Bool[Array, " M"]
+    controls: Bool[Array, " M"]
+    """Limits of the controls."""
 
 
 def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
@@ -97,13 +100,17 @@ def constraints(problem: TrajectoryProblem, n: int, m: int) -> tuple[Rows, Rows,
         limits_u, limits_x = finite_u(m), finite_x(n)
         path, states, end = size(problem.path, n, m), size(problem.states, n), size(problem.end_below, n)
         yes, no = (lambda number: jnp.ones(number, bool)), (lambda number: jnp.zeros(number, bool))
-        present = jnp.concatenate([limits_u, yes(path), limits_x, yes(states)])
-        soft = jnp.concatenate([no(len(limits_u)), yes(path), no(len(limits_x)), yes(states)])
-        present, soft = jnp.tile(present, (steps, 1)), jnp.tile(soft, (steps, 1))
-        present = present.at[0, len(limits_u) + path :].set(False)
-        end_present = jnp.concatenate([limits_x, yes(states + end)])
-        end_soft = jnp.concatenate([no(len(limits_x)), yes(states + end)])
-        return Kinds(*(jnp.concatenate([a.ravel(), b]) for a, b in ((present, end_present), (soft, end_soft))))
+        u, x = len(limits_u), len(limits_x)
+
+        def every(of_step: list[Array], of_end: list[Array]) -> Array:
+            rows = jnp.tile(jnp.concatenate(of_step), (steps, 1)).at[0, u + path :].set(False)
+            return jnp.concatenate([rows.ravel(), *of_end])
+
+        return Kinds(
+            every([limits_u, yes(path), limits_x, yes(states)], [limits_x, yes(states + end)]),
+            every([no(u), yes(path), no(x), yes(states)], [no(x), yes(states + end)]),
+            every([yes(u), no(path + x + states)], [no(x + states + end)]),
+        )
 
     return step_rows, end_rows, kinds
 
@@ -116,17 +123,30 @@ class Conditions(NamedTuple):
     curvatures: Callable[[Array, Array, Array, Array, Array], tuple[Array, Array]]
     """(x, u, prices, z, nu) -> Hessians of L by steps [N, n+m, n+m] and of the end [n, n]."""
     kinds: Kinds
+    """Of the rows but the last, h and -h."""
 
 
-def conditions(problem: TrajectoryProblem, shape: tuple[int, int, int], scale: Array, exact: bool) -> Conditions:
-    """Returns the functions for N steps of n states and m controls; Gauss-Newton unless `exact`: costs curve alone."""
+def conditions(
+    problem: TrajectoryProblem, shape: tuple[int, int, int], scale: Array, exact: bool, held: Array
+) -> Conditions:
+    """Returns the functions for N steps of n states and m controls; Gauss-Newton unless `exact`: costs curve alone.
+
+    `held` is one, or zero where the equations of the end are left to the rows h and -h.
+    """
     steps, n, m = shape
-    step_rows, end_rows, kinds = constraints(problem, n, m)
-    equal = problem.end if problem.end is not None else (lambda x, *knot: jnp.zeros(0, x.dtype))
+    step_rows, below, kinds = constraints(problem, n, m)
+    end = problem.end if problem.end is not None else (lambda x, *knot: jnp.zeros(0, x.dtype))
     knots, last = knots_of(problem)
 
     def of_both(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda xu, *rest: function(xu[:n], xu[n:], *rest)
+
+    def equal(x: Array, *knot: Any) -> Array:
+        return held * end(x, *knot)
+
+    def end_rows(x: Array, *knot: Any) -> Array:
+        h = end(x, *knot)
+        return jnp.concatenate([below(x, *knot), h, -h])
 
     def cost(x: Array, u: Array, *knot: Any) -> Array:
         return scale * problem.cost(x, u, *knot)

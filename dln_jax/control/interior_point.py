@@ -6,8 +6,10 @@ barrier function accepts a step, after a second-order correction where the longe
 Hessian is damped until the recursion's pivots are positive. The damping has a memory, and a search that finds no step
 raises it.
 
-There is no phase of restoration. Where inequalities cut some steps in a row short, or searches fail, slacks are
-widened: the inequalities may then be violated on the way, like the other constraints.
+Where inequalities cut some steps in a row short, or searches fail, slacks are widened: the inequalities may then be
+violated on the way, like the other constraints. A stationary point counts as a minimum if its undamped pivots are
+positive; at a saddle, the last step leads along a direction in which the Lagrangian curves down (an inverse iteration
+from noise).
 """
 
 from collections.abc import Callable
@@ -15,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from dln_jax.control.barrier import (
@@ -50,6 +53,8 @@ FILTER = 64
 SHORT, MOST_SHORT, MOST_RELEASES = 0.02, 4, 10
 """Length below which a step counts as cut short by inequalities, number of such or failed steps in a row after which
 slacks are widened, and number of times that this is done."""
+CURVATURE = 1e-6
+"""Negative curvature that still counts as none, relative to the largest second derivative if that is above one."""
 ROUNDING = 2.2e-16
 
 
@@ -58,7 +63,8 @@ class Search(NamedTuple):
 
     at: Iterate
     values: Values
-    K: Array
+    change: HorizonSolution
+    """The last step; its gains are those of the plan."""
     barrier: Array
     damping: Array
     """Memory of the damping that was needed last."""
@@ -86,18 +92,17 @@ def straight(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array
 
 
 def search(
-    of: Conditions, trial: Trial, x: Array, u: Array, *, soft: tuple[Any, Any] | None, free: Any,
-    iterations: int, tolerance: float,
-) -> Search:  # fmt: skip
-    """Runs the method from states x [N+1, n] and controls u [N, m]; soft constraints have the weights w_1, w_2."""
-    present = of.kinds.present
-    weights = (0.0, 0.0) if soft is None else soft
-    rows = Inequalities(present, None if soft is None else of.kinds.soft & present, *weights)
+    of: Conditions, rows: Inequalities, trial: Trial, start: Search, *, free: Any, iterations: int, tolerance: Any
+) -> Search:
+    """Runs the method from `started`."""
+    present, (steps, m, n) = rows.present, start.change.K.shape
+    random = np.random.default_rng(0)
+    noise, end_noise = random.normal(size=(steps, n + m)), random.normal(size=n)
 
-    def damped(solve: Callable[[Array], Any], search: Search) -> tuple[Any, Array]:
+    def damped(solve: Callable[[Array], Any], search: Search, done: Array, bent: Array) -> tuple[Any, Array]:
         """Raises the damping until the step is that of a minimum."""
         again = jnp.maximum(search.damping / 3, LEAST_DAMPING)
-        first = jnp.where(search.damping > 0, again, FIRST_DAMPING)
+        first = jnp.where(done, bent, jnp.where(search.damping > 0, again, FIRST_DAMPING))
         growth = jnp.where(search.damping > 0, 8.0, 100.0)
 
         def more(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
@@ -139,10 +144,15 @@ def search(
         share = jnp.maximum(TO_BOUNDARY, 1 - barrier)
         gap = gaps(rows, at, values)
 
-        def solve(damping: Array) -> Any:
-            return newton(rows, at, slopes, curved, barrier, values, gap, damping, free)
+        # Where all is done, the step serves to find a direction of negative curvature.
+        pulls = slopes._replace(cost=jnp.where(done, noise, slopes.cost),
+                                end_cost=jnp.where(done, end_noise, slopes.end_cost))  # fmt: skip
+        bent = CURVATURE * jnp.maximum(1.0, jnp.max(jnp.abs(curved[0])))
 
-        (change, step), damping = damped(solve, search)
+        def solve(damping: Array) -> Any:
+            return newton(rows, at, pulls, curved, barrier, values, gap, damping, free)
+
+        (change, step), damping = damped(solve, search._replace(least=jnp.where(done, 0.0, search.least)), done, bent)
         violation, phi = measure(rows, at, values, barrier)
         fall = slope(rows, at, slopes, step, barrier)
         slack = 10 * ROUNDING * jnp.abs(phi)
@@ -182,7 +192,7 @@ def search(
             return judged(other, other_step, jnp.where(correct, longest, length)), length, number + 1
 
         def unfinished(carry: Any) -> Array:
-            return ~carry[0][2] & (carry[1] > first * 2.0**-MOST_HALVINGS)
+            return ~carry[0][2] & (carry[1] > first * 2.0**-MOST_HALVINGS) & ~done
 
         untried = (at, values, jnp.asarray(False), jnp.asarray(False), violation), first, jnp.asarray(0)
         (new, at_new, good, descended, _), _, _ = jax.lax.while_loop(unfinished, attempt, untried)
@@ -197,15 +207,16 @@ def search(
         release = (short >= MOST_SHORT) & ~done
         releases = search.releases + release
         lost = ~jnp.isfinite(plain.largest())
-        conditions = [lost, done, releases > MOST_RELEASES, search.iterations + 1 >= iterations]
-        outcomes = [Ending.NOT_FINITE, Ending.CONVERGED, Ending.NO_DESCENT, Ending.OUT_OF_ITERATIONS]
+        spent = search.iterations + 1 >= iterations
+        conditions = [lost, done & (damping > bent), done, releases > MOST_RELEASES, spent]
+        outcomes = [Ending.NOT_FINITE, Ending.SADDLE, Ending.CONVERGED, Ending.NO_DESCENT, Ending.OUT_OF_ITERATIONS]
         ending = jnp.select(conditions, outcomes, Ending.UNDECIDED)
         at, values = jax.tree.map(
             lambda new, old: jnp.where(good & ~done, new, old), (new, at_new), (search.at, search.values)
         )
         used = jnp.where(damping > 0, damping, search.damping)
         after = Search(
-            at, values, change.K, barrier, jnp.where(good, used, raised), jnp.where(good, 0.0, raised), filtered,
+            at, values, change, barrier, jnp.where(good, used, raised), jnp.where(good, 0.0, raised), filtered,
             entries + keep, search.largest, short, releases, search.iterations + ~done, plain, ending,
         )  # fmt: skip
         # The slacks as the whole step would leave them, negative where it is cut short.
@@ -217,23 +228,27 @@ def search(
         at = search.at
         s = jnp.where(present, jnp.maximum(at.s, jnp.clip(width, 1e-1, 1e2)), at.s)
         z = jnp.where(present, FIRST_BARRIER / s, 0.0)
-        y = at.y if rows.elastic is None else jnp.where(rows.elastic, FIRST_BARRIER / at.t, 0.0)
+        y = jnp.where(rows.elastic, FIRST_BARRIER / at.t, 0.0)
         at = at._replace(prices=0 * at.prices, nu=0 * at.nu, s=s, z=z, y=y)
-        return _begun(search._replace(at=at))
+        return _begun(rows, search._replace(at=at))
 
-    def _begun(search: Search) -> Search:
-        barrier = jnp.full_like(search.barrier, FIRST_BARRIER)
-        largest = LARGE_VIOLATION * jnp.maximum(measure(rows, search.at, search.values, barrier)[0], 1.0)
-        none = jnp.zeros_like(search.entries)
-        zero = jnp.zeros_like(barrier)
-        return search._replace(barrier=barrier, damping=zero, least=zero, entries=none, short=none, largest=largest)
+    return jax.lax.while_loop(lambda search: search.ending == Ending.UNDECIDED, body, start)
 
+
+def started(of: Conditions, rows: Inequalities, x: Array, u: Array) -> Search:
+    """Returns the start of a search at states x [N+1, n] and controls u [N, m]."""
     values = of.values(x, u)
     at = inside(rows, values, x, u, FIRST_SLACK)
-    barrier = jnp.asarray(FIRST_BARRIER, x.dtype)
-    zero, none = jnp.zeros_like(barrier), jnp.asarray(0)
-    start = Search(
-        at, values, jnp.zeros((*u.shape, x.shape[1]), x.dtype), barrier, zero, zero, jnp.zeros((FILTER, 2), x.dtype),
-        none, zero, none, none, none, Residuals(zero, zero, zero), jnp.asarray(Ending.UNDECIDED),
-    )  # fmt: skip
-    return jax.lax.while_loop(lambda search: search.ending == Ending.UNDECIDED, body, _begun(start))
+    zero, none, K = jnp.zeros((), x.dtype), jnp.asarray(0), jnp.zeros((*u.shape, x.shape[1]), x.dtype)
+    change = HorizonSolution(jnp.zeros_like(x), jnp.zeros_like(u), K, at.prices, jnp.asarray(True))
+    return _begun(rows, Search(
+        at, values, change, zero, zero, zero, jnp.zeros((FILTER, 2), x.dtype), none, zero, none, none, none,
+        Residuals(zero, zero, zero), jnp.asarray(Ending.UNDECIDED),
+    ))  # fmt: skip
+
+
+def _begun(rows: Inequalities, search: Search) -> Search:
+    barrier = jnp.full_like(search.barrier, FIRST_BARRIER)
+    largest = LARGE_VIOLATION * jnp.maximum(measure(rows, search.at, search.values, barrier)[0], 1.0)
+    none, zero = jnp.zeros_like(search.entries), jnp.zeros_like(barrier)
+    return search._replace(barrier=barrier, damping=zero, least=zero, entries=none, short=none, largest=largest)

@@ -21,7 +21,9 @@ from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.barrier import Iterate
 from dln_jax.control.conditions import Conditions, conditions
-from dln_jax.control.interior_point import Search, search, straight
+from dln_jax.control.contradictions import require_end, require_start
+from dln_jax.control.interior_point import Search, straight
+from dln_jax.control.phases import gave_up, phases
 from dln_jax.control.riccati import HorizonSolution
 from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, first_plan, followed, knots_of
 from dln_jax.solvers.ending import Ending
@@ -77,22 +79,28 @@ def shoot(
 ) -> Shooting:
     """Returns a locally optimal trajectory near a guess, by multiple shooting; traceable.
 
+    Saddles are left, and where the search gives up outside hard constraints, another one restores them or shows that
+    the problem is locally infeasible (see `control.phases`). The plan of `Ending.INFEASIBLE` has the least violation
+    nearby; its residuals and multipliers are those of the sum of violations.
+
     Args:
         problem: to solve.
         x: initial state [n].
         states: guess [N+1, n], whose first is replaced by the initial state; it need not be a motion.
         u: guess [N, m].
-        iterations: largest number of iterations.
+        iterations: largest number of iterations of a search; leaving a saddle and restoring constraints are searches
+            of their own.
         tolerance: of stationarity, feasibility and complementarity, with the cost scaled so that its derivatives at the
             guess are at most 100. Stationarity and complementarity are divided by a hundredth of the mean multiplier
             if that is above one.
-        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton, which
+            does not recognise saddles.
         starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: the
             least cost within the constraints, or else the least violation.
 
     Raises:
-        InputError: shapes that do not agree, settings that are not positive, crossed limits, or a start outside the
-            limits of the states or their constraints.
+        InputError: shapes that do not agree, settings that are not positive, crossed limits, a start outside the limits
+            of the states or their constraints, or a linear constraint of the end that these limits exclude.
     """
     if starts is not None:
 
@@ -100,12 +108,13 @@ def shoot(
             return shoot(problem, x, states, u, iterations=iterations, tolerance=tolerance, exact=exact)
 
         return _best(jax.vmap(one)(*_with_first((states, u), starts)), tolerance)
+    start = x
     x, states, u = (jnp.asarray(array, float) for array in (x, states, u))
     if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
         raise InputError(
             f"x has shape {x.shape}, states {states.shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]"
         )
-    _require_start(problem, x)
+    require_start(problem, start)
     inside = _inside(states, problem.lower_x, problem.upper_x, "states")
     first = x if problem.free is None else jnp.where(jnp.asarray(problem.free), inside[0], x)
     u = _inside(u, problem.lower, problem.upper, "controls")
@@ -130,9 +139,9 @@ def optimise(
         problem: to solve.
         x: initial state [n].
         u: initial controls [N, m].
-        iterations: largest number of iterations.
+        iterations: as for `shoot`.
         tolerance: as for `shoot`.
-        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton.
+        exact: as for `shoot`.
         starts: more guesses [G, N, m], as for `shoot`.
 
     Raises:
@@ -148,7 +157,7 @@ def optimise(
 def _single(problem: TrajectoryProblem, x: Any, u: Any, iterations: int, tolerance: float, exact: bool) -> Shooting:
     u = _inside(jnp.asarray(u, float), problem.lower, problem.upper, "controls")
     plan = first_plan(problem, x, u)
-    _require_start(problem, jnp.asarray(x, float))
+    require_start(problem, x)
 
     def motion(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
         """The motion under the gains of the step."""
@@ -164,6 +173,7 @@ def _solved(
     exact: bool,
 ) -> Shooting:  # fmt: skip
     require_positive(iterations=iterations, tolerance=tolerance)
+    require_end(problem, x.shape[1])
     shape, (knots, last_knot) = (len(u), x.shape[1], u.shape[1]), knots_of(problem)
 
     def cost(x: Array, u: Array) -> Array:
@@ -172,25 +182,28 @@ def _solved(
     gradients = jax.grad(cost, argnums=(0, 1))(x, u)
     scale = jnp.maximum(jnp.max(jnp.abs(jnp.concatenate([g.ravel() for g in gradients]))) / LARGEST_GRADIENT, 1.0)
     scale = jnp.where(jnp.isfinite(scale), scale, 1.0)
-    of = conditions(problem, shape, 1 / scale, exact)
+
+    def of(weight: Array, held: Array) -> Conditions:
+        return conditions(problem, shape, weight / scale, exact, held)
+
     soft = None if problem.soft is None else (problem.soft[0] / scale, problem.soft[1] / scale)
-    last = search(of, trial, x, u, soft=soft, free=problem.free, iterations=iterations, tolerance=tolerance)
-    return _result(of, last, scale, tolerance)
+    last, weight = phases(of, trial, x, u, soft=soft, free=problem.free, iterations=iterations, tolerance=tolerance)
+    return _result(of(jnp.ones(()), jnp.ones(())), last, scale / weight, tolerance)
 
 
 def _result(of: Conditions, last: Search, scale: Array, tolerance: float) -> Shooting:
     at, values, residuals = last.at, last.values, last.residuals
-    excess = jnp.max(jnp.where(of.kinds.present, values.c, -jnp.inf), initial=0.0)
-    violation = jnp.maximum(excess, jnp.max(jnp.abs(values.h), initial=0.0))
-    given_up = (last.ending == Ending.NO_DESCENT) | (last.ending == Ending.OUT_OF_ITERATIONS)
+    present = of.kinds.present
+    rows, (above, below) = len(present), jnp.split(at.z[len(present) :], 2)
+    excess = jnp.max(jnp.where(present, values.c[:rows], -jnp.inf), initial=0.0)
+    violation = jnp.maximum(excess, jnp.max(values.c[rows:], initial=0.0))
     outside = jnp.maximum(violation, residuals.feasibility) > jnp.sqrt(tolerance)
-    ending = jnp.where(given_up & outside, Ending.VIOLATED, last.ending)
-    plan = Plan(
-        at.u, at.x, last.K, scale * values.cost, jnp.asarray(FIRST_DAMPING, at.u.dtype), jnp.asarray(True), ending
-    )
+    ending = jnp.where(gave_up(last.ending) & outside, Ending.VIOLATED, last.ending)
+    damping, cost = jnp.asarray(FIRST_DAMPING, at.u.dtype), scale * values.cost
+    plan = Plan(at.u, at.x, last.change.K, cost, damping, jnp.asarray(True), ending)
     return Shooting(
-        plan, scale * at.prices, scale * at.nu, scale * at.z, jnp.max(jnp.abs(values.defects)),
-        violation, *residuals, scale, last.iterations, ending,
+        plan, scale * at.prices, scale * (at.nu + above - below), scale * at.z[:rows],
+        jnp.max(jnp.abs(values.defects)), violation, *residuals, scale, last.iterations, ending,
     )  # fmt: skip
 
 
@@ -211,23 +224,6 @@ def _best(solutions: Shooting, tolerance: float) -> Shooting:
     best = jnp.where(inside.any(), *(jnp.argmin(jnp.where(jnp.isfinite(key), key, jnp.inf)) for key in (
         jnp.where(inside, solutions.plan.cost, jnp.inf), off)))  # fmt: skip
     return jax.tree.map(lambda leaf: leaf[best], solutions)
-
-
-def _require_start(problem: TrajectoryProblem, x: Array) -> None:
-    """Raises `InputError` for a known start outside its limits, which no control changes."""
-    known = [x, problem.lower_x, problem.upper_x]
-    if any(isinstance(value, Tracer) for value in known) or not np.isfinite(x).all():
-        return
-    fixed = np.ones(len(x), bool) if problem.free is None else ~np.asarray(problem.free)
-    for word, limit, sign in (("below its lower", problem.lower_x, -1), ("above its upper", problem.upper_x, 1)):
-        limit = np.broadcast_to(np.asarray(limit, float), x.shape)
-        for i in np.flatnonzero(fixed & (sign * (np.asarray(x) - limit) > 0))[:1]:
-            raise InputError(f"state {i} starts at {x[i]:.6g}, {word} limit of {limit[i]:.6g}; start inside the limits")
-    if problem.states is not None and fixed.all():
-        first = jax.tree.map(lambda rows: rows[0], knots_of(problem)[0])
-        for i, excess in enumerate(np.asarray(jax.jit(problem.states)(x, *first))):
-            if excess > 0:
-                raise InputError(f"constraint {i} on the states is {excess:.6g} at the start; expected zero or less")
 
 
 def _inside(guess: Array, lower: Any, upper: Any, name: str) -> Array:

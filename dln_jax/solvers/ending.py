@@ -15,6 +15,8 @@ class Ending(IntEnum):
     NOT_FINITE = 3
     UNDECIDED = 4
     VIOLATED = 5
+    INFEASIBLE = 6
+    SADDLE = 7
 
 
 REASONS = {
@@ -24,6 +26,9 @@ REASONS = {
     Ending.NOT_FINITE: "met a number that is not finite; start closer, or bound the states and controls",
     Ending.VIOLATED: "ended where constraints are violated (`control.worst_violation` names the worst); start closer, "
     "or make them soft",
+    Ending.INFEASIBLE: "is locally infeasible: no small change lowers the violation (`control.worst_violation` names "
+    "the worst); change the limits, the horizon or the start",
+    Ending.SADDLE: "ended at a saddle: all slopes vanish, but the cost curves down; start beside it",
     Ending.UNDECIDED: "has not ended: a single iteration cannot tell",
 }
 

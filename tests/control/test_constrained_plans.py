@@ -119,8 +119,9 @@ def test_an_infeasible_problem_says_which_constraint_and_by_how_much():
     """With 0.1 m/s² the mass gets 0.2 m far in 2 s."""
     problem = BLOCK._replace(lower=-0.1, upper=0.1, end=lambda x: x[:1] - 1.0)
     solution = shoot(problem, np.zeros(2), *STILL)
-    assert not solution.converged
-    assert reason(solution.ending).startswith("ended where constraints are violated")
+    assert not solution.converged and float(solution.violation) == pytest.approx(0.8, abs=1e-5)
+    assert reason(solution.ending).startswith("is locally infeasible")
+    assert worst_violation(problem, solution.plan) == "equation 0 of the end is violated by 0.8"
     soft = problem._replace(end=None, end_below=lambda x: 1.0 - x[:1])
     solution = shoot(soft, np.zeros(2), *STILL)
     assert solution.converged and float(solution.violation) == pytest.approx(0.8, abs=1e-6)

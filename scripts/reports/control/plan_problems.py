@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from scripts.reports.control.plan_arm import accelerated, beyond_torques, clear_of_sphere, tip_error
+
 GRAVITY = 9.81
 GUESSES = 12
 Formula = Callable[..., list[Any]]
@@ -132,52 +134,6 @@ def pendulum_rates(f: Any, x: Any, u: Any) -> list[Any]:
     return [x[1], 3 * (u[0] + GRAVITY / 2 * f.sin(x[0]))]
 
 
-LINKS = (0.34, 0.40, 0.40, 0.126)
-"""Lengths of a seven-axis arm between shoulder, elbow and wrist, m."""
-
-
-def arm_points(f: Any, q: Any) -> list[list[Any]]:
-    """Elbow, wrist and tip of a seven-axis arm whose axes alternate between z and y."""
-
-    def turned(v: list[Any], axis: str, angle: Any) -> list[Any]:
-        c, s = f.cos(angle), f.sin(angle)
-        x, y, z = v
-        return [c * x - s * y, s * x + c * y, z] if axis == "z" else [c * x + s * z, y, c * z - s * x]
-
-    def after(joints: int, v: list[Any]) -> list[Any]:
-        for joint in reversed(range(joints)):
-            v = turned(v, "zyzyzyz"[joint], q[joint])
-        return v
-
-    upper, fore, hand = after(2, [0.0, 0.0, LINKS[1]]), after(4, [0.0, 0.0, LINKS[2]]), after(6, [0.0, 0.0, LINKS[3]])
-    elbow = [upper[0], upper[1], upper[2] + LINKS[0]]
-    wrist = [a + b for a, b in zip(elbow, fore, strict=True)]
-    return [elbow, wrist, [a + b for a, b in zip(wrist, hand, strict=True)]]
-
-
-OBSTACLE, RADIUS = (0.55, 0.0, 0.45), 0.16
-"""Centre and radius of the sphere, m."""
-
-
-def clear_of_sphere(f: Any, x: Any) -> list[Any]:
-    """RADIUS² - distance² of wrist, tip and the middle of the forearm."""
-    elbow, wrist, tip = arm_points(f, x)
-    middle = [(a + b) / 2 for a, b in zip(elbow, wrist, strict=True)]
-    points = middle, wrist, tip
-    return [RADIUS**2 - sum((p - o) ** 2 for p, o in zip(point, OBSTACLE, strict=True)) for point in points]
-
-
-def tip_error(f: Any, x: Any) -> Any:
-    """Squared distance of the tip from its target."""
-    return sum((p - o) ** 2 for p, o in zip(arm_points(f, x)[2], (0.5, 0.4, 0.4), strict=True))
-
-
-def accelerated(f: Any, x: Any, u: Any) -> list[Any]:
-    """Seven joints with the accelerations as controls, 50 ms."""
-    h = 0.05
-    return [x[i] + h * x[7 + i] + h**2 / 2 * u[i] for i in range(7)] + [x[7 + i] + h * u[i] for i in range(7)]
-
-
 def quadratic(goal: Sequence[float], weights: Sequence[float], force: float, dt: float, last: float) -> tuple[Any, Any]:
     """Running and final cost of the squared error, with the angles as they are."""
 
@@ -226,7 +182,7 @@ def problems() -> list[Planned]:
                 Steps(flexible_rates, 0.04, 2), *flexible, (15.0,)),
         Planned("seven-axis-reach", arm_start, arm_goal, 30, accelerated, arm_cost,
                 lambda f, x: 200.0 * tip_error(f, x) + 5.0 * sum(x[7 + i] ** 2 for i in range(7)), (15.0,) * 7,
-                (*-joints, *(-2.0,) * 7), (*joints, *(2.0,) * 7), states=clear_of_sphere),
+                (*-joints, *(-2.0,) * 7), (*joints, *(2.0,) * 7), beyond_torques, clear_of_sphere),
         Planned("quadrotor-wall", (-2.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0, 0.0, 0.0), 50,
                 Steps(rotor_rates, 0.05), *rotor, (2.0, 2.0),
                 states=lambda f, x: [1.0 - (x[0] / 0.3) ** 2 - (x[1] + 0.4) ** 2]),

@@ -17,6 +17,7 @@ from jax import Array
 
 from dln_jax.control import Shooting, TrajectoryProblem, integrated, shoot
 from dln_jax.control.conditions import constraints
+from dln_jax.solvers.ending import Ending
 from scripts.reports.case import Findings
 from scripts.reports.control.ipopt import ipopt
 from scripts.reports.control.plan_problems import Planned, Steps, guesses, problems
@@ -38,6 +39,8 @@ class Compared(NamedTuple):
     lower: bool
     """Whether the cost is lower than IPOPT's by more than a millionth, or IPOPT did not converge."""
     wrong: bool
+    infeasible: bool
+    """Whether the plan claims that the problem is locally infeasible; all problems have solutions."""
     iterations: int
     ipopt_iterations: int
     seconds: float
@@ -130,8 +133,8 @@ def compared(problem: Planned, count: int) -> tuple[list[Compared], float]:
         results.append(
             Compared(
                 converged, as_low, as_low and (not other.converged or cost < other.cost - margin), wrong,
-                int(solution.iterations), other.iterations, seconds, other.cpu_seconds,
-                float(between(solution)),
+                int(solution.ending) == Ending.INFEASIBLE, int(solution.iterations), other.iterations, seconds,
+                other.cpu_seconds, float(between(solution)),
             )
         )  # fmt: skip
     return results, compile_seconds
@@ -158,4 +161,5 @@ def plans(quick: bool) -> Findings:
     rows.append(expect("plans/all", "as_low_share", words, as_low, SHARE, at_least=True))
     rows.append(Row("plans/all", "converged_share", float(np.mean([r.converged for r in every])), expected=words))
     rows.append(expect("plans/all", "wrongly_converged", words, sum(result.wrong for result in every), 0))
+    rows.append(expect("plans/all", "wrongly_infeasible", words, sum(result.infeasible for result in every), 0))
     return Findings(rows)
