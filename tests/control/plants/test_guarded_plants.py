@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dln_jax.control.plants import Plant, Stopped, guarded, hardware_plant, layout
-from dln_jax.control.plants.runs import PlantRun, judged_runs
+from dln_jax.control.plants.runs import PlantRun, judged_runs, run
 from dln_jax.types import InputError
 
 HALF_PI = np.pi / 2
@@ -156,3 +156,31 @@ def test_up_is_near_the_goal_for_the_last_second_without_a_stop():
     trials = judged_runs(runs, plant, seconds=5.0)
     np.testing.assert_array_equal(trials.up, [True, False, False, False])
     assert trials.seconds[0] == pytest.approx(2.0) and trials.stopped == ("rail",)
+
+
+def test_compilation_is_no_late_answer():
+    puppet, calls = Puppet(), []
+
+    def act(memory, t, y):
+        calls.append(t)
+        puppet.t += 1.0 if len(calls) <= 2 else 0.0  # compilation for the first memory, and for later ones
+        return memory, np.zeros((1, 1))
+
+    plant = Plant(puppet.layout, lambda: None, lambda: puppet.q, puppet.act, lambda: puppet.t)
+    (result,) = run([plant], act, np.zeros(1), seconds=0.1)
+    assert not result.stopped and len(result.t) == 10
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, ValueError])
+def test_an_interrupt_or_a_failure_of_the_law_leaves_the_motors_at_zero(failure):
+    puppet = Puppet()
+
+    def act(memory, t, y):
+        if len(puppet.commands) == 3:
+            raise failure
+        return memory, np.ones((1, 1))
+
+    plant = Plant(puppet.layout, lambda: None, lambda: puppet.q, puppet.act, lambda: puppet.t)
+    with pytest.raises(failure):
+        run([plant], act, np.zeros(1), seconds=1.0)
+    np.testing.assert_array_equal(np.ravel(puppet.commands), [1.0, 1.0, 1.0, 0.0])
