@@ -106,7 +106,9 @@ def refined_by_motions(
         rigid = make_rigid_tree(known, friction=friction, velocity_scale=scale)
         prior = rigid.init(jax.random.key(0))
         solution = identify(rigid, prior, sets.train, joints=needs.joints)
-        solution, _, choice = fit_by("motions", rigid, prior, solution, sets.train, motions, window, joints=needs.joints)
+        solution, _, choice = fit_by(
+            "motions", rigid, prior, solution, sets.train, motions, window, joints=needs.joints
+        )
         fitted = parameters_of(solution.theta, prior)
         better = parameters._replace(
             **{name: value for name in parameters._fields if (value := getattr(fitted, name, None)) is not None}
