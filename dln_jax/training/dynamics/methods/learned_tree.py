@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.learning.engine.problem import Training
@@ -114,14 +115,17 @@ def refined_by_motions(
             **{name: value for name in parameters._fields if (value := getattr(fitted, name, None)) is not None}
         )
         variance, model = spread_of(*motions), build(dict(description))
-        seconds = [
-            [float(np.mean(prediction_times(model, tried, held, variance)[0])) for tried in (parameters, better)]
-            for held in (sets.validation, sets.test)
-        ]
+
+        def seconds(held: Trajectories) -> tuple[float, float]:
+            times = (prediction_times(model, tried, held, variance)[0] for tried in (parameters, better))
+            before, after = (float(np.mean(each)) for each in times)
+            return before, after
+
+        validation, test = seconds(sets.validation), seconds(sets.test)
     if choice.seconds:
         print(choice.line)
-    kept = seconds[0][1] > seconds[0][0]
-    return Refinement(better if kept else parameters, kept, *map(tuple, seconds))
+    kept = validation[1] > validation[0]
+    return Refinement(better if kept else parameters, kept, validation, test)
 
 
 METHOD = Method(plan, fit)
