@@ -116,10 +116,14 @@ def _parameters(inertial: ET.Element) -> np.ndarray:
     return np.asarray(moved(inertial_parameters(m, np.zeros(3), moments), turn, xyz))
 
 
-def without_inertias(root: ET.Element) -> ET.Element:
-    """Prepares a URDF for MuJoCo: no shapes, every link a body of its own, and unit inertias that MuJoCo accepts."""
+def without_shapes(root: ET.Element, *, inertias: bool) -> ET.Element:
+    """Prepares a URDF for MuJoCo: no shapes, every link a body of its own, and its inertias or ones MuJoCo accepts."""
     for link in root.iter("link"):
-        for part in [*link.findall("visual"), *link.findall("collision"), *link.findall("inertial")]:
+        for part in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(part)
+        if inertias:
+            continue
+        for part in link.findall("inertial"):
             link.remove(part)
         inertial = ET.SubElement(link, "inertial")
         ET.SubElement(inertial, "mass", value="1")

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.robot_xml import MOST_JOINTS, check_joints, link_inertias, parsed, velocity_limits, without_inertias
+from dln_jax.data.robot_xml import MOST_JOINTS, check_joints, link_inertias, parsed, velocity_limits, without_shapes
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -68,20 +68,21 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
 
 
 def opened(
-    path: Path, root: ET.Element, lock: Mapping[str, float] | Sequence[str]
+    path: Path, root: ET.Element, lock: Mapping[str, float] | Sequence[str], *, inertias: bool = False
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
 
-    For a URDF, shapes and inertias are left out. Errors as for `read_robot`.
+    For a URDF, shapes are left out, and inertias are placeholders unless they are asked for, as by a simulation: MuJoCo
+    refuses those that are not physically consistent. Errors as for `read_robot`.
     """
     if root.tag == "mujoco":
-        mujoco, model = _compiled(path, root, ())
+        mujoco, model = _compiled(path, root, (), inertias)
         locked = _matching(lock, joint_names(model))
         check_joints(path, root, locked)
         return mujoco, model, locked
     locked = _matching(lock, [joint.get("name", "") for joint in root.findall("joint")])
     check_joints(path, root, locked)
-    return (*_compiled(path, root, locked), locked)
+    return (*_compiled(path, root, locked, inertias), locked)
 
 
 def joint_names(model: Any) -> list[str]:
@@ -101,7 +102,7 @@ def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -
     return locked
 
 
-def _compiled(path: Path, root: ET.Element, locked: Collection[str]) -> tuple[Any, Any]:
+def _compiled(path: Path, root: ET.Element, locked: Collection[str], inertias: bool) -> tuple[Any, Any]:
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
@@ -116,7 +117,7 @@ def _compiled(path: Path, root: ET.Element, locked: Collection[str]) -> tuple[An
                         "freely: lock it, and the joint that it follows"
                     )
                 joint.remove(mimic)
-        text = ET.tostring(without_inertias(root), encoding="unicode")
+        text = ET.tostring(without_shapes(root, inertias=inertias), encoding="unicode")
     try:
         with quiet(mujoco):
             model = mujoco.MjModel

@@ -141,7 +141,7 @@ def predict_measured(
     if not 2 <= fitted < segments.t.shape[1]:
         raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {segments.t.shape[1]}")
     spread = segments.q.reshape(-1, segments.q.shape[2]).std(axis=0)
-    scale = tuple(np.where(spread > 0, spread, 1.0).tolist())
+    scale = jnp.asarray(np.where(spread > 0, spread, 1.0))
     options = {"scale": scale, "fitted": fitted, "torque": torque, "substeps": substeps, "momenta": momenta}
     predicted = _predict(model, parameters, *map(jnp.asarray, segments), **options)
     return Predictions(*map(np.asarray, predicted))
@@ -164,8 +164,8 @@ def valid_times(
     )
 
 
-# Compiled once per model and shape, for all parameters.
-@functools.partial(jax.jit, static_argnames=("model", "scale", "fitted", "torque", "substeps", "momenta"))
+# Compiled once per model and shape, for all parameters and motions.
+@functools.partial(jax.jit, static_argnames=("model", "fitted", "torque", "substeps", "momenta"))
 def _predict(
     model: Model, parameters, t, q, qd, tau, weight, *, scale, fitted: int, torque: Torque, substeps: int, momenta
 ):
@@ -192,7 +192,7 @@ def _predict(
 
         def error(start):
             off = weight[first, None] * (moved(start, t[first], tau[first])[:, :d] - q[first])
-            return jnp.ravel(off / jnp.asarray(scale))
+            return jnp.ravel(off / scale)
 
         start = nearest(error, jnp.concatenate([q[0], qd[0]]), steps=START_STEPS)
         states, moves = jax.jvp(lambda start: moved(start, t, tau), (start,), (jnp.ones(2 * d),))

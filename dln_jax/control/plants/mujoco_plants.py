@@ -11,7 +11,7 @@ from dln_jax.control.mujoco_loop import compiled_model
 from dln_jax.control.plants.plant import Layout, Plant, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.plants.simulated import simulated
-from dln_jax.data.robot_xml import parsed
+from dln_jax.data.robot_xml import parsed, velocity_limits
 from dln_jax.data.robots import joint_names, opened, quiet
 from dln_jax.types import InputError
 
@@ -26,7 +26,7 @@ def mujoco_plant(
     goal: Any = None,
     hanging: Any = None,
     rate: float | None = None,
-    speed: Any = np.inf,
+    speed: Any = None,
     hardware: Hardware = Hardware(),  # noqa: B008
     seed: int = 0,
 ) -> Plant:
@@ -41,7 +41,7 @@ def mujoco_plant(
         goal: posture to hold [d]; by default the highest one.
         hanging: posture of rest [d]; by default the lowest one.
         rate: of the samples, Hz; by default one sample a time step.
-        speed: largest rates, one or [d].
+        speed: largest rates, one or [d]; by default those of a URDF, which MJCF cannot state.
         hardware: noise, resolution and delay.
         seed: of the starts and the noise.
 
@@ -63,7 +63,7 @@ def layout_of_file(
     rate: float | None = None,
 ) -> Layout:
     """Returns the layout of an MJCF or URDF file, whose joints may all have a motor; arguments as `mujoco_plant`."""
-    return _described(path, actuated, control, goal, None, rate, np.inf, False)[3]
+    return _described(path, actuated, control, goal, None, rate, None, False)[3]
 
 
 def _described(
@@ -77,8 +77,9 @@ def _described(
     passive: bool,
 ) -> tuple[Any, Any, Any, Layout, int]:
     """MuJoCo, its model, its data, the layout of the plant, and the number of time steps in a sample."""
-    mujoco, model = _model(source)
+    mujoco, model, speeds = _model(source)
     names = joint_names(model)
+    speed = [speeds.get(name, np.inf) for name in names] if speed is None else speed
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
         if kind not in kinds:
@@ -128,10 +129,13 @@ def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, ha
     return simulated(described, begin, lambda: data.qpos, advance, kick=kick, hardware=hardware, seed=seed)
 
 
-def _model(source: Any) -> tuple[Any, Any]:
+def _model(source: Any) -> tuple[Any, Any, dict[str, float]]:
+    """MuJoCo, its model, and the largest rates of joints that a URDF states."""
     if isinstance(source, Path) or (isinstance(source, str) and not source.lstrip().startswith("<")):
-        return opened(Path(source), parsed(Path(source)), ())[:2]
-    return compiled_model(source)
+        root = parsed(Path(source))
+        speeds = velocity_limits(root) if root.tag == "robot" else {}
+        return *opened(Path(source), root, (), inertias=True)[:2], speeds
+    return *compiled_model(source), {}
 
 
 def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:

@@ -48,7 +48,7 @@ def compiled(controller: Controller, layout: Layout) -> Act:
 def run(
     plants: Sequence[Plant], act: Act, memories: Any, *, seconds: float, push: Push | None = None
 ) -> list[PlantRun]:
-    """Resets plants of one layout and runs them in step.
+    """Resets plants of one layout and runs them in step; ends with zero controls, also when it is interrupted.
 
     Args:
         plants: one or several; they are guarded.
@@ -68,21 +68,26 @@ def run(
     samples, count = round(seconds * layout.rate), len(plants)
     y, u, t = np.zeros((samples, count, d)), np.zeros((samples, count, m)), np.arange(samples) / layout.rate
     lengths, reasons = np.full(count, samples), [""] * count
+    # Compiled before a clock runs: seconds would be late answers. The second call has the types of later memories.
+    like = jnp.asarray(np.tile(np.asarray(layout.hanging, float), (count, 1)))
+    act(act(memories, t[0], like)[0], t[0], like)
     for plant in safe:
         plant.reset()
     going = list(range(count))
-    for k in range(samples):
-        if push is not None and k == round(push.seconds * layout.rate):
-            for i in going:
-                plants[i].kick(np.asarray(push.rates, float))  # type: ignore[misc]
-        going = _each(going, k, lengths, reasons, lambda i: y[k].__setitem__(i, safe[i].read()))  # noqa: B023
-        if not going:
-            break
-        memories, controls = act(memories, t[k], jnp.asarray(y[k]))
-        u[k] = controls
-        going = _each(going, k, lengths, reasons, lambda i: safe[i].act(u[k, i]))  # noqa: B023
-    for i in going:
-        plants[i].act(np.zeros(m))
+    try:
+        for k in range(samples):
+            if push is not None and k == round(push.seconds * layout.rate):
+                for i in going:
+                    plants[i].kick(np.asarray(push.rates, float))  # type: ignore[misc]
+            going = _each(going, k, lengths, reasons, lambda i: y[k].__setitem__(i, safe[i].read()))  # noqa: B023
+            if not going:
+                break
+            memories, controls = act(memories, t[k], jnp.asarray(y[k]))
+            u[k] = controls
+            going = _each(going, k, lengths, reasons, lambda i: safe[i].act(u[k, i]))  # noqa: B023
+    finally:  # also after an interrupt
+        for i in going:
+            plants[i].act(np.zeros(m))
     return [PlantRun(t[:n], y[:n, i], u[:n, i], reasons[i]) for i, n in enumerate(lengths)]
 
 

@@ -59,6 +59,8 @@ MEANINGS = {
     "coverage_95_share": "torques within the 95 % band",
     "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
     "out_of_distribution_share": "states out of distribution",
+    "by_torques_vpt_seconds": "valid prediction time of a start fitted to q, tree by torques",
+    "by_motions_vpt_seconds": "the same, tree refined by motions",
     "vpt_seconds": "valid prediction time, torque held",
     "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
     "rollout_seconds": "duration of a test motion",
@@ -105,6 +107,7 @@ def evaluate(
     metrics = {
         **errors(predicted, test),
         **judged.metrics,
+        **({} if task.refinement is None else task.refinement.metrics),
         **spread,
         **definiteness_metrics(functions, task),
         **of_bands,

@@ -99,6 +99,8 @@ def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
     if seeds > 1:
         by = "validation" if task.best is None else "cross-validation"
         lines.append(f"the run keeps seed {options.seed + best}, the best in {by}")
+    if task.refinement is not None:
+        lines.append(task.refinement.line)
     limits = [getattr(options, name, None) for name in ("steps", "seconds")]
     return Judged(
         metrics=evaluation.metrics,

@@ -11,6 +11,7 @@ from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem, Training
 from dln_jax.learning.kinematics import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
+from dln_jax.models.model import Parameters
 from dln_jax.scenes.scene import Scene
 from dln_jax.time_limit import seconds_left
 from dln_jax.training.dynamics.options import AUTO, FITS
@@ -30,6 +31,31 @@ class Solver(NamedTuple):
     """Number of training samples that are drawn for it; `None` for all."""
 
 
+class Refinement(NamedTuple):
+    """A learned tree whose bodies and friction were fitted to motions, if these predict validation motions longer."""
+
+    parameters: Parameters
+    kept: bool
+    validation: tuple[float, float]
+    """Mean valid prediction times of the parameters by torques and by motions, s."""
+    test: tuple[float, float]
+
+    @property
+    def line(self) -> str:
+        """What the refinement did."""
+        shown = "; ".join(
+            f"{name} motions predicted for {after:.3g} s, by torques for {before:.3g} s"
+            for name, (before, after) in (("validation", self.validation), ("test", self.test))
+        )
+        return f"refined by motions: {shown}; {'kept' if self.kept else 'not kept, as validation motions decide'}"
+
+    @property
+    def metrics(self) -> dict[str, float | int]:
+        """Entries of metrics.json."""
+        (before, after), kept = self.test, int(self.kept)
+        return {"by_torques_vpt_seconds": before, "by_motions_vpt_seconds": after, "refinement_kept": kept}
+
+
 class Task(NamedTuple):
     """A resolved task: the data, their `Needs`, and the model to train."""
 
@@ -46,6 +72,8 @@ class Task(NamedTuple):
     """Reading of `time.perf_counter` at which training stops, for the command or a candidate of model selection."""
     search: TreeFit | None = None
     """Outcome of the search for the joint frames of a learned tree."""
+    refinement: Refinement | None = None
+    """Its refinement by motions, if it was asked for."""
     best: int | None = None
     """Index of the seed selected by cross-validation; `None` without cross-validation."""
 

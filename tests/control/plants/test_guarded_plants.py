@@ -171,3 +171,31 @@ def test_a_push_reaches_the_plant_at_its_sample():
     np.testing.assert_array_equal(rates, [0.0, 3.0])
     with pytest.raises(InputError, match="no kick"):
         run([plant], act, start_of(still, 1), seconds=0.1, push=push)
+
+
+def test_compilation_is_no_late_answer():
+    puppet, calls = Puppet(), []
+
+    def act(memory, t, y):
+        calls.append(t)
+        puppet.t += 1.0 if len(calls) <= 2 else 0.0  # compilation for the first memory, and for later ones
+        return memory, np.zeros((1, 1))
+
+    plant = Plant(puppet.layout, lambda: None, lambda: puppet.q, puppet.act, lambda: puppet.t)
+    (result,) = run([plant], act, np.zeros(1), seconds=0.1)
+    assert not result.stopped and len(result.t) == 10
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, ValueError])
+def test_an_interrupt_or_a_failure_of_the_law_leaves_the_motors_at_zero(failure):
+    puppet = Puppet()
+
+    def act(memory, t, y):
+        if len(puppet.commands) == 3:
+            raise failure
+        return memory, np.ones((1, 1))
+
+    plant = Plant(puppet.layout, lambda: None, lambda: puppet.q, puppet.act, lambda: puppet.t)
+    with pytest.raises(failure):
+        run([plant], act, np.zeros(1), seconds=1.0)
+    np.testing.assert_array_equal(np.ravel(puppet.commands), [1.0, 1.0, 1.0, 0.0])

@@ -5,6 +5,9 @@ import pytest
 
 from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.plants import guarded, mujoco_plant
+from dln_jax.data.robots import read_robot
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import tree_system
 from dln_jax.types import InputError
 
 pytest.importorskip("mujoco", reason="MuJoCo simulates the plants; it is in the extra [robot]")
@@ -73,6 +76,43 @@ def test_the_energy_of_an_idle_plant_is_kept_and_controls_act_late():
 def test_a_file_that_is_no_plant_is_one_line(file, actuated, control, message):
     with pytest.raises(InputError, match=message):
         mujoco_plant(file, actuated, control=control)
+
+
+URDF = """<robot name="acrobot"><link name="base"/>
+<link name="upper"><inertial><origin xyz="0 0 -.15"/><mass value=".5"/>
+<inertia ixx=".004" ixy="0" ixz="0" iyy=".003" iyz="0" izz=".002"/></inertial>
+<collision><geometry><box size="1 1 1"/></geometry></collision></link>
+<link name="lower"><inertial><origin xyz="0 0 -.2"/><mass value=".4"/>
+<inertia ixx=".005" ixy="0" ixz="0" iyy=".005" iyz="0" izz=".001"/></inertial></link>
+<joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 -.3"/>
+<axis xyz="0 1 0"/><limit lower="-2.9" upper="2.8" effort="2.5" velocity="25"/></joint></robot>"""
+
+
+def test_a_urdf_plant_has_the_masses_and_the_limits_of_its_file(tmp_path):
+    file = tmp_path / "acrobot.urdf"
+    file.write_text(URDF)
+    plant = guarded(mujoco_plant(file, ["elbow"], rate=500.0, seed=1))
+    limits = plant.layout.limits
+    np.testing.assert_array_equal(limits.control, [[-2.5, 2.5]])
+    np.testing.assert_array_equal(limits.position, [[-np.inf, np.inf], [-2.9, 2.8]])
+    np.testing.assert_array_equal(limits.rate, [np.inf, 25.0])
+    model, q = dynamics(tree_system(read_robot(file).tree)), []
+    plant.reset()
+    for _ in range(3):  # MuJoCo's step is qd += dt qdd, q += dt qd
+        q.append(plant.read())
+        plant.act([2.0])
+    qdd = (q[2] - 2 * q[1] + q[0]) * 500.0**2
+    rates = (q[1] - q[0]) * 500.0
+    np.testing.assert_allclose(qdd, model.forward_dynamics(q[1], rates, np.array([0.0, 2.0])), rtol=1e-8)
+
+
+def test_a_urdf_plant_with_a_link_of_no_mass_is_one_line(tmp_path):
+    file = tmp_path / "light.urdf"
+    start, end = URDF.rindex("<inertial>"), URDF.rindex("</inertial>") + len("</inertial>")
+    file.write_text(URDF[:start] + URDF[end:])
+    with pytest.raises(InputError, match="mass and inertia of moving bodies"):
+        mujoco_plant(file, ["elbow"])
 
 
 def test_a_sample_is_a_whole_number_of_steps():

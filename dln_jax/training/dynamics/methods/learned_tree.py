@@ -1,5 +1,6 @@
 """Fits trees of unknown joint frames: a search from random starts finds the frames, elimination everything else."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split
 from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.kinematics import Search, fit_tree
@@ -16,7 +19,7 @@ from dln_jax.models.serial_tree import SerialTreeParameters, tree_of
 from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
 from dln_jax.training.dynamics.options import TreeOptions
 from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.task import Method, Task
+from dln_jax.training.dynamics.task import Method, Refinement, Task
 from dln_jax.training.identification.motions import MotionSets, fit_by, prediction_times, spread_of
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe_for
@@ -69,49 +72,60 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
     )
     size = f"{solution.parameter_count} parameters, of the linear ones rank {solution.rank}, "
     print(f"learned tree: {size}condition {solution.condition:.3g}")
-    task = task._replace(search=solution)
-    parameters = solution.parameters
+    task, parameters = task._replace(search=solution), solution.parameters
     if getattr(options, "refine", None) == "motions":
-        parameters = refined_by_motions(task, parameters)
+        refinement = refined_by_motions(needs, task.description, task.sets, parameters)
+        task, parameters = task._replace(refinement=refinement), refinement.parameters
     training = training_of(task, parameters, solution.torque_mse, solution.seconds)
     return task, refined_if_asked(task, training)
 
 
-def refined_by_motions(task: Task, parameters: SerialTreeParameters) -> SerialTreeParameters:
+def refined_by_motions(
+    needs: Needs, description: Mapping[str, Any], sets: Split, parameters: SerialTreeParameters,
+    window: float | None = None,
+) -> Refinement:  # fmt: skip
     """Refits bodies and friction on the same axes to motions; keeps them if they predict validation motions longer.
 
     The bodies start as balls, and a fit of torques first makes them physically consistent.
+
+    Args:
+        needs: of the tree, as by `needs_of_tree`.
+        description: its parents, acceleration and velocity scale.
+        sets: motions to fit, those that decide, and the test, which only measures.
+        parameters: of the tree by torques.
+        window: length of the windows, s (default: chosen by inner splits).
     """
-    needs, description = needs_of_tree(task.needs), task.description
+    scale = description["velocity_scale"]
     tree = tree_of(parameters, needs, parents=description["parents"], acceleration=description["acceleration"])
     d, friction = tree.degrees_of_freedom, USUAL if needs.friction else ()
     known = tree._replace(
         rotations=np.asarray(tree.rotations), positions=np.asarray(tree.positions),
         inertias=np.tile(BALL, (d, 1)), armature=np.full(d, BALL[-1]),
     )  # fmt: skip
-    train, validation = task.sets.train, task.sets.validation
+    motions = MotionSets(sets.train, sets.validation)
     with jax.enable_x64(True):
-        rigid = make_rigid_tree(known, friction=friction, velocity_scale=description["velocity_scale"])
+        rigid = make_rigid_tree(known, friction=friction, velocity_scale=scale)
         prior = rigid.init(jax.random.key(0))
-        solution = identify(rigid, prior, train, joints=needs.joints)
-        sets = MotionSets(train, validation)
-        solution, _, choice = fit_by("motions", rigid, prior, solution, train, sets, None, joints=needs.joints)
+        solution = identify(rigid, prior, sets.train, joints=needs.joints)
+        solution, _, choice = fit_by(
+            "motions", rigid, prior, solution, sets.train, motions, window, joints=needs.joints
+        )
         fitted = parameters_of(solution.theta, prior)
         better = parameters._replace(
             **{name: value for name in parameters._fields if (value := getattr(fitted, name, None)) is not None}
         )
-        variance, model = spread_of(*sets), build(description)
-        seconds = [
-            float(np.mean(prediction_times(model, candidate, validation, variance)[0]))
-            for candidate in (parameters, better)
-        ]
-    kept = seconds[1] > seconds[0]
-    print(*([choice.line] if choice.seconds else []), sep="\n", end="\n" * bool(choice.seconds))
-    print(
-        f"refined by motions: validation motions predicted for {seconds[1]:.3g} s, by torques for {seconds[0]:.3g} s; "
-        f"{'kept' if kept else 'not kept'}"
-    )
-    return better if kept else parameters
+        variance, model = spread_of(*motions), build(dict(description))
+
+        def seconds(held: Trajectories) -> tuple[float, float]:
+            times = (prediction_times(model, tried, held, variance)[0] for tried in (parameters, better))
+            before, after = (float(np.mean(each)) for each in times)
+            return before, after
+
+        validation, test = seconds(sets.validation), seconds(sets.test)
+    if choice.seconds:
+        print(choice.line)
+    kept = validation[1] > validation[0]
+    return Refinement(better if kept else parameters, kept, validation, test)
 
 
 METHOD = Method(plan, fit)

@@ -1,0 +1,53 @@
+"""--refine motions: a tree with wrong bodies predicts held-out motions longer once they are fitted to motions."""
+
+import jax
+import numpy as np
+import pytest
+
+from dln_jax.data.schema import from_arrays
+from dln_jax.data.splits import Split
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import inertial_parameters
+from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree
+from dln_jax.training.dynamics.methods.learned_tree import refined_by_motions
+from dln_jax.training.dynamics.task import Refinement
+from dln_jax.types import Needs
+from dln_jax.zoo.descriptions import describe
+
+NEEDS = Needs(joints=("revolute",), friction=True)
+DESCRIPTION = describe(
+    "learned-tree", precision="f64", needs=NEEDS, parents=[-1], acceleration=9.81, velocity_scale=0.01
+)
+LINK = inertial_parameters(2.0, [0.2, 0.05, 0.1], np.diag([0.02, 0.04, 0.05]))
+# A pendulum: its axis is turned by 90 degrees from the direction against gravity.
+TRUE = SerialTreeParameters(
+    *map(np.array, ([[np.pi / 2, 0, 0]], [[0.0, 0, 0]], [LINK], [0.1], [0.2], [0.5], [0.1]))
+)  # fmt: skip
+
+
+def motion(seed):
+    """A sum of sines for 4 s, with torques with noise."""
+    random, t = np.random.default_rng(seed), np.linspace(0, 4, 81)
+    size, rate, phase = random.uniform([0.3, 0.5, 0], [0.8, 3, 6], (3, 3)).T
+    angle = np.outer(t, rate) + phase
+    waves = np.sin(angle) @ size, np.cos(angle) @ (size * rate), -np.sin(angle) @ (size * rate**2)
+    q, qd, qdd = (wave[:, None] for wave in waves)
+    known = dynamics(make_serial_tree(NEEDS, velocity_scale=0.01).energies(TRUE))
+    tau = np.asarray(jax.jit(jax.vmap(known.inverse_dynamics))(q, qd, qdd)) + 0.05 * random.normal(size=q.shape)
+    return from_arrays({"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": np.zeros(81, int)})
+
+
+@pytest.mark.slow
+def test_motions_mend_the_bodies_of_a_tree_and_the_line_says_so():
+    wrong = TRUE._replace(inertias=1.2 * TRUE.inertias, coulomb=0.5 * TRUE.coulomb)
+    mended = refined_by_motions(NEEDS, DESCRIPTION, Split(*map(motion, range(3))), wrong, window=0.3)
+    (before, after), (_, validated) = mended.test, mended.validation
+    assert mended.kept and after > 2 * before and validated > mended.validation[0]
+    assert mended.line.endswith("; kept") and f"test motions predicted for {after:.3g} s, by torques" in mended.line
+    assert mended.metrics == {"by_torques_vpt_seconds": before, "by_motions_vpt_seconds": after, "refinement_kept": 1}
+
+
+def test_a_refinement_that_predicts_no_longer_is_not_kept():
+    line = Refinement(TRUE, False, (0.9, 0.8), (0.7, 0.75)).line
+    assert line.startswith("refined by motions: validation motions predicted for 0.8 s, by torques for 0.9 s; test")
+    assert line.endswith("not kept, as validation motions decide")
