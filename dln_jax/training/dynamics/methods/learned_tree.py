@@ -118,7 +118,7 @@ def refined_by_motions(
 
         def seconds(held: Trajectories) -> tuple[float, float]:
             times = (prediction_times(model, tried, held, variance)[0] for tried in (parameters, better))
-            before, after = (float(np.mean(each)) for each in times)
+            before, after = (float(np.mean(of_tree)) for of_tree in times)
             return before, after
 
         validation, test = seconds(sets.validation), seconds(sets.test)
