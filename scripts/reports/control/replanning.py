@@ -1,7 +1,7 @@
 """Recovery of the board's plants by model predictive control, whose model is identified on the way.
 
-The plan from hanging is followed first. Then `control.recovery_by_plans` plans from three first guesses, every `every` samples,
-and a regulator holds the goal where its value is below a level.
+The plan from hanging is followed first. Then `control.recovery_by_plans` plans from three first guesses, every `every`
+samples, and a regulator holds the goal where its value is below a level.
 
 Nine numbers determine the motion of two links: with the known length l1,
 
