@@ -22,7 +22,7 @@ from dln_jax.control.energy_shaping import (
 from dln_jax.control.observers import with_differences, with_prediction
 from dln_jax.control.plan_limits import free_time, with_limits_of, worst_violation
 from dln_jax.control.real_time import feedback, improve, mpc, prepare
-from dln_jax.control.receding import receding
+from dln_jax.control.recovery import recovery_by_plans
 from dln_jax.control.regulators import (
     Region,
     Regulator,
@@ -107,7 +107,7 @@ __all__ = [
     "parts_of",
     "passive_energy",
     "prepare",
-    "receding",
+    "recovery_by_plans",
     "region_of_attraction",
     "regulated",
     "sampled_lqr",

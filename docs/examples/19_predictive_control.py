@@ -69,7 +69,7 @@ at = control.linearise(field, goal, np.zeros(1))
 regulator = control.lqr(at.A, at.B, Q=np.diag([10, 10, 1, 0.1]), R=[[0.1]])
 level = LIMIT**2 / (regulator.K @ np.linalg.solve(regulator.S, regulator.K.T)).item()
 guesses = np.array([0.0, 3.0, -3.0])[:, None, None] * np.sin(5 * DT * np.arange(STEPS))[:, None]
-controller = control.receding(
+controller = control.recovery_by_plans(
     problem,
     jax.vmap(lambda u: control.first_plan(problem, hanging, u))(guesses),
     near=control.regulated(regulator, goal, at.u, joints),

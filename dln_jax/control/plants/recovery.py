@@ -1,4 +1,4 @@
-"""Swing-up and recovery of a plant by receding plans, from numbers in the natural scales of its model.
+"""Swing-up and recovery of a plant by repeated plans, from numbers in the natural scales of its model.
 
 Plans are those of `planned` with a cost of the way to the goal, so that they do not put it off, and with any number of
 turns of the passive joints. They start from three first guesses: no control, and swings of half the motors' limits that
@@ -16,7 +16,7 @@ from dln_jax.control.closed_loop import Controller
 from dln_jax.control.plants.planned import plan_problem, steps_of
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.scales import Scales
-from dln_jax.control.receding import receding
+from dln_jax.control.recovery import recovery_by_plans
 from dln_jax.control.regulators import Regulator, regulated, value
 from dln_jax.control.swing_up import SwingUpNumbers, Upright
 from dln_jax.control.tracking import friction_compensation
@@ -35,7 +35,7 @@ SWINGS = (0.0, 0.5, -0.5)
 def recovering(
     upright: Upright, layout: Layout, scales: Scales, settings: SwingUpNumbers, regulator: Regulator, level: Any
 ) -> Controller:
-    """Returns the controller of states x by receding plans and a regulator.
+    """Returns the controller of states x by repeated plans and a regulator.
 
     Args:
         upright: the model.
@@ -56,7 +56,7 @@ def recovering(
     plans = jax.vmap(lambda u: first_plan(problem, hanging, u))(swings)
     near = regulated(regulator, upright.at.x, upright.at.u, layout.joints)
     cost = value(regulator, upright.at.x, layout.joints)
-    plain = receding(problem, plans, near, cost, level, rate=layout.rate, every=every)
+    plain = recovery_by_plans(problem, plans, near, cost, level, rate=layout.rate, every=every)
     if settings.compensation == 0:
         return plain
     to_controls = jnp.linalg.pinv(upright.B[np.array(upright.parts.active)])

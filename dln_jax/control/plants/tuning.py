@@ -9,7 +9,7 @@
 4. Plans with feedback (`planned`) are tried first, and taken if they stand every error. Otherwise energy laws are tried
    as well, with right models in the first round, because few sets work. One with a margin of `LEAST` or more is taken:
    it acts in any state, and a wrong model costs it time where it throws a plan off. Else the larger margin decides.
-   For a plant that has to recover from pushes by plans, receding plans are tried instead.
+   For a plant that has to recover from pushes by plans, repeated plans are tried instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -52,7 +52,7 @@ class Tuned(NamedTuple):
     controller: Controller
     """Of the measurements."""
     way: str
-    """"energy", "plan" or "receding plans"."""
+    """"energy", "plan" or "repeated plans"."""
     numbers: Mapping[str, float]
     """What was chosen, in SI units."""
     regulator: Regulator

@@ -1,4 +1,4 @@
-"""Ways of swinging up whose settings trials choose: by plans with feedback, by receding plans, and by energy laws."""
+"""Ways of swinging up whose settings trials choose: by plans with feedback, by repeated plans, and by energy laws."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -72,8 +72,8 @@ def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
     return Way("plan", draw, lambda settings: follower(upright, layout, plain, settings), numbers, (0.15, -0.15))
 
 
-def by_receding_plans(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
-    """Receding plans, which also recover from pushes, and a regulator."""
+def by_repeated_plans(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
+    """Repeated plans, which also recover from pushes, and a regulator."""
     plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
 
     def draw(random: np.random.Generator, count: int) -> list[Any]:
@@ -87,12 +87,12 @@ def by_receding_plans(upright: Upright, layout: Layout, scales: Scales, seed: in
         regulator, level = settings
         return {"level": float(level)}, regulator
 
-    return Way("receding plans", draw, controller, numbers, (0.15, -0.15))
+    return Way("repeated plans", draw, controller, numbers, (0.15, -0.15))
 
 
 RECOVERIES: Mapping[str, tuple[Callable[..., Way], ...]] = {
     "swing-up": (by_plan, by_energy),
-    "plans": (by_receding_plans,),
+    "plans": (by_repeated_plans,),
 }
 """Ways that are tried, by how the plant comes up again after a push: as from hanging, or by plans from there."""
 

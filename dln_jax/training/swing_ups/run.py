@@ -109,7 +109,7 @@ def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, flo
     estimator = estimator_of(task.estimator, plant.layout, process, delay=late)
     law = law_of(plant, got.dynamics, estimator)
     if task.recover == "plans":
-        estimator = by_receding_plans(plant, got.dynamics, law, estimator)
+        estimator = by_repeated_plans(plant, got.dynamics, law, estimator)
     tried = try_starts(
         plant, got.dynamics, starts=task.starts, seed=task.seed, estimator=estimator, push=task.push
     )  # fmt: skip
@@ -127,8 +127,8 @@ def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, flo
     return metrics
 
 
-def by_receding_plans(plant: DesktopPlant, model: Dynamics, law: SwingUp, estimator: Estimator) -> Estimator:
-    """The estimator, with receding plans and the law's regulator in place of any law."""
+def by_repeated_plans(plant: DesktopPlant, model: Dynamics, law: SwingUp, estimator: Estimator) -> Estimator:
+    """The estimator, with repeated plans and the law's regulator in place of any law."""
     layout, upright = plant.layout, upright_for(plant, model)
     settings = plant.numbers
     states = recovering(upright, layout, scales_of(upright, layout), settings, law.regulator, settings.level)

@@ -1,7 +1,7 @@
 """Recovery of the board's plants by model predictive control, whose model is identified on the way.
 
-The plan from hanging is followed first. Then `control.receding` plans from three first guesses, every `every` samples,
-and a regulator holds the goal where its value is below a level.
+The plan from hanging is followed first. Then `control.recovery_by_plans` plans from three first guesses, every `every`
+samples, and a regulator holds the goal where its value is below a level.
 
 Nine numbers determine the motion of two links: with the known length l1,
 
@@ -26,7 +26,7 @@ from dln_jax.control import (
     error,
     field_of,
     first_plan,
-    receding,
+    recovery_by_plans,
     sampled_lqr,
     saturated,
     with_differences,
@@ -212,7 +212,7 @@ def replanning(
         friction = model.p[6 + driven] * jnp.arctan(100 * x[2 + driven]) * numbers.identified
         return saturated(friction - model.K @ off(x), -LIMIT, LIMIT)
 
-    again = receding(
+    again = recovery_by_plans(
         lambda model: problem(field_for(model.p, B), numbers), first_plans(problem(known, numbers), numbers), near,
         lambda x, model: off(x) @ model.S @ off(x), numbers.level, rate=RATE, every=numbers.every,
         parameters=Model(jnp.asarray(regulator.S), jnp.asarray(regulator.K), jnp.asarray(centre)),

@@ -77,7 +77,7 @@ def test_a_plant_that_was_not_at_rest_hangs_first_and_then_swings_up(planned):
 
 
 @pytest.mark.slow
-def test_receding_plans_swing_up_and_recover_within_the_rail():
+def test_repeated_plans_swing_up_and_recover_within_the_rail():
     plant = rail(8.0)
     upright, scales = scaled(plant)
     settings, regulator = swing_up_numbers(upright, plant, scales, USUAL)

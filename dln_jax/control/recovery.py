@@ -1,4 +1,4 @@
-"""Receding plans: recovery from any state, such as after a push, by predictive control that plans again on the way.
+"""Repeated plans: recovery from any state, such as after a push, by predictive control that plans again on the way.
 
 Where the regulator's cost to go is below a level, the regulator acts and nothing is planned. Elsewhere a set of plans
 is improved in every step of the horizon by `real_time.prepare`, and the cheapest acts: its control and its gains,
@@ -28,8 +28,8 @@ RENEWING = 5
 """Iterations on plans that start again where the regulator's region ends."""
 
 
-class Receding(NamedTuple):
-    """Memory of a controller by receding plans."""
+class Recovery(NamedTuple):
+    """Memory of a controller by repeated plans."""
 
     near: Bool[Array, ""]
     """Whether the regulator acts."""
@@ -40,7 +40,7 @@ class Receding(NamedTuple):
     parameters: Any
 
 
-def receding(
+def recovery_by_plans(
     problem: Any,
     plans: Plan,
     near: Callable[..., Array],
@@ -69,7 +69,7 @@ def receding(
     """
     require_positive(rate=rate, every=every)
 
-    def planned(memory: Receding, x: Array) -> Receding:
+    def planned(memory: Recovery, x: Array) -> Recovery:
         now = problem if memory.parameters is None else problem(memory.parameters)
         fresh = jax.vmap(lambda u: first_plan(now, x, u))(plans.u)
         going = memory.plans._replace(damping=jnp.clip(memory.plans.damping, *DAMPING))
@@ -84,7 +84,7 @@ def receding(
         acting = controls[best], started.K[best, 0], x, after.x[best, 0]
         return memory._replace(near=jnp.zeros_like(memory.near), plans=after, acting=acting)
 
-    def act(memory: Receding, t: Array, x: Array) -> tuple[Receding, Array]:
+    def act(memory: Recovery, t: Array, x: Array) -> tuple[Recovery, Array]:
         last = () if memory.parameters is None else (memory.parameters,)
         now = problem if memory.parameters is None else problem(memory.parameters)
         within = cost(x, *last) <= level
@@ -101,4 +101,4 @@ def receding(
         return memory, where_finite(u, x)
 
     x, u, K = plans.x[0, 0], plans.u[0, 0], plans.K[0, 0]
-    return Controller(Receding(jnp.asarray(True), plans, (u, K, x, x), parameters), act)
+    return Controller(Recovery(jnp.asarray(True), plans, (u, K, x, x), parameters), act)

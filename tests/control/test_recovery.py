@@ -1,11 +1,11 @@
-"""After a push that throws a pendulum down, receding plans bring it up again; a small one is left to the regulator."""
+"""After a push that throws a pendulum down, repeated plans bring it up again; a small one is left to the regulator."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import TrajectoryProblem, first_plan, integrated, lqr, receding, regulated, value
+from dln_jax.control import TrajectoryProblem, first_plan, integrated, lqr, recovery_by_plans, regulated, value
 from dln_jax.types import InputError
 
 RATE, EVERY, STEPS, LIMIT = 100.0, 5, 40, 4.0
@@ -32,7 +32,7 @@ def controller():
     plans = jax.jit(jax.vmap(lambda u: first_plan(problem, UPRIGHT, u)))(guesses)
     near, cost = regulated(regulator, UPRIGHT, np.zeros(1), JOINTS), value(regulator, UPRIGHT, JOINTS)
     level = float(LIMIT**2 / (regulator.K @ np.linalg.solve(regulator.S, regulator.K.T)).item())
-    return receding(
+    return recovery_by_plans(
         lambda strength: problem._replace(step=lambda x, u: step(x, strength * u)), plans,
         lambda x, strength: near(x) / strength, lambda x, strength: cost(x), level, rate=RATE, every=EVERY,
         parameters=jnp.asarray(1.0),
@@ -91,4 +91,4 @@ def test_a_state_that_is_not_finite_has_no_torque(pushed):
 def test_a_step_without_samples_is_refused():
     plans = first_plan(TrajectoryProblem(rates, lambda x, u: x @ x, lambda x: x @ x), UPRIGHT, np.zeros((1, 1)))
     with pytest.raises(InputError, match="every"):
-        receding(None, plans, rates, rates, 1.0, rate=RATE, every=0)
+        recovery_by_plans(None, plans, rates, rates, 1.0, rate=RATE, every=0)
