@@ -74,7 +74,16 @@ def prepare(
         problem._replace(knots=jax.tree.map(lambda rows, part=part: rows[part], problem.knots))
         for part in (slice(None, -1), slice(1, None))
     )
-    states, u = followed(now, x, (plan.x[:-1], plan.u, jnp.zeros_like(plan.u), plan.K), _limited(problem))
+
+    def under(about: Array, K: Array) -> tuple[Array, Array]:
+        return followed(now, x, (about, plan.u, jnp.zeros_like(plan.u), K), _limited(problem))
+
+    states, u = under(plan.x[:-1], plan.K)
+    # Gains that are too large for the deviation, as after a blow, would leave every later plan without a value.
+    lost = ~jnp.isfinite(states).all()
+    bare = lambda: under(jnp.zeros_like(plan.x[:-1]), jnp.zeros_like(plan.K))  # noqa: E731
+    states, u = jax.lax.cond(lost, bare, lambda: (states, u))
+    u = jnp.where(jnp.isfinite(u), u, plan.u)  # x was not finite
     knot = jax.tree.map(lambda rows: rows[-1], knots_of(later)[0])
     last = problem.step(states[-1], u[-1], *knot)
     moved = plan._replace(

@@ -99,6 +99,28 @@ def test_a_control_is_nan_where_the_state_is():
     assert int(prepare(BLOCK, plan, jnp.asarray(START) * np.nan).ending) == Ending.NOT_FINITE
 
 
+STEEP = BLOCK._replace(
+    step=lambda x, u: BLOCK.step(x, u) + DT * jnp.stack([0.0, 1.0]) * x[0] ** 3, upper_x=np.inf, upper=30.0, lower=-30.0
+)
+"""A spring that pushes the mass away ever harder."""
+
+
+@pytest.mark.parametrize("cause", ["gains", "reading"])
+def test_a_plan_without_a_value_is_no_end(cause):
+    """Gains that throw the prediction to infinity, or one reading that is none, leave the next plans finite."""
+    act, plan = jax.jit(mpc(STEEP)), first_plan(STEEP, START / 2, np.zeros((N, 1)))
+    x = jnp.asarray(START) / 2
+    for sample in range(40):
+        hit = sample == 10
+        if hit and cause == "gains":
+            plan = plan._replace(K=plan.K + 1e200)
+        u, after = act(x * np.nan if hit and cause == "reading" else x, plan)
+        lost = cause == "reading" and sample in (10, 11)
+        assert np.isnan(u).all() == lost
+        plan, x = after, STEEP.step(x, jnp.zeros(1) if lost else u)
+    assert int(plan.ending) == Ending.UNDECIDED and np.abs(x).max() < 0.05
+
+
 def test_knots_move_a_reference_and_constraints_that_depend_on_time():
     """A gate that opens at 1 s: the mass waits before it, in plans of `shoot` and in real time alike."""
     t = DT * np.arange(N + 41)
