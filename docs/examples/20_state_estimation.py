@@ -94,10 +94,8 @@ settled = slice(round(0.2 * RATE), None)
 for name, qd in rates.items():
     errors[name] = np.sqrt(np.mean((np.asarray(qd) - truth)[settled] ** 2, axis=0))
     print(f"{name}: rms error of the rates {errors[name][0]:.3f} rad/s (arm), {errors[name][1]:.3f} rad/s (pole)")
-for name in filters:
-    assert (errors[name] < 0.5 * errors["differences"]).all()
-    if name in chatter:
-        assert chatter[name][0] < 0.5 * chatter["differences"][0]
+assert all((errors[name] < 0.5 * errors["differences"]).all() for name in filters)
+assert all(chatter[name][0] < 0.5 * chatter["differences"][0] for name in ("extended", "unscented"))
 
 # %%
 # Torques of the last half second, and how much they chatter.
