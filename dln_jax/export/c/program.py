@@ -193,14 +193,13 @@ class Program:
         return self.gather(elements, np.arange(len(elements)).reshape(batch, m, n))
 
     def _dot(self, left: Iterable[Node], right: Iterable[Node]) -> Node:
-        total: Node | None = None
-        for a, b in zip(left, right, strict=True):
-            if total is not None and a.dtype == "real":
+        (a, b), *rest = zip(left, right, strict=True)
+        total = self.elementwise("mul", a, b)
+        for a, b in rest:
+            if a.dtype == "real":
                 total = self.elementwise("multiply_add", a, b, total)
             else:
-                product = self.elementwise("mul", a, b)
-                total = product if total is None else self.elementwise("add", total, product)
-        assert total is not None
+                total = self.elementwise("add", total, self.elementwise("mul", a, b))
         return total
 
     def scalars(self, node: Node) -> list[Node]:
