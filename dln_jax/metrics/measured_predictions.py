@@ -1,9 +1,8 @@
 """Horizon of predictions on motions with measured coordinates: initial states are fitted to the first samples.
 
     VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= threshold, counted from the end of the fitted samples
-        lambda = ln |dx(T) / dx(0)| / T, the growth rate of infinitesimal changes of the start along the predicted
-        motion
-        drift = largest |E(t) - E(0) - (work of tau - work lost to friction)| relative to the largest kinetic energy
+    lambda = ln |dx(T) / dx(0)| / T, the growth rate of an infinitesimal change of the start
+    drift = largest |E(t) - E(0) - (work of tau - work lost to friction)| relative to the largest kinetic energy
 
 A perturbation e of the initial state grows to e exp(lambda t). Predictions of chaotic motions are measured in Lyapunov
 times, 1 / lambda: a more accurate model extends them only by the logarithm of its accuracy.

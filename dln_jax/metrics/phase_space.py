@@ -1,7 +1,7 @@
 """Errors of a model of a phase space: of its field at test states, and of its predicted motions.
 
     test loss        mean over samples and components of (rates - measured rates)², as published
-        clean field      the same against the exact field at the same noisy states, which distinguishes models
+    clean field      the same against the exact field at the same noisy states, which distinguishes models
     energy           mean over starts and times of (H(x_hat(t)) - H(x(t)))², H the true one
     rollout          mean over starts, times and components of (x_hat(t) - x(t))²
 

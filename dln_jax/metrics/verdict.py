@@ -6,7 +6,7 @@ the error of the robot's own file. A joint is
 
     explained     e <= UNEXPLAINED v + NOISE n
     unexplained   e >= v: a constant would have done as well
-        doubtful      in between; if the mean of e / v over all joints exceeds FAILED, the fit is refused
+    doubtful      in between; if the mean of e / v over all joints exceeds FAILED, the fit is refused
     unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: no conclusion
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
@@ -16,7 +16,7 @@ times the farthest measured one; angles may grow, since a pendulum can turn over
 square of its first `EARLY` samples over the variance of the data, because chaotic motions later diverge from any model.
 
     refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the spread)
-        doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the share of noise in the variance is added to both limits
+    doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the share of noise in the variance is added to both limits
 """
 
 from collections.abc import Sequence

@@ -5,9 +5,8 @@ only `exp` flushes results below the smallest normal number to zero. The methods
 Manual for the Elementary Functions, 1980; Muller, Elementary Functions, 2016):
 
     exp, expm1  x = n ln 2 + r, a polynomial in r, 2ⁿ by its bits
-        tanh        1 - 2 e / (1 + e) with e = exp(-2|x|); near 0 a rational function; one division serves both
-        sin, cos    |x| = n pi/2 + r, with pi/2 in parts whose products with n are exact; n selects one of two
-        polynomials
+    tanh        1 - 2 e / (1 + e) with e = exp(-2|x|); near 0 a rational function; one division serves both
+    sin, cos    |x| = n pi/2 + r, with pi/2 in parts whose products with n are exact; n selects a polynomial
     log, log1p  x = 2ᵏ (1 + s), log(1 + s) = 2 artanh(s / (2 + s))
 
 A number is rounded to an integer n by adding 1.5 2⁵² (float: 1.5 2²³), which leaves n in the low bits of the sum. This

@@ -16,8 +16,7 @@ AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
 FACETS = {2: ((0, 1), (1, 2), (2, 0)), 3: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))}
 """Corners of the facets by dimension, oriented outwards: in the plane the body lies on the left of an edge, in space
-the
- right-hand normal of a triangle points away from the body."""
+the right-hand normal of a triangle points away from the body."""
 
 SIDES = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}
 """Corners of the edges by dimension, in the order of the mid-side nodes (that of VTK)."""

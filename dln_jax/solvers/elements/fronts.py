@@ -4,8 +4,8 @@ Every node of the elimination tree has a front: a dense matrix over the unknowns
 boundary, the unknowns that this affects. Fronts of any size consist of square tiles of one size, so that few operations
 are compiled. Only tiles of the lower triangle are stored:
 
-        L    tiles of the eliminated columns, row after row of each front; they are kept
-        U    tiles of the boundary, which the parent adds to its own front; later fronts reuse their storage
+    L    tiles of the eliminated columns, row after row of each front; they are kept
+    U    tiles of the boundary, which the parent adds to its own front; later fronts reuse their storage
 """
 
 from collections.abc import Sequence

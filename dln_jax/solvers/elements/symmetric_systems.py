@@ -39,7 +39,7 @@ def factorise_blocks(diagonal: Float[Array, "count s s"], below: Float[Array, "c
 
     Args:
         diagonal: D_i; only their lower triangles are read.
-            below: C_1, C_2, ...: rows of block i, columns of block i - 1.
+        below: C_1, C_2, ...: rows of block i, columns of block i - 1.
     """
 
     def eliminate(previous: Array, blocks: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
