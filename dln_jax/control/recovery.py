@@ -69,7 +69,7 @@ def recovery_by_plans(
     """
     require_positive(rate=rate, every=every)
 
-    def planned(memory: Recovery, x: Array) -> Recovery:
+    def planned(memory: Recovery, x: Array, within: Array) -> Recovery:
         now = problem if memory.parameters is None else problem(memory.parameters)
         fresh = jax.vmap(lambda u: first_plan(now, x, u))(plans.u)
         going = memory.plans._replace(damping=jnp.clip(memory.plans.damping, *DAMPING))
@@ -77,8 +77,9 @@ def recovery_by_plans(
         chosen = jax.vmap(lambda again, *pair: jax.tree.map(lambda new, old: jnp.where(again, new, old), *pair))
         started = chosen(again, fresh, going)
         controls = jax.vmap(lambda plan: feedback(now, plan, x))(started)
-        # A number in place of a condition: under `vmap` it is one unless a lane starts again.
-        turns = jnp.where(memory.near, RENEWING, 1)
+        # A number in place of a condition: under `vmap`, where lanes near the goal plan too, it is one for all lanes
+        # unless one of them has just left the goal.
+        turns = jnp.where(memory.near & ~within, RENEWING, 1)
         after = jax.vmap(lambda plan: prepare(now, plan, x, iterations=turns, step_lengths=LENGTHS))(started)
         best = jnp.argmin(jnp.where(jnp.isfinite(after.cost), after.cost, jnp.inf))
         acting = controls[best], started.K[best, 0], x, after.x[best, 0]
@@ -91,9 +92,9 @@ def recovery_by_plans(
         # By the time, which all lanes of a `vmap` share: with a counter in the memory they would plan at every sample.
         number = jnp.round(t * rate).astype(int) % every
         # The regulator takes over at any sample, and a plan at the start of a step.
-        kept = lambda memory, x: memory  # noqa: E731
-        if_away = lambda memory, x: jax.lax.cond(within, kept, planned, memory, x)  # noqa: E731
-        memory = jax.lax.cond(number == 0, if_away, kept, memory, x)
+        kept = lambda memory, x, within: memory  # noqa: E731
+        if_away = lambda *args: jax.lax.cond(within, kept, planned, *args)  # noqa: E731
+        memory = jax.lax.cond(number == 0, if_away, kept, memory, x, within)
         memory = memory._replace(near=memory.near | within)
         u, K, begin, end = memory.acting
         along = u + K @ (x - begin - number / every * (end - begin))

@@ -127,7 +127,9 @@ def _chosen(
 ) -> Tuned:  # fmt: skip
     """The settings of one way with the largest margin."""
     random = np.random.default_rng([seed, 31])
-    lanes = max(sets * len(way.errors), FINALISTS * len(ERRORS) * STARTS)
+    sets = min(sets, way.most_sets or sets)
+    finalists = min(FINALISTS, way.most_sets or FINALISTS)
+    lanes = max(sets * len(way.errors), finalists * len(ERRORS) * STARTS)
     program = jax.jit(jax.vmap(trial))
     settings: list[Any] = []
     times = np.zeros((0, len(way.errors)))
@@ -151,7 +153,7 @@ def _chosen(
         fresh = way.draw(random, sets)
         settings += fresh
         times = np.concatenate([times, tried(fresh, way.errors, 1)[:, :, 0]])
-        if np.isfinite(times).all(axis=1).sum() >= FINALISTS:
+        if np.isfinite(times).all(axis=1).sum() >= finalists:
             break
     good = np.isfinite(times).all(axis=1)
     if not good.any():
@@ -160,8 +162,8 @@ def _chosen(
             f"limits in {trials} trials, of which {np.isfinite(times).mean():.0%} came up; a stronger motor, wider "
             "limits, more time or a better model may"
         )
-    best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(FINALISTS, int(good.sum()))]
-    starts = max(STARTS, lanes // (FINALISTS * len(ERRORS)))
+    best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(finalists, int(good.sum()))]
+    starts = max(STARTS, lanes // (finalists * len(ERRORS)))
     final = tried([settings[k] for k in best], ERRORS, starts)
     margins = np.array([_margin(np.isfinite(one).all(axis=1)) for one in final])
     share = np.isfinite(final).mean(axis=(1, 2))

@@ -17,7 +17,9 @@ from dln_jax.control.swing_up import Upright, law_at
 from dln_jax.types import InputError
 
 PLANS = 8
-"""Number of plans, at most, that are tried with feedback."""
+"""Largest number of plans that are tried with feedback."""
+SETS_OF_REPEATED_PLANS = 2
+"""Trials of repeated plans take far longer than others, because every one of them plans at every step of a plan."""
 
 
 class Way(NamedTuple):
@@ -32,6 +34,8 @@ class Way(NamedTuple):
     """Settings -> their numbers, and the regulator at the goal."""
     errors: tuple[float, ...]
     """Errors in the first round, one trial each."""
+    most_sets: int | None = None
+    """Largest number of sets in a round; by default as many as are asked for."""
 
 
 def by_energy(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
@@ -87,7 +91,7 @@ def by_repeated_plans(upright: Upright, layout: Layout, scales: Scales, seed: in
         regulator, level = settings
         return {"level": float(level)}, regulator
 
-    return Way("repeated plans", draw, controller, numbers, (0.15, -0.15))
+    return Way("repeated plans", draw, controller, numbers, (0.15, -0.15), SETS_OF_REPEATED_PLANS)
 
 
 RECOVERIES: Mapping[str, tuple[Callable[..., Way], ...]] = {
