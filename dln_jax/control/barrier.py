@@ -1,8 +1,8 @@
 """Newton steps of an interior-point method on the conditions of an optimal trajectory.
 
-Inequalities c - t + s = 0 have slacks s > 0 with multipliers z; those that are soft have an excess t > 0 with a
-multiplier y, which costs w_1 t + w_2 t² / 2. With s z = μ and t y = μ, slacks and excesses are eliminated, and what is
-left is a quadratic program over the horizon.
+An inequality c - t + s = 0 has a slack s > 0 with multiplier z. A soft one also has an excess t > 0 with multiplier y,
+which costs w_1 t + w_2 t² / 2. The conditions s z = μ and t y = μ eliminate slacks and excesses, which leaves a
+quadratic program over the horizon.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ class Inequalities(NamedTuple):
 
     present: Array
     elastic: Array
-    """Those that are soft."""
+    """Soft inequalities."""
     linear: Any
     square: Any
 
@@ -42,24 +42,24 @@ class Iterate(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Residuals of the conditions, largest absolute values."""
+    """Largest absolute residuals of the optimality conditions."""
 
     stationarity: Array
     feasibility: Array
     complementarity: Array
 
     def largest(self) -> Array:
-        """The largest of the three."""
+        """Returns the largest of the three."""
         return jnp.max(jnp.stack(self))
 
 
 def gaps(of: Inequalities, at: Iterate, values: Values) -> Array:
-    """Residuals of the inequalities with their slacks."""
+    """Returns the residuals c - t + s of the inequalities."""
     return jnp.where(of.present, values.c + at.s - at.t, 0.0)
 
 
 def measure(of: Inequalities, at: Iterate, values: Values, barrier: Array) -> tuple[Array, Array]:
-    """Sum of the violations, and barrier function, infinite where it is not finite."""
+    """Returns the sum of the violations, and the barrier function, infinite if it is not a finite number."""
     violation = jnp.sum(jnp.abs(jnp.concatenate([values.defects.ravel(), values.h, gaps(of, at, values)])))
     price = of.linear * at.t + of.square * at.t**2 / 2 - barrier * jnp.log(at.t)
     phi = values.cost - barrier * jnp.sum(jnp.where(of.present, jnp.log(at.s), 0.0))
@@ -68,7 +68,7 @@ def measure(of: Inequalities, at: Iterate, values: Values, barrier: Array) -> tu
 
 
 def slope(of: Inequalities, at: Iterate, slopes: Slopes, step: Iterate, barrier: Array) -> Array:
-    """Derivative of the barrier function along a step."""
+    """Returns the derivative of the barrier function along a step."""
     fall = along(slopes, step.x, step.u)[0] - barrier * jnp.sum(jnp.where(of.present, step.s / at.s, 0.0))
     return fall + jnp.sum(jnp.where(of.elastic, (of.linear + of.square * at.t - barrier / at.t) * step.t, 0.0))
 
@@ -76,7 +76,7 @@ def slope(of: Inequalities, at: Iterate, slopes: Slopes, step: Iterate, barrier:
 def residuals(
     of: Inequalities, at: Iterate, values: Values, slopes: Slopes, barrier: Any, free: Any
 ) -> tuple[Residuals, Residuals]:
-    """Residuals at a barrier, plain and divided by a hundredth of the mean multiplier where that is above one."""
+    """Returns the residuals at a barrier, plain and divided by 1/100 of the mean multiplier if that is above one."""
     gradient = stationarity(slopes, at.prices, at.z, at.nu, free)
     products = jnp.where(of.present, at.s * at.z - barrier, 0.0)
     gradient = jnp.append(gradient, jnp.where(of.elastic, of.linear + of.square * at.t - at.z - at.y, 0.0))
@@ -94,7 +94,7 @@ def newton(
     of: Inequalities, at: Iterate, slopes: Slopes, curvatures: tuple[Array, Array], barrier: Array, unmet: Values,
     gap: Array, damping: Array, free: Any,
 ) -> tuple[HorizonSolution, Iterate]:  # fmt: skip
-    """Returns the step that removes the residuals of the constraints, as a solution and as a change of the iterate."""
+    """Returns the Newton step, as a solution of the quadratic program and as a change of the iterate."""
     stiff = at.z / at.s
     drive = jnp.where(of.present, barrier / at.s, 0.0) - at.z + stiff * gap
     give = jnp.where(of.elastic, 1 / (of.square + at.y / at.t), 0.0)
@@ -115,7 +115,7 @@ def newton(
 
 
 def to_boundary(of: Inequalities, at: Iterate, step: Iterate, share: Array) -> tuple[Array, Array]:
-    """Longest lengths, at most one, that keep a share of the distance of s and t, and of z and y, from zero."""
+    """Returns the longest step lengths, at most one, that use up at most `share` of s and t, and of z and y."""
 
     def longest(*pairs: tuple[Array, Array, Array]) -> Array:
         fastest = [jnp.max(jnp.where(mask, -d / v, 0.0), initial=0.0) for v, d, mask in pairs]
@@ -128,7 +128,7 @@ def to_boundary(of: Inequalities, at: Iterate, step: Iterate, share: Array) -> t
 
 
 def inside(of: Inequalities, values: Values, x: Array, u: Array, margin: float) -> Iterate:
-    """The first iterate: slacks of at least a margin, multipliers one."""
+    """Returns the first iterate: slacks of at least a margin, z = 1, y >= 1, and other multipliers zero."""
     t = jnp.where(of.elastic, jnp.maximum(values.c, 0.0) + margin, 0.0)
     s, z = jnp.where(of.present, jnp.maximum(t - values.c, margin), 1.0), jnp.where(of.present, 1.0, 0.0)
     y = jnp.where(of.elastic, jnp.maximum(of.linear + of.square * t - z, 1.0), 0.0)
@@ -136,7 +136,7 @@ def inside(of: Inequalities, values: Values, x: Array, u: Array, margin: float) 
 
 
 def guarded(of: Inequalities, at: Iterate, barrier: Array, spread: float) -> Iterate:
-    """Keeps s z and t y within a factor of the barrier."""
+    """Limits z and y so that s z and t y stay within the factor `spread` of the barrier."""
 
     def within(z: Array, s: Array, mask: Array) -> Array:
         return jnp.where(mask, jnp.clip(z, barrier / (spread * s), spread * barrier / s), 0.0)

@@ -1,11 +1,10 @@
-"""Closed loop of a plant in continuous time and a sampled controller, with the effects of the hardware on both.
+"""Closed loop of a continuous-time plant and a sampled controller, including the effects of the hardware.
 
-At every sample the controller receives the measured coordinates and returns controls. They are limited, delayed by
-whole samples and noisy, and held until the next sample while the classical Runge-Kutta method integrates the plant.
-`vmap` over starts and keys simulates many runs in one program; `outcomes` evaluates those of a pole.
+At every sample the controller receives the measured coordinates and returns controls. These are limited, delayed by
+whole samples, disturbed by noise and held until the next sample, while the classical Runge-Kutta method integrates the
+plant. `vmap` over starts and keys simulates many runs in one program; `outcomes` evaluates the runs of a pole.
 
-If a control or a measurement is not finite, the controls are NaN, and so is everything after them: a failure is never
-hidden.
+If a control or a measurement is not finite, the controls and everything after them are NaN: a failure is never hidden.
 """
 
 from collections.abc import Callable
@@ -26,7 +25,7 @@ UP = 0.1
 
 
 class Controller(NamedTuple):
-    """A control law with memory, such as a filter, an observer or a plan; pure."""
+    """A pure control law with memory, such as a filter, an observer or a plan."""
 
     start: Any
     """Memory before the first sample, any tree of arrays."""
@@ -49,7 +48,7 @@ class Hardware(NamedTuple):
     delay: int = 0
     """Delay of the controls in samples."""
     sees_rates: bool = True
-    """Whether the controller also receives qd, free of noise; otherwise y = q."""
+    """Whether the controller also receives qd, without noise; otherwise y = q."""
 
 
 class ClosedLoopRun(NamedTuple):
@@ -57,7 +56,7 @@ class ClosedLoopRun(NamedTuple):
 
     t: Float[Array, "N+1"]
     x: Float[Array, "N+1 n"]
-    """True states: the initial one and those at the ends of the samples."""
+    """True states: at the start, and at the end of every sample."""
     u: Float[Array, "N m"]
     """Controls that acted on the plant."""
     y: Float[Array, "N p"]
@@ -68,9 +67,9 @@ class Push(NamedTuple):
     """A push: a jump of the rates, as after a short blow."""
 
     seconds: float
-    """Its time, s."""
+    """Time of the push, s."""
     rates: Any
-    """What is added to the rates [d], 1/s or m/s."""
+    """Change of the rates [d], 1/s or m/s."""
 
 
 def stateless(law: Law) -> Controller:
@@ -81,15 +80,15 @@ def stateless(law: Law) -> Controller:
 def following(law: Tracker, reference: Reference, *, rate: float) -> Controller:
     """Returns a controller that follows a recorded reference, from measurements y = (q, qd).
 
-    The reference is the memory of the controller, so that runs along references of one length share a program.
+    The reference is the memory of the controller, so runs along references of equal length share a program.
 
     Args:
         law: such as `tracking.feed_forward`.
         reference: q, qd and qdd [N, d] at the times k / rate; the last row applies to all later times.
-        rate: Hz.
+        rate: sampling rate, Hz.
 
     Raises:
-        InputError: a rate that is not positive.
+        InputError: the rate is not positive.
     """
     require_positive(rate=rate)
 
@@ -117,19 +116,19 @@ def simulate(
     """Simulates the closed loop from a state; traceable and differentiable.
 
     Args:
-        field: of the plant, (x, u) -> dx/dt, on x = (q, qd).
+        field: (x, u) -> dx/dt of the plant, on x = (q, qd).
         controller: called once per sample.
         x: initial state [2 d].
         seconds: duration of the run.
-        rate: of the samples, Hz.
-        controls: m.
+        rate: sampling rate, Hz.
+        controls: m, number of controls.
         hardware: limits, noise, delay.
-        key: of the noise; required if there is any.
+        key: random key of the noise; required if there is any.
         substeps: integrator steps per sample.
-        push: before the measurement of its sample; by default none.
+        push: acts before the measurement of its sample; by default none.
 
     Raises:
-        InputError: settings out of range, or noise without a key.
+        InputError: a setting is out of range, or there is noise without a key.
     """
     require_positive(seconds=seconds, rate=rate, controls=controls)
     step, dt = integrated(field, 1.0 / rate, substeps=substeps), 1.0 / rate
@@ -153,10 +152,10 @@ def simulate(
 def sampled(
     controller: Controller, hardware: Hardware, *, controls: int, rate: float, key: Array | None
 ) -> tuple[Any, Callable[[Any, Array, Array], tuple[Any, Array, Array]]]:
-    """What happens at a sample between a plant and its controller, for any simulator of the plant.
+    """Puts the hardware between a controller and any simulator of the plant.
 
-    Returns the initial memory, with the queue of delayed controls, and (memory, x, number of the sample) -> memory, the
-    acting controls and the measurement. Raises `InputError` as `noise_of`.
+    Returns the initial memory, including the queue of delayed controls, and (memory, x, number of the sample) ->
+    (memory, acting controls, measurement). Raises `InputError` as `noise_of` does.
     """
     key = noise_of(hardware, key)
 
@@ -172,7 +171,7 @@ def sampled(
 
 
 def noise_of(hardware: Hardware, key: Array | None) -> Array:
-    """Returns the key, or any key without noise; raises `InputError` for noise without a key, or an invalid delay."""
+    """Returns the key, or a default key; raises `InputError` for noise without a key, or an invalid delay."""
     delay = hardware.delay
     if delay < 0 or delay != int(delay):
         raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
@@ -182,7 +181,7 @@ def noise_of(hardware: Hardware, key: Array | None) -> Array:
 
 
 def measured(hardware: Hardware, x: Array, key: Array) -> Array:
-    """Measurement of a state (q, qd) that the controller receives."""
+    """Returns the measurement of a state (q, qd) that the controller receives."""
     q, qd = jnp.split(x, 2)
     if _noisy(hardware):
         q = q + hardware.encoder_noise * jax.random.normal(key, q.shape, x.dtype)
@@ -230,7 +229,7 @@ class Outcomes(NamedTuple):
 
 
 def outcomes(angle: Any, *, rate: float, up: float = UP) -> Outcomes:
-    """Evaluates a pole's angles from upright [n, N+1], rad, at the samples of the runs.
+    """Evaluates the angles of a pole from upright [n, N+1], rad, at the samples of n runs.
 
     An angle that is not finite does not count as upright.
     """
@@ -242,11 +241,11 @@ def outcomes(angle: Any, *, rate: float, up: float = UP) -> Outcomes:
 
 
 def hanging_starts(count: int, seed: int, *, position: float, angle: float = 0.1) -> Float[np.ndarray, "n 4"]:
-    """Random states (position, angle from upright, rates) near a pole hanging at rest, with normal deviations.
+    """Draws normally distributed states (position, angle from upright, rates) near a pole hanging at rest.
 
     Args:
         count: n.
-        seed: of the draw.
+        seed: seed of the draw.
         position: standard deviation of the driven coordinate, m or rad.
         angle: standard deviation of the pole from hanging, rad.
     """

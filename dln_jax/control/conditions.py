@@ -1,10 +1,10 @@
-"""The conditions of an optimal trajectory: constraints as one vector, derivatives by stages, residuals.
+"""Optimality conditions of a trajectory: constraints as one vector, derivatives by stage, residuals.
 
     L = sum_k l(x_k, u_k) + l_N(x_N) + sum_k λ_{k+1}·(f(x_k, u_k) - x_{k+1}) + z·c + ν·h(x_N),   c <= 0, h = 0
 
-c stacks limits of controls, path constraints, limits of states and constraints on states, first of the steps, then of
-the end. The limits and constraints of a fixed first state are left out: no control changes them. h and -h follow as
-rows that take the place of h = 0 where violations are minimised.
+c stacks limits of controls, path constraints, limits of states and constraints on states, first for the steps, then for
+the end. Limits and constraints of the first state are left out: no control changes them. The rows h and -h follow; they
+replace h = 0 where violations are minimised.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ Rows = Callable[..., Array]
 
 
 class Values(NamedTuple):
-    """A trajectory's cost and constraints."""
+    """Cost and constraints of a trajectory."""
 
     cost: Float[Array, ""]
     c: Float[Array, " M"]
@@ -49,19 +49,19 @@ class Kinds(NamedTuple):
     """Masks of the inequalities."""
 
     present: Bool[Array, " M"]
-    """Limits that are finite, at states that are unknowns."""
+    """Finite limits and all constraints, except those on the first state."""
     soft: Bool[Array, " M"]
     controls: Bool[Array, " M"]
     """Limits of the controls."""
 
 
 def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
-    """Returns y -> distances beyond the finite limits, and the mask of those that are."""
+    """Returns y -> distances beyond the finite limits, and size of y -> mask of the finite ones."""
 
     def sides(size: int) -> list[tuple[int, Any, np.ndarray]]:
         chosen = []
         for sign, limit in ((-1, lower), (1, upper)):
-            # Limits that are traced may turn out infinite: their rows are masked.
+            # Traced limits may turn out to be infinite; their rows are then masked.
             traced = isinstance(limit, Tracer)
             index = np.arange(size) if traced else np.flatnonzero(np.broadcast_to(np.isfinite(limit), size))
             chosen.append((sign, jnp.broadcast_to(jnp.asarray(limit, float), size)[index], index))
@@ -77,7 +77,7 @@ def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
 def constraints(problem: TrajectoryProblem, n: int, m: int) -> tuple[Rows, Rows, Callable[[int], Kinds]]:
     """Returns (x, u) -> rows [P] of a step, x -> rows [E] of the end, and N -> the masks of all M rows.
 
-    Rows of steps are those of limits of the controls, `path`, limits of the states and `states`.
+    The rows of a step are limits of the controls, `path`, limits of the states and `states`.
     """
     of_u, finite_u = _beyond(problem.lower, problem.upper)
     of_x, finite_x = _beyond(problem.lower_x, problem.upper_x)
@@ -121,17 +121,17 @@ class Conditions(NamedTuple):
     values: Callable[[Array, Array], Values]
     slopes: Callable[[Array, Array], Slopes]
     curvatures: Callable[[Array, Array, Array, Array, Array], tuple[Array, Array]]
-    """(x, u, prices, z, nu) -> Hessians of L by steps [N, n+m, n+m] and of the end [n, n]."""
+    """(x, u, prices, z, nu) -> Hessians of L for the steps [N, n+m, n+m] and the end [n, n]."""
     kinds: Kinds
-    """Of the rows but the last, h and -h."""
+    """Masks of all rows except the last, h and -h."""
 
 
 def conditions(
     problem: TrajectoryProblem, shape: tuple[int, int, int], scale: Array, exact: bool, held: Array
 ) -> Conditions:
-    """Returns the functions for N steps of n states and m controls; Gauss-Newton unless `exact`: costs curve alone.
+    """Returns the functions for N steps with n states and m controls.
 
-    `held` is one, or zero where the equations of the end are left to the rows h and -h.
+    Unless `exact`, only costs have curvature (Gauss-Newton). `held` is one, or zero if the rows h and -h replace h = 0.
     """
     steps, n, m = shape
     step_rows, below, kinds = constraints(problem, n, m)
@@ -193,7 +193,7 @@ def split(rows: Array, steps: int, end_size: int) -> tuple[Array, Array]:
 
 
 def along(slopes: Slopes, dx: Array, du: Array) -> tuple[Array, Array, Array]:
-    """Directional derivatives of the cost, of c [M] and of h [q]."""
+    """Returns the directional derivatives of the cost, of c [M] and of h [q]."""
     both = jnp.concatenate([dx[:-1], du], axis=1)
     of_cost = jnp.sum(slopes.cost * both) + slopes.end_cost @ dx[-1]
     rows = jnp.einsum("kpi,ki->kp", slopes.rows, both)
@@ -201,7 +201,7 @@ def along(slopes: Slopes, dx: Array, du: Array) -> tuple[Array, Array, Array]:
 
 
 def stationarity(slopes: Slopes, prices: Array, z: Array, nu: Array, free: Any) -> Array:
-    """Gradient of L by all unknowns; a fixed first state has none."""
+    """Returns the gradient of L by all unknowns, zero for a fixed first state."""
     n, steps = slopes.steps.shape[1], len(slopes.steps)
     by_step, at_end = split(z, steps, len(slopes.end_rows))
     both = slopes.cost + jnp.einsum("kij,ki->kj", slopes.steps, prices) + jnp.einsum("kpj,kp->kj", slopes.rows, by_step)
@@ -214,7 +214,7 @@ def stationarity(slopes: Slopes, prices: Array, z: Array, nu: Array, free: Any) 
 def program(
     slopes: Slopes, curvatures: tuple[Array, Array], gradient: Array, weight: Array, missed: Array, damping: Any
 ) -> Horizon:
-    """The quadratic program of a step, with `gradient` and `weight` [M] on the inequalities' rows, and damping."""
+    """Returns the quadratic program of a step, with `gradient` and `weight` [M] on the inequalities, and damping."""
     n, steps = slopes.steps.shape[1], len(slopes.steps)
     (by_step, at_end), (stiff, stiff_end) = (split(rows, steps, len(slopes.end_rows)) for rows in (gradient, weight))
     of_steps = curvatures[0] + jnp.einsum("kpi,kp,kpj->kij", slopes.rows, stiff, slopes.rows)

@@ -1,4 +1,4 @@
-"""Problems of trajectories that contradict themselves, found before anything is solved."""
+"""Finds trajectory problems that contradict themselves, before anything is solved."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,11 +12,11 @@ from dln_jax.control.trajectories import TrajectoryProblem, knots_of
 from dln_jax.types import InputError
 
 ROUNDING = 1e-9
-"""Relative size below which differences count as none."""
+"""Relative and absolute size below which differences count as zero."""
 
 
 def require_start(problem: TrajectoryProblem, x: Any) -> None:
-    """Raises `InputError` for a known start outside its limits, which no control changes."""
+    """Raises `InputError` if a known start is outside its limits, because no control changes it."""
     known = [x, problem.lower_x, problem.upper_x]
     if any(isinstance(value, Tracer) for value in known) or not np.isfinite(x).all():
         return
@@ -35,7 +35,7 @@ def require_start(problem: TrajectoryProblem, x: Any) -> None:
 
 
 def require_end(problem: TrajectoryProblem, states: int) -> None:
-    """Raises `InputError` for a hard constraint of the end that is linear and that no state within the limits meets."""
+    """Raises `InputError` if no state within the limits meets a hard linear constraint of the end."""
     if any(isinstance(limit, Tracer) for limit in (problem.lower_x, problem.upper_x)):
         return
     limits = [np.broadcast_to(np.asarray(limit, float), states) for limit in (problem.lower_x, problem.upper_x)]
@@ -53,7 +53,7 @@ def require_end(problem: TrajectoryProblem, states: int) -> None:
 
 
 def _least(problem: TrajectoryProblem, rows: Any, sign: int, low: np.ndarray, high: np.ndarray) -> list[float]:
-    """The least value of each row, times a sign, within limits: -inf for rows that are not linear, or not known."""
+    """Returns the least value of each row times a sign within limits; -inf if it is unbounded, nonlinear or unknown."""
     _, last = knots_of(problem)
 
     def values(x: Array) -> Array:
@@ -73,7 +73,7 @@ def _least(problem: TrajectoryProblem, rows: Any, sign: int, low: np.ndarray, hi
 
 
 def _known(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The value of a function, or None where it depends on what is traced."""
+    """Returns the value of a function, or `None` if it depends on traced values."""
     with jax.ensure_compile_time_eval():
         value = jax.jit(function)(*arguments)
     return None if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)) else jax.tree.map(np.asarray, value)

@@ -1,9 +1,9 @@
-"""Two desktop plants with friction, limits, encoders, noise and delay, and swing-ups on them by any model.
+"""Two desktop plants with friction, limits, encoders, noise and delay, and their swing-ups by any model.
 
-The sizes are Quanser's (Lutter, Listmann and Peters 2019) and those of `scenes.poles`, similar to a QUBE. Dry
-friction of the driven joint is 3 % of the limit, and a third more at rest; that of the pole's hinge is 0.2 %
-(cart-pole) or 0.3 % of its weight's torque. Both plants run at 500 Hz, with forces delayed by one sample. Stiction is
-dry friction below 5 mm/s or 10 mrad/s.
+The cart-pole has Quanser's sizes (Lutter, Listmann and Peters 2019); the rotary pendulum has those of `scenes.poles`,
+similar to a QUBE. Dry friction of the driven joint is 3 % of the limit, and a third more at rest; that of the pole's
+hinge is 0.2 % (cart-pole) or 0.3 % of the torque of its weight. Both plants run at 500 Hz, with forces delayed by one
+sample. Below 5 mm/s or 10 mrad/s, dry friction stands in for stiction.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,11 +32,11 @@ from dln_jax.types import InputError
 TURN = 2 * np.pi / 2048
 """Resolution of an encoder, rad."""
 SECONDS = 10.0
-"""Duration of a swing-up's simulation, s."""
+"""Duration of a simulated swing-up, s."""
 HOLDING = 1.0
-"""Last part of a run in which the pole is held upright, s."""
+"""Duration of the last part of a run, in which the pole is held upright, s."""
 POSTURES = 65
-"""Number of pole angles around the circle at which a model has to be usable."""
+"""Number of pole angles around the circle at which a model must be usable."""
 
 
 class DesktopPlant(NamedTuple):
@@ -54,13 +54,13 @@ class DesktopPlant(NamedTuple):
     substeps: int
     """Integrator steps per sample, enough to resolve stiction."""
     numbers: SwingUpNumbers
-    """Numbers of its swing-up, tuned by a random search with the analytic model."""
+    """Settings of its swing-up, tuned by random search with the analytic model."""
     position: float
     """Standard deviation of the driven coordinate's initial value, m or rad."""
 
     @property
     def layout(self) -> Layout:
-        """What is known before it has moved."""
+        """Returns what is known of the plant before it has moved."""
         return layout(
             self.scene.needs.joints, [0], goal=np.zeros(2), hanging=[0.0, np.pi], rate=self.rate,
             control=self.hardware.upper,
@@ -78,7 +78,7 @@ class Tried(NamedTuple):
 
 
 def desktop_cart_pole() -> DesktopPlant:
-    """Returns a cart on a rail."""
+    """Returns a cart on a rail, with a pole."""
     sizes = {"cart_mass": 0.57, "pole_mass": 0.127, "length": 0.16825}
     friction = FrictionCoefficients(viscous=(0.1, 1e-3), coulomb=(0.3, 5e-4), stribeck=(0.1, 2e-4))
     shape = FrictionShape(velocity_scale=(0.005, 0.01), stribeck_velocity=(0.05, 0.1))
@@ -92,7 +92,7 @@ def desktop_cart_pole() -> DesktopPlant:
 
 
 def desktop_rotary_pendulum() -> DesktopPlant:
-    """Returns a pendulum on the arm of a motor's shaft."""
+    """Returns a pendulum on an arm that a motor turns."""
     sizes = {"arm_mass": 0.095, "arm_length": 0.085, "pole_mass": 0.024, "pole_length": 0.129}
     friction = FrictionCoefficients(viscous=(1e-4, 1e-5), coulomb=(1.5e-3, 5e-5), stribeck=(5e-4, 2e-5))
     shape = FrictionShape(velocity_scale=(0.01, 0.01), stribeck_velocity=(0.1, 0.1))
@@ -114,31 +114,31 @@ NAMES = {**{name: name for name in PLANTS}, "furuta": "rotary-pendulum"}
 
 
 def desktop_plant(name: str) -> DesktopPlant:
-    """Returns the plant of this name; `InputError` lists the names."""
+    """Returns the plant with this name; for an unknown name, `InputError` lists the known ones."""
     if name not in NAMES:
         raise InputError(f"plant is {name!r:.40}; choose from {', '.join(NAMES)}, or a file")
     return PLANTS[NAMES[name]]()
 
 
 def model_of_plant(plant: DesktopPlant) -> Dynamics:
-    """The true plant with its friction, which is unknown in practice."""
+    """Returns the true plant with its friction, which is unknown in practice."""
     return dynamics(plant.scene.closed_form)
 
 
 def nominal_model(plant: DesktopPlant) -> Dynamics:
-    """Model with the manufacturer's sizes, without friction."""
+    """Returns the model with the manufacturer's sizes, without friction."""
     return dynamics(plant.nominal(**plant.sizes).closed_form)
 
 
 def simulated_plant(plant: DesktopPlant, *, seed: int = 0) -> Plant:
-    """The plant as four callables, as for any plant; the seed sets its starts and its noise."""
+    """Returns the plant as callables, as for any plant; the seed determines its starts and its noise."""
     return plant_of(
         model_of_plant(plant), plant.layout, substeps=plant.substeps, hardware=plant.hardware, seed=seed
     )  # fmt: skip
 
 
 def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, estimator: Estimator | None = None) -> SwingUp:
-    """Returns the plant's swing-up by a model, by default with rates by differences; raises as `swing_up`."""
+    """Returns the plant's swing-up by a model, by default with rates from differences; raises as `swing_up`."""
     needs, hardware = plant.scene.needs, plant.hardware
     return swing_up(
         model, needs.actuation, needs.joints, np.zeros(2), plant.numbers, postures=_circle(), lower=hardware.lower,
@@ -147,7 +147,7 @@ def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, estimator: Esti
 
 
 def upright_for(plant: DesktopPlant, model: Dynamics | PlainDynamics) -> Upright:
-    """The model, checked, with its equilibrium near the goal; raises as `swing_up`."""
+    """Returns the checked model with its equilibrium near the goal; raises as `swing_up`."""
     return upright_of(
         model, plant.scene.needs.actuation, np.zeros(2), postures=_circle(), lower=plant.hardware.lower,
         upper=plant.hardware.upper,
@@ -167,7 +167,7 @@ def motion_of(
     estimator: Estimator | None = None,
     push: Push | None = None,
 ) -> Callable[[Array, Array], ClosedLoopRun]:
-    """(initial state [4], key of the noise) -> a run of the true plant with the model's law; as for `law_of`."""
+    """Returns (initial state [4], key of the noise) -> run of the true plant under the law of `law_of`."""
     controller = law_of(plant, model, estimator).controller
     B = np.asarray(plant.scene.needs.actuation)
     field = field_of(model_of_plant(plant), B)
@@ -191,7 +191,7 @@ def try_starts(
     estimator: Estimator | None = None,
     push: Push | None = None,
 ) -> Tried:
-    """Runs swing-ups from random states near hanging, with independent noise; the rest as for `motion_of`."""
+    """Runs swing-ups from random states near hanging, with independent noise; other arguments as for `motion_of`."""
     run = motion_of(plant, model, seconds=seconds, estimator=estimator, push=push)
     held = min(round(HOLDING * plant.rate), round(seconds * plant.rate))
 

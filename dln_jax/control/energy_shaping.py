@@ -1,13 +1,13 @@
-"""Energy laws for plants with passive joints, of known or learned models: the same functions for all of them.
+"""Energy laws for plants with passive joints, from known or learned models.
 
 Collocated partial feedback linearisation gives the active joints any acceleration a (Spong 1995, "The swing up control
-problem for the acrobot"). The passive rows of the equations of motion, without motors, determine the other
+problem for the acrobot"). The passive rows of the equations of motion, which have no motors, determine the other
 accelerations. With h = c + g + friction,
 
     qdd_p = -M_pp⁻¹ (M_pa a + h_p),   tau_a = M_aa a + M_ap qdd_p + h_a
 
 The passive part, with the active joints locked, has the energy E = ½ qd_pᵀ M_pp qd_p + V. Accelerating the active
-joints does work on it at the rate -qd_pᵀ M_pa a, so that a = k (E - E*) M_ap qd_p drives E to that of the goal.
+joints does work on it at the rate -qd_pᵀ M_pa a, so a = k (E - E*) M_ap qd_p drives E to the energy E* of the goal.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,14 +27,14 @@ class EnergyGains(NamedTuple):
     """Gains of the accelerations of the active joints."""
 
     energy: float
-    """1/(kg m² J s) for revolute joints; maps M_ap qd_p times the energy's error to an acceleration."""
+    """k, 1/(kg m² J s) for revolute joints; maps M_ap qd_p times the energy error to an acceleration."""
     proportional: float
     """1/s²."""
     derivative: float
     """1/s."""
     total: Any = None
-    """Whether the energy is that of the whole plant, as for acrobots (Spong), and the coupling that of the goal; 0 or
-    1, possibly traced. `None`: the energy of the passive part, as for poles on a driven base."""
+    """1 for the energy of the whole plant and the coupling at the goal, as for acrobots (Spong); 0 or `None` for the
+    energy of the passive part, as for poles on a driven base. The number may be traced."""
 
 
 class Parts(NamedTuple):
@@ -48,20 +48,20 @@ def parts_of(actuation: Any) -> Parts:
     """Derives the parts from the matrix [d, u] in tau = B u, if every motor drives one coordinate.
 
     Raises:
-        InputError: motors that drive several coordinates, or no passive one.
+        InputError: a motor drives several coordinates or none, two motors drive the same one, or none is passive.
     """
     B = np.asarray(actuation, float)
     driven = (B != 0).sum(axis=1)
     active = tuple(np.flatnonzero(driven).tolist())
     if B.ndim != 2 or (driven > 1).any() or ((B != 0).sum(axis=0) != 1).any() or len(active) == len(B):
         raise InputError(
-            f"actuation is {B.tolist()}; expected motors that drive one coordinate each, and some coordinate without"
+            f"actuation is {B.tolist()}; expected one coordinate per motor, and a coordinate without a motor"
         )
     return Parts(active, tuple(np.setdiff1d(np.arange(len(B)), active).tolist()))
 
 
 def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Vector, Array], Array]:
-    """(q, qd, accelerations of the active joints) -> their forces, exact where M_pp is regular."""
+    """Returns (q, qd, accelerations of the active joints) -> their forces, exact where M_pp is regular."""
     active, passive = map(np.array, parts)
 
     def forces(q: Vector, qd: Vector, a: Array) -> Array:
@@ -75,7 +75,7 @@ def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Ve
 
 
 def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector, Vector], Scalar]:
-    """(q, qd) -> energy of the passive part in J, with the active joints locked at the goal, relative to the goal."""
+    """Returns (q, qd) -> energy of the passive part above the goal's, J, with the active joints locked at the goal."""
     active, passive = map(np.array, parts)
     goal = jnp.asarray(goal, float)
 
@@ -95,17 +95,17 @@ def energy_shaping(
     *,
     surplus: Any = 0.0,
 ) -> Callable[[Vector, Vector], Array]:
-    """(q, qd) -> forces that bring the passive joints to the goal's energy, and the active joints to the goal.
+    """Returns (q, qd) -> forces that drive the passive joints to the goal's energy, and the active joints to the goal.
 
     Args:
         plant: a known or learned model with energies; its friction is compensated at the active joints.
         parts: driven and passive joints.
         goal: posture [d].
-        gains: of the accelerations.
-        surplus: target energy of the passive joints above that of the goal, J, which compensates their losses.
+        gains: gains of the accelerations.
+        surplus: target energy of the passive joints above that of the goal, J, to compensate their losses.
 
     Raises:
-        InputError: a model without energies.
+        InputError: the model has no energy.
     """
     plant, (active, passive) = with_energy(plant), map(np.array, parts)
     forces, energy = partial_linearisation(plant, parts), passive_energy(plant, parts, goal)
@@ -126,7 +126,7 @@ def energy_shaping(
 
 
 def with_energy(model: Dynamics | PlainDynamics) -> Dynamics:
-    """Returns a model that has energies; raises `InputError` for another."""
+    """Returns the model if it has an energy; raises `InputError` otherwise."""
     if not isinstance(model, Dynamics):
-        raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
+        raise InputError("the model has no energy for an energy law to shape; train one that has, such as a DeLaN")
     return model

@@ -1,6 +1,7 @@
 """A plant with sensors and actuators as a `gymnasium.Env`, to train controllers with other libraries (extra `[rl]`).
 
-NumPy in float32; actions in [-1, 1] are scaled to the limits of the controls. The loop is that of `simulate`.
+Observations and actions are NumPy arrays in float32; actions in [-1, 1] are scaled to the limits of the controls. The
+loop is that of `simulate`.
 """
 
 from collections.abc import Callable
@@ -26,27 +27,27 @@ class _Place(NamedTuple):
 
 
 class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Environment of one plant: actions in [-1, 1] span the controls' limits, the reward is minus the sample's cost.
+    """Environment of one plant: actions in [-1, 1] span the control limits, the reward is minus the cost of a sample.
 
     Observations are the measurements of the hardware, with cosine and sine for revolute joints. An episode is
-    truncated after `seconds`. It is terminated if the state is not finite: `info["failed"]` is then true, the
-    observation is the last finite one, and the reward is minus the cost of a failure. `info["x"]` is the true state,
-    `info["u"]` the acting control.
+    truncated after `seconds`. It is terminated if state, observation or cost is not finite: `info["failed"]` is then
+    true, the observation is the last finite one, and the reward is minus the cost of a failure. `info["x"]` is the true
+    state, `info["u"]` the acting control.
 
     Args:
-        field: of the plant, (x, u) -> dx/dt, on x = (q, qd).
+        field: (x, u) -> dx/dt of the plant, on x = (q, qd).
         cost: (x, u) -> cost per second at the start of a sample.
         start: key of jax.random -> x [2 d], drawn anew at every reset.
-        joints: their kinds [d].
+        joints: kinds of the joints [d].
         seconds: duration of an episode.
-        rate: of the samples, Hz.
+        rate: sampling rate, Hz.
         hardware: with finite limits, one per control or one for all.
-        controls: m.
+        controls: m, number of controls.
         substeps: integrator steps per sample.
-        failure_cost: cost of a state that is not finite; it should exceed the remaining cost of any other episode.
+        failure_cost: cost of a failure; it should exceed the remaining cost of any other episode.
 
     Raises:
-        InputError: settings that are not positive, limits that are not finite, or an invalid delay.
+        InputError: a setting is not positive, a limit is not finite, or the delay is invalid.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
         low, high = (np.broadcast_to(np.asarray(limit, float), controls) for limit in hardware[:2])
         if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
-            raise InputError(f"limits are {low} and {high}; expected finite ones, which actions in [-1, 1] span")
+            raise InputError(f"limits are {low} and {high}; expected finite ones in order, for actions in [-1, 1]")
         noise_of(hardware, jax.random.key(0))
         self._samples, self._failure_cost = round(seconds * rate), failure_cost
         self._key, self._place, self._seen = jax.random.key(0), None, np.zeros(0)
@@ -127,7 +128,7 @@ def register(name: str, make: Callable[[], PlantEnvironment]) -> None:
     """Registers `make` with Gymnasium, so that `gymnasium.make(name)` calls it; nothing is registered by default.
 
     Args:
-        name: in Gymnasium's form, such as "dln_jax/CartPole-v0".
+        name: name in Gymnasium's form, such as "dln_jax/CartPole-v0".
         make: builds the environment.
     """
     if name not in gymnasium.registry:

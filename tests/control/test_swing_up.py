@@ -117,7 +117,7 @@ def test_mistakes_are_one_line():
         holding_controls(plant, [0.0, 0.3], scene.needs.actuation)
     with pytest.raises(InputError, match="no equilibrium"):
         linearise(field_of(plant, scene.needs.actuation), [0.0, 0.3, 0.0, 0.0], [0.0])
-    with pytest.raises(InputError, match="some coordinate without"):
+    with pytest.raises(InputError, match="a coordinate without a motor"):
         parts_of(np.eye(2))
     with pytest.raises(InputError, match="has no energy"):
         plain = PlainDynamics(plant.inverse_dynamics, plant.forward_dynamics, plant.decompose)
