@@ -1,15 +1,14 @@
 """The interior-point method of `shoot` and `optimise`.
 
-Newton steps on the conditions of an optimum are solved by Riccati's recursion, while the barrier μ falls to zero
-(Fiacco and McCormick 1968). As in IPOPT (Wächter and Biegler 2006, with its constants), a filter of violation and
-barrier function accepts a step, after a second-order correction where the longest step raises the violation, and the
-Hessian is damped until the recursion's pivots are positive. The damping has a memory, and a search that finds no step
-raises it.
+Riccati's recursion solves Newton steps on the optimality conditions while the barrier μ falls to zero (Fiacco and
+McCormick 1968). As in IPOPT (Wächter and Biegler 2006, with its constants), a filter of violation and barrier function
+accepts steps; if the longest step raises the violation, a second-order correction is tried. The Hessian is damped until
+the recursion's pivots are positive. The damping is remembered, and rises if no step is accepted.
 
-Where inequalities cut some steps in a row short, or searches fail, slacks are widened: the inequalities may then be
-violated on the way, like the other constraints. A stationary point counts as a minimum if its undamped pivots are
-positive; at a saddle, the last step leads along a direction in which the Lagrangian curves down (an inverse iteration
-from noise).
+If inequalities cut several steps in a row short, or no step is accepted, slacks are widened: the inequalities may then
+be violated on the way, like the other constraints. A stationary point counts as a minimum if its undamped pivots are
+positive. At a saddle, the last step follows a direction of negative curvature of the Lagrangian (by an inverse
+iteration from noise).
 """
 
 from collections.abc import Callable
@@ -41,20 +40,21 @@ FIRST_BARRIER, BARRIER_FACTOR, BARRIER_POWER, BARRIER_RATIO = 0.1, 0.2, 1.5, 10.
 FIRST_SLACK = 1e-2
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-20, 1e12
 TO_BOUNDARY = 0.99
-"""Share of the way to the boundary that a step may go, at least."""
+"""A step may go this share of the way to the boundary, and more as μ falls."""
 VIOLATION_MARGIN, BARRIER_MARGIN, ARMIJO = 1e-5, 1e-8, 1e-8
 SMALL_VIOLATION, LARGE_VIOLATION = 1e-4, 1e4
-"""Violations relative to the first: below one the barrier function has to fall, above the other no step is accepted."""
+"""Violations relative to the first: below the small one the barrier function must fall; none above the large one is
+accepted."""
 MULTIPLIER_SPREAD = 1e10
 """Largest ratio of s z to μ, and of μ to s z."""
 MOST_HALVINGS = 24
 FILTER = 64
-"""Number of remembered pairs; the oldest are forgotten."""
+"""Number of pairs that the filter remembers; the oldest are forgotten."""
 SHORT, MOST_SHORT, MOST_RELEASES = 0.02, 4, 10
-"""Length below which a step counts as cut short by inequalities, number of such or failed steps in a row after which
-slacks are widened, and number of times that this is done."""
+"""Length below which a step counts as cut short by inequalities, number of short or failed steps in a row after which
+slacks are widened, and largest number of times that this is done."""
 CURVATURE = 1e-6
-"""Negative curvature that still counts as none, relative to the largest second derivative if that is above one."""
+"""Negative curvature up to this counts as zero, relative to the largest second derivative if that is above one."""
 ROUNDING = 2.2e-16
 
 
@@ -67,7 +67,7 @@ class Search(NamedTuple):
     """The last step; its gains are those of the plan."""
     barrier: Array
     damping: Array
-    """Memory of the damping that was needed last."""
+    """Damping that was needed last."""
     least: Array
     """Damping from which the next step starts: positive after a failed search."""
     filter: Array
@@ -87,7 +87,7 @@ Trial = Callable[[Iterate, HorizonSolution, Array], tuple[Array, Array]]
 
 
 def straight(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
-    """The trial of multiple shooting: states and controls move along the change."""
+    """Returns the trial of multiple shooting: states and controls move along the change."""
     return at.x + length * change.dx, at.u + length * change.du
 
 
@@ -100,7 +100,7 @@ def search(
     noise, end_noise = random.normal(size=(steps, n + m)), random.normal(size=n)
 
     def damped(solve: Callable[[Array], Any], search: Search, done: Array, bent: Array) -> tuple[Any, Array]:
-        """Raises the damping until the step is that of a minimum."""
+        """Raises the damping until the step leads to a minimum of its quadratic program."""
         again = jnp.maximum(search.damping / 3, LEAST_DAMPING)
         first = jnp.where(done, bent, jnp.where(search.damping > 0, again, FIRST_DAMPING))
         growth = jnp.where(search.damping > 0, 8.0, 100.0)
@@ -114,7 +114,7 @@ def search(
         def wanted(carry: tuple[Any, Array, Array]) -> Array:
             return ~carry[0][0].convex & (carry[1] < MOST_DAMPING)
 
-        # Without a first solution, so that the step is compiled once.
+        # The loop starts without a solution, so that the step is compiled once.
         none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(solve, search.least))
         return jax.lax.while_loop(wanted, more, (none, search.least, jnp.asarray(0)))[:2]
 
@@ -144,7 +144,7 @@ def search(
         share = jnp.maximum(TO_BOUNDARY, 1 - barrier)
         gap = gaps(rows, at, values)
 
-        # Where all is done, the step serves to find a direction of negative curvature.
+        # Once converged, the step only serves to find a direction of negative curvature.
         pulls = slopes._replace(cost=jnp.where(done, noise, slopes.cost),
                                 end_cost=jnp.where(done, end_noise, slopes.end_cost))  # fmt: skip
         bent = CURVATURE * jnp.maximum(1.0, jnp.max(jnp.abs(curved[0])))
@@ -177,7 +177,7 @@ def search(
             return new, at_new, (good | small) & jnp.isfinite(phi_new), descends & enough, violation_new
 
         def attempt(carry: Any) -> Any:
-            """The longest step, then its second-order correction where the violation rose, then shorter ones."""
+            """Tries the longest step, then its second-order correction if the violation rose, then shorter steps."""
             (before, at_before, _, _, violation_before), length, number = carry
             correct = (number == 1) & (violation_before >= violation)
 
@@ -198,7 +198,7 @@ def search(
         (new, at_new, good, descended, _), _, _ = jax.lax.while_loop(unfinished, attempt, untried)
         good &= change.convex
         new = guarded(rows, new, barrier, MULTIPLIER_SPREAD)
-        # A step of the filter's second kind leaves a pair behind.
+        # A step that is accepted without enough descent of the barrier function adds a pair to the filter.
         keep = good & ~descended
         pair = jnp.stack([(1 - VIOLATION_MARGIN) * violation, phi - BARRIER_MARGIN * violation])
         filtered = jnp.where(keep, search.filter.at[entries % FILTER].set(pair), search.filter)
@@ -219,12 +219,12 @@ def search(
             at, values, change, barrier, jnp.where(good, used, raised), jnp.where(good, 0.0, raised), filtered,
             entries + keep, search.largest, short, releases, search.iterations + ~done, plain, ending,
         )  # fmt: skip
-        # The slacks as the whole step would leave them, negative where it is cut short.
+        # How far below zero the whole step would take the slacks.
         wanted = jnp.max(jnp.where(present, -(search.at.s + step.s), 0.0), initial=0.0)
         return jax.lax.cond(release, released, lambda after, _: after, after, wanted)
 
     def released(search: Search, width: Array) -> Search:
-        """Widens the slacks, so that the inequalities are violated on the way, and starts anew."""
+        """Widens the slacks, so that inequalities may be violated on the way, and starts again."""
         at = search.at
         s = jnp.where(present, jnp.maximum(at.s, jnp.clip(width, 1e-1, 1e2)), at.s)
         z = jnp.where(present, FIRST_BARRIER / s, 0.0)

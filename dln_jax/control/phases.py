@@ -1,10 +1,10 @@
-"""The phases of `shoot` and `optimise`: searches for a minimum, ways out of saddles, and restoration.
+"""The phases of `shoot` and `optimise`: searches for a minimum, escapes from saddles, and restoration.
 
-After a search that ended at a saddle, the next one starts beside it, along a direction in which the Lagrangian curves
-down. After a search that gave up where hard constraints are violated, the next one minimises the sum of violations of
-all hard constraints but the steps and the limits of the controls (the phase of restoration of Wächter and Biegler 2006,
-section 3.3). If this leads to a point where they hold, the search for a minimum goes on from there; if it converges
-elsewhere, the violation is stationary, and the problem is locally infeasible.
+If a search ends at a saddle, the next one starts beside it, along a direction of negative curvature of the Lagrangian.
+If a search gives up where hard constraints are violated, the next one minimises the sum of violations of all hard
+constraints except the steps and the limits of the controls (the restoration phase of Wächter and Biegler 2006, section
+3.3). If it reaches a point where they hold, the search for a minimum continues from there; if it converges elsewhere,
+the violation is stationary and the problem is locally infeasible.
 """
 
 from collections.abc import Callable
@@ -20,19 +20,19 @@ from dln_jax.control.interior_point import Search, Trial, search, started
 from dln_jax.solvers.ending import Ending
 
 RESTORING = 1e-6
-"""Weight of the cost where violations are minimised: it decides between points of equal violation. Constraints whose
-multipliers are below its inverse are met if they can be."""
+"""Weight of the cost while violations are minimised, to decide between points of equal violation. Constraints whose
+multipliers are below its inverse are met if possible."""
 PRICE = 10.0
-"""Price of the limits of states in the sum of violations; that of other constraints is one."""
+"""Price of the limits of states in the sum of violations; other constraints have price one."""
 STATIONARY = 1e-6
-"""Least tolerance of a minimum of the violations."""
+"""Smallest tolerance for a minimum of the violations."""
 MOST_ESCAPES, MOST_RESTORATIONS = 3, 2
 WAY = 0.1
-"""Length of the way out of a saddle, relative to the largest state and control or one."""
+"""Length of the step away from a saddle, relative to one plus the largest state or control."""
 
 
 class Phase(NamedTuple):
-    """The start of the next search, and the last one."""
+    """The start of the next search, and the last search."""
 
     x: Array
     u: Array
@@ -42,7 +42,7 @@ class Phase(NamedTuple):
     iterations: Array
     last: Search
     weight: Array
-    """Of the cost in the last search."""
+    """Weight of the cost in the last search."""
 
 
 def phases(
@@ -51,8 +51,8 @@ def phases(
 ) -> tuple[Search, Array]:  # fmt: skip
     """Runs all phases from states x [N+1, n] and controls u [N, m]; soft constraints have the weights w_1, w_2.
 
-    `of` takes the weight of the cost, and one, or zero where the equations of the end are left to rows. Returns the
-    last search and the weight of its cost.
+    `of` takes the weight of the cost, and one, or zero if rows replace the equations of the end. Returns the last
+    search and the weight of its cost.
     """
     kinds, ends = _with_ends(of(jnp.ones(()), jnp.ones(())), x, u)
     limited = kinds.soft & (soft is not None)
@@ -103,12 +103,12 @@ def phases(
 
 
 def gave_up(ending: Array) -> Array:
-    """Whether a search ended without a reason in its point."""
+    """Returns whether a search ended without a verdict on its point."""
     return (ending == Ending.NO_DESCENT) | (ending == Ending.OUT_OF_ITERATIONS)
 
 
 def _with_ends(of: Conditions, x: Array, u: Array) -> tuple[Kinds, Array]:
-    """Masks of all rows, with those in place of the equations of the end; and the mask of these."""
+    """Returns the masks of all rows, including those that replace the equations of the end, and the mask of these."""
     number = len(jax.eval_shape(of.values, x, u).c)
     ends = jnp.arange(number) >= len(of.kinds.present)
     kinds = Kinds(*(jnp.append(mask, jnp.zeros(number - len(mask), bool)) for mask in of.kinds))

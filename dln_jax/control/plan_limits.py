@@ -1,4 +1,4 @@
-"""Limits of a robot for plans, plans of free duration, and the constraint that a plan violates most."""
+"""Plans within the limits of a robot, plans of free duration, and the constraint that a plan violates most."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 
 def with_limits_of(problem: TrajectoryProblem, robot: Robot) -> TrajectoryProblem:
-    """Returns the problem of a robot on x = (q, qd), with a motor per joint, with the limits that its file states."""
+    """Returns the problem with the limits of a robot's file, for x = (q, qd) and a motor per joint."""
     speed = np.broadcast_to(np.asarray(robot.velocity_limits, float), len(robot.position_limits))
     (low, high), (weakest, strongest) = robot.position_limits.T, robot.force_limits.T
     return problem._replace(
@@ -31,20 +31,20 @@ def free_time(
     shortest: float,
     longest: float,
 ) -> TrajectoryProblem:
-    """Returns a problem whose steps have an unknown duration, equal for all: the last state, free at the start.
+    """Returns a problem whose steps share an unknown duration dt: an additional last state, free at the start.
 
-    Its states are (x, dt), also in the constraints that `_replace` adds and in `final_cost`.
+    The states are (x, dt), also in `final_cost` and in constraints added by `_replace`.
 
     Args:
         step: (x [n], u [m], dt) -> x' [n].
         cost: (x, u, dt) -> cost of one step; dt alone for the shortest time.
         final_cost: (x, dt) [n+1] -> cost of the last state.
         states: n.
-        shortest: step, s.
-        longest: step, s.
+        shortest: shortest step, s.
+        longest: longest step, s.
 
     Raises:
-        InputError: numbers that are not positive, or a shortest step that is not below the longest.
+        InputError: a number is not positive, or the shortest step is not below the longest.
     """
     require_positive(states=states, shortest=shortest, longest=longest)
     if not shortest < longest:
@@ -61,12 +61,12 @@ def free_time(
 
 
 def worst_violation(problem: TrajectoryProblem, plan: Plan, *, tolerance: float = 1e-6) -> str:
-    """Names the constraint that a plan violates most, and by how much, in a sentence.
+    """Returns a sentence that names the constraint that a plan violates most, and by how much.
 
     Args:
-        problem: that was solved.
-        plan: of `optimise`, or `solution.plan` of `shoot`.
-        tolerance: largest violation that counts as none.
+        problem: the solved problem.
+        plan: result of `optimise`, or `solution.plan` of `shoot`.
+        tolerance: violations up to this count as none.
     """
 
     knots, last = knots_of(problem)

@@ -1,19 +1,19 @@
 """Model predictive control with constraints in real time: one iteration per sample, with a fixed number of operations.
 
-At a sample, the control follows from the measured state by the gains of the plan: `feedback`, a product of a matrix
+At a sample, `feedback` computes the control from the measured state and the gains of the plan, by a product of a matrix
 and a vector. Then, until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and
 improves it by an iteration of single shooting (the split is that of Diehl, Bock and Schlöder 2005). The iteration
-solves a smooth problem, in which limits of the controls are barriers and all other constraints c <= 0 are prices:
+solves a smooth problem, with barriers for the limits of the controls and prices for all other constraints c <= 0:
 
     -μ log(-c)   and   min_t  w_1 t - μ log t - μ log(t - c)  +  w_2 max(c, 0)² / 2
 
 Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick
 1968): as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. It has a
-closed form: with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So there is
-a plan at every sample, it needs no memory of multipliers, and it says whether it violates a constraint.
+closed form: with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So every
+sample has a plan, which needs no memory of multipliers and states whether it violates a constraint.
 
-An iteration is that of a Gauss-Newton regulator (Li and Todorov 2004) by Riccati's recursion. It takes the best of some
-step lengths, each of which is a motion, and raises the damping of the controls' Hessian if none lowers the cost.
+An iteration is that of a Gauss-Newton regulator (Li and Todorov 2004) by Riccati's recursion. It takes the best of
+several step lengths, each giving a motion, and raises the damping of the controls' Hessian if none lowers the cost.
 """
 
 from collections.abc import Callable
@@ -35,11 +35,11 @@ STEP_LENGTHS = (1.0, 0.3)
 BARRIER = 1e-3
 """Default μ, in units of the cost: a control whose limit is worth p per unit stays μ / p away from it."""
 PRICES = 1e3, 1e3
-"""Prices (w_1, w_2) of the constraints of problems that state none."""
+"""Prices (w_1, w_2) of the constraints of problems without `soft`."""
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e9
 TO_BOUNDARY, CLOSEST = 0.99, 1e-5
 """Share of the distance to a limit that a control may go in an iteration, and its least distance from finite limits
-relative to their distance."""
+relative to their range."""
 ROUNDING = 1e-12
 """Relative difference of costs that counts as rounding."""
 VIOLATED = 5.0
@@ -47,7 +47,7 @@ VIOLATED = 5.0
 
 
 def feedback(problem: TrajectoryProblem, plan: Plan, x: Any) -> Array:
-    """Returns the control [m] of the plan at a measured state [n] near its first; NaN if a state is not finite."""
+    """Returns the control [m] of the plan at a measured state [n] near its first; NaN if the state is not finite."""
     return where_finite(_limited(problem)(plan.u[0] + plan.K[0] @ (x - plan.x[0]), plan.u[0]), jnp.asarray(x, float))
 
 
@@ -59,7 +59,7 @@ def prepare(
 
     Args:
         problem: over the horizon; its knots, if any, have N+2 rows, from this sample to the end of the next horizon.
-        plan: that gave the control.
+        plan: the plan that gave the control.
         x: measured state.
         barrier, step_lengths: as for `improve`.
         iterations: number of iterations; it may be traced.
@@ -79,7 +79,7 @@ def prepare(
         return followed(now, x, (about, plan.u, jnp.zeros_like(plan.u), K), _limited(problem))
 
     states, u = under(plan.x[:-1], plan.K)
-    # Gains that are too large for the deviation, as after a blow, would leave every later plan without a value.
+    # Gains that are too large for the deviation, as after a blow, would make every later plan NaN.
     lost = ~jnp.isfinite(states).all()
     bare = lambda: under(jnp.zeros_like(plan.x[:-1]), jnp.zeros_like(plan.K))  # noqa: E731
     states, u = jax.lax.cond(lost, bare, lambda: (states, u))
@@ -91,7 +91,7 @@ def prepare(
         K=jnp.concatenate([plan.K[1:], plan.K[-1:]]),
     )  # fmt: skip
     again = lambda _, plan: improve(later, plan, barrier=barrier, step_lengths=step_lengths)  # noqa: E731
-    # A loop of a single turn would only be more code.
+    # A loop with a single turn would only add code.
     single = not isinstance(iterations, Tracer) and iterations == 1
     return again(0, moved) if single else jax.lax.fori_loop(0, iterations, again, moved)
 
@@ -101,13 +101,13 @@ def mpc(
 ) -> Callable[..., tuple[Array, Plan]]:
     """Model predictive control: (state, plan) -> (control, plan of the next sample), by `feedback`, then `prepare`.
 
-    Start with a plan of `optimise`, `shoot` or `first_plan`, after some calls of `improve`. A problem with knots takes
-    them as a third argument, N+2 rows from the sample's on.
+    Start with a plan of `optimise`, `shoot` or `first_plan`, after a few calls of `improve`. If the problem has knots,
+    pass them as a third argument, N+2 rows from the present sample on.
 
     Args:
         problem: over the horizon.
         barrier, step_lengths: as for `improve`.
-        iterations: per call.
+        iterations: number of iterations per call.
     """
 
     def act(x: Any, plan: Plan, knots: Any = None) -> tuple[Array, Plan]:
@@ -123,18 +123,18 @@ def improve(
 ) -> Plan:
     """Runs one iteration from the plan's first state; the cost with barriers and prices rises by rounding at most.
 
-    Limits of the states have prices too: the problem's `soft` or 1e3, like all its constraints but the limits of the
-    controls. The plan's `ending` is `VIOLATED` if the plan violates a constraint (`worst_violation` says which),
+    All constraints except the limits of the controls have the prices `soft` of the problem, or 1e3; limits of the
+    states too. The plan's `ending` is `VIOLATED` if the plan violates a constraint (`worst_violation` says which),
     `NOT_FINITE` if its cost is not finite, and otherwise undecided.
 
     Args:
         problem: over the horizon.
-        plan: such as one of `optimise`, `shoot` or `first_plan`.
+        plan: such as a result of `optimise`, `shoot` or `first_plan`.
         barrier: μ, in units of the cost; it may be traced, to fall from iteration to iteration.
-        step_lengths: tried in an iteration [L].
+        step_lengths: step lengths [L] that an iteration tries.
 
     Raises:
-        InputError: a first state with free components, or a barrier that is not positive.
+        InputError: a component of the first state is free, or the barrier is not positive.
     """
     if not isinstance(barrier, Tracer):
         require_positive(barrier=barrier)
@@ -146,7 +146,7 @@ def improve(
     u = limited(plan.u, plan.u)
 
     def total(x: Array, u: Array) -> tuple[Array, Array]:
-        """Cost with barriers and prices, and the largest excess."""
+        """Returns the cost with barriers and prices, and the largest excess."""
         costs, excesses = jax.vmap(at_step.cost)(jnp.concatenate([x[:-1], u], axis=1), *knots)
         end_cost, end_excess = at_end.cost(x[-1], *last)
         return jnp.sum(costs) + end_cost, jnp.maximum(jnp.max(excesses), end_excess)
@@ -181,16 +181,16 @@ def improve(
 
 
 class _Smooth(NamedTuple):
-    """Cost of a step or of the end with its barriers and prices, of y = (x, u) or x."""
+    """Cost of a step or of the end with barriers and prices, as a function of y = (x, u) or x."""
 
     cost: Callable[..., tuple[Array, Array]]
     """(y, knot) -> cost, and largest row of the constraints."""
     expansion: Callable[..., tuple[Array, Array]]
-    """(y, knot) -> gradient, and Hessian of Gauss and Newton."""
+    """(y, knot) -> gradient and Gauss-Newton Hessian."""
 
 
 def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_Smooth, _Smooth]:
-    """Returns the cost of a step and that of the end."""
+    """Returns the cost of a step and the cost of the end."""
     w_1, w_2 = PRICES if problem.soft is None else problem.soft
     width = _width(problem, barrier)
 
@@ -205,7 +205,7 @@ def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_
         return value, barrier / s + w_2 * beyond, barrier / s**2 * (1 - c / r) / 2 + jnp.where(c > 0, w_2, 0.0)
 
     def priced(cost: Callable[..., Any], rows: list[Callable[..., Array]], limits: list[tuple[Any, ...]]) -> _Smooth:
-        # Derivatives of limits are constant, and each has one element.
+        # The derivative of a limit is constant and has one non-zero element.
         boxes = [(law, signs, bounds) for law, signs, bounds in limits if len(bounds)]
 
         def every(y: Array, *knot: Any) -> Array:
@@ -254,7 +254,7 @@ def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_
 
 
 def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array]:
-    """Returns signs [r, size] and bounds [r] of the finite limits, rows signs y - bounds; traced limits are finite."""
+    """Returns signs [r, size] and bounds [r] of finite limits, signs y <= bounds; traced limits count as finite."""
     signs, bounds = [], []
     for sign, limit in ((-1.0, lower), (1.0, upper)):
         known = np.ones(size, bool) if isinstance(limit, Tracer) else np.isfinite(np.broadcast_to(limit, size))
@@ -264,7 +264,7 @@ def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array]:
 
 
 def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
-    """Returns (control, control before) -> control within its limits, and on the way to them."""
+    """Returns (control, previous control) -> control within its limits and at most `TO_BOUNDARY` of the way to them."""
     lower, upper = (jnp.asarray(limit, float) for limit in (problem.lower, problem.upper))
     closest = CLOSEST * jnp.where(jnp.isfinite(upper - lower), upper - lower, 1.0)
 
@@ -276,5 +276,5 @@ def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
 
 
 def _width(problem: TrajectoryProblem, barrier: Any) -> Any:
-    """δ, over which a price rises."""
+    """Returns δ, the width over which a price rises."""
     return 2 * barrier / (PRICES if problem.soft is None else problem.soft)[0]

@@ -1,9 +1,9 @@
 """Repeated plans: recovery from any state, such as after a push, by predictive control that plans again on the way.
 
-Where the regulator's cost to go is below a level, the regulator acts and nothing is planned. Elsewhere a set of plans
-is improved in every step of the horizon by `real_time.prepare`, and the cheapest acts: its control and its gains,
-about the states that it expects within the step. When the state leaves the region, all plans start again from there
-with the controls of their first guesses; a plan that is not finite starts again in any step.
+Where the regulator's cost to go is below a level, the regulator acts and nothing is planned. Elsewhere,
+`real_time.prepare` improves a set of plans in every step of the horizon, and the cheapest plan acts: its control and
+its gains, about the states that it expects within the step. When the state leaves the region, all plans restart from
+there with the controls of their first guesses; a plan that is not finite restarts in any step.
 """
 
 from collections.abc import Callable
@@ -23,9 +23,9 @@ from dln_jax.types import require_positive
 LENGTHS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Step lengths of an iteration."""
 DAMPING = (1e-5, 10.0)
-"""Range of the damping before an iteration: a plan that moves with the plant cannot wait until a smaller one grows."""
+"""Range of the damping before an iteration: a plan that moves with the plant cannot wait for a smaller one to grow."""
 RENEWING = 5
-"""Iterations on plans that start again where the regulator's region ends."""
+"""Iterations on plans that restart when the state leaves the regulator's region."""
 
 
 class Recovery(NamedTuple):
@@ -34,7 +34,7 @@ class Recovery(NamedTuple):
     near: Bool[Array, ""]
     """Whether the regulator acts."""
     plans: Plan
-    """For the next step, along a leading axis."""
+    """Plans for the next step, along a leading axis."""
     acting: tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " n"], Float[Array, " n"]]
     """Control and gains of the present step, and the states expected at its start and its end."""
     parameters: Any
@@ -55,17 +55,17 @@ def recovery_by_plans(
 
     Args:
         problem: over the horizon, in steps of `every` samples.
-        plans: first guesses along a leading axis, such as of `jax.vmap(first_plan)`; their controls count.
+        plans: first guesses along a leading axis, such as by `jax.vmap(first_plan)`; only their controls count.
         near: x -> u of the regulator.
         cost: x -> cost to go, such as `value(regulator, goal, joints)`.
         level: cost to go up to which the regulator acts.
-        rate: of the samples, Hz.
-        every: samples in a step.
-        parameters: tree of arrays that another controller changes on the way, in the memory; by default none. With it,
-            `problem` is a function of them, and `near` and `cost` take them as a last argument.
+        rate: sampling rate, Hz.
+        every: samples per step.
+        parameters: tree of arrays in the memory, which another controller changes on the way; by default none. If
+            given, `problem` is a function of them, and `near` and `cost` take them as last argument.
 
     Raises:
-        InputError: a rate or a number that is not positive, or a problem that `improve` refuses.
+        InputError: a number is not positive, or `improve` refuses the problem.
     """
     require_positive(rate=rate, every=every)
 
@@ -77,7 +77,7 @@ def recovery_by_plans(
         chosen = jax.vmap(lambda again, *pair: jax.tree.map(lambda new, old: jnp.where(again, new, old), *pair))
         started = chosen(again, fresh, going)
         controls = jax.vmap(lambda plan: feedback(now, plan, x))(started)
-        # A number in place of a condition: under `vmap`, where lanes near the goal plan too, it is one for all lanes
+        # A number instead of a condition: under `vmap`, where lanes near the goal plan too, it is one for all lanes
         # unless one of them has just left the goal.
         turns = jnp.where(memory.near & ~within, RENEWING, 1)
         after = jax.vmap(lambda plan: prepare(now, plan, x, iterations=turns, step_lengths=LENGTHS))(started)
@@ -89,9 +89,9 @@ def recovery_by_plans(
         last = () if memory.parameters is None else (memory.parameters,)
         now = problem if memory.parameters is None else problem(memory.parameters)
         within = cost(x, *last) <= level
-        # By the time, which all lanes of a `vmap` share: with a counter in the memory they would plan at every sample.
+        # Counted by time, which all lanes of a `vmap` share: with a counter in memory they would plan at every sample.
         number = jnp.round(t * rate).astype(int) % every
-        # The regulator takes over at any sample, and a plan at the start of a step.
+        # The regulator takes over at any sample, a plan only at the start of a step.
         kept = lambda memory, x, within: memory  # noqa: E731
         if_away = lambda *args: jax.lax.cond(within, kept, planned, *args)  # noqa: E731
         memory = jax.lax.cond(number == 0, if_away, kept, memory, x, within)

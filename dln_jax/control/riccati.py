@@ -3,8 +3,8 @@
     min  sum_k gᵀ (dx_k, du_k) + ½ (dx_k, du_k)ᵀ H (dx_k, du_k) + end,   dx_{k+1} = F (dx_k, du_k) + d_k
 
 The components of dx_0 are zero, or free where stated. The recursion factorises the matrix of the Karush-Kuhn-Tucker
-conditions stage by stage (Rao, Wright and Rawlings 1998). All its pivots are positive exactly if the program has one
-minimum, which is the test of inertia of an interior-point method.
+conditions stage by stage (Rao, Wright and Rawlings 1998). All its pivots are positive if and only if the program has a
+unique minimum, which is the inertia test of an interior-point method.
 """
 
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from dln_jax.solvers.lapack import cholesky, substitute
 
 
 class Horizon(NamedTuple):
-    """A program of N steps of n states and m controls."""
+    """A program of N steps with n states and m controls."""
 
     slopes: Float[Array, "N n n+m"]
     missed: Float[Array, "N n"]
@@ -34,15 +34,15 @@ class HorizonSolution(NamedTuple):
     dx: Float[Array, "N+1 n"]
     du: Float[Array, "N m"]
     K: Float[Array, "N m n"]
-    """Feedback of the controls from the state."""
+    """Feedback gains from the state to the controls."""
     multipliers: Float[Array, "N n"]
     """Derivative of the cost to go by dx_{k+1}."""
     convex: Bool[Array, ""]
-    """Whether the program has one minimum."""
+    """Whether the program has a unique minimum."""
 
 
 def least_cost(horizon: Horizon, free: Any = None) -> HorizonSolution:
-    """Returns the solution; traceable. `free` [n] marks the components of the first state that are unknowns."""
+    """Returns the solution; traceable. `free` [n] marks the unknown components of the first state."""
     n = horizon.missed.shape[1]
 
     def back(
@@ -77,7 +77,7 @@ def least_cost(horizon: Horizon, free: Any = None) -> HorizonSolution:
 def eliminated(n: int, q: Array, Q: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
     """Eliminates the controls from q·(dx, du) + ½ (dx, du)ᵀ Q (dx, du), with n states.
 
-    Returns k and K of du = k + K dx, gradient and curvature of the rest, and whether there is one minimum.
+    Returns k and K of du = k + K dx, gradient and curvature of the rest, and whether the minimum is unique.
     """
     both, definite = _definite_solve(Q[n:, n:], jnp.concatenate([q[n:, None], Q[n:, :n]], axis=1))
     k, K = -both[:, 0], -both[:, 1:]
@@ -86,7 +86,7 @@ def eliminated(n: int, q: Array, Q: Array) -> tuple[Array, Array, tuple[Array, A
 
 
 def made_convex(R: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Returns R, or R plus enough of the identity (by Gershgorin's discs) where R is not positive definite."""
+    """Returns R, plus enough of the identity (by Gershgorin's discs) if R is not positive definite; |R| if m = 1."""
     if len(R) == 1:
         return jnp.abs(R)
     diagonal = jnp.diagonal(R)

@@ -1,12 +1,12 @@
-"""Optimal trajectories with constraints, by multiple and by single shooting with one interior-point method.
+"""Optimal trajectories with constraints, by multiple or single shooting and an interior-point method.
 
     min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 
 `shoot` takes the states at all knots as unknowns. The defect of a step, f(x_k, u_k) - x_{k+1}, vanishes only at the
 solution: a guess need not be a motion, and an unstable system does not multiply its errors over the horizon (Bock and
-Plitt 1984). `optimise` moves the controls alone: each trial is a motion under the gains of the step. Both use all
-curvature, that of the steps included; through steps that are `integrated` by implicit methods, derivatives are those of
-the implicit function theorem.
+Plitt 1984). `optimise` moves the controls alone: each trial is a motion under the gains of the step. Both use the full
+curvature, including that of the steps. Implicit steps made by `integrated` are differentiated by the implicit function
+theorem.
 """
 
 from collections.abc import Callable
@@ -30,24 +30,24 @@ from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, require_positive
 
 LARGEST_GRADIENT = 100.0
-"""The cost is scaled such that its derivatives at the guess are not larger."""
+"""The cost is scaled so that its derivatives at the guess do not exceed this."""
 
 
 class Shooting(NamedTuple):
     """Result of multiple shooting."""
 
     plan: Plan
-    """Plan for `mpc` and for feedback along it; its states are the knots, a motion to within the defect."""
+    """Plan for `mpc` and for feedback along it; its states are those at the knots, a motion to within the defect."""
     multipliers: Float[Array, "N n"]
     """Derivatives of the cost to go by the states at the ends of the steps."""
     end_multipliers: Float[Array, " q"]
-    """Of the equations of the end."""
+    """Multipliers of the equations of the end."""
     pressures: Float[Array, " M"]
     """Multipliers of the inequalities, not negative, in the order of `control.conditions`."""
     defect: Float[Array, ""]
     """Largest |f(x_k, u_k) - x_{k+1}|, in the states' units."""
     violation: Float[Array, ""]
-    """Largest excess of an inequality or equation of the end, soft ones included."""
+    """Largest excess of an inequality, soft ones included, or of an equation of the end."""
     stationarity: Float[Array, ""]
     """Largest derivative of the Lagrangian, for the cost divided by `scale`."""
     feasibility: Float[Array, ""]
@@ -79,28 +79,28 @@ def shoot(
 ) -> Shooting:
     """Returns a locally optimal trajectory near a guess, by multiple shooting; traceable.
 
-    Saddles are left, and where the search gives up outside hard constraints, another one restores them or shows that
-    the problem is locally infeasible (see `control.phases`). The plan of `Ending.INFEASIBLE` has the least violation
-    nearby; its residuals and multipliers are those of the sum of violations.
+    The search leaves saddles. If it gives up where hard constraints are violated, another search restores them or shows
+    that the problem is locally infeasible (see `control.phases`). The plan of `Ending.INFEASIBLE` has the least
+    violation nearby; its residuals and multipliers are those of the sum of violations.
 
     Args:
-        problem: to solve.
+        problem: problem to solve.
         x: initial state [n].
-        states: guess [N+1, n], whose first is replaced by the initial state; it need not be a motion.
+        states: guess [N+1, n], which need not be a motion; x replaces its first state, except for free components.
         u: guess [N, m].
-        iterations: largest number of iterations of a search; leaving a saddle and restoring constraints are searches
-            of their own.
+        iterations: largest number of iterations of a search; leaving a saddle and restoring constraints are separate
+            searches.
         tolerance: of stationarity, feasibility and complementarity, with the cost scaled so that its derivatives at the
             guess are at most 100. Stationarity and complementarity are divided by a hundredth of the mean multiplier
             if that is above one.
         exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton, which
             does not recognise saddles.
-        starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: the
-            least cost within the constraints, or else the least violation.
+        starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: that of
+            least cost within the constraints, or else of least violation.
 
     Raises:
-        InputError: shapes that do not agree, settings that are not positive, crossed limits, a start outside the limits
-            of the states or their constraints, or a linear constraint of the end that these limits exclude.
+        InputError: shapes do not agree, a setting is not positive, limits are crossed, the start violates the limits of
+            the states or their constraints, or these limits exclude a linear constraint of the end.
     """
     if starts is not None:
 
@@ -133,10 +133,11 @@ def optimise(
 ) -> Plan:
     """Returns a locally optimal plan from initial controls, by single shooting; traceable.
 
-    The plan's `ending` states why it ended; all conditions of an optimum hold within the tolerance if it converged.
+    The plan's `ending` states why the search ended; if it converged, all conditions of an optimum hold within the
+    tolerance.
 
     Args:
-        problem: to solve.
+        problem: problem to solve.
         x: initial state [n].
         u: initial controls [N, m].
         iterations: as for `shoot`.
@@ -160,7 +161,7 @@ def _single(problem: TrajectoryProblem, x: Any, u: Any, iterations: int, toleran
     require_start(problem, x)
 
     def motion(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
-        """The motion under the gains of the step."""
+        """Returns the motion under the gains of the step."""
         k = length * (change.du - jnp.einsum("kij,kj->ki", change.K, change.dx[:-1]))
         first = at.x[0] + length * change.dx[0]
         return followed(problem, first, (at.x[:-1], at.u, k, change.K), lambda u, _: u)
@@ -208,18 +209,18 @@ def _result(of: Conditions, last: Search, scale: Array, tolerance: float) -> Sho
 
 
 def _with_first(first: tuple[Any, ...], more: tuple[Any, ...]) -> list[Array]:
-    """Stacks a guess and more of its kind."""
+    """Stacks a guess and further guesses."""
     pairs = [(jnp.asarray(one, float), jnp.asarray(others, float)) for one, others in zip(first, more, strict=True)]
     if any(others.shape[1:] != one.shape for one, others in pairs):
         shapes = [others.shape for _, others in pairs]
-        raise InputError(f"starts have shapes {shapes}; expected that of the guess after an axis of guesses")
+        raise InputError(f"starts have shapes {shapes}; expected the shape of the guess behind an axis of guesses")
     return [jnp.concatenate([one[None], others]) for one, others in pairs]
 
 
 def _best(solutions: Shooting, tolerance: float) -> Shooting:
-    """The solution of least cost within the constraints; where there is none, that of least violation."""
+    """Returns the solution of least cost within the constraints, or that of least violation if there is none."""
     off = jnp.maximum(solutions.violation, solutions.feasibility)
-    # Soft constraints may be violated where all conditions hold.
+    # Soft constraints may be violated even if all conditions hold.
     inside = (solutions.ending == Ending.CONVERGED) | (off <= jnp.sqrt(tolerance))
     best = jnp.where(inside.any(), *(jnp.argmin(jnp.where(jnp.isfinite(key), key, jnp.inf)) for key in (
         jnp.where(inside, solutions.plan.cost, jnp.inf), off)))  # fmt: skip
@@ -227,7 +228,7 @@ def _best(solutions: Shooting, tolerance: float) -> Shooting:
 
 
 def _inside(guess: Array, lower: Any, upper: Any, name: str) -> Array:
-    """Moves a guess inside its limits, by a hundredth of their distance."""
+    """Moves a guess inside its limits, by at most a hundredth of their range."""
     if not any(isinstance(limit, Tracer) for limit in (lower, upper)):
         low, high = np.broadcast_arrays(np.asarray(lower, float), np.asarray(upper, float))
         if crossed := np.flatnonzero(~(low < high)).tolist():

@@ -1,4 +1,4 @@
-"""Problems of optimal trajectories with constraints, and plans: trees of arrays, so that everything is traceable.
+"""Problems of optimal trajectories with constraints, and plans as trees of arrays, so that everything is traceable.
 
 min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 """
@@ -22,7 +22,7 @@ class TrajectoryProblem(NamedTuple):
     """Dynamics, costs and limits of a trajectory."""
 
     step: Callable[..., Array]
-    """(x [n], u [m]) -> x' [n], for example of an integrator."""
+    """(x [n], u [m]) -> x' [n], for example by an integrator."""
     cost: Callable[..., Scalar]
     """(x, u) -> cost of one step."""
     final_cost: Callable[..., Scalar]
@@ -34,11 +34,11 @@ class TrajectoryProblem(NamedTuple):
     """Lower limits of the states x_1 to x_N, [n] or one for all; hard, like those of the controls."""
     upper_x: Any = jnp.inf
     path: Callable[..., Array] | None = None
-    """(x, u) -> [p], not above zero at every step, such as limits of a torque that depends on the state."""
+    """(x, u) -> [p], at most zero at every step, such as limits of a torque that depends on the state."""
     states: Callable[..., Array] | None = None
-    """x -> [r], not above zero at x_1 to x_N, such as distances to obstacles with their sign reversed."""
+    """x -> [r], at most zero at x_1 to x_N, such as negative distances to obstacles."""
     end_below: Callable[..., Array] | None = None
-    """x_N -> [e], not above zero."""
+    """x_N -> [e], at most zero."""
     end: Callable[..., Array] | None = None
     """x_N -> [q], zero; always hard."""
     soft: tuple[float, float] | None = (1e3, 1e3)
@@ -47,16 +47,16 @@ class TrajectoryProblem(NamedTuple):
     The excess is zero where constraints can be met at a price per unit below w_1.
     """
     free: Any = None
-    """Mask [n] of the components of the first state that are unknowns, such as a duration; by default none."""
+    """Mask [n] of the unknown components of the first state, such as a duration; by default none."""
     knots: Any = None
-    """Tree of arrays [N+1, ...] of what differs between knots, such as times or a reference.
+    """Tree of arrays [N+1, ...] that differ between knots, such as times or a reference.
 
-    With it, all functions take its row of their knot as a last argument: `cost(x, u, knot)`, `states(x, knot)`.
+    All functions then take the row of their knot as last argument: `cost(x, u, knot)`, `states(x, knot)`.
     """
 
 
 def knots_of(problem: TrajectoryProblem) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Returns the last arguments of functions at the steps, with an axis [N], and at the end: none without knots."""
+    """Returns the last arguments of functions at the steps, with an axis [N], and at the end; none without knots."""
     if problem.knots is None:
         return (), ()
     return (jax.tree.map(lambda rows: rows[:-1], problem.knots),), (jax.tree.map(lambda rows: rows[-1], problem.knots),)
@@ -83,7 +83,7 @@ class Plan(NamedTuple):
 
 
 def first_plan(problem: TrajectoryProblem, x: Any, u: Any) -> Plan:
-    """Returns the plan of controls [N, m] from a state [n]; raises `InputError` for other shapes."""
+    """Returns the plan with controls [N, m] from a state [n]; raises `InputError` for other shapes."""
     x, u = jnp.asarray(x, float), jnp.asarray(u, float)
     if x.ndim != 1 or u.ndim != 2 or not len(u):
         raise InputError(f"x has shape {x.shape}, u {u.shape}; expected a state [n] and controls [N, m]")
@@ -104,7 +104,7 @@ def followed(
     """Returns states [N+1, n] and controls [N, m] from a state, under u_k + k_k + K_k (x - x_k) within limits.
 
     Args:
-        problem: with the steps.
+        problem: defines the steps.
         x: first state [n].
         stages: x_k [N, n], u_k [N, m], k_k [N, m] and K_k [N, m, n].
         limited: (control, u_k) -> control within the limits.
