@@ -1,4 +1,4 @@
-"""Closed loop with a plant simulated by MuJoCo, which shares no equation with this library (extra `[robot]`)."""
+"""Closed loop with a plant simulated by MuJoCo, which shares no equations with this library (extra `[robot]`)."""
 
 import importlib
 from typing import Any
@@ -28,21 +28,21 @@ def simulate_in_mujoco(
 ) -> ClosedLoopRun:
     """Simulates one run as `simulate` does, sample by sample, with MuJoCo's integrator and time step.
 
-    After a control that is not finite, or MuJoCo's warning of divergence, all is NaN.
+    After a control that is not finite, or if MuJoCo warns of divergence, everything is NaN.
 
     Args:
         model: the text of an MJCF file, for example of a tree from `data.robot_files.mjcf`, or a `mujoco.MjModel`.
         controller: called once per sample.
         x: initial (q, qd) [2 d], in MuJoCo's order of joints.
         seconds: duration of the run.
-        rate: of the samples, Hz; a sample is a whole number of MuJoCo's steps.
+        rate: sampling rate, Hz; a sample is a whole number of MuJoCo's time steps.
         actuation: matrix [actuators, m] in ctrl = actuation u; by default u is ctrl.
         hardware: limits, noise, delay; the model's own limits also apply.
-        key: of the noise; required if there is any.
+        key: random key of the noise; required if there is any.
 
     Raises:
-        InputError: MuJoCo is missing or refuses the model; joints that are not hinges or slides; an initial state of
-            another size; a sample that is not a whole number of steps; settings as for `simulate`.
+        InputError: MuJoCo is missing or refuses the model; a joint is neither a hinge nor a slide; x has another size;
+            a sample is not a whole number of steps; or as for `simulate`.
     """
     require_positive(seconds=seconds, rate=rate)
     mujoco, model = compiled_model(model)
@@ -83,11 +83,11 @@ def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: in
 
 
 def compiled_model(model: Any) -> tuple[Any, Any]:
-    """MuJoCo, and its model of MJCF text or the model itself; raises `InputError` if either is missing or wrong."""
+    """Returns MuJoCo and the model, compiled if it is MJCF text; `InputError` if either is missing or invalid."""
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
-        raise InputError(f"MuJoCo simulates the plant and is missing; {INSTALL}") from None
+        raise InputError(f"MuJoCo, which simulates the plant, is missing; {INSTALL}") from None
     if not isinstance(model, str):
         return mujoco, model
     try:

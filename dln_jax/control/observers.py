@@ -14,18 +14,17 @@ from dln_jax.types import InputError, require_positive
 
 
 def with_differences(law: Law | Controller, d: int, *, rate: float, cutoff: float, order: int = 1) -> Controller:
-    """Estimates the rates for a law of (q, qd) from measurements of q: differences and a first-order low-pass.
+    """Estimates the rates for a law of (q, qd) from measurements of q, by differences and a first-order low-pass.
 
     Args:
         law: (q, qd) in one vector [2 d] -> u, or a controller with such measurements.
         d: number of coordinates.
-        rate: of the samples, Hz.
-        cutoff: of the low-pass, Hz.
-        order: of the differences; order 1 is late by half a sample, order 2 is not but amplifies the encoders' noise
-            more.
+        rate: sampling rate, Hz.
+        cutoff: cut-off frequency of the low-pass, Hz.
+        order: order of the differences; 1 is late by half a sample, 2 is not but amplifies encoder noise more.
 
     Raises:
-        InputError: a rate or a cut-off that is not positive, or another order.
+        InputError: the rate or the cut-off is not positive, or the order is neither 1 nor 2.
     """
     require_positive(rate=rate, cutoff=cutoff)
     if order not in (1, 2):
@@ -36,7 +35,7 @@ def with_differences(law: Law | Controller, d: int, *, rate: float, cutoff: floa
     def act(memory: tuple, t: Array, y: Array) -> tuple[tuple, Array]:
         (before, slope, qd, seen), inner = memory
         newest = y - before
-        # The first sample has no difference, and the second no earlier one.
+        # The first sample has no difference, and the second no earlier difference.
         rates = rate * (1.5 * newest - 0.5 * jnp.where(seen > 1, slope, newest) if order == 2 else newest)
         qd = jnp.where(seen > 0, qd + share * (rates - qd), 0.0)
         inner, u = controller.act(inner, t, jnp.concatenate([y, qd]))
@@ -74,21 +73,20 @@ def with_prediction(
 ) -> Controller:
     """Wraps a controller for measurements that are late by an unknown number of samples: it acts on predictions.
 
-    The system starts at rest. From the first non-zero control to the first measured motion there are one sample and the
-    delay; until then the state is predicted from rest with all controls so far. If the system moves before its controls
-    can explain it, the delay counts as zero.
+    The system starts at rest. Motion is first measured one sample plus the delay after the first non-zero control;
+    until then the state is predicted from rest with all controls so far. If the system moves before its controls can
+    explain it, the delay counts as zero.
 
     Args:
-        controller: of measurements of the whole state [n].
-        step: (x, u) -> x a sample later, of a model.
-        states: n.
-        controls: m.
+        controller: takes measurements of the whole state [n].
+        step: (x, u) -> x a sample later, by a model.
+        states: n, number of states.
+        controls: m, number of controls.
         max_delay: largest possible delay in samples.
-        threshold: smallest change of a measurement that counts as motion, in its largest coordinate, for example some
-            steps of an encoder.
+        threshold: smallest change of a measured coordinate that counts as motion, for example a few encoder steps.
 
     Raises:
-        InputError: a number that is not positive.
+        InputError: a number is not positive.
     """
     require_positive(states=states, controls=controls, max_delay=max_delay)
 

@@ -1,9 +1,9 @@
-"""Linear-quadratic regulators: at an equilibrium in continuous and in sampled time, along a trajectory, and in use.
+"""Linear-quadratic regulators at an equilibrium, in continuous or sampled time, and along a trajectory.
 
     J = integral (x - x0)ᵀ Q (x - x0) + (u - u0)ᵀ R (u - u0) dt,   u = u0 - K (x - x0),   J(x) = (x - x0)ᵀ S (x - x0)
 
-SciPy solves the Riccati equations of constant matrices (imported on use); the backward recursion along a trajectory is
-our own, and differentiable. Errors of angles are wrapped.
+SciPy (imported on use) solves the Riccati equations of constant matrices; the backward recursion along a trajectory is
+differentiable. Errors of angles are wrapped.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from dln_jax.control.state_space import Field, Law, error, where_finite
 from dln_jax.types import InputError, JointKind, Scalar, require_positive
 
 NEGLIGIBLE = 1e-12
-"""Rounding in eigenvalues, relative to the largest entry of a cost, or in 1/s or 1 for decay."""
+"""Rounding of eigenvalues: relative to the largest entry of a cost, or absolute (1/s or 1) for decay."""
 
 
 class Regulator(NamedTuple):
@@ -32,14 +32,14 @@ class Regulator(NamedTuple):
 
 
 class SampledRegulators(NamedTuple):
-    """Regulators of the steps of a trajectory, and the costs to go at the steps and at the end."""
+    """Regulators for the steps of a trajectory, and the costs to go at the steps and at the end."""
 
     K: Float[Array, "N m n"]
     S: Float[Array, "N+1 n n"]
 
 
 class Region(NamedTuple):
-    """Region around a goal in which a regulator's own value is below a level."""
+    """Region around a goal in which a regulator's cost to go is at most a level."""
 
     level: float
     """Level of (x - x0)ᵀ S (x - x0)."""
@@ -57,7 +57,7 @@ def lqr(A: Any, B: Any, Q: Any, R: Any) -> Regulator:
         R: cost of the controls [m, m], symmetric, positive definite.
 
     Raises:
-        InputError: shapes that do not agree, costs that are not definite, or a system that no control stabilises.
+        InputError: shapes do not agree, a cost is not definite, or no control stabilises the system.
     """
     from scipy.linalg import solve_continuous_are
 
@@ -70,14 +70,14 @@ def sampled_lqr(A: Any, B: Any, Q: Any, R: Any, dt: float) -> Regulator:
     """Returns the regulator for controls held for dt, with the cost sum dt (xᵀ Q x + uᵀ R u) at the samples.
 
     Args:
-        A: of continuous time [n, n].
+        A: in continuous time [n, n].
         B: [n, m].
         Q: as for `lqr`.
         R: as for `lqr`.
         dt: s.
 
     Raises:
-        InputError: as for `lqr`, or a time that is not positive.
+        InputError: as for `lqr`, or dt is not positive.
     """
     from scipy.linalg import solve_discrete_are
 
@@ -91,7 +91,7 @@ def sampled_lqr(A: Any, B: Any, Q: Any, R: Any, dt: float) -> Regulator:
 
 
 def held(A: Any, B: Any, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """F and G in x(t + dt) = F x + G u with held controls."""
+    """Returns F and G in x(t + dt) = F x + G u with held controls."""
     from scipy.signal import cont2discrete
 
     system: Any = cont2discrete((A, B, np.eye(len(A)), np.zeros_like(B)), dt)
@@ -102,7 +102,7 @@ def time_varying_lqr(F: Any, G: Any, Q: Any, R: Any, S_end: Any) -> SampledRegul
     """Returns regulators along a trajectory of N steps, by the backward Riccati recursion; pure and differentiable.
 
     Args:
-        F: of the steps x' = F x + G u [N, n, n].
+        F: [N, n, n], of the steps x' = F x + G u.
         G: [N, n, m].
         Q: cost of the state [n, n], or [N, n, n].
         R: cost of the controls [m, m], or [N, m, m].
@@ -125,12 +125,12 @@ def time_varying_lqr(F: Any, G: Any, Q: Any, R: Any, S_end: Any) -> SampledRegul
 
 
 def regulated(regulator: Regulator, goal: Any, controls: Any, joints: tuple[JointKind, ...]) -> Law:
-    """u = u0 - K (x - x0)."""
+    """Returns the law u = u0 - K (x - x0)."""
     return lambda x: where_finite(jnp.asarray(controls) - regulator.K @ error(x, goal, joints), x)
 
 
 def value(regulator: Regulator, goal: Any, joints: tuple[JointKind, ...]) -> Callable[[Array], Scalar]:
-    """x -> (x - x0)ᵀ S (x - x0)."""
+    """Returns the cost to go x -> (x - x0)ᵀ S (x - x0)."""
 
     def cost(x: Array) -> Scalar:
         difference = error(x, goal, joints)
@@ -140,7 +140,7 @@ def value(regulator: Regulator, goal: Any, joints: tuple[JointKind, ...]) -> Cal
 
 
 def switched(far: Law, near: Law, cost: Callable[[Array], Scalar], level: Any) -> Law:
-    """Switches to `near` where the cost to go is at most the level; `far` elsewhere."""
+    """Returns the law that is `near` where the cost to go is at most the level, and `far` elsewhere."""
     # Both are evaluated, and the one that does not apply may be NaN.
     return lambda x: where_finite(jnp.where(cost(x) <= level, near(x), far(x)), x)
 
@@ -160,21 +160,21 @@ def region_of_attraction(
     starts: int = 64,
     key: Array | None = None,
 ) -> Region:
-    """Returns the largest level below which all random starts on the level's surface reach the goal in simulation.
+    """Returns the largest level up to which all random starts on the level's surface reach the goal in simulation.
 
     Args:
-        field: of the plant.
-        law: near the goal.
+        field: (x, u) -> dx/dt of the plant.
+        law: x -> u near the goal.
         regulator: its S shapes the region.
         goal: x0 [2 d].
-        joints: kinds.
+        joints: kinds of the joints.
         lower: lower limits of the controls.
         upper: upper limits of the controls.
-        rate: of the samples, Hz.
-        seconds: time within which the cost has to fall to a hundredth of the level.
-        levels: ascending; by default powers of ten of 10⁻³ to 10³ times the trace of S, five to a decade.
+        rate: sampling rate, Hz.
+        seconds: time within which the cost to go must fall to a hundredth of the level.
+        levels: ascending; by default 10⁻³ to 10³ times the trace of S, five per decade.
         starts: number of starts on every surface.
-        key: of the starts.
+        key: random key of the starts.
     """
     require_positive(starts=starts, rate=rate, seconds=seconds)
     m, n = regulator.K.shape
@@ -224,9 +224,9 @@ def _checked(A: Any, B: Any, Q: Any, R: Any) -> tuple[np.ndarray, ...]:
 
 
 def _regulator(A: np.ndarray, B: np.ndarray, solve: Any, gain: Any, *, decay: Any) -> Regulator:
-    """Returns the regulator of a Riccati equation's solution, if all eigenvalues of the closed loop decay.
+    """Returns the regulator from the solution of a Riccati equation, if all eigenvalues of the closed loop decay.
 
-    Hautus test first: [A - s I, B] has full rank at every eigenvalue s that does not decay by itself.
+    The Hautus test comes first: [A - s I, B] has full rank at every eigenvalue s that does not decay by itself.
     """
     values, size = np.linalg.eigvals(A), max(np.linalg.norm(A), np.linalg.norm(B), 1e-300)
     for value in values[decay(values) <= NEGLIGIBLE]:

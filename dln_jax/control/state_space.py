@@ -1,6 +1,6 @@
 """Mechanical systems in state space, x = (q, qd): field, steps, linearisation, and errors of angles.
 
-A control law returns NaN for a state that is not finite (`where_finite`), also behind limits (`saturated`).
+A control law returns NaN for a state that is not finite (`where_finite`), even after limiting (`saturated`).
 """
 
 from collections.abc import Callable
@@ -50,19 +50,19 @@ def field_of(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Field:
 def integrated(
     field: Field, dt: float, *, method: Tableau = CLASSICAL, substeps: int = 1
 ) -> Callable[[Array, Array], Array]:
-    """(x, u) -> x after dt with u held: the step of a sampled controller and of a `Problem`, differentiable.
+    """Returns (x, u) -> x after dt with u held, for a sampled controller or a `TrajectoryProblem`; differentiable.
 
-    A step of an implicit method is NaN if its equations are not solved. Its derivatives are those of the implicit
-    function theorem.
+    A step of an implicit method is NaN if its equations are not solved. It is differentiated by the implicit function
+    theorem.
 
     Args:
         field: (x, u) -> dx/dt.
         dt: s.
         method: Runge-Kutta tableau, such as `integrators.MIDPOINT` or `RADAU_3` for a stiff plant.
-        substeps: of the method.
+        substeps: steps of the method within dt.
 
     Raises:
-        InputError: a time or a number of substeps that is not positive.
+        InputError: dt or the number of substeps is not positive.
     """
     require_positive(dt=dt, substeps=substeps)
 
@@ -79,7 +79,7 @@ def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linea
         field: (x, u) -> dx/dt.
         x: state [n] at rest.
         u: controls [m] that hold it.
-        tolerance: of |dx/dt| at (x, u), in the units of the field.
+        tolerance: largest |dx/dt| at (x, u), in the units of the field.
 
     Raises:
         InputError: (x, u) is not an equilibrium.
@@ -102,7 +102,7 @@ def holding_controls(plant: Dynamics, q: Any, actuation: Any = None, *, toleranc
         plant: with gravity.
         q: posture [d].
         actuation: as for `field_of`.
-        tolerance: of the remaining torque, N m or N.
+        tolerance: largest remaining torque, N m or N.
 
     Raises:
         InputError: no controls hold it.
@@ -123,9 +123,9 @@ def holding_controls(plant: Dynamics, q: Any, actuation: Any = None, *, toleranc
 
 
 def where_finite(u: Array, *state: Any) -> Array:
-    """Returns the controls [m] for a finite state, and NaN in every motor otherwise, for whoever handles the failure.
+    """Returns the controls [m] for a finite state, and NaN for every motor otherwise, so that the caller can react.
 
-    Without it, a law of some coordinates only would return numbers while others are NaN.
+    Without it, a law that uses only some coordinates would return numbers while others are NaN.
     """
     finite = jnp.asarray(True)
     for part in state:
@@ -134,13 +134,13 @@ def where_finite(u: Array, *state: Any) -> Array:
 
 
 def saturated(u: Any, lower: Any, upper: Any) -> Array:
-    """Clips controls to their limits; one that is not finite becomes NaN, for whoever handles the failure."""
+    """Clips controls to their limits; one that is not finite becomes NaN, so that the caller can react."""
     u = jnp.asarray(u)
     return jnp.where(jnp.isfinite(u), jnp.clip(u, lower, upper), jnp.nan)
 
 
 def circular(joints: tuple[JointKind, ...], n: int) -> Bool[np.ndarray, " n"]:
-    """Mask of the angles on a circle among n states, of which the first have these kinds."""
+    """Returns the mask of the angles on a circle among n states, the first of which are these joints."""
     return np.array([number < len(joints) and joints[number] == "revolute" for number in range(n)])
 
 

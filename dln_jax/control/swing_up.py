@@ -1,12 +1,12 @@
-"""Swing-ups by energy: a whole law, or a controller with an estimator, from a known or learned model.
+"""Swing-ups by energy: a complete law, or a controller with an estimator, from a known or learned model.
 
-`swing_up` makes a whole law from a model:
+`swing_up` makes a complete law from a model:
 
-1. The model's friction is removed: the rest has energies, and a smooth linearisation.
+1. The model's friction is removed: the rest has an energy and a smooth linearisation.
 2. The model's own equilibrium near the goal is computed, because a learned potential is not level exactly at the goal.
-3. Far from it the energy law acts, near it the regulator of the model's linearisation; the regulator's value decides.
+3. Far from it the energy law acts, near it the regulator of the linearisation; the regulator's cost to go decides.
 4. A share of the friction of the active joints is compensated, at the measured rates.
-5. At rest the energy law returns zero, and dry friction would hold the plant: a kick starts it.
+5. At rest the energy law returns zero and dry friction would hold the plant, so a kick starts it.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ class SwingUpNumbers(NamedTuple):
     control_cost: Any
     """R [m, m]."""
     level: float
-    """Level of the regulator's value below which the regulator acts."""
+    """Cost to go of the regulator up to which the regulator acts."""
     smoothing: Any
     """Smoothing of the friction compensation, rad/s or m/s."""
     compensation: float = GAIN
@@ -58,7 +58,7 @@ class SwingUp(NamedTuple):
 
     law: Law
     controller: Controller
-    """Of measurements, by the estimator; without one, of states."""
+    """Controller of measurements, by the estimator; without one, of states."""
     equilibrium: Float[Array, " two_d"]
     """The model's own equilibrium near the goal."""
     controls: Float[Array, " m"]
@@ -67,23 +67,23 @@ class SwingUp(NamedTuple):
 
     @property
     def offset(self) -> float:
-        """Largest coordinate of the equilibrium, rad or m, where the goal is zero."""
+        """Largest coordinate of the equilibrium, rad or m, for a goal at zero."""
         return float(jnp.max(jnp.abs(self.equilibrium)))
 
 
 class Upright(NamedTuple):
-    """A checked model with its own equilibrium near the goal, and what a swing-up needs of both."""
+    """A checked model with its own equilibrium near the goal, as a swing-up needs them."""
 
     model: Dynamics
     """With friction, if it has any."""
     parts: Parts
     B: Float[np.ndarray, "d m"]
     at: Linearisation
-    """At the equilibrium, without friction."""
+    """Linearisation at the equilibrium, without friction."""
 
 
 def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> Vector:
-    """Posture [d] nearest to a goal with zero force at the passive joints, by Newton's method over these.
+    """Returns the posture [d] near a goal with zero force at the passive joints, by Newton's method over these.
 
     Raises:
         InputError: there is none within `FARTHEST`.
@@ -125,18 +125,18 @@ def swing_up(
     Args:
         model: known or learned, with friction or without.
         actuation: matrix [d, m]; every motor drives one coordinate.
-        joints: kinds.
+        joints: kinds of the joints.
         goal: posture [d].
         numbers: gains and costs.
-        postures: [n, d], postures of a swing-up, in which the model has to be usable.
+        postures: [n, d], postures of a swing-up, in which the model must be usable.
         estimator: law -> controller of measurements, such as `plants.by_filter`; by default states are measured.
         lower: lower limits of the controls.
         upper: upper limits of the controls.
-        tolerance: of the equilibrium, in N m or N.
+        tolerance: largest remaining torque at the equilibrium, N m or N.
 
     Raises:
-        InputError: a model without energies, with a mass matrix that is not definite, without an equilibrium near the
-            goal, or with one that the limits cannot hold or no feedback stabilises.
+        InputError: the model has no energy, no definite mass matrix or no equilibrium near the goal; or the limits
+            cannot hold the equilibrium, or no feedback stabilises it.
     """
     upright = upright_of(
         model, actuation, goal, postures=postures, lower=lower, upper=upper, tolerance=tolerance
@@ -170,7 +170,7 @@ def upright_of(
                 "motions"
             )
         conservative = without_friction(model)
-        # Compiled, because operation by operation they take longer.
+        # Compiled, because they take longer operation by operation.
         inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
         whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
         home = nearest_equilibrium(whole, goal, parts.passive)
@@ -185,7 +185,7 @@ def upright_of(
 
 
 def law_at(upright: Upright, joints: tuple[JointKind, ...], numbers: SwingUpNumbers, regulator: Regulator) -> Law:
-    """The law x -> u of a swing-up to an equilibrium; gains, level, kick and regulator may be traced."""
+    """Returns the law x -> u of a swing-up to an equilibrium; gains, level, kick and regulator may be traced."""
     parts, (home, _) = upright.parts, jnp.split(upright.at.x, 2)
     # Motors are ordered by columns of the matrix, active joints by coordinates.
     to_controls = jnp.linalg.pinv(upright.B[np.array(parts.active)])

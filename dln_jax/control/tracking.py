@@ -7,8 +7,8 @@ Laws are functions of one state; gains and torques are differentiable.
     computed torque         tau = f(q, qd, qdd* + feedback)
 
 with f the inverse dynamics of a known or learned model, and feedback = P (q* - q) + D (qd* - qd). Computed torque
-evaluates the model at any measured state: with a bad model it is worse than feedback alone (`trusted`). If a state is
-not finite, all torques are NaN.
+evaluates the model at the measured state, so with a bad model it is worse than feedback alone (see `trusted`). If a
+state is not finite, all torques are NaN.
 
 Dry friction jumps when a joint reverses, where a measured rate is mostly noise. With r = √(u² + s²) > |u|, the
 compensation of a joint at rate u is
@@ -16,7 +16,7 @@ compensation of a joint at rate u is
     gain (w F(r) + (1 - w) F(-r)),   w = (1 + u / r) / 2
 
 This equals F(u) at rates well above the smoothing rate s. Below, it is a straight line through rest with the magnitude
-of friction at s: no jump, and no work at rest. A gain below 1 never compensates all friction, so that it cannot drive a
+of friction at s: no jump, and no work at rest. A gain below 1 never compensates all friction, so it cannot drive a
 joint.
 """
 
@@ -63,12 +63,12 @@ Tracker = Callable[[Vector, Vector, Reference], Array]
 
 
 def feedback(gains: Gains, q: Any, qd: Any, wanted: Reference) -> Array:
-    """P (q* - q) + D (qd* - qd)."""
+    """Returns P (q* - q) + D (qd* - qd)."""
     return _times(gains.proportional, wanted.q - q) + _times(gains.derivative, wanted.qd - qd)
 
 
 def gravity_compensation(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
-    """Gravity of the present posture plus feedback: exact at rest."""
+    """Returns the law of gravity at the present posture plus feedback: exact at rest."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
         rest = jnp.zeros_like(qd)
@@ -78,7 +78,7 @@ def gravity_compensation(plant: Dynamics | PlainDynamics, gains: Gains) -> Track
 
 
 def feed_forward(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
-    """The model's torque on the reference plus feedback; the model is never evaluated at the measured state."""
+    """Returns the law of the model's torque on the reference plus feedback, without the model at the measured state."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
         planned = plant.inverse_dynamics(wanted.q, wanted.qd, wanted.qdd)
@@ -88,9 +88,9 @@ def feed_forward(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
 
 
 def computed_torque(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
-    """The model's torque for the reference acceleration plus feedback; with an exact model, errors decay linearly.
+    """Returns the law of the model's torque for the reference acceleration plus feedback.
 
-    With gains [d] or matrices in 1/s² and 1/s, the error obeys e'' + D e' + P e = 0.
+    With an exact model, and gains [d] or matrices in 1/s² and 1/s, the error obeys e'' + D e' + P e = 0.
     """
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
@@ -108,16 +108,16 @@ def trusted(
     out_of_distribution: Callable[[Vector, Vector, Vector], Any] | None = None,
     usable: bool = True,
 ) -> Callable[[Vector, Vector, Reference], tuple[Array, Array]]:
-    """Returns a law that takes `first` where the model is usable and `otherwise` elsewhere, with a flag for the first.
+    """Returns a law that uses `first` where the model is usable, with a flag, and `otherwise` elsewhere.
 
     A model is usable if its mass matrix is positive definite (by a Cholesky factor) and the state is in distribution,
-    as far as the model can test this. The other law should not evaluate the model at the state, such as `feed_forward`.
+    if that can be tested. `otherwise` should not evaluate the model at the state; `feed_forward` does not.
 
     Args:
         plant: the model.
         first: a law such as `computed_torque`.
         otherwise: a law such as `feed_forward`.
-        out_of_distribution: (q, qd, qdd) -> whether the state is, for example from a run with uncertainty.
+        out_of_distribution: (q, qd, qdd) -> whether the state is out of it, for example by a run with uncertainty.
         usable: whether the model may be used at all, for example by `judged` on held-out motions.
     """
 
@@ -131,7 +131,7 @@ def trusted(
 
 
 def definite(plant: Dynamics, q: Vector) -> Bool[Array, ""]:
-    """Whether the mass matrix is positive definite."""
+    """Returns whether the mass matrix is positive definite."""
     return jnp.isfinite(cholesky(plant.mass_matrix(q))).all()
 
 
@@ -147,7 +147,7 @@ class Judgement(NamedTuple):
     line: str
     """The reason, in a sentence."""
     nmse: Float[np.ndarray, " d"]
-    """Mean squared errors of the joints' torques over their variances."""
+    """Mean squared errors of the joints' torques, divided by their variances."""
     definite: float
     """Share of the states in which the mass matrix is positive definite."""
 
@@ -157,7 +157,7 @@ def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERA
 
     Args:
         plant: the model.
-        held_out: motions like those to follow, not used in the fit; joints with constant torques do not count.
+        held_out: motions like those to be tracked, not used in the fit; joints with constant torques do not count.
         tolerance: largest nMSE of the worst joint.
     """
     require_positive(tolerance=tolerance)
@@ -167,7 +167,7 @@ def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERA
     variance = np.var(held_out.tau, axis=0)
     moved = variance > 0
     nmse = np.mean((tau - held_out.tau) ** 2, axis=0) / np.where(moved, variance, np.nan)
-    # An error that is not finite is the worst.
+    # An error that is not finite counts as the worst.
     worst = int(np.argmax(np.where(moved, np.where(np.isfinite(nmse), nmse, np.inf), -1.0)))
     usable = bool(nmse[worst] <= tolerance) and share == 1.0
     if share < 1:
@@ -183,7 +183,7 @@ def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERA
 def without_friction(plant: Dynamics) -> Dynamics:
     """Removes the friction, whose slope at rest a linearisation should not contain; the energies stay.
 
-    It requires friction that adds to the other forces, which holds for all systems without load in their transmissions.
+    Friction must add to the other forces, which holds for all systems without load-dependent friction.
     """
     return plant._replace(
         inverse_dynamics=lambda q, qd, qdd: plant.inverse_dynamics(q, qd, qdd) - plant.friction(q, qd),
@@ -195,16 +195,16 @@ def without_friction(plant: Dynamics) -> Dynamics:
 def friction_compensation(
     plant: Dynamics, active: Sequence[int], *, smoothing: Any, gain: float = GAIN
 ) -> Callable[[Vector, Vector], Array]:
-    """(q, qd) -> forces of the active joints that compensate a share of their friction; qd measured or wanted.
+    """Returns (q, qd) -> forces of the active joints that compensate a share of their friction; qd measured or wanted.
 
     Args:
         plant: with friction, known or learned.
         active: joints with a motor.
-        smoothing: s, rad/s or m/s, one per active joint or one for all: some times the noise of a measured rate.
+        smoothing: s, rad/s or m/s, one per active joint or one for all: a few times the noise of a measured rate.
         gain: share of the friction, above 0 and at most 1.
 
     Raises:
-        InputError: a smoothing that is not positive, or a gain out of range.
+        InputError: a smoothing is not positive, or the gain is out of range.
     """
     for rate in np.ravel(smoothing):
         require_positive(smoothing=float(rate))
