@@ -3,8 +3,8 @@
     process = mechanical(model, B, rate=500.0, band=[0.3, 1e-3], encoder_step=[2.3e-5, 3.1e-3])
     controller = with_estimate(law, extended(process), belief(x, 0.1), controls=1, measurements=2, delay=1)
 
-`extended`, `unscented` and `moving_horizon` make filters of a process, all with the same three functions: `start`,
-`predict` and `update`, pure and for one state.
+`extended`, `unscented` and `moving_horizon` make filters of a process. All have the same three pure functions `start`,
+`predict` and `update`, for one state.
 """
 
 from dln_jax.control.estimate.extended import extended

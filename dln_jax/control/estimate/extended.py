@@ -2,7 +2,7 @@
 
     x' = step(x, u, 0),   P' = F P Fᵀ + G diag(disturbance²) Gᵀ,   F = d step/dx,  G = d step/dw
 
-It carries a square root of P (see `process.corrected`). For a linear process it is the Kalman filter.
+The filter carries a square root of P (see `process.corrected`). For a linear process it is the Kalman filter.
 """
 
 import jax

@@ -4,13 +4,13 @@ With the momentum p = M(q) qd and the Lagrangian L = T - V, the equations of mot
 
     dp/dt = tau + dL/dq - friction + external,      r' = gain (external - r)
 
-so that the residual r follows the external torque as a first-order low-pass, without accelerations and without an
-inverted mass matrix (De Luca and Mattone 2003; De Luca, Albu-Schäffer, Haddadin and Hirzinger 2006). In sampled time,
-with tau held and the trapezoidal rule for beta = dL/dq - friction,
+so the residual r follows the external torque like a first-order low-pass, without accelerations and without an inverse
+mass matrix (De Luca and Mattone 2003; De Luca, Albu-Schäffer, Haddadin and Hirzinger 2006). In sampled time, with tau
+held and the trapezoidal rule for beta = dL/dq - friction,
 
     r <- r + (1 - exp(-gain dt)) ((p' - p) / dt - tau - (beta + beta') / 2 - r)
 
-A push shows if r leaves the band of the model's own errors. The score of a sample is the largest |r_i| / band_i, and
+A push shows when r leaves the band of the model's own errors. The score of a sample is the largest |r_i| / band_i;
 `contact_threshold` finds the score that motions without contact exceed only as often as allowed.
 """
 
@@ -29,7 +29,7 @@ from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
 BLOCK = 1.0
-"""s: length of the blocks whose largest scores are fitted."""
+"""Length of the blocks whose largest scores are fitted, s."""
 LEAST_BLOCKS = 20
 """Fewest blocks for a fit."""
 
@@ -42,7 +42,7 @@ class Momentum(NamedTuple):
     p: Float[Array, " d"]
     beta: Float[Array, " d"]
     begun: Bool[Array, ""]
-    """Whether there was a sample before."""
+    """Whether there was an earlier sample."""
 
 
 class MomentumObserver(NamedTuple):
@@ -50,7 +50,7 @@ class MomentumObserver(NamedTuple):
 
     start: Momentum
     update: Callable[[Momentum, Vector, Vector, Vector], Momentum]
-    """(memory, q, qd, tau held since the sample before) -> memory with r at this sample."""
+    """(memory, q, qd, tau held since the previous sample) -> memory with r at this sample."""
 
 
 def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, gain: Any) -> MomentumObserver:
@@ -59,11 +59,11 @@ def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, g
     Args:
         model: known or learned, with an energy; its friction counts as known.
         d: number of coordinates.
-        rate: of the samples, Hz.
-        gain: of the residual, 1/s, one for all or one per joint; 1 / gain is the time constant.
+        rate: sampling rate, Hz.
+        gain: gain of the residual, 1/s, one for all or one per joint; 1 / gain is the time constant.
 
     Raises:
-        InputError: a model without energy, or numbers that are not positive.
+        InputError: the model has no energy, or a number is not positive.
     """
     if not isinstance(model, Dynamics):
         raise InputError("the model has no energy, which a momentum observer needs; train a DeLaN, for example")
@@ -86,7 +86,7 @@ def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, g
 
 
 def observed(observer: MomentumObserver, q: Any, qd: Any, tau: Any) -> Float[Array, "N d"]:
-    """External torques r along a log of q, qd and tau [N, d], with tau[k] held from sample k to k + 1; pure."""
+    """Returns the external torques r along a log of q, qd and tau [N, d], with tau[k] held from k to k + 1; pure."""
     q, qd, tau = (jnp.asarray(column) for column in (q, qd, tau))
     held = jnp.concatenate([jnp.zeros_like(tau[:1]), tau[:-1]])
 
@@ -98,7 +98,7 @@ def observed(observer: MomentumObserver, q: Any, qd: Any, tau: Any) -> Float[Arr
 
 
 def contact_score(r: Vector, band: Any) -> Scalar:
-    """Largest |r_i| / band_i; a contact is a score above the threshold.
+    """Returns the largest |r_i| / band_i; a contact is a score above the threshold.
 
     Args:
         r: external torques.
@@ -111,17 +111,17 @@ def contact_score(r: Vector, band: Any) -> Scalar:
 def contact_threshold(scores: Any, *, rate: float, false_alarms: float) -> float:
     """Returns the score that motions without contact exceed at a stated rate.
 
-    The largest scores of blocks of a second follow a generalised extreme value law, fitted by its probability-weighted
-    moments (Hosking, Wallis and Wood 1985). It extrapolates to alarms rarer than the recording is long. No alarm is
-    counted twice within a block.
+    The largest scores in blocks of a second follow a generalised extreme value law, fitted by its probability-weighted
+    moments (Hosking, Wallis and Wood 1985). It extrapolates to alarms that are rarer than one per recording. Alarms
+    within a block count once.
 
     Args:
-        scores: of motions without contact [N], or a list of such recordings, like those to come.
-        rate: of the samples, Hz.
-        false_alarms: per hour.
+        scores: [N], of motions without contact like those to come; or a list of such recordings.
+        rate: sampling rate, Hz.
+        false_alarms: allowed number per hour.
 
     Raises:
-        InputError: fewer than 20 s, scores that are not finite, or a rate of alarms of one per block or more.
+        InputError: the scores last less than 20 s or are not finite, or one alarm per block or more is allowed.
     """
     from scipy.special import gamma
     from scipy.stats import genextreme
@@ -146,7 +146,7 @@ def contact_threshold(scores: Any, *, rate: float, false_alarms: float) -> float
 
 
 def block_maxima(scores: Any, *, rate: float) -> Float[np.ndarray, " B"]:
-    """Largest scores of the whole blocks of a second in recordings."""
+    """Returns the largest scores in the whole blocks of a second of recordings."""
     size = max(round(BLOCK * rate), 1)
     recordings = [np.asarray(part, float) for part in (scores if isinstance(scores, list | tuple) else [scores])]
     whole = [part[: len(part) // size * size].reshape(-1, size) for part in recordings]
@@ -154,25 +154,25 @@ def block_maxima(scores: Any, *, rate: float) -> Float[np.ndarray, " B"]:
 
 
 class Wrench(NamedTuple):
-    """Force and moment of the environment on a flange, in the ground's frame."""
+    """Force and moment of the environment on a flange, in the ground frame."""
 
     force: Float[Array, " 3"]
     """N."""
     moment: Float[Array, " 3"]
     """About the flange's point, N m."""
     determined: Bool[Array, ""]
-    """Whether the joints determine all six components; otherwise this is the shortest wrench that explains them."""
+    """Whether the torques determine all six components; otherwise this is the shortest wrench that explains them."""
     residual: Scalar
     """Norm of the torques that no wrench at the flange explains, N m or N: a contact elsewhere."""
 
 
 def flange_wrench(jacobian: Any, tau: Any, *, length: float = 0.1, smallest: float = 1e-3) -> Wrench:
-    """Returns the wrench F with Jᵀ F = tau, in the sense of least squares.
+    """Returns the least-squares solution of Jᵀ F = tau for the wrench F.
 
     Args:
         jacobian: of the flange's linear and angular velocity [6, d], by `mechanics.trees.frame_jacobian`.
         tau: external torques [d].
-        length: that makes moments comparable with forces, m.
+        length: length that makes moments comparable with forces, m.
         smallest: singular values of the scaled Jacobian below this share of the largest count as zero.
     """
     jacobian, tau = jnp.asarray(jacobian), jnp.asarray(tau)

@@ -6,8 +6,8 @@ Over the first state x_0 of a window and the disturbances w_j of its N steps it 
     with  x_j+1 = step(x_j, u_j, w_j)
 
 (Rao, Rawlings and Mayne 2003). When the window moves on, its oldest sample goes into the prior by the extended Kalman
-filter. For a linear process the estimate is that of the Kalman filter. For others the window is linearised again in
-every iteration, where the extended filter linearises each sample once.
+filter. For a linear process the estimate is that of the Kalman filter. For others every iteration linearises the window
+again, while the extended filter linearises each sample once.
 """
 
 from typing import NamedTuple
@@ -32,12 +32,12 @@ class Window(NamedTuple):
     prior: Belief
     """Belief in the oldest state of the window, before its measurement."""
     newest: Belief
-    """Belief of the extended filter in the newest state, whose innovations are reported."""
+    """Belief of the extended filter in the newest state; the filter's innovations are reported."""
     u: Float[Array, "N m"]
     y: Float[Array, "N+1 p"]
     seen: Bool[Array, "N+1 p"]
     w: Float[Array, "N k"]
-    """Disturbances in units of their deviations, from which the next solution starts."""
+    """Disturbances in units of their standard deviations, from which the next solution starts."""
     first: Float[Array, " n"]
     """Estimate of the oldest state."""
     steps: Int[Array, ""]
@@ -55,10 +55,10 @@ def moving_horizon(
         controls: m.
         measurements: p.
         disturbances: k.
-        iterations: of Levenberg-Marquardt per measurement, from the last solution.
+        iterations: Levenberg-Marquardt iterations per measurement, from the last solution.
 
     Raises:
-        InputError: a number that is not positive, or a disturbance that is a function.
+        InputError: a number is not positive, or the disturbance is a function.
     """
     require_positive(window=window, controls=controls, measurements=measurements, iterations=iterations)
     if callable(process.disturbance):
@@ -97,7 +97,7 @@ def moving_horizon(
         memory = memory._replace(
             newest=newest, y=memory.y.at[memory.steps].set(y), seen=memory.seen.at[memory.steps].set(innovation.seen)
         )
-        # In units of the filtered deviations: damping is one number for all unknowns.
+        # The unknowns are in units of filtered deviations, because damping is one number for all of them.
         root = kalman.update(memory.prior, memory.y[0], memory.seen[0])[0].W
         begun = levenberg_marquardt.init({"first": jnp.zeros_like(memory.first), "w": memory.w})
         one = jax.tree.map(lambda leaf: leaf[None], (memory, root))

@@ -1,9 +1,9 @@
 """Filters in closed loops and over logs: late measurements, several rates, and controls on their way to the motors.
 
-A measurement that is late by some samples belongs to an earlier state. The memory holds the belief at the time of the
-latest channel, and the measurements and controls since then. At every sample the filter goes through them again, so
-that each measurement is used at its own time, prompt channels at once. The law receives the state that the process
-predicts for the moment at which its control begins to act.
+A late measurement belongs to an earlier state. The memory holds the belief at the time of the most delayed channel, and
+the measurements and controls since then. At every sample the filter goes through them again, so that each measurement
+is used at its own time, and prompt channels at once. The law receives the state predicted for the moment at which its
+control begins to act.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ class Estimating(NamedTuple):
     inner: Any
     """Memory of the inner controller."""
     filter: Any
-    """Memory of the filter, D samples ago, before the measurement of then."""
+    """Memory of the filter D samples ago, before the measurement at that time."""
     y: Float[Array, "D p"]
     """Measurements of the last D samples by the time that they belong to, oldest first."""
     seen: Bool[Array, "D p"]
@@ -52,23 +52,23 @@ def with_estimate(
     late: Sequence[int] | int = 0,
     every: Sequence[int] | int = 1,
 ) -> Controller:
-    """Gives a law the states that a filter estimates from measurements, in place of differences of encoder readings.
+    """Gives a law the states that a filter estimates from measurements, instead of differences of encoder readings.
 
     Args:
         law: x [n] -> u, or a controller with such measurements.
         filter: such as `extended(process)`.
-        belief: in the state before the first measurement.
+        belief: belief in the state before the first measurement.
         controls: m.
         measurements: p.
-        lower: lower limits of the controls, which the filter has to know.
+        lower: lower limits of the controls, which the filter must know.
         upper: upper limits.
         delay: samples after which a control begins to act.
         late: samples by which the channels of y are late, one per channel or one for all.
-        every: a channel has a new measurement at every so many samples, from the first on, one per channel or one for
-            all; in between its value is ignored.
+        every: samples between new measurements of a channel, from the first sample on, one per channel or one for all;
+            values in between are ignored.
 
     Raises:
-        InputError: a number of samples that is negative or no whole number.
+        InputError: a number of samples is negative or not whole, or `every` is zero.
     """
     require_positive(controls=controls, measurements=measurements)
     lag, period = _samples("late", late, measurements, 0), _samples("every", every, measurements, 1)
@@ -122,11 +122,11 @@ def with_estimate(
 def filtered(
     filter: Filter, belief: Belief, y: Float[Array, "N p"], u: Float[Array, "N m"], seen: Any = True
 ) -> tuple[Float[Array, "N n"], Innovation]:
-    """Filters a log: estimates of the states at its samples, and the innovations [N, p]; pure.
+    """Filters a log: returns estimates of the states at its samples, and the innovations [N, p]; pure.
 
     Args:
         filter: such as `extended(process)`.
-        belief: in the state before the first measurement.
+        belief: belief in the state before the first measurement.
         y: measurements.
         u: controls that act from each sample to the next.
         seen: which channels have a measurement at a sample, [N, p], [p] or one for all.

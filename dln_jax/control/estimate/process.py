@@ -1,9 +1,9 @@
-"""What a filter knows of a plant: its step with random disturbances, its measurements, and their noise.
+"""Model of a plant for filters: its step with random disturbances, its measurements, and their noise.
 
     x' = step(x, u, w),   w ~ N(0, disturbance²),      y = measured(x) + v,   v ~ N(0, noise²)
 
-For a mechanical system x = (q, qd), and w is a torque that the model lacks, held for a sample: friction, errors of the
-model, a push. Its standard deviation is the model's torque band. An encoder of step s rounds q, which adds the variance
+For a mechanical system x = (q, qd), and w is a torque that the model lacks, held for a sample: friction, model errors,
+a push. Its standard deviation is the model's torque band. An encoder with step s rounds q, which adds the variance
 s² / 12.
 """
 
@@ -33,7 +33,7 @@ class Process(NamedTuple):
     """Standard deviation of v [p], above zero."""
 
     def deviation(self, x: Array, u: Array) -> Array:
-        """Standard deviation of w [k] at a state."""
+        """Returns the standard deviation of w [k] at a state."""
         value = self.disturbance(x, u) if callable(self.disturbance) else self.disturbance
         return jnp.asarray(value, x.dtype)
 
@@ -51,12 +51,12 @@ class Belief(NamedTuple):
 
 
 class Innovation(NamedTuple):
-    """What a measurement tells that was not predicted: independent normal residuals if the process is right."""
+    """The part of a measurement that was not predicted: independent normal residuals if the process is right."""
 
     residual: Float[Array, " p"]
-    """Measurement minus its prediction from all those before it, channel by channel; 0 for one that is unseen."""
+    """Measurement minus its prediction from all earlier ones, channel by channel; 0 if unseen."""
     variance: Float[Array, " p"]
-    """Predicted variance of the residual; 1 for one that is unseen."""
+    """Predicted variance of the residual; 1 if unseen."""
     seen: Bool[Array, " p"]
 
 
@@ -69,7 +69,7 @@ class Filter(NamedTuple):
     predict: Callable[[Any, Array], Any]
     """(memory, u held for a sample) -> memory a sample later."""
     update: Callable[[Any, Array, Array], tuple[Any, Innovation]]
-    """(memory, y [p], seen [p]) -> memory with these measurements; channels that are not seen are ignored."""
+    """(memory, y [p], seen [p]) -> memory with these measurements, and innovation; unseen channels are ignored."""
 
 
 def mechanical(
@@ -87,14 +87,14 @@ def mechanical(
     Args:
         model: known or learned.
         actuation: matrix [d, m] in tau = actuation u; by default every coordinate has its own motor.
-        rate: of the samples, Hz.
+        rate: sampling rate, Hz.
         band: standard deviation of the torques that the model lacks [d], N m or N, or (x, u) -> [d].
         encoder_step: resolution of the coordinates [d], or one for all, rad or m.
         encoder_noise: standard deviation of other noise of the coordinates [d], or one for all, rad or m.
         substeps: integrator steps per sample.
 
     Raises:
-        InputError: a rate that is not positive, a negative number, or a coordinate without step and noise.
+        InputError: the rate is not positive, a number is negative, or a coordinate has neither step nor noise.
     """
     require_positive(rate=rate)
     noise = np.sqrt(np.asarray(encoder_step, float) ** 2 / 12 + np.asarray(encoder_noise, float) ** 2)
@@ -124,7 +124,7 @@ def belief(x: Any, deviation: Any) -> Belief:
         deviation: standard deviations [n], or one for all, above zero.
 
     Raises:
-        InputError: a standard deviation that is not positive.
+        InputError: a standard deviation is not positive.
     """
     x = jnp.asarray(x, float)
     deviation = np.broadcast_to(np.asarray(deviation, float), x.shape)
@@ -136,8 +136,8 @@ def belief(x: Any, deviation: Any) -> Belief:
 def triangular(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """Returns the lower triangular L with L Lᵀ = A Aᵀ, m >= n, by the modified Gram-Schmidt process on the rows.
 
-    It never forms A Aᵀ, whose condition is squared (Golub and Van Loan 2013, section 5.2.8). A row that depends on
-    those above it has a zero on the diagonal.
+    It never forms A Aᵀ, whose condition number is squared (Golub and Van Loan 2013, section 5.2.8). A row that depends
+    on those above it has a zero on the diagonal.
     """
     columns = []
     for row in range(len(A)):

@@ -4,7 +4,7 @@ For a filter whose innovations r have the predicted variances S, the negative lo
 
     sum over samples and channels of  ½ (r² / S + log 2 pi S)
 
-(Schweppe 1965). Its minimum over the logarithms of all deviations is found by L-BFGS with central differences.
+(Schweppe 1965). L-BFGS with central differences minimises it over the logarithms of all deviations.
 """
 
 import math
@@ -26,11 +26,11 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, Scalar
 
 SAMPLES = 4000
-"""Samples of a log that are used, the same number from the start of every trajectory."""
+"""Number of samples of a log that are used, equally many from the start of every trajectory."""
 FIRST_RATE = 1.0
-"""Deviation of the first rates, 1/s or m/s."""
+"""Standard deviation of the first rates, 1/s or m/s."""
 DIFFERENCE = 1e-3
-"""Half of the step of central differences in a deviation's logarithm."""
+"""Half the step of central differences in the logarithm of a deviation."""
 RANGE = math.log(1e4)
 """Largest change of a deviation's logarithm from its first value."""
 
@@ -42,17 +42,17 @@ class Tuned(NamedTuple):
     cost: float
     """Negative log-likelihood per measurement."""
     consistency: float
-    """Mean of r² / S: 1 for a process that is right, above 1 for a filter that trusts itself too much."""
+    """Mean of r² / S: 1 for a correct process, above 1 for an overconfident filter."""
 
 
 def surprise(innovation: Innovation) -> Scalar:
-    """Negative log-likelihood of innovations, in nats."""
+    """Returns the negative log-likelihood of innovations, in nats."""
     r, S, seen = innovation
     return jnp.sum(jnp.where(seen, 0.5 * (r**2 / S + jnp.log(2 * jnp.pi * S)), 0.0))
 
 
 def consistency(innovation: Innovation) -> Scalar:
-    """Mean of r² / S over the measurements (normalised innovations squared)."""
+    """Returns the mean of r² / S over the measurements (normalised innovations squared)."""
     r, S, seen = innovation
     return jnp.sum(jnp.where(seen, r**2 / S, 0.0)) / jnp.maximum(jnp.sum(seen), 1)
 
@@ -70,12 +70,12 @@ def tuned(
     Args:
         process: with first values above zero.
         logs: (belief in the first state, y [N, p], u [N, m]) of every log; those of equal length share a program.
-        noise: whether to change the measurements' noise too; by default it is known, such as from an encoder's step.
+        noise: whether to tune the measurement noise too; by default it is known, such as from an encoder's step.
         make: process -> filter.
-        iterations: most iterations of L-BFGS.
+        iterations: largest number of L-BFGS iterations.
 
     Raises:
-        InputError: no logs, first values that are not positive, or a likelihood that is not finite.
+        InputError: there are no logs, a first value is not positive, or the likelihood is not finite.
     """
     from scipy.optimize import minimize
 
@@ -91,7 +91,7 @@ def tuned(
             disturbance=values[: len(first)], noise=values[len(first) :] if noise else process.noise
         )
 
-    # Logs of one length are filtered together.
+    # Logs of equal length are filtered together.
     lengths = {len(y) for _, y, _ in logs}
     groups = [
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *(log for log in logs if len(log[1]) == n)) for n in lengths
@@ -138,7 +138,7 @@ def from_log(
         delay: samples after which the log's torques act.
 
     Raises:
-        InputError: a log without motion or with trajectories of fewer than eight samples.
+        InputError: the log has no motion, or trajectories of fewer than eight samples.
     """
     noise, rate = noise_of(log.q, log.trajectory), timing(log.t, log.trajectory).rate
     if not (np.isfinite(noise).all() and (noise > 0).all()):

@@ -2,7 +2,7 @@
 
 With N = n + k columns s_j of a square root of the covariance of (x, w), the 2 N points mean +- √N s_j have the weight
 1 / (2 N) each (Julier and Uhlmann 1997 with kappa = 0; Arasaratnam and Haykin 2009, "Cubature Kalman filters").
-Weights are positive, so that a square root of the covariance is a triangular factor of the scaled differences. It is
+Weights are positive, so a triangular factor of the scaled differences is a square root of the covariance. The filter is
 exact for a linear process, and to second order for others.
 """
 
