@@ -3,8 +3,8 @@
     g*(w) = max_u wᵀu - g(u),   attained at u = grad g*(w)
 
 With the cost to go V, dynamics a + B u and cost q + g, the optimal control is u = grad g*(-Bᵀ dV/dx). A cost that is
-infinite beyond limits keeps the control within them. The seven costs are those of the paper's table 1; three rules
-derive others from them.
+infinite beyond limits keeps the control within them. The basic costs are those of the paper's table 1; rules derive
+others from them.
 """
 
 from collections.abc import Callable
@@ -32,19 +32,19 @@ class ActionCost(NamedTuple):
 
 
 def quadratic(R: Any) -> ActionCost:
-    """½ uᵀ R u, for unlimited controls, which are linear in w.
+    """Returns ½ uᵀ R u, for unlimited controls, which are linear in w.
 
     Args:
         R: symmetric, positive definite [m, m], or one number for all controls.
 
     Raises:
-        InputError: an R of another form.
+        InputError: R has another form.
     """
     R = np.asarray(R, float)
     if R.ndim not in (0, 2) or (R.ndim and (R.shape[0] != R.shape[1] or not np.allclose(R, R.T))):
         raise InputError(f"R has shape {R.shape}; expected a number, or a symmetric matrix [m, m]")
     if not (np.linalg.eigvalsh(R) if R.ndim else R).min() > 0:
-        raise InputError("R is not positive definite; expected a cost that every control has")
+        raise InputError("R is not positive definite; expected a positive cost for every control")
     inverse = np.linalg.inv(R) if R.ndim else np.asarray(1 / R)
 
     def times(matrix: np.ndarray, vector: Array) -> Array:
@@ -58,7 +58,7 @@ def quadratic(R: Any) -> ActionCost:
 
 
 def _within(lower: float, upper: float, cost: Callable[[Array], Array]) -> Callable[[Array], Scalar]:
-    """Sum over controls, infinite if one is out of range; NaN stays NaN."""
+    """Returns the sum over controls, infinite if one is out of range; NaN stays NaN."""
     return lambda u: jnp.sum(jnp.where((u < lower) | (u > upper), jnp.inf, cost(jnp.clip(u, lower, upper))))
 
 
@@ -92,26 +92,26 @@ bang_lin = ActionCost(
 
 
 def scaled(cost: ActionCost, a: Any) -> ActionCost:
-    """a g(u/a): the range is a times as wide, for all controls."""
+    """Returns a g(u/a): the range is a times as wide, for all controls."""
     _require_scale(a=a)
     return ActionCost(lambda u: a * cost.cost(u / a), lambda w: a * cost.policy(w), lambda w: a * cost.conjugate(w))
 
 
 def weighted(cost: ActionCost, b: Any) -> ActionCost:
-    """b g(u): controls cost b times as much."""
+    """Returns b g(u): controls cost b times as much."""
     _require_scale(b=b)
     return ActionCost(lambda u: b * cost.cost(u), lambda w: cost.policy(w / b), lambda w: b * cost.conjugate(w / b))
 
 
 def stretched(cost: ActionCost, a: Any) -> ActionCost:
-    """g(u / a), with a range of its own for every control: a [m], or one for all."""
+    """Returns g(u / a), with a separate range for every control: a [m], or one for all."""
     a = np.asarray(a, float)
     _require_scale(a=a.min())
     return ActionCost(lambda u: cost.cost(u / a), lambda w: a * cost.policy(a * w), lambda w: cost.conjugate(a * w))
 
 
 def shifted(cost: ActionCost, c: Any) -> ActionCost:
-    """g(u + c) - g(c): the range is shifted by -c."""
+    """Returns g(u + c) - g(c): the range is shifted by -c."""
     c = jnp.asarray(c, float)
     return ActionCost(
         lambda u: cost.cost(u + c) - cost.cost(c),
@@ -121,7 +121,7 @@ def shifted(cost: ActionCost, c: Any) -> ActionCost:
 
 
 def centred(cost: ActionCost, u: Any) -> ActionCost:
-    """g minus its tangent at u0: minimal and zero at the control u0 that holds a goal, within the same limits.
+    """Returns g minus its tangent at u0: minimal and zero at the control u0 that holds a goal, within the same limits.
 
     Args:
         cost: g, with a slope at u0.
@@ -146,17 +146,17 @@ def centred(cost: ActionCost, u: Any) -> ActionCost:
 
 
 def limited_atan(limit: float, weight: float) -> ActionCost:
-    """-(2 a b/π) log cos(π u/(2 a)), infinite beyond the limit a; the curvature at 0 is π b/(2 a).
+    """Returns -(2 a b/π) log cos(π u/(2 a)), infinite beyond the limit a; the curvature at 0 is π b/(2 a).
 
-    The cost of continuous fitted value iteration (Lutter et al. 2021, arXiv:2105.04682), whose program takes
-    b = 4 a² R/π, so that the curvature is 2 a R (its comment says 2 R).
+    This is the cost of continuous fitted value iteration (Lutter et al. 2021, arXiv:2105.04682). The published program
+    uses b = 4 a² R/π, so the curvature is 2 a R (its comment says 2 R).
 
     Args:
-        limit: a, of all controls.
+        limit: a, for all controls.
         weight: b.
 
     Raises:
-        InputError: a number that is not positive.
+        InputError: a number is not positive.
     """
     _require_scale(limit=limit, weight=weight)
     return weighted(scaled(atan, 2 * limit / np.pi), weight)

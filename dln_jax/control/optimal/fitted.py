@@ -1,16 +1,16 @@
 """Continuous fitted value iteration: follows a network's greedy policy and fits the network to the resulting costs.
 
-Every iteration draws states in the box and follows u = grad g*(-Bᵀ V_x) from them for N steps. Along a trajectory,
-backwards, costs are added up with exponential weights (Lutter et al. 2021, arXiv:2105.04682):
+Every iteration draws states in the box and follows u = grad g*(-Bᵀ V_x) from them for N steps. Backwards along a
+trajectory, costs are added up with exponential weights (Lutter et al. 2021, arXiv:2105.04682):
 
     G_k = c_k + e^(-rho dt) [(1 - w) V(x_{k+1}) + w G_{k+1}],    G_N = V(x_N),    w = e^(-dt / memory)
 
-so that all states on the way have a target, not only the first. They also have a target for the slope p_k = dG_k/dx, by
-the chain rule through the closed loop, including the policy. With fixed controls instead, as in the costate of
-Pontryagin's principle, slopes of an unstable plant would grow backwards wherever the controls are not yet optimal. With
-a long memory the targets are the policy's own cost, whose excess over the optimum is quadratic in the policy's error,
-and the iteration is Howard's policy iteration, which converges like Newton's method. With a short one they are n-step
-returns, which do not require a good policy.
+so all states on the way have a target, not only the first. They also have a target for the slope p_k = dG_k/dx, by the
+chain rule through the closed loop, including the policy. With fixed controls, as in the costate of Pontryagin's
+principle, slopes of an unstable plant would grow backwards wherever the controls are not yet optimal. With a long
+memory the targets are the policy's own cost, whose excess over the optimum is quadratic in the policy's error, and the
+iteration is Howard's policy iteration, which converges like Newton's method. With a short one they are n-step returns,
+which do not require a good policy.
 """
 
 import functools
@@ -38,7 +38,7 @@ VALIDATED = 256
 
 
 class Iteration(NamedTuple):
-    """Numbers of fitted value iteration."""
+    """Settings of fitted value iteration."""
 
     iterations: int = 36
     starts: int = 1024
@@ -61,12 +61,12 @@ class Iteration(NamedTuple):
     slope_weight: float = 0.05
     """Weight of the slopes' misfit, in units of the box, relative to that of the values."""
     floor: float = 0.02
-    """Share of the largest target added to every target in relative misfits."""
+    """Share of the 90 % quantile of the targets that is added to every target in relative misfits."""
     followed: float = 2.0
     """Time for which the validation follows the policy, in units of `seconds`; V stands for the costs after it."""
     margin: float = 1.25
-    """Factor on the box for drawing states and clipping trajectories; 1 as published, where the edges of the box affect
-    the value inside."""
+    """Factor on the box for drawing states and clipping trajectories; 1 as published, but then the edges of the box
+    affect the value inside."""
 
 
 class ValueProgress(NamedTuple):
@@ -81,7 +81,7 @@ class ValueProgress(NamedTuple):
 
 
 class IterationState(NamedTuple):
-    """State after some iterations of a seed; going on from it gives the same bits as never having stopped."""
+    """State after some iterations of a seed; resuming from it gives the same bits as never having stopped."""
 
     parameters: Any
     optimiser: Any
@@ -91,7 +91,7 @@ class IterationState(NamedTuple):
 
 
 Restore = Callable[[int, IterationState], IterationState]
-"""(seed, state before the first iteration) -> the state to go on from."""
+"""(seed, state before the first iteration) -> the state to resume from."""
 
 
 class FittedValue(NamedTuple):
@@ -130,18 +130,18 @@ def fit_values(
     Args:
         problem: the control problem.
         network: family of value functions.
-        seeds: of parameters and states.
-        numbers: of the iteration.
-        parameters: initial ones; random by default.
+        seeds: seeds of parameters and states.
+        numbers: settings of the iteration.
+        parameters: initial parameters; random by default.
         double: whether to compute in float64, which takes twice as long.
-        disturbance: of the worst case, for a robust value.
+        disturbance: worst-case disturbance, for a robust value.
         mesh: devices that share the states from which the policy is followed; all devices do the whole fits.
         report: called after every iteration.
-        restore: returns the state of a seed to go on from.
+        restore: returns the state of a seed to resume from.
         store: called with the state of a seed after every iteration.
 
     Raises:
-        InputError: numbers out of range, or a value that was never finite.
+        InputError: a number is out of range, or the cost of the policy was never finite.
     """
     require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
     subject = _Subject(widened(problem, numbers.margin), network, numbers, disturbance, mesh)
@@ -149,7 +149,7 @@ def fit_values(
     adam = optax.adam(rate, b2=0.99)
 
     def begin(key: Array) -> tuple[Any, Any, Array]:
-        """Parameters, state of the optimiser, and validation states."""
+        """Returns parameters, state of the optimiser, and validation states."""
         start = network.init(jax.random.fold_in(key, 0)) if parameters is None else parameters
         start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), start)
         return start, adam.init(start), drawn(subject.problem, jax.random.fold_in(key, 1), VALIDATED)
@@ -234,7 +234,7 @@ def _iterate(
 
 
 def _kept_targets(subject: _Subject, parameters: Any, x: Array, memory: Array) -> Targets:
-    """Targets at some states of the trajectories from x [N, n], one row per state."""
+    """Returns targets at some states of the trajectories from x [N, n], one row per state."""
 
     def of_start(parameters: Any, memory: Array, x: Array) -> Targets:
         return targets(
@@ -254,13 +254,13 @@ def _kept_targets(subject: _Subject, parameters: Any, x: Array, memory: Array) -
 
 
 def _robust(off: Array) -> Array:
-    """Loss that is quadratic for small errors and linear for large ones, because slopes jump at a ridge of V."""
+    """Returns a loss, quadratic for small errors and linear for large ones, because slopes jump at a ridge of V."""
     size = 0.1
     return size**2 * (jnp.sqrt(1 + (off / size) ** 2) - 1)
 
 
 def _score(subject: _Subject, parameters: Any, x: Array) -> Array:
-    """Mean cost of the policy from states x [N, n], plus the mean of |V - cost|."""
+    """Returns the mean cost of the policy from states x [N, n], plus the mean of |V - cost|."""
     problem, network, dt = subject.problem, subject.network, subject.numbers.dt
     steps = round(subject.numbers.followed * subject.steps)
 

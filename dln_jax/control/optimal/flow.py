@@ -2,8 +2,8 @@
 
     x(t + dt),   integral from 0 to dt of e^(-rho s) (q(x(t + s)) + g(u)) ds
 
-by the classical Runge-Kutta method on both at once. Targets of a value along a trajectory are costs with exponential
-weights, and their slopes; see `fitted`.
+are integrated together by the classical Runge-Kutta method. Targets of a value along a trajectory are costs with
+exponential weights, and their slopes; see `fitted`.
 """
 
 import math
@@ -40,7 +40,7 @@ def limits(problem: ControlProblem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def uniform(problem: ControlProblem, key: Array, samples: int) -> Float[Array, "samples n"]:
-    """Random states, uniform in the box."""
+    """Returns random states, uniform in the box."""
     low, high = jnp.asarray(problem.low, float), jnp.asarray(problem.high, float)
     return jax.random.uniform(key, (samples, len(low)), low.dtype, low, high)
 
@@ -54,7 +54,7 @@ def widened(problem: ControlProblem, factor: float) -> ControlProblem:
 
 
 def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"]:
-    """Random states, half of them uniform in the box, half in boxes shrunk by a uniformly distributed factor.
+    """Returns random states: half of them uniform in the box, half in boxes shrunk by a uniformly distributed factor.
 
     Angles on a circle are uniform in both. In a box of several dimensions nearly all uniform states are far from rest,
     where motions rarely are.
@@ -70,7 +70,7 @@ def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool
     """Returns the step of a problem.
 
     Args:
-        problem: with plant and costs.
+        problem: defines plant and costs.
         dt: time for which the controls are held, s.
         substeps: integrator steps.
         clipped: whether states that are not on a circle are clipped to the box, as in published fitted iterations; this
@@ -96,7 +96,7 @@ def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool
 def greedy(
     problem: ControlProblem, value: ValueAndGradient, dt: float, disturbance: Disturbance | None = None
 ) -> Callable[[Array], tuple[Array, Scalar]]:
-    """x -> the state after a step under the value's policy, with the worst disturbance if any, and the step's cost."""
+    """Returns x -> state after a step under the value's policy, and the step's cost, under the disturbance if any."""
     step: Flow = flow(problem, dt, clipped=True)
 
     def closed(x: Array) -> tuple[Array, Scalar]:
@@ -117,7 +117,7 @@ def targets(
     memory: Any,
     disturbance: Disturbance | None = None,
 ) -> Targets:
-    """Returns targets at all states of the trajectory from x [n], without the last.
+    """Returns targets at all states of the trajectory from x [n] except the last.
 
     Args:
         problem: the control problem.
@@ -125,7 +125,7 @@ def targets(
         x: initial state.
         steps: N.
         dt: s.
-        memory: of the weights, s.
+        memory: memory of the weights, s.
         disturbance: worst disturbance, held over a step like the controls.
     """
     closed = greedy(problem, value, dt, disturbance)

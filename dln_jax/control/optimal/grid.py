@@ -2,16 +2,16 @@
 
     V(x) = min over u of  integral from 0 to dt of e^(-rho t) (q + g) dt + e^(-rho dt) V(x(dt))
 
-A semi-Lagrangian scheme (Falcone and Ferretti 2014): the classical Runge-Kutta method with held controls gives the feet
-x(dt) of characteristics, and linear interpolation V there. That makes the scheme monotone and its fixed point unique:
-it converges to the viscosity solution, and Howard's policy iteration (1960), which never raises V, converges to the
-fixed point. (With cubic interpolation it need not: it did not at ridges.) The candidates for a control are the present
-one, a list over their range, and the controls from the conjugate of their cost for the slopes of V on both sides,
-u = grad g*(-Bᵀ V_x). Coarse grids initialise fine ones.
+The scheme is semi-Lagrangian (Falcone and Ferretti 2014): the classical Runge-Kutta method with held controls gives the
+feet x(dt) of characteristics, and linear interpolation gives V there. This makes the scheme monotone and its fixed
+point unique: it converges to the viscosity solution, and Howard's policy iteration (1960), which never raises V,
+converges to the fixed point. (With cubic interpolation it did not at ridges.) The candidates for a control are the
+present one, a list over the range, and the controls u = grad g*(-Bᵀ V_x) for the slopes of V on both sides, by the
+conjugate of their cost. Coarse grids initialise fine ones.
 
-Linear interpolation costs O(h²/dt) and held controls O(dt²), so dt should be as long as the controls allow. The change
-between two grids estimates the distance of V from its limit; `extrapolated` removes most of it where V is smooth.
-`lookahead` gives the policy of V; the cost of following it bounds the true value from above.
+Linear interpolation has an error of O(h²/dt) and held controls of O(dt²), so dt should be as long as the controls
+allow. The change between two grids estimates the distance of V from its limit; `extrapolated` removes most of it where
+V is smooth. `lookahead` gives the policy of V; the cost of following it bounds the true value from above.
 """
 
 import math
@@ -72,17 +72,18 @@ def solve_on_grid(
     Args:
         problem: of two states and one control.
         points: number of nodes per side, for every grid; on a circle the last node is the first.
-        low: corner of the rectangle [2]. Trajectories that would leave it stay on its edge: make it large enough for
-            those of interest.
-        high: the opposite corner.
-        limit: magnitude of the largest control, where its cost is finite.
-        dt: s. Controls are held for it, which costs O(dt²); interpolation costs O(h²/dt) for nodes at a distance h.
-        tolerance: of V, relative to its largest.
+        low: lower corner of the rectangle [2]. Trajectories that would leave it stay on its edge: make it large enough
+            for those of interest.
+        high: upper corner.
+        limit: largest magnitude of the control; the cost must be finite there.
+        dt: time in s for which controls are held, with an error of O(dt²); that of interpolation is O(h²/dt) for nodes
+            at a distance h.
+        tolerance: largest change of V, relative to the largest V.
         improvements: largest number of policy improvements per grid; the result states whether they sufficed.
         start: a solution on a coarser grid.
 
     Raises:
-        InputError: another number of states, or settings out of range.
+        InputError: there are not two states, or a setting is out of range.
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     if low.shape != (2,) or high.shape != (2,) or not (low < high).all():
@@ -109,7 +110,7 @@ def solve_on_grid(
 
 
 def extrapolated(coarse: GridValue, fine: GridValue, x: Any) -> Array:
-    """V at states [..., 2] by Richardson's extrapolation from two grids, whose errors are proportional to h²."""
+    """Returns V at states [..., 2] by Richardson's extrapolation from two grids with errors proportional to h²."""
     ratio = (coarse.grid.steps[0] / fine.grid.steps[0]) ** 2
     of_coarse, of_fine = (interpolated(value.grid, value.V, x) for value in (coarse, fine))
     return of_fine + (of_fine - of_coarse) / (ratio - 1)
@@ -152,7 +153,7 @@ def _iterate(
         return cost + discount * read(V, linear(grid, after))
 
     def conjugates(V: Array) -> list[Array]:
-        """Controls of the backward, forward and mean slopes."""
+        """Returns the controls for the backward, forward and mean slopes."""
         sides = [one_sided_slopes(grid, V, axis) for axis in (0, 1)]
         pairs = [tuple(side[which] for side in sides) for which in (0, 1)]
         pairs.append(tuple((before + after) / 2 for before, after in sides))

@@ -1,8 +1,8 @@
 """Interpolation between the nodes of a rectangular grid of two dimensions.
 
-Linear interpolation is monotone: its weights are not negative and sum to one, so that larger values at the nodes give
-larger values between them. Cubic interpolation is more accurate for smooth values. Limited to the values of the four
-surrounding corners (Bermejo and Staniforth 1992) it does not overshoot at ridges.
+Linear interpolation is monotone: its weights are not negative and sum to one, so larger values at the nodes give larger
+values between them. Cubic interpolation is more accurate for smooth values. Limited to the values of the four
+surrounding corners (Bermejo and Staniforth 1992), it does not overshoot at ridges.
 """
 
 import math
@@ -19,7 +19,7 @@ class Grid(NamedTuple):
 
     low: tuple[float, ...]
     steps: tuple[float, ...]
-    """Distance between neighbouring nodes on the sides."""
+    """Distance between neighbouring nodes along each side."""
     shape: tuple[int, ...]
     circle: tuple[bool, ...]
     """Whether a side is a circle: its last node is its first and is not stored."""
@@ -33,7 +33,7 @@ class Grid(NamedTuple):
 
 
 class Stencil(NamedTuple):
-    """Nodes around some states on both sides, and their weights, for `read`."""
+    """Nodes around some states along both sides, and their weights, for `read`."""
 
     rows: Array
     """[k, ...]."""
@@ -44,12 +44,12 @@ class Stencil(NamedTuple):
 
 
 def linear(grid: Grid, x: Array) -> Stencil:
-    """Stencil of bilinear interpolation at states x [..., 2]; beyond an edge, the edge's value applies."""
+    """Returns the stencil of bilinear interpolation at states x [..., 2]; beyond an edge, the edge's value applies."""
     return _stencil(grid, x, (0, 1))
 
 
 def read(values: Array, at: Stencil) -> Array:
-    """Evaluates values at the nodes [A, B] at the states of a stencil."""
+    """Interpolates values at the nodes [A, B] to the states of a stencil."""
     count = at.rows.shape[0]
     total = jnp.zeros(at.rows.shape[1:], values.dtype)
     for i in range(count):
@@ -59,14 +59,14 @@ def read(values: Array, at: Stencil) -> Array:
 
 
 def interpolated(grid: Grid, values: Array, x: Any) -> Array:
-    """Limited cubic interpolation of values at the nodes [A, B], such as V, at states [..., 2]."""
+    """Interpolates values at the nodes [A, B], such as V, to states [..., 2] by limited cubics."""
     smooth, around = (_stencil(grid, jnp.asarray(x), offsets) for offsets in ((-1, 0, 1, 2), (0, 1)))
     corners = jnp.stack([values[row, column] for row in around.rows for column in around.columns])
     return jnp.clip(read(values, smooth), jnp.min(corners, axis=0), jnp.max(corners, axis=0))
 
 
 def one_sided_slopes(grid: Grid, values: Array, axis: int) -> tuple[Array, Array]:
-    """Backward and forward difference quotients along an axis; at an edge both are the one that exists."""
+    """Returns backward and forward difference quotients along an axis; at an edge both are the one that exists."""
     forward = (jnp.roll(values, -1, axis) - values) / grid.steps[axis]
     backward = jnp.roll(forward, 1, axis)
     if grid.circle[axis]:
@@ -77,7 +77,7 @@ def one_sided_slopes(grid: Grid, values: Array, axis: int) -> tuple[Array, Array
 
 
 def _stencil(grid: Grid, x: Array, offsets: tuple[int, ...]) -> Stencil:
-    """Stencil of Lagrange's polynomials through the nodes at these offsets from a state's cell, on both sides."""
+    """Returns the stencil of Lagrange polynomials through the nodes at these offsets from a state's cell."""
     nodes, weights = [], []
     for axis, (low, step, count, circle) in enumerate(zip(*grid, strict=True)):
         place = (x[..., axis] - low) / step

@@ -9,8 +9,8 @@ The plant falls from its goal at the rate f, and motors at their limits accelera
     w = 1 for angles (1/2 with a motor), 5 / r² for slides,   v = 1 / lambda² and 2 / (lambda r)²
     g(u) is that of limited controls: half of all limits together cost effort π², if hanging costs π²
 
-The box has the whole circle or range, and rates up to 2.4 lambda, of slides up to what the motor reaches. Times of the
-fit and of the discount are multiples of 1 / lambda.
+The box contains the whole circle or range, and rates up to 2.4 lambda, or for slides up to what the motor reaches.
+Times of the fit and of the discount are multiples of 1 / lambda.
 """
 
 import math
@@ -39,11 +39,11 @@ from dln_jax.types import InputError, JointKind, Scalar
 EFFORT = 0.25
 """Cost of half of all limits, relative to that of hanging."""
 SHARE, HORIZON = 0.8, 40.0
-"""Weight of a cost after this time, in units of 1 / lambda."""
+"""Weight of a cost after the horizon, and the horizon in units of 1 / lambda."""
 FASTEST = 2.4
 """Rates of the box, in units of lambda times the size of a joint."""
 WALL, STEEPNESS = 0.8, 10.0
-"""Share of a range at which its barrier begins, and the barrier's steepness in units of half the range."""
+"""Share of half a range at which its barrier begins, and the barrier's steepness in units of half the range."""
 NEAR = 0.2
 """Largest angle from the goal that counts as up, rad."""
 SLOWEST = 1e-6
@@ -52,7 +52,7 @@ SLOWEST = 1e-6
 
 @dataclass(frozen=True)
 class OwnProblem:
-    """All numbers of a problem, as JSON values; they rebuild it whatever the defaults are."""
+    """All numbers of a problem, as JSON values that rebuild it even if defaults change."""
 
     names: tuple[str, ...]
     joints: tuple[JointKind, ...]
@@ -77,7 +77,7 @@ class OwnProblem:
 
     @property
     def turning(self) -> tuple[bool, ...]:
-        """Whether a coordinate turns freely, so that its states are a circle."""
+        """Whether each coordinate turns freely, so that its states are a circle."""
         return tuple(
             kind == "revolute" and low is None and high is None
             for kind, (low, high) in zip(self.joints, self.positions, strict=True)
@@ -95,15 +95,15 @@ def own_problem(
     """Chooses the numbers of a problem by the scales of a plant.
 
     Args:
-        model: of the plant, smooth.
+        model: smooth model of the plant.
         layout: motors, goal and limits.
         effort: by default `EFFORT`.
-        weights: of the squared deviations [2 d]; angles of free joints enter as 2 sin(θ/2) π/2.
+        weights: weights of the squared deviations [2 d]; angles of free joints enter as π sin(θ/2).
         box: half widths [2 d].
 
     Raises:
-        InputError: a goal that the limits cannot hold or that is no equilibrium, numbers of the wrong count or sign, or
-            a plant that neither falls nor is driven.
+        InputError: the limits cannot hold the goal or it is no equilibrium, numbers have the wrong count or sign, or
+            the plant neither falls nor is driven.
     """
     B, size = layout.actuation, layout.limits.control[:, 1]
     passive = np.flatnonzero((B == 0).all(axis=1))
@@ -135,7 +135,7 @@ def own_problem(
     }
     numbers = {name: _stated(name, usual, wish) for name, (usual, wish) in chosen.items()}
     if not np.isfinite(effort := EFFORT if effort is None else effort) or not effort > 0:
-        raise InputError(f"effort is {effort}; expected a positive number: the cost of half the limits over hanging's")
+        raise InputError(f"effort is {effort}; expected a positive cost of half the limits, relative to hanging")
     return OwnProblem(
         names=tuple(layout.names),
         joints=tuple(layout.joints),
@@ -154,7 +154,7 @@ def own_problem(
 def _rates(
     model: Dynamics | PlainDynamics, goal: np.ndarray, B: np.ndarray, size: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Rate of the fall from the goal, 1/s, and accelerations [d] by the joints' own motors at their limits."""
+    """Returns the rate of the fall from the goal, 1/s, and accelerations [d] by each joint's own motor at its limit."""
     field, d, still = field_of(model), len(goal), jnp.zeros(len(goal))
 
     def accelerations(q: Array, tau: Array) -> Array:
@@ -169,7 +169,7 @@ def _rates(
 
 
 def _stated(name: str, usual: np.ndarray, wish: Any) -> tuple[float, ...]:
-    """Positive numbers [2 d], by default the usual ones."""
+    """Returns positive numbers [2 d], by default the usual ones."""
     if wish is None:
         return tuple(usual.tolist())
     numbers = np.asarray(wish, float)
@@ -187,15 +187,15 @@ def _finite(number: float) -> float | None:
 def own_plant(model: Dynamics | PlainDynamics, numbers: OwnProblem) -> ValuePlant:
     """Returns the control problem with its evaluation.
 
-    The evaluation starts near hanging, and anywhere in the box at rest. It integrates by the classical Runge-Kutta
-    method for 40 / lambda. A run that leaves the limits of a coordinate fails.
+    The evaluation starts near hanging, or at rest anywhere on circles and in a third of other sides of the box. It
+    integrates by the classical Runge-Kutta method for 40 / lambda. A run that leaves the limits of a coordinate fails.
 
     Args:
-        model: of the plant, smooth.
+        model: smooth model of the plant.
         numbers: from `own_problem`, for this model.
 
     Raises:
-        InputError: numbers that do not fit the model; see `checked`.
+        InputError: the numbers do not fit the model; see `checked`.
     """
     d, scale = len(numbers.joints), numbers.scale
     goal = np.concatenate([numbers.goal, np.zeros(d)])
@@ -204,7 +204,7 @@ def own_plant(model: Dynamics | PlainDynamics, numbers: OwnProblem) -> ValuePlan
     bounded = np.isfinite(ranges).all(axis=1)
     middle = goal.copy()
     middle[:d][bounded] = ranges[bounded].mean(axis=1)
-    # Limited joints turn along a line, for which a value needs no circle.
+    # Limited joints move along a line, so a value needs no circle for them.
     kinds: tuple[JointKind, ...] = tuple("revolute" if turns else "prismatic" for turns in turning)
     drift, actuation = from_plant(model, np.asarray(numbers.actuation))
     limit, tau = np.asarray(numbers.limits), 2 * (1 + MARGIN) / np.pi
@@ -258,7 +258,7 @@ def _state_cost(
 
 
 def own_settings(numbers: OwnProblem, widths: Sequence[int] = (96, 96, 96)) -> ValueSettings:
-    """Settings of the fit, in times of the plant."""
+    """Returns the settings of the fit, with times in units of 1 / lambda."""
     unit = 1 / numbers.scale
     iteration = Iteration(
         iterations=80, starts=2048, kept=6, steps=250, slope_weight=0.1, floor=0.01, followed=4.0,
@@ -268,7 +268,7 @@ def own_settings(numbers: OwnProblem, widths: Sequence[int] = (96, 96, 96)) -> V
 
 
 def described(numbers: OwnProblem) -> list[str]:
-    """Lines on the numbers of a problem."""
+    """Returns lines that describe the numbers of a problem."""
 
     def listed(values: Sequence[float], units: Mapping[str, str]) -> str:
         pairs = zip(numbers.names, numbers.joints, values, strict=True)

@@ -1,13 +1,13 @@
 """Plants, costs, settings and evaluation of continuous fitted value iteration (Lutter et al. 2021, arXiv:2105.04682).
 
-As in its program, angles are zero upright and enter the costs as π sin(θ/2), the action cost is that of limited
-controls with the weight b = 4 limit² R/π, and the cart's rail is a barrier in the state cost. The evaluation integrates
-by Euler's method at 250 Hz for 5 s, with controls at 125 Hz, clips states that are not on a circle to the box
-(`Evaluation`), and returns
+As in the published program, angles are zero upright and enter the costs as π sin(θ/2), the action cost is that of
+limited controls with the weight b = 4 limit² R/π, and the cart's rail is a barrier in the state cost. The evaluation
+integrates by Euler's method at 250 Hz for 5 s, with controls at 125 Hz, clips states that are not on a circle to the
+box (`Evaluation`), and returns
 
     - sum of dt (q(x) + g(u)),
 
-undiscounted, including the walls. It is the reward of the paper, so more is better.
+undiscounted, including the walls. This is the reward of the paper, so more is better.
 """
 
 import math
@@ -36,13 +36,13 @@ from dln_jax.types import JointKind, Scalar
 MARGIN = 1e-3
 """Margin of the action cost's range beyond the limit."""
 HORIZON = 5.0
-"""Time in s after which a cost counts by the factor `share`."""
+"""Time in s after which a cost has the weight `share`."""
 EULER = Tableau(((0.0,),), (1.0,))
 Where = Literal["down", "uniform"]
 
 
 class Starts(NamedTuple):
-    """Initial states of the published evaluation: near hanging, and anywhere around the circle at rest."""
+    """Initial states of the published evaluation: near hanging, or at rest anywhere around the circle."""
 
     down: Sequence[float]
     """Mean [n]."""
@@ -76,7 +76,7 @@ class ValuePlant(NamedTuple):
     """Limit of the controls, N m or N; one, or [m]."""
     starts: Starts
     angles: tuple[int, ...]
-    """Coordinates that have to be near the goal."""
+    """Coordinates that must come near the goal."""
     rest: float = 0.0
     """Cost per second of the published costs at the goal; the problem's costs are zero there."""
     evaluation: Evaluation = Evaluation()
@@ -103,7 +103,7 @@ class Returns(NamedTuple):
 
 
 def pendulum() -> ValuePlant:
-    """A driven rod of 1 kg and 1 m: thdd = 3 (u + g/2 sin θ), with 2.5 N m too weak to lift it at once."""
+    """Returns a driven rod of 1 kg and 1 m: thdd = 3 (u + g/2 sin θ). Its 2.5 N m are too weak to lift it at once."""
     weight = 9.81 / 2
     rod = ClosedForm(
         lambda q: jnp.full((1, 1), 1 / 3, q.dtype),
@@ -117,7 +117,7 @@ def pendulum() -> ValuePlant:
 
 
 def cart_pole_on_rail() -> ValuePlant:
-    """A desktop cart-pole on a rail of 1 m, with 12 N."""
+    """Returns a desktop cart-pole on a rail of 1 m, with 12 N."""
     scene = cart_pole(cart_mass=0.57, pole_mass=0.127, length=0.16825)
     plant = scene.closed_form._replace(
         dissipation=lambda q, qd: 0.05 * qd[0] ** 2 + 0.0005 * qd[1] ** 2,
@@ -132,7 +132,7 @@ def cart_pole_on_rail() -> ValuePlant:
 
 
 def desktop_rotary_pendulum() -> ValuePlant:
-    """A rotary pendulum of desktop size with 50 mN m; the costs are ours, as the published ones are not printed.
+    """Returns a desktop rotary pendulum with 50 mN m; the costs are ours, because the paper does not print its own.
 
     Half of the limit costs 11 per second, as much as hanging: with cheaper controls the iterations do not converge.
     """
@@ -161,7 +161,7 @@ FITS = {
 
 
 def starts(plant: ValuePlant, where: Where, count: int = 100, seed: int = 0) -> Float[np.ndarray, "N n"]:
-    """Random initial states, as published."""
+    """Returns random initial states, as published."""
     random, (mean, variance, widths) = np.random.default_rng(seed), plant.starts
     if where == "down":
         return np.asarray(mean) + np.sqrt(variance) * random.normal(size=(count, len(mean)))
@@ -171,7 +171,7 @@ def starts(plant: ValuePlant, where: Where, count: int = 100, seed: int = 0) -> 
 
 
 def evaluate(plant: ValuePlant, law: Law, x: Any) -> Returns:
-    """Returns of a law x [n] -> u [m] from states x [N, n]; NaN where it fails."""
+    """Evaluates a law x [n] -> u [m] from states x [N, n]; the return is NaN where it fails."""
     problem, how = plant.problem, plant.evaluation
     dt, angles = 1 / how.rate, np.array(plant.angles)
     low, high = limits(problem) if how.clipped else (-np.inf, np.inf)
@@ -198,7 +198,7 @@ def evaluate(plant: ValuePlant, law: Law, x: Any) -> Returns:
         return total, every, u, off
 
     totals, states, controls, off = map(np.asarray, jax.jit(jax.vmap(run))(jnp.asarray(x, float)))
-    # Angles beyond a straight one are far, whatever their cosine.
+    # Angles above π are far, whatever their cosine.
     settled = outcomes(np.minimum(off, np.pi), rate=how.rate / how.held, up=how.near).seconds
     return Returns(totals, settled, float(np.max(np.abs(controls))), states, controls)
 
@@ -224,7 +224,7 @@ def _problem(
         return sum((weight * way**2 for weight, way in zip(weights, ways(x), strict=True)), jnp.zeros((), x.dtype))
 
     def with_walls(x: Array) -> Scalar:
-        # The walls begin at 0.4 m of a rail's 0.5 m. Their value at the goal, where costs are zero, is subtracted.
+        # The walls begin at 0.4 m of the rail's 0.5 m. Their cost at the goal, where costs are zero, is subtracted.
         wrapped = [
             part - 2 * math.pi * jnp.round(part / (2 * math.pi)) if angle else part
             for part, angle in zip(x, angles, strict=True)

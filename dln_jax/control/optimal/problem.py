@@ -7,7 +7,7 @@ For convex g the optimal control has a closed form, which removes the minimum (L
     u = grad g*(-Bᵀ V_x),    rho V + g*(-Bᵀ V_x) - q - aᵀ V_x = 0
 
 V is a cost, non-negative and minimised. Formulations with rewards, such as continuous fitted value iteration
-(arXiv:2105.04682), have -q - g, the value -V and u = grad g*(+Bᵀ dvalue/dx).
+(arXiv:2105.04682), have the reward -q - g, the value -V and u = grad g*(+Bᵀ dvalue/dx).
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ def from_field(field: Field, controls: int | None = None) -> Affine:
     """Returns a and B of a field (x, u) -> dx/dt that is affine in its controls.
 
     Args:
-        field: of the plant.
+        field: (x, u) -> dx/dt of the plant.
         controls: m; by default half the number of states.
     """
 
@@ -87,17 +87,17 @@ def from_field(field: Field, controls: int | None = None) -> Affine:
 
 
 def rates(problem: ControlProblem) -> Field:
-    """The field (x, u) -> a + B u of a problem."""
+    """Returns the field (x, u) -> a + B u of a problem."""
     return lambda x, u: problem.drift(x) + problem.actuation(x) @ u
 
 
 def optimal_control(problem: ControlProblem, x: Array, slope: Array) -> Array:
-    """u = grad g*(-Bᵀ V_x) [m]."""
+    """Returns u = grad g*(-Bᵀ V_x) [m]."""
     return problem.action_cost.policy(-problem.actuation(x).T @ slope)
 
 
 def hjb_residual(problem: ControlProblem, x: Array, value: Scalar, slope: Array) -> Scalar:
-    """rho V + g*(-Bᵀ V_x) - q - aᵀ V_x, the residual of the equation at x as a cost per second."""
+    """Returns rho V + g*(-Bᵀ V_x) - q - aᵀ V_x, the residual of the equation at x as a cost per second."""
     gain = problem.action_cost.conjugate(-problem.actuation(x).T @ slope)
     return problem.discount * value + gain - problem.state_cost(x) - problem.drift(x) @ slope
 
@@ -106,12 +106,12 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     """Validates a problem and returns it with its box and goal as arrays.
 
     Args:
-        problem: to validate.
-        tolerance: of |dx/dt| at the goal with the cheapest control, and of its cost.
+        problem: problem to validate.
+        tolerance: largest |dx/dt| at the goal with the cheapest control, and largest cost there.
 
     Raises:
-        InputError: shapes that do not agree, an empty box, a negative discount, or a goal that is not an equilibrium or
-            has a cost.
+        InputError: shapes do not agree, the box is empty, the discount is negative, or the goal is outside the box, is
+            not an equilibrium or has a cost.
     """
     low, high, goal = (np.asarray(point, float) for point in (problem.low, problem.high, problem.goal))
     if goal.ndim != 1 or low.shape != goal.shape or high.shape != goal.shape:
@@ -149,7 +149,7 @@ def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> C
     Args:
         problem: with zero cost at its goal.
         goal: state [n].
-        tolerance: of the remaining dx/dt.
+        tolerance: largest remaining dx/dt.
 
     Raises:
         InputError: no control holds the goal, or none within the limits of the action cost.
@@ -175,12 +175,12 @@ def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> C
 
 
 def circles(problem: ControlProblem) -> Bool[np.ndarray, " n"]:
-    """Mask of the coordinates that are angles on a circle."""
+    """Returns the mask of the coordinates that are angles on a circle."""
     return circular(problem.joints, len(problem.low))
 
 
 def features(problem: ControlProblem, x: Array) -> Float[Array, " k"]:
-    """z(x) - z(goal) [k]: sines, then cosines of angles, which close the circle, and the other states in box units."""
+    """Returns z(x) - z(goal) [k]: sines, then cosines of angles on a circle, then the other states in box units."""
     angles = circles(problem)
     half = (np.asarray(problem.high, float) - np.asarray(problem.low, float)) / 2
     goal = jnp.asarray(problem.goal, x.dtype)
@@ -190,7 +190,7 @@ def features(problem: ControlProblem, x: Array) -> Float[Array, " k"]:
 
 
 def hjb_policy(value_and_gradient: ValueAndGradient, problem: ControlProblem) -> Law:
-    """x [n] -> u [m], within the limits of the action cost; NaN if the state is not finite.
+    """Returns x [n] -> u [m] within the limits of the action cost; NaN if the state is not finite.
 
     Args:
         value_and_gradient: x -> V and V_x, for example of a trained network.

@@ -6,7 +6,7 @@ The fit minimises the mean square over the box of
 
 The equation has several solutions, only one of which is the cost to go. With a large discount that one is near q / rho
 and the others are far away. Training starts there and follows it while the discount decreases to the problem's own
-(continuation: Lutter, Belousov et al. 2019). Every discount has new samples; unseen samples select the parameters.
+(continuation: Lutter, Belousov et al. 2019). Every fit draws new samples; unseen samples select the parameters.
 """
 
 import functools
@@ -49,20 +49,20 @@ class HJBFit(NamedTuple):
 
 
 def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.5, last: float = 0.01) -> list[float]:
-    """discount + first ratioᵏ while the second term is at least `last`, and then the discount itself, all in 1/s.
+    """Returns discount + first ratioᵏ while the second term is at least `last`, then the discount itself, all in 1/s.
 
     Args:
         discount: rho of the problem.
         first: first increment; V is then about q / (rho + first).
-        ratio: of consecutive increments, between 0 and 1.
+        ratio: ratio of consecutive increments, between 0 and 1.
         last: lower bound of the increments.
 
     Raises:
-        InputError: numbers out of range.
+        InputError: a number is out of range.
     """
     require_positive(first=first, ratio=ratio, last=last)
     if not ratio < 1:
-        raise InputError(f"ratio is {ratio}; expected less than 1, as the discount is to come down")
+        raise InputError(f"ratio is {ratio}; expected less than 1, so that the discount decreases")
     steps = max(int(np.floor(np.log(last / first) / np.log(ratio))), 0) + 1
     return [*(discount + first * ratio**step for step in range(steps)), discount]
 
@@ -83,31 +83,31 @@ def fit_hjb(
     mesh: Mesh | None = None,
     report: Callable[[ResidualStage], None] = lambda stage: None,
 ) -> HJBFit:
-    """Fits the value function of a family to the equation, in float64.
+    """Fits a value function to the equation, in float64.
 
     Args:
         problem: the control problem.
         value_and_gradient: (parameters, x) -> V and V_x, for example of `value_network`.
         parameters: initial parameters, float64.
-        key: of the samples.
+        key: random key of the samples.
         discounts: decreasing to the problem's own; by default `discounts_down_to` it.
-        samples: uniform in the box, for every discount.
+        samples: number of samples per draw, uniform in the box.
         validation: number of samples that select the parameters.
         iterations: largest number of Levenberg-Marquardt iterations per draw of samples.
         rounds: largest number of draws at the last discount.
         patience: the fit ends after this many rounds without a lower validation.
-        disturbance: of the worst case, for a robust value function.
+        disturbance: worst-case disturbance, for a robust value function.
         mesh: devices that share the samples of a fit.
         report: called after every draw.
 
     Raises:
-        InputError: an invalid problem, discounts that do not end with its own, or an equation that is not finite.
+        InputError: the problem is invalid, the discounts do not end with its own, or the equation is not finite.
     """
     problem = checked(problem)
     require_positive(samples=samples, validation=validation, iterations=iterations, rounds=rounds, patience=patience)
     discounts = discounts_down_to(problem.discount) if discounts is None else list(discounts)
     if not discounts or discounts[-1] != problem.discount:
-        raise InputError(f"discounts are {discounts}; expected some that end with the problem's, {problem.discount}")
+        raise InputError(f"discounts are {discounts}; expected a list that ends with the problem's, {problem.discount}")
     of_draws, of_validation = jax.random.split(key)
     unseen = uniform(problem, of_validation, validation)
     unit = float(jnp.mean(jax.vmap(problem.state_cost)(unseen)))
@@ -135,7 +135,7 @@ def fit_hjb(
     def fitted(parameters: Any, discount: float) -> Any:
         x = uniform(problem, jax.random.fold_in(of_draws, len(stages)), samples)
         parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
-        # This number decides how many rounds there are, so all processes must use the same one.
+        # This number decides how many rounds there are, so all processes must use the same value.
         left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
         stages.append(ResidualStage(discount, int(done), float(loss), float(left)))
         report(stages[-1])

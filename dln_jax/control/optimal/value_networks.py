@@ -48,14 +48,14 @@ def value_network(
 
     Args:
         problem: its box, joints and goal define z.
-        widths: of the hidden layers; none for a constant L.
+        widths: widths of the hidden layers; none for a constant L.
         members: K of the ensemble.
         activation: between layers.
         floor: lower bound on the diagonal of L; 0 leaves the form semi-definite.
         scale: factor on V, for example the expected cost at the edge of the box.
 
     Raises:
-        InputError: sizes out of range.
+        InputError: a size is out of range.
     """
     require_positive(members=members, scale=scale)
     for width in widths:

@@ -2,7 +2,7 @@
 
     dx/dt = f(x + xi_o, u + xi_u, p + xi_p) + xi_x
 
-Every disturbance increases the cost to go as fast as its bound permits, to first order along V_xᵀ f:
+Every disturbance increases the cost to go as fast as its bound permits, to first order in V_xᵀ f:
 
     xi_x along V_x,   xi_u along Bᵀ V_x,   xi_o along (df/dx)ᵀ V_x,   all of prescribed length,
     xi_p = +- a share of every parameter, by the sign of (df/dp)ᵀ V_x
@@ -49,12 +49,12 @@ def worst_disturbance(
     Args:
         plant: (x [n], u [m], p [k]) -> dx/dt [n], f.
         parameters: p.
-        bounds: of the disturbances.
+        bounds: bounds of the disturbances.
         lower: bound of p + xi_p [k], for example zero for masses; by default none.
         upper: bound of p + xi_p [k]; by default none.
 
     Raises:
-        InputError: bounds that are negative.
+        InputError: a bound is negative.
     """
     for name, bound in bounds._asdict().items():
         if not bound >= 0:
@@ -72,7 +72,7 @@ def worst_disturbance(
 
 
 def unit(z: Array) -> Array:
-    """z / |z|, or zero if z is zero, with finite derivatives."""
+    """Returns z / |z|, or zero if z is zero, with finite derivatives."""
     square = jnp.sum(z**2)
     some = square > 0
     return jnp.where(some, z / jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
