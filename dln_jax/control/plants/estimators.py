@@ -1,4 +1,4 @@
-"""From controllers of states to controllers of measurements, for the plants of a layout."""
+"""Turns controllers of states into controllers of measurements, for the plants of a layout."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -15,16 +15,16 @@ from dln_jax.types import InputError
 Estimator = Callable[[Law | Controller], Controller]
 """Law or controller of (q, qd) -> controller of measurements of q."""
 FASTEST_FILTER = 50.0
-"""Cut-off frequency of differences, Hz, and at most a quarter of the samples' rate."""
+"""Largest cut-off frequency for differences, Hz; it is also at most a quarter of the sampling rate."""
 FILTERS: Mapping[str, Callable[[Process], Filter]] = {"extended": extended, "unscented": unscented}
 ESTIMATORS = (*FILTERS, "differences")
 """Names of `estimator_of`."""
 UNSURE = 1.0
-"""Standard deviation of the first estimate: coordinates, and rates in 1/s or m/s."""
+"""Standard deviation of the first estimate: of coordinates in rad or m, and of rates in 1/s or m/s."""
 
 
 def by_differences(layout: Layout) -> Estimator:
-    """Rates by differences of the measurements and a low-pass."""
+    """Returns an estimator of the rates by differences of the measurements and a low-pass."""
     cutoff = min(FASTEST_FILTER, layout.rate / 4)
     return lambda law: with_differences(law, len(layout.joints), rate=layout.rate, cutoff=cutoff)
 
@@ -32,10 +32,10 @@ def by_differences(layout: Layout) -> Estimator:
 def by_filter(
     layout: Layout, process: Process, *, delay: int = 0, make: Callable[[Process], Filter] = extended
 ) -> Estimator:
-    """States by a filter of the measurements.
+    """Returns an estimator of the states by a filter of the measurements.
 
     Args:
-        layout: of the plant.
+        layout: layout of the plant.
         process: such as that of `estimate.from_log`.
         delay: samples after which a control begins to act.
         make: process -> filter, such as `estimate.unscented`.
@@ -52,12 +52,12 @@ def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: i
 
     Args:
         name: one of `ESTIMATORS`.
-        layout: of the plant.
+        layout: layout of the plant.
         process: for the filters.
         delay: samples after which a control begins to act.
 
     Raises:
-        InputError: another name, or a filter without a process.
+        InputError: the name is unknown, or a filter has no process.
     """
     if name not in ESTIMATORS:
         raise InputError(f"estimator is {name!r:.40}; choose from {', '.join(ESTIMATORS)}")

@@ -1,9 +1,9 @@
-"""Motions to learn any plant from, without a model of it: smooth noise first, then energy laws of what was learned.
+"""Motions from which any plant can be learned without a model: first smooth noise, then energy laws of a learned model.
 
 1. Blind episodes: smooth noise, with a spring and a damper that are scaled by the limits of motors and coordinates. An
-   episode that `guarded` stops halves the noise of the next.
-2. A model is fitted. The others are episodes of its energy law, some to below and some to above the energy of the goal,
-   with noise; it is fitted again on the way.
+   episode that `guarded` stops halves the noise of all later ones.
+2. A model is fitted. The other episodes follow its energy law, with noise, some to energies below that of the goal and
+   some above; the model is fitted again on the way.
 3. If none of these came near the goal, as with an acrobot, whose motor hardly reaches its passive joint, the model does
    not know the weight there. The remaining episodes follow a plan of the model to the goal, with less noise.
 """
@@ -32,7 +32,7 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive, require_seed
 
 DAMPING = 0.15
-"""Damping of the blind episodes' spring over its stiffness, s."""
+"""Damping of the spring in blind episodes, divided by its stiffness, s."""
 FITTED_EVERY = 2
 """Number of later episodes after which the model is fitted again."""
 NEAR = 0.5
@@ -54,7 +54,7 @@ class Exploration(NamedTuple):
     noise: float = 0.3
     """Standard deviation of their noise, as a share of the limits."""
     along_plans: float = 0.1
-    """The same of episodes that follow plans, whose feedback has less to spare."""
+    """The same for episodes that follow plans, whose feedback has less to spare."""
     bandwidth: float = 3.0
     """Bandwidth of the noise, Hz."""
     share: float = 0.8
@@ -62,12 +62,12 @@ class Exploration(NamedTuple):
 
 
 class Explored(NamedTuple):
-    """What was recorded."""
+    """Result of an exploration."""
 
     recording: Trajectories
     """t, q and the commanded torques, without rates."""
     stopped: tuple[str, ...]
-    """Reasons of the episodes that were stopped."""
+    """Reasons why episodes were stopped."""
 
 
 def explore(
@@ -81,12 +81,12 @@ def explore(
 
     Args:
         plant: any; it is guarded.
-        fit: recording -> model, for the later episodes; where it raises `InputError`, the episode is blind.
+        fit: recording -> model, for the later episodes; if it raises `InputError`, the episode is blind.
         exploration: settings.
-        seed: of the noise.
+        seed: seed of the noise.
 
     Raises:
-        InputError: settings out of range, a start outside the limits, or a plant that is stopped every time.
+        InputError: a setting is out of range, a start is outside the limits, or fewer than two episodes were kept.
     """
     require_seed(seed)
     require_positive(seconds=exploration.seconds, bandwidth=exploration.bandwidth, share=exploration.share)
@@ -135,7 +135,7 @@ def explore(
 def smooth_noise(
     shape: tuple[int, ...], *, rate: float, bandwidth: float, random: np.random.Generator
 ) -> Float[np.ndarray, "N m"]:
-    """Normal noise of unit deviation below a frequency, [N, m] at a rate in Hz."""
+    """Returns normal noise of unit deviation below a frequency, [N, m] at a rate in Hz."""
     noise = low_pass(random.normal(size=shape), rate=rate, cutoff=bandwidth)
     return noise / noise.std(axis=0)
 
@@ -158,7 +158,7 @@ def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
 
 
 def _start(layout: Layout, number: float | int) -> Any:
-    """Memory of `by_differences` before the first sample, for a controller whose memory is a number."""
+    """Returns the memory of `by_differences` before the first sample, for a controller whose memory is a number."""
     return by_differences(layout)(Controller(jnp.asarray(number), lambda memory, t, x: (memory, x))).start
 
 
@@ -176,7 +176,7 @@ def _with_noise(states: Controller, layout: Layout) -> Any:
 
 
 def _spring(layout: Layout, centre: np.ndarray) -> Callable[[Array], Array]:
-    """x -> share of the limits [m], of a spring and a damper that keep the active joints around a centre."""
+    """Returns x -> share of the limits [m] of a spring and a damper that keep the active joints around a centre."""
     active = np.flatnonzero((layout.actuation != 0).any(axis=1))
     d, (low, high) = len(layout.joints), layout.limits.position[active].T
     reach = np.minimum(np.minimum(high - centre[active], centre[active] - low), np.pi)
@@ -193,7 +193,7 @@ def _blind(layout: Layout) -> Any:
 
 
 def _upright(layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun]) -> Any:
-    """A model of the runs so far with its scales; `None` without one."""
+    """Returns a model of the runs so far with its scales, or `None` if there is none."""
     if len(runs) < 2:
         return None
     lower, upper = layout.limits.control.T
@@ -206,7 +206,7 @@ def _upright(layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list
 
 
 def _plan_law(layout: Layout, upright: Upright, scales: Scales, *, seed: int) -> Any:
-    """The compiled follower of the least sensitive plan of a model; `None` without a plan."""
+    """Returns the compiled follower of a model's least sensitive plan, or `None` if there is no plan."""
     try:
         plan = plans_of(upright, layout, scales, seed=seed)[0]
         (chosen,) = followed([plan], upright, layout, scales, [USUAL], spread_of(layout))
@@ -217,7 +217,7 @@ def _plan_law(layout: Layout, upright: Upright, scales: Scales, *, seed: int) ->
 
 
 def _energy_law(layout: Layout, upright: Upright, scales: Scales) -> Any:
-    """The compiled energy law of a model, whose number is its surplus."""
+    """Returns the compiled energy law of a model; the number in its memory is the surplus."""
     lower, upper = layout.limits.control.T
     home = jnp.split(upright.at.x, 2)[0]
     gains, size = gains_of(scales, USUAL), layout.limits.control[:, 1]

@@ -1,4 +1,4 @@
-"""Safety of a plant: limits of position, rate and control, and answers that are late or not finite, stop it."""
+"""Stops a plant that leaves its limits of position, rate or control, or whose answers are late or not finite."""
 
 import math
 from collections import deque
@@ -12,7 +12,7 @@ from dln_jax.types import InputError
 LATE = 2.0
 """Largest time between two answers, in samples."""
 SPAN = 5
-"""Samples over which a rate is measured, so that an encoder's step is no high rate."""
+"""Samples over which a rate is measured, so that an encoder step does not look like a high rate."""
 ROUNDING = 1e-9
 
 

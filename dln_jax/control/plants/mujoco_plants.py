@@ -1,4 +1,4 @@
-"""Plants from MJCF and URDF files, or models of MuJoCo: layout, goal and limits are read from the model."""
+"""Plants from MJCF and URDF files, or MuJoCo models: layout, goal and limits are read from the model."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,25 +30,25 @@ def mujoco_plant(
     hardware: Hardware = Hardware(),  # noqa: B008
     seed: int = 0,
 ) -> Plant:
-    """Returns a simulated plant; only its layout is known to whoever learns it.
+    """Returns a simulated plant; a learner knows only its layout.
 
     Motors act as generalised forces of their joints, whatever actuators the file has.
 
     Args:
         source: path of an MJCF or URDF file, text of MJCF, or a `mujoco.MjModel`.
         actuated: joints with a motor, by name or number from 0; by default those on which an actuator acts.
-        control: largest size of the motors' forces, N m or N; by default that of the file.
+        control: largest forces of the motors, N m or N; by default those of the file.
         goal: posture to hold [d]; by default the highest one.
         hanging: posture of rest [d]; by default the lowest one.
-        rate: of the samples, Hz; by default one sample a time step.
-        speed: largest rates, one or [d]; by default those of a URDF, which MJCF cannot state.
+        rate: sampling rate, Hz; by default one sample per time step.
+        speed: largest rates, one or [d]; by default those of a URDF, as MJCF cannot state them.
         hardware: noise, resolution and delay.
-        seed: of the starts and the noise.
+        seed: seed of the starts and the noise.
 
     Raises:
-        InputError: MuJoCo is missing or refuses the model; a joint that is no hinge or slide, or not in the file;
-            motors without limits; a plant without a motor or a passive joint, or whose passive joints no gravity moves;
-            a sample that is not a whole number of steps.
+        InputError: MuJoCo is missing or refuses the model; a joint is not a hinge or slide, or not in the file; a motor
+            has no limits; there is no motor or no passive joint, or gravity does not move a passive joint; a sample is
+            not a whole number of steps.
     """
     mujoco, model, data, described, steps = _described(source, actuated, control, goal, hanging, rate, speed, True)
     return _plant(mujoco, model, data, described, steps, hardware, seed)
@@ -76,14 +76,14 @@ def _described(
     speed: Any,
     passive: bool,
 ) -> tuple[Any, Any, Any, Layout, int]:
-    """MuJoCo, its model, its data, the layout of the plant, and the number of time steps in a sample."""
+    """Returns MuJoCo, its model, its data, the layout of the plant, and the number of time steps in a sample."""
     mujoco, model, speeds = _model(source)
     names = joint_names(model)
     speed = [speeds.get(name, np.inf) for name in names] if speed is None else speed
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
         if kind not in kinds:
-            raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected a plant of such joints alone")
+            raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected a plant with such joints only")
     if not 1 + passive <= len(names) <= MOST_JOINTS:
         which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
         raise InputError(f"the plant has {len(names)} joint(s); expected {which}")
@@ -130,7 +130,7 @@ def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, ha
 
 
 def _model(source: Any) -> tuple[Any, Any, dict[str, float]]:
-    """MuJoCo, its model, and the largest rates of joints that a URDF states."""
+    """Returns MuJoCo, its model, and the largest rates of joints that a URDF states."""
     if isinstance(source, Path) or (isinstance(source, str) and not source.lstrip().startswith("<")):
         root = parsed(Path(source))
         speeds = velocity_limits(root) if root.tag == "robot" else {}
@@ -139,7 +139,7 @@ def _model(source: Any) -> tuple[Any, Any, dict[str, float]]:
 
 
 def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
-    """Numbers of joints that are given by name or number."""
+    """Returns the numbers of joints from names or numbers."""
     chosen = []
     for joint in actuated:
         number = int(joint) if isinstance(joint, int) or (str(joint).isdigit() and joint not in names) else None
@@ -151,7 +151,7 @@ def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
 
 
 def _actuators(mujoco: Any, model: Any) -> dict[int, float]:
-    """Largest forces of the joints on which actuators act, by number; infinite where the file states none."""
+    """Returns the largest forces of joints with actuators, by number of the joint; infinite if the file states none."""
     of_joint = int(mujoco.mjtTrn.mjTRN_JOINT)
     forces: dict[int, float] = {}
     for k in range(model.nu):

@@ -1,4 +1,4 @@
-"""Plants of others: an environment of Gymnasium, and the loop of one's own hardware."""
+"""Plants from outside: a Gymnasium environment, and the loop of your own hardware."""
 
 import time
 from collections.abc import Callable
@@ -18,14 +18,14 @@ def gymnasium_plant(
     action: Callable[[Any], Any] = lambda u: np.asarray(u, np.float32),
     seed: int = 0,
 ) -> Plant:
-    """Returns an environment of Gymnasium as a plant; rewards, `terminated` and `truncated` are ignored.
+    """Returns a Gymnasium environment as a plant; rewards, `terminated` and `truncated` are ignored.
 
     Args:
         env: with `reset(seed=)` and `step(action)`; its start is near the layout's hanging posture.
-        layout: of the plant; its rate is that of the environment's steps.
+        layout: layout of the plant; its rate is that of the environment's steps.
         coordinates: observation -> q [d]; angles may be wrapped.
         action: controls [m] -> action.
-        seed: of the first reset.
+        seed: seed of the first reset.
 
     Raises:
         InputError: the environment has no reset or no step.
@@ -54,12 +54,12 @@ def hardware_plant(
 ) -> Plant:
     """Returns hardware as a plant: `act` writes the controls and waits for the next sample of the clock.
 
-    A sample that is missed is not made up for: the next follows a period after the late one, and `guarded` stops the
-    plant if it was too late.
+    A missed sample is not made up for: the next follows a period after the late one, and `guarded` stops the plant if
+    it was too late.
 
     Args:
-        layout: of the plant.
-        reset: brings it to rest near hanging, and returns when it is there.
+        layout: layout of the plant.
+        reset: brings the plant to rest near hanging, and returns when it is there.
         read: () -> coordinates [d].
         write: (controls [m]) -> nothing.
         clock: () -> time, s.

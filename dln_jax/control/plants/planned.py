@@ -2,11 +2,11 @@
 
     min  |error_N|² weight + integral lambda (effort |u / u_max|² + rates²) dt,   |u| <= `SHARE` u_max
 
-in the units of `scales`. Guesses of the controls are drawn, and solved together by iterative linear-quadratic
+in the units of `scales`. Guesses of the controls are drawn, and improved together by iterative linear-quadratic
 regulators. Plans with the smallest feedback gains come first, because gains are large where the motors hardly reach the
-passive joints, and an error of phase turns their sign. The feedback is the time-varying regulator of the samples; its
-cost to go at the end is that of the goal's. A regulator about hanging brings the plant to rest first, and again if the
-goal is lost.
+passive joints, and there a phase error reverses their sign. The feedback is a time-varying regulator for the samples;
+its cost to go at the end is that of the regulator at the goal. A regulator about hanging brings the plant to rest
+first, and again if the goal is lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,25 +34,25 @@ DURATIONS = (8.0, 14.0, 20.0)
 FINENESS = 15.0
 """Steps of a plan per 1 / lambda."""
 SHARE = 0.7
-"""Largest share of the motors' limits in a plan; feedback has the rest."""
+"""Largest share of the motors' limits in a plan; the rest is for feedback."""
 INSIDE = 0.8
-"""Share of the limits of the coordinates in which a plan stays."""
+"""Share of the limits of the coordinates within which a plan should stay."""
 GUESSES, ITERATIONS, LENGTHS = 16, 100, 0.5 ** np.arange(6)
 CLOSE = 0.1
-"""Largest error of a plan's end, in units of the coordinates."""
+"""Largest error at the end of a plan, in units of the coordinates."""
 EFFORTS = (1.0, 0.1)
-"""Weights of the controls in plans by turns: gentle plans, and firm ones."""
+"""Weights of the controls in alternate plans: gentle plans, and firm ones."""
 AT_END, RATES, POSTURE, BEYOND = 300.0, 0.003, 0.02, 100.0
-"""Weights of the errors at the end, of the rates, of active coordinates away from the goal, where an acrobot's motor
-hardly reaches its passive joint, and of coordinates outside their share of the limits."""
+"""Weights of the errors at the end, of the rates, of active coordinates away from the goal (where an acrobot's motor
+hardly reaches its passive joint), and of coordinates outside their share of the limits."""
 READY = -1
-"""Number of a plan's sample while the plant hangs and waits for its start."""
+"""Sample number of a plan while the plant hangs and waits for its start."""
 CALM, PATIENCE = 1 / 36, 4
-"""Share of the level below which a lost plan starts again: half a standard deviation of the starts in place of three,
-as it may have been lost because it began too far away. After this number of a plan's durations the whole level counts,
-in case friction keeps the plant off."""
+"""Share of the level below which a lost plan starts again: half a standard deviation of the starts instead of three,
+because it may have been lost by starting too far away. After `PATIENCE` durations of the plan the whole level counts,
+in case friction keeps the plant away."""
 LOST = 1.0
-"""Distance from the plan or the goal in an angle, rad, beyond which the plant hangs and starts again."""
+"""Distance of an angle from the plan or the goal, rad, beyond which the plant hangs and starts again."""
 
 
 class Followed(NamedTuple):
@@ -84,19 +84,19 @@ def plan_problem(
 
     Args:
         upright: the model; friction of its driven joints is left to the compensation.
-        layout: of the plant.
-        scales: of the model.
+        layout: layout of the plant.
+        scales: scales of the model.
         effort: weight of the controls; it may be traced.
-        every: samples in a step.
-        share: of the motors' limits.
+        every: samples per step.
+        share: largest share of the motors' limits.
         at_end: weight of the errors at the end.
-        soon: weight of the coordinates away from the goal on the way. If it is not zero, passive joints may reach the
-            goal after any number of turns.
+        soon: weight of the distance from the goal on the way. If it is not zero, passive joints may reach the goal
+            after any number of turns.
     """
     d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
     dt, goal, units = every / layout.rate, np.asarray(upright.at.x), _units(scales)
     low, high = INSIDE * layout.limits.position.T
-    # Motors do not turn on: their cables might not.
+    # Driven joints must not make extra turns, because their cables might not.
     free = circular(layout.joints, 2 * d) & np.isin(np.arange(2 * d), upright.parts.passive) & (soon > 0)
 
     def off(x: Array) -> Array:
@@ -119,7 +119,7 @@ def plan_problem(
 
 
 def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0) -> list[Plan]:
-    """Plans from hanging to the goal that arrive, the least sensitive first; raises `InputError` if none does."""
+    """Returns the plans from hanging that reach the goal, least sensitive first; raises `InputError` if none does."""
     d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
     every, goal, units = steps_of(layout, scales), np.asarray(upright.at.x), _units(scales)
     start = np.concatenate([layout.hanging, np.zeros(d)])
@@ -145,12 +145,12 @@ def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0)
         nearest = np.nanmin([nearest, *off])
     raise InputError(
         f"no plan of {DURATIONS[-1] / scales.fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} "
-        "of a coordinate's size away; a stronger motor or wider limits may"
+        "of a coordinate's size away; try a stronger motor or wider limits"
     )
 
 
 def steps_of(layout: Layout, scales: Scales, fineness: float = FINENESS) -> int:
-    """Samples in a step of a plan."""
+    """Returns the number of samples per step of a plan."""
     return max(1, round(layout.rate / (fineness * scales.fall)))
 
 
@@ -162,13 +162,13 @@ def followed(
     numbers: Sequence[Mapping[str, float]],
     spread: Any,
 ) -> list[Followed]:
-    """Feedback about plans, from numbers without units.
+    """Returns feedback about plans, from numbers without units.
 
     Args:
         chosen: plans from hanging, one for each set of numbers.
         upright: the model.
-        layout: of the plant.
-        scales: of the model.
+        layout: layout of the plant.
+        scales: scales of the model.
         numbers: as for `swing_up_numbers`.
         spread: standard deviations of the coordinates at a start [d].
 
@@ -203,7 +203,7 @@ def followed(
 
 
 def follower(upright: Upright, layout: Layout, settings: SwingUpNumbers, plan: Followed) -> Controller:
-    """The controller of states x that swings up by a plan, whose arrays may be traced."""
+    """Returns the controller of states x that swings up by a plan, whose arrays may be traced."""
     joints, angles = layout.joints, np.array([kind == "revolute" for kind in layout.joints])
     plan = jax.tree.map(jnp.asarray, plan)
     rest = jnp.concatenate([jnp.asarray(layout.hanging), jnp.zeros(len(joints))])
@@ -235,7 +235,7 @@ def _units(scales: Scales) -> np.ndarray:
 
 
 def _compensated(upright: Upright) -> Field:
-    """The field of a plant whose active joints' friction is compensated; that of the others is there."""
+    """Returns the field of a plant with friction at the passive joints only; that of the others is compensated."""
     driven = (upright.B != 0).any(axis=1)
 
     def field(x: Array, u: Array) -> Array:

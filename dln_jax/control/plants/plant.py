@@ -1,4 +1,4 @@
-"""A plant to swing up, of any origin: four callables, and what has to be known about it beforehand.
+"""A plant of any origin to swing up: four callables, and what must be known about it beforehand.
 
 The callables are impure, as hardware is. `act` commands the controls and returns at the next sample, which a simulated
 plant reaches at once; `guarded` stops a plant at its limits, and `run` closes the loop.
@@ -14,7 +14,7 @@ from dln_jax.types import InputError, JointKind, Needs, require_positive
 
 
 class Limits(NamedTuple):
-    """Limits of safe operation; the plant stops where it leaves them."""
+    """Limits of safe operation; the plant is stopped when it leaves them."""
 
     control: Float[np.ndarray, "m 2"]
     """Lower and upper limits of the motors, N m or N; finite."""
@@ -23,7 +23,7 @@ class Limits(NamedTuple):
     rate: Float[np.ndarray, " d"]
     """Largest rates, 1/s or m/s; infinite for none."""
     stopping: float = 0.0
-    """Time ahead for which the present rate must not lead out of the positions, s: what a brake needs."""
+    """Time ahead for which the present rate must not lead beyond the positions, s: the time that a brake needs."""
 
 
 class Layout(NamedTuple):
@@ -33,11 +33,11 @@ class Layout(NamedTuple):
     actuation: Float[np.ndarray, "d m"]
     """tau = actuation u; every motor drives one coordinate."""
     goal: Float[np.ndarray, " d"]
-    """Posture to hold, an equilibrium up to some hundredths of a radian."""
+    """Posture to hold, an equilibrium to within a few hundredths of a radian."""
     hanging: Float[np.ndarray, " d"]
     """Posture in which the plant comes to rest, and starts."""
     rate: float
-    """Samples per second, Hz."""
+    """Sampling rate, Hz."""
     limits: Limits
     names: tuple[str, ...] = ()
 
@@ -56,7 +56,7 @@ class Plant(NamedTuple):
     read: Callable[[], Any]
     """() -> measured coordinates [d]; angles may be wrapped."""
     act: Callable[[Any], None]
-    """Controls u [m] -> nothing, at the time of the next sample."""
+    """Controls u [m] -> nothing; returns at the time of the next sample."""
     time: Callable[[], float]
     """() -> time in s, by the plant's clock."""
     kick: Callable[[Any], None] | None = None
@@ -84,17 +84,17 @@ def layout(
         actuated: numbers of the coordinates with a motor, from 0.
         goal: posture to hold [d], rad or m.
         hanging: posture of rest [d].
-        rate: of the samples, Hz.
+        rate: sampling rate, Hz.
         control: largest size of the controls, one for all motors or one each, N m or N.
         position: limits [d, 2], rad or m; by default none.
         speed: largest rates, one for all or one each, 1/s or m/s.
         stopping: as `Limits.stopping`.
-        names: of the coordinates; by default joint_0, joint_1, ...
-        passive: whether there has to be a coordinate without a motor, as a swing-up needs one.
+        names: names of the coordinates; by default joint_0, joint_1, ...
+        passive: whether a coordinate without a motor is required, as for a swing-up.
 
     Raises:
-        InputError: shapes that do not agree, a motor at a coordinate that is not there, no motor, no passive
-            coordinate, limits that are not positive, or a posture outside the limits.
+        InputError: shapes do not agree, a motor's coordinate does not exist, there is no motor or no passive
+            coordinate, a limit is not positive, or a posture is outside the limits.
     """
     require_positive(rate=rate)
     d, chosen = len(joints), sorted(set(actuated))

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 TURNS = 8
-"""Angles of a joint from which the highest and the lowest posture are sought."""
+"""Number of angles of a joint from which the highest and the lowest posture are searched."""
 LEVEL = 1e-3
-"""Smallest share of the model's weight times its size that counts as a potential of a passive joint."""
+"""Smallest change of energy by a passive joint that counts as gravity, as a share of the range of the energies."""
 
 
 def extremes(
@@ -31,7 +31,7 @@ def extremes(
         ranges: limits of the coordinates, infinite for none.
 
     Raises:
-        InputError: the limits exclude every posture of the search, or a passive joint that no gravity moves.
+        InputError: the limits exclude every posture of the search, or gravity does not move a passive joint.
     """
     from scipy.optimize import minimize
 

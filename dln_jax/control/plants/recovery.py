@@ -1,8 +1,8 @@
 """Swing-up and recovery of a plant by repeated plans, from numbers in the natural scales of its model.
 
-Plans are those of `planned` with a cost of the way to the goal, so that they do not put it off, and with any number of
-turns of the passive joints. They start from three first guesses: no control, and swings of half the motors' limits that
-begin to either side.
+Plans are those of `planned`, with a cost of the distance from the goal on the way, so that they do not put it off, and
+with any number of turns of the passive joints. They start from three first guesses: no control, and swings of half the
+motors' limits that begin to either side.
 """
 
 from typing import Any
@@ -27,7 +27,7 @@ HORIZON, FINENESS = 6.0, 7.0
 SHARE = 0.9
 """Largest share of the motors' limits in a plan."""
 EFFORT, SOON, AT_END = 0.1, 1.0, 100.0
-"""Weights of the controls, of the way to the goal, and of the errors at the end."""
+"""Weights of the controls, of the distance from the goal on the way, and of the errors at the end."""
 SWINGS = (0.0, 0.5, -0.5)
 """Sizes of the first guesses, as shares of the motors' limits."""
 
@@ -39,11 +39,11 @@ def recovering(
 
     Args:
         upright: the model.
-        layout: of the plant.
-        scales: of the model.
+        layout: layout of the plant.
+        scales: scales of the model.
         settings: compensation of the friction and its smoothing.
-        regulator: at the goal; it may be traced.
-        level: of its cost to go, up to which it acts.
+        regulator: regulator at the goal; it may be traced.
+        level: cost to go up to which the regulator acts.
     """
     every, size = steps_of(layout, scales, FINENESS), np.abs(layout.limits.control).min(axis=1)
     dt = every / layout.rate

@@ -17,14 +17,14 @@ from dln_jax.types import InputError, require_positive
 TOLERANCE = 0.2
 """Largest distance of every angle from the goal that counts as up, rad."""
 HELD = 1.0
-"""Time for which a plant has to stay up until the end, s."""
+"""Time at the end for which a plant must stay up, s."""
 
 Act = Callable[[Any, Any, Any], tuple[Any, Any]]
 """(memories, t, measurements [n, d]) -> (memories, controls [n, m]), compiled."""
 
 
 class PlantRun(NamedTuple):
-    """What was measured and commanded in N samples; fewer than asked for if the plant was stopped."""
+    """Measurements and commands of N samples; fewer than asked for if the plant was stopped."""
 
     t: Float[np.ndarray, " N"]
     y: Float[np.ndarray, "N d"]
@@ -48,17 +48,17 @@ def compiled(controller: Controller, layout: Layout) -> Act:
 def run(
     plants: Sequence[Plant], act: Act, memories: Any, *, seconds: float, push: Push | None = None
 ) -> list[PlantRun]:
-    """Resets plants of one layout and runs them in step; ends with zero controls, also when it is interrupted.
+    """Resets plants of one layout and runs them in step; ends with zero controls, even if it is interrupted.
 
     Args:
         plants: one or several; they are guarded.
-        act: of `compiled`.
+        act: result of `compiled`.
         memories: of the controller before the first sample, one for each plant along the leading axis.
         seconds: duration.
-        push: on every plant that still runs; by default none.
+        push: acts on every plant that still runs; by default none.
 
     Raises:
-        InputError: a start outside the limits, an answer of another shape, or a push on plants without `kick`.
+        InputError: a start is outside the limits, an answer has another shape, or plants without `kick` are pushed.
     """
     require_positive(seconds=seconds)
     if push is not None and any(plant.kick is None for plant in plants):
@@ -68,7 +68,7 @@ def run(
     samples, count = round(seconds * layout.rate), len(plants)
     y, u, t = np.zeros((samples, count, d)), np.zeros((samples, count, m)), np.arange(samples) / layout.rate
     lengths, reasons = np.full(count, samples), [""] * count
-    # Compiled before a clock runs: seconds would be late answers. The second call has the types of later memories.
+    # Compile before a clock runs, or answers would be seconds late. The second call has the types of later memories.
     like = jnp.asarray(np.tile(np.asarray(layout.hanging, float), (count, 1)))
     act(act(memories, t[0], like)[0], t[0], like)
     for plant in safe:
@@ -92,7 +92,7 @@ def run(
 
 
 def _each(going: list[int], k: int, lengths: Any, reasons: list[str], do: Callable[[int], Any]) -> list[int]:
-    """Calls `do` for the plants that run; returns those that still do."""
+    """Calls `do` for the plants that run; returns those that still run."""
     left = []
     for i in going:
         try:
@@ -104,26 +104,26 @@ def _each(going: list[int], k: int, lengths: Any, reasons: list[str], do: Callab
 
 
 def start_of(controller: Controller, count: int) -> Any:
-    """Memories of `count` equal controllers."""
+    """Returns the memories of `count` equal controllers."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (count, *jnp.shape(leaf))), controller.start)
 
 
 class Trials(NamedTuple):
-    """Swing-ups of n starts."""
+    """Swing-ups from n starts."""
 
     seconds: Float[np.ndarray, " n"]
     """Time after which the plant stays up until the end, s; infinite if it does not."""
     stopped: tuple[str, ...]
-    """Reasons of the starts that were stopped."""
+    """Reasons why runs were stopped."""
 
     @property
     def up(self) -> Bool[np.ndarray, " n"]:
-        """Starts that end up."""
+        """Mask of the starts from which the plant ends up."""
         return np.isfinite(self.seconds)
 
 
 def distances(y: Float[np.ndarray, "N d"], layout: Layout) -> Float[np.ndarray, " N"]:
-    """Largest distance of an angle from the goal, rad."""
+    """Returns the largest distance of an angle from the goal, rad."""
     angles = np.array([kind == "revolute" for kind in layout.joints])
     return np.abs(np.remainder(y - layout.goal + np.pi, 2 * np.pi) - np.pi)[:, angles].max(axis=1)
 

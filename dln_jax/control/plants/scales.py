@@ -1,16 +1,16 @@
-"""Natural scales of a swing-up by a model: from them, numbers without units give gains, costs and the catch region.
+"""Natural scales of a swing-up by a model; they turn numbers without units into gains, costs and the catch region.
 
-With the active joints locked at the goal, the passive part falls from the goal at a rate lambda, and swings with the
-energy E from its lowest to its highest posture, at the speed w = √(2 E / M_pp) at most. Motors at their limits
+With the active joints locked at the goal, the passive part falls from the goal at a rate lambda. It needs the energy E
+from its lowest to its highest posture, and swings at the speed w = √(2 E / M_pp) at most. Motors at their limits
 accelerate the active joints by a. Then
 
     k_energy = energy · a / (E |M_ap| w),   k_p = (stiffness · lambda)²,   k_d = 2 damping · stiffness · lambda
     Q = diag(1 / s², (rates / (s lambda))²),   R = effort / u²,   level = (catch · u)² / max(K S⁻¹ Kᵀ)
 
-with the limits u of the controls, and errors s that are worth as much: `PASSIVE` for passive angles, `reach` for an
-active angle in rad, `reach` g / lambda² for a rail, or half the rail if that is shorter. On the surface of the catch
-region the regulator asks for at most `catch` times what the motors have. The energy law aims `surplus` E above the
-goal, because friction takes energy away on the way up.
+with the limits u of the controls (in `level`, what holding the goal leaves of them), and errors s of equal cost:
+`PASSIVE` for passive angles, `reach` for an active angle in rad, and for a rail `reach` times g / lambda² or half the
+rail, whichever is shorter. On the surface of the catch region the regulator asks for at most `catch` times what the
+motors have to spare. The energy law aims `surplus` E above the goal, because friction takes energy away on the way up.
 """
 
 from collections.abc import Mapping
@@ -62,11 +62,11 @@ class Scales(NamedTuple):
     acceleration: float
     """a, 1/s² or m/s²."""
     sizes: np.ndarray
-    """Size of every coordinate [d]: 1 rad, and for a rail a m or half of it."""
+    """Size of every coordinate [d]: 1 rad, and for a rail g / lambda² or half of the rail."""
 
 
 def circle(layout: Layout) -> np.ndarray:
-    """Postures [n, d] in which the passive joints turn together, with the active ones at the goal and at rest."""
+    """Returns postures [n, d] in which the passive joints turn together, with the active at the goal or hanging."""
     angle = np.linspace(-np.pi, np.pi, CIRCLE)[:, None]
     passive = 1.0 - (layout.actuation != 0).any(axis=1)
     rest = np.where(passive > 0, layout.goal, layout.hanging)
@@ -100,7 +100,7 @@ def scales_of(upright: Upright, layout: Layout) -> Scales:
 
 
 def gains_of(scales: Scales, numbers: Mapping[str, Any]) -> EnergyGains:
-    """Gains of the energy law from the numbers "energy", "stiffness" and "damping", and perhaps "total"."""
+    """Returns the gains of the energy law from the numbers "energy", "stiffness" and "damping", and perhaps "total"."""
     stiffness = numbers["stiffness"] * scales.fall
     unit = scales.acceleration / (scales.energy * scales.coupling * scales.speed)
     gains = EnergyGains(numbers["energy"] * unit, stiffness**2, 2 * numbers["damping"] * stiffness)
@@ -110,7 +110,7 @@ def gains_of(scales: Scales, numbers: Mapping[str, Any]) -> EnergyGains:
 def swing_up_numbers(
     upright: Upright, layout: Layout, scales: Scales, numbers: Mapping[str, float]
 ) -> tuple[SwingUpNumbers, Regulator]:
-    """Settings of `swing_up` and their regulator, from numbers without units; raises as `lqr`."""
+    """Returns the settings of `swing_up` and their regulator, from numbers without units; raises as `lqr`."""
     active, passive = map(np.array, upright.parts)
     size = np.copy(scales.sizes)
     size[active] *= numbers["reach"]
@@ -132,6 +132,6 @@ def swing_up_numbers(
 
 
 def has_friction(upright: Upright) -> bool:
-    """Whether the model has friction at the active joints."""
+    """Returns whether the model has friction at the active joints."""
     qd = jnp.ones(len(upright.at.x) // 2)
     return bool(jnp.any(upright.model.friction(jnp.zeros_like(qd), qd)[np.array(upright.parts.active)] != 0))

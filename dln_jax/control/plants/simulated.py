@@ -1,4 +1,4 @@
-"""Plants from a step function: what all simulators share, with the noise, the resolution and the delay of hardware."""
+"""Plants from the step function of any simulator, with the noise, the resolution and the delay of hardware."""
 
 from collections import deque
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 SPREAD = 0.1
 """Standard deviation of the passive coordinates at a start, rad or m."""
 ACTIVE_SPREAD = 0.02
-"""The same of the coordinates with a motor."""
+"""The same for the coordinates with a motor."""
 
 
 def simulated(
@@ -31,13 +31,13 @@ def simulated(
     """Returns a plant that a simulator advances by one sample at a time, from random starts near hanging.
 
     Args:
-        layout: of the plant; the limits of the controls are those of the layout.
+        layout: layout of the plant, with the limits of the controls.
         begin: (posture [d]) -> nothing; puts the simulator there, at rest.
         coordinates: () -> the true q [d].
         advance: (controls that act [m]) -> nothing; advances the simulator by a sample.
         kick: (rates [d]) -> nothing; adds them to those of the simulator.
-        hardware: noise, resolution and delay; its limits are not read.
-        seed: of the starts and the noise.
+        hardware: noise, resolution and delay; its limits are not used.
+        seed: seed of the starts and the noise.
     """
     random = np.random.default_rng([seed, 29])
     d, m = layout.actuation.shape
@@ -64,7 +64,7 @@ def simulated(
 
 
 def spread_of(layout: Layout) -> np.ndarray:
-    """Standard deviations of the coordinates at a start [d]."""
+    """Returns the standard deviations of the coordinates at a start [d]."""
     return np.where((layout.actuation != 0).any(axis=1), ACTIVE_SPREAD, SPREAD)
 
 
@@ -76,12 +76,12 @@ def plant_of(
     hardware: Hardware = Hardware(),  # noqa: B008
     seed: int = 0,
 ) -> Plant:
-    """Returns a plant whose truth is a model of this library, such as that of a scene with friction.
+    """Returns a plant that simulates a model of this library, such as that of a scene with friction.
 
     Args:
         model: for example `dynamics(scene.closed_form)`.
-        layout: of the plant.
-        substeps: Runge-Kutta steps a sample.
+        layout: layout of the plant.
+        substeps: Runge-Kutta steps per sample.
         hardware: as for `simulated`.
         seed: as for `simulated`.
     """

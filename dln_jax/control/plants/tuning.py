@@ -1,15 +1,15 @@
 """Chooses a swing-up's gains, catch region and regulator by simulated trials of a model, in one compiled program.
 
-1. Numbers without units (`scales.RANGES`) are drawn; scales of the model make gains and a regulator of them.
+1. Numbers without units (`scales.RANGES`) are drawn; scales of the model turn them into gains and a regulator.
 2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
-   are stronger or weaker than the model says. Weight is wrong by the share `WEIGHT` of that, the
-   other way round.
+   are stronger or weaker than the model says. The weight is wrong by the share `WEIGHT` of that, in the opposite
+   direction.
 3. The best sets are tried again with more errors and starts. The margin of a set is the largest error up to which every
    trial succeeds; the set with the largest margin is chosen.
-4. Plans with feedback (`planned`) are tried first, and taken if they stand every error. Otherwise energy laws are tried
-   as well, with right models in the first round, because few sets work. One with a margin of `LEAST` or more is taken:
-   it acts in any state, and a wrong model costs it time where it throws a plan off. Else the larger margin decides.
-   For a plant that has to recover from pushes by plans, repeated plans are tried instead.
+4. Plans with feedback (`planned`) are tried first, and taken if they tolerate every error. Otherwise energy laws are
+   tried as well, with correct models in the first round, because few sets work. One with a margin of `LEAST` or more is
+   taken: it acts in any state, and a wrong model only costs it time but throws a plan off. Otherwise the larger margin
+   decides. If the plant must recover from pushes by plans, repeated plans are tried instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,12 +36,12 @@ from dln_jax.types import InputError, require_positive, require_seed
 ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 """Relative errors of the motors' strength in the second round."""
 WEIGHT = 0.125
-"""Relative error of gravity over that of the motors' strength."""
+"""Relative error of gravity, divided by that of the motors' strength."""
 STARTS = 2
-"""Starts of a set with each error in the second round, at least."""
+"""Smallest number of starts of a set with each error in the second round."""
 FINALISTS = 8
 ROUNDS = 4
-"""First rounds, at most, until `FINALISTS` sets have succeeded."""
+"""Largest number of first rounds until `FINALISTS` sets have succeeded."""
 LEAST = 0.1
 """Smallest margin of an energy law that is taken in place of a plan."""
 
@@ -50,13 +50,13 @@ class Tuned(NamedTuple):
     """A controller that swings the model up, and how safely."""
 
     controller: Controller
-    """Of the measurements."""
+    """Controller of the measurements."""
     way: str
     """"energy", "plan" or "repeated plans"."""
     numbers: Mapping[str, float]
-    """What was chosen, in SI units."""
+    """Chosen settings, in SI units."""
     regulator: Regulator
-    """At the goal."""
+    """Regulator at the goal."""
     trials: int
     """Number of simulated trials."""
     worked: float
@@ -83,17 +83,17 @@ def tune(
 
     Args:
         model: known or learned, with friction if the plant has it.
-        layout: of the plant: its motors, goal, limits and rate.
+        layout: layout of the plant: its motors, goal, limits and rate.
         hardware: noise, resolution and delay; the limits are those of the layout.
         estimator: makes a controller of measurements from one of states, such as `by_filter`; by default differences.
         sets: number of sets in a first round.
-        seconds: duration of a trial, within which a plant has to be up and stay for a second.
-        substeps: Runge-Kutta steps a sample.
-        seed: of the sets, the starts and the noise.
+        seconds: duration of a trial, within which a plant must come up and stay for a second.
+        substeps: Runge-Kutta steps per sample.
+        seed: seed of the sets, the starts and the noise.
         recover: "plans" for a law that plans again from where a push leaves the plant, or "swing-up".
 
     Raises:
-        InputError: a model that `swing_up` refuses, or of which no set swings it up; another recovery.
+        InputError: `swing_up` refuses the model, no set swings it up, or the recovery is unknown.
     """
     require_positive(sets=sets, substeps=substeps)
     require_seed(seed)
@@ -125,7 +125,7 @@ def tune(
 def _chosen(
     way: Way, trial: Any, estimator: Estimator, layout: Layout, *, sets: int, seconds: float, seed: int
 ) -> Tuned:  # fmt: skip
-    """The settings of one way with the largest margin."""
+    """Returns the settings of one way with the largest margin."""
     random = np.random.default_rng([seed, 31])
     sets = min(sets, way.most_sets or sets)
     finalists = min(FINALISTS, way.most_sets or FINALISTS)
@@ -136,7 +136,7 @@ def _chosen(
     trials = 0
 
     def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> np.ndarray:
-        """Times [set, error, start]; idle lanes repeat the first trials."""
+        """Returns times [set, error, start]; idle lanes repeat the first trials."""
         nonlocal trials
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
         count = len(chosen) * len(errors) * starts
@@ -159,8 +159,8 @@ def _chosen(
     if not good.any():
         raise InputError(
             f"none of {len(settings)} sets of numbers swings the model up by {way.name} within {seconds:g} s and its "
-            f"limits in {trials} trials, of which {np.isfinite(times).mean():.0%} came up; a stronger motor, wider "
-            "limits, more time or a better model may"
+            f"limits in {trials} trials, of which {np.isfinite(times).mean():.0%} came up; try a stronger motor, wider "
+            "limits, more time or a better model"
         )
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(finalists, int(good.sum()))]
     starts = max(STARTS, lanes // (finalists * len(ERRORS)))
@@ -172,8 +172,8 @@ def _chosen(
     if margins[choice] < 0:
         raise InputError(
             f"of {trials} trials by {way.name}, no set of numbers brings all {starts} starts up at the model's own "
-            f"strength: the best reaches {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; a stronger motor or wider "
-            "limits may"
+            f"strength: the best reaches {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; try a stronger motor or "
+            "wider limits"
         )
     selected = jax.tree.map(jnp.asarray, settings[best[choice]])
     numbers, regulator = way.numbers(selected)
@@ -192,7 +192,7 @@ def trial_of(
     seconds: float,
     substeps: int,
 ) -> Callable[[Any, Array, Array, Array], Array]:
-    """(traced settings, start [d], error of the model, key) -> time in s until the goal, infinite if never."""
+    """Returns (traced settings, start [d], error of the model, key) -> time in s until the goal, infinite if never."""
     B, d = layout.actuation, len(layout.joints)
     lower, upper = layout.limits.control.T
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
@@ -226,6 +226,6 @@ def trial_of(
 
 
 def _margin(succeeded: np.ndarray) -> float:
-    """Largest error up to which all trials succeeded; negative if there is none."""
+    """Returns the largest error up to which all trials succeeded; negative if there is none."""
     failed = [abs(error) for error, fine in zip(ERRORS, succeeded, strict=True) if not fine]
     return max((abs(error) for error in ERRORS if not failed or abs(error) < min(failed)), default=-1.0)

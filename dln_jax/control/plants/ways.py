@@ -1,4 +1,4 @@
-"""Ways of swinging up whose settings trials choose: by plans with feedback, by repeated plans, and by energy laws."""
+"""Ways of swinging up, with settings chosen by trials: plans with feedback, repeated plans, and energy laws."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -19,11 +19,11 @@ from dln_jax.types import InputError
 PLANS = 8
 """Largest number of plans that are tried with feedback."""
 SETS_OF_REPEATED_PLANS = 2
-"""Trials of repeated plans take far longer than others, because every one of them plans at every step of a plan."""
+"""Few, because trials of repeated plans take far longer than others: each of them plans at every step of a plan."""
 
 
 class Way(NamedTuple):
-    """A way of swinging up, whose settings trials choose."""
+    """A way of swinging up, with settings chosen by trials."""
 
     name: str
     draw: Callable[[np.random.Generator, int], list[Any]]
@@ -39,8 +39,8 @@ class Way(NamedTuple):
 
 
 def by_energy(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
-    """Energy laws and a regulator."""
-    # One set of smoothing and compensation for all: they are no arrays of the trial.
+    """Returns the way by energy laws and a regulator."""
+    # Smoothing and compensation are the same for all sets, because trials do not take them as arrays.
     plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
 
     def draw(random: np.random.Generator, count: int) -> list[Any]:
@@ -62,7 +62,7 @@ def by_energy(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Wa
 
 
 def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
-    """Plans with feedback; raises as `plans_of`."""
+    """Returns the way by plans with feedback; raises as `plans_of`."""
     plans = plans_of(upright, layout, scales, seed=seed)[:PLANS]
     plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
 
@@ -77,7 +77,7 @@ def by_plan(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
 
 
 def by_repeated_plans(upright: Upright, layout: Layout, scales: Scales, seed: int) -> Way:
-    """Repeated plans, which also recover from pushes, and a regulator."""
+    """Returns the way by repeated plans, which also recover from pushes, and a regulator."""
     plain = swing_up_numbers(upright, layout, scales, {name: 1.0 for name in RANGES})[0]
 
     def draw(random: np.random.Generator, count: int) -> list[Any]:
@@ -98,7 +98,7 @@ RECOVERIES: Mapping[str, tuple[Callable[..., Way], ...]] = {
     "swing-up": (by_plan, by_energy),
     "plans": (by_repeated_plans,),
 }
-"""Ways that are tried, by how the plant comes up again after a push: as from hanging, or by plans from there."""
+"""Ways that are tried, by how the plant comes up again after a push: as from hanging, or by plans from where it is."""
 
 
 def require_recovery(name: str) -> None:
@@ -108,7 +108,7 @@ def require_recovery(name: str) -> None:
 
 
 def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:
-    """Sets of numbers, alternately with the energy of the passive part and of the whole plant."""
+    """Returns sets of numbers, alternately with the energy of the passive part and of the whole plant."""
     low, high = np.log(np.array(list(RANGES.values()))).T
     rows = np.exp(random.uniform(low, high, size=(count, len(RANGES))))
     return [{**dict(zip(RANGES, row, strict=True)), "total": float(k % 2)} for k, row in enumerate(rows)]
