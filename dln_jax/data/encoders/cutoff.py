@@ -12,6 +12,7 @@ of the differences, so that the motion does not leak into the floor.
 Spectra are means of squares, which a single jump can dominate; the noise is a median, which no jump changes. Jumps are
 therefore interpolated before spectra are taken. If the top of a spectrum is flat and above the median's floor, it is
 the floor. Noise need not be white: where the spectrum of accelerations rises up to the highest frequency, it is noise.
+A periodic motion has lines with gaps between them, in which there is only noise: neither rule ends a motion in a gap.
 """
 
 import math
@@ -45,6 +46,8 @@ MEDIAN = math.log(2)
 """Ratio of median to mean of a spectrum's lines if few segments are averaged."""
 RISES = 3.0
 """A spectrum of accelerations that exceeds its minimum by this factor at high frequencies is noise there."""
+GAP = 3.3
+"""Widest gap between the lines of a periodic motion, as a ratio of frequencies: odd harmonics begin with 1 and 3."""
 FLAT = 4.0
 """Largest ratio between the thirds of the upper half of a spectrum for it to count as flat."""
 
@@ -83,8 +86,9 @@ def choose_cutoff(
     f, spectrum = spectra(without_jumps(q, trajectory, noise), trajectory, rate=rate)
     white = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
     floor = np.maximum(white, _rising(f, spectrum))
-    # The motion's spectrum S ends at the frequency where the smoothed spectrum first falls to the floor.
-    hidden = np.cumsum(_smoothed(spectrum) < SEEN * floor, axis=0) > 0
+    # The motion's spectrum S ends where the mean spectrum falls to the floor and stays there for more than a gap.
+    seen = _mean(spectrum) >= SEEN * _mean(floor)
+    hidden = np.cumsum(~_highest(seen, 1.0, GAP), axis=0) > 0
     signal = np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
     tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
     weight = (2 * np.pi * f) ** 4
@@ -147,10 +151,13 @@ def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> F
     jitter of a fraction of a step, for example, is noise proportional to the velocity.
     """
     accelerations = f[:, None] ** 4 * _smoothed(spectrum)
+    envelopes = _highest(f[:, None] ** 4 * _mean(spectrum), math.sqrt(1 / GAP), math.sqrt(GAP))
     rising = np.zeros_like(spectrum)
-    for channel, power in enumerate(accelerations.T):
+    for channel, (power, envelope) in enumerate(zip(accelerations.T, envelopes.T, strict=True)):
         peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
-        lowest = peak + int(np.argmin(power[peak:]))
+        lowest, of_envelope = (peak + int(np.argmin(values[peak:])) for values in (power, envelope))
+        if math.sqrt(GAP) * f[lowest] < f[of_envelope]:  # a gap
+            lowest = of_envelope
         if power[f > f[-1] / 2].min() > RISES * power[lowest]:
             rising[lowest:, channel] = spectrum[lowest:, channel]
     return rising
@@ -183,10 +190,24 @@ def spectra(
 
 
 def _smoothed(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
-    """Geometric mean over a sixth of an octave on either side, so that a gap between lines does not end a motion."""
-    logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
-    summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(logarithm, axis=0)])
-    place = np.arange(1, len(spectrum) + 1)
-    low = np.maximum(np.floor(place * 2 ** (-1 / 6)).astype(int) - 1, 0)
-    high = np.minimum(np.ceil(place * 2 ** (1 / 6)).astype(int), len(spectrum))
-    return np.exp((summed[high] - summed[low]) / (high - low)[:, None])
+    """Geometric mean over a sixth of an octave on either side."""
+    return np.exp(_mean(np.log(np.maximum(spectrum, np.finfo(float).tiny))))
+
+
+def _mean(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
+    """Mean over a sixth of an octave on either side, which keeps lines."""
+    summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(spectrum, axis=0)])
+    low, high = _window(len(spectrum), 2 ** (-1 / 6), 2 ** (1 / 6))
+    return (summed[high] - summed[low]) / (high - low)[:, None]
+
+
+def _highest(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Maximum over the frequencies from `low` to `high` times each one."""
+    return np.stack([values[a:b].max(axis=0) for a, b in zip(*_window(len(values), low, high), strict=True)])
+
+
+def _window(count: int, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """First and last index + 1 of the frequencies from `low` to `high` times each one."""
+    place = np.arange(1, count + 1)
+    first = np.maximum(np.floor(place * low).astype(int) - 1, 0)
+    return first, np.minimum(np.ceil(place * high).astype(int), count)

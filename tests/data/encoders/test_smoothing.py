@@ -125,6 +125,24 @@ def test_the_cut_off_is_nearly_the_best_there_is(noise, rate):
     assert smoothed.noise_tau == pytest.approx([NOISE_TAU, NOISE_TAU], rel=0.15)
 
 
+@pytest.mark.parametrize("period", [0.6, 1.3])
+def test_lines_of_a_periodic_motion_are_not_cut_off_though_only_noise_is_between_them(period):
+    rate, random = 500.0, np.random.default_rng(0)
+    t = np.arange(6000) / rate
+    # A triangle with round corners, of odd harmonics only.
+    order = np.arange(1, 60, 2)
+    size, w = np.exp(-0.005 * order**2) / order**2, 2 * np.pi * order / period
+    q, qd = np.cos(w * t[:, None]) @ size, -np.sin(w * t[:, None]) @ (w * size)
+    measured = (q + 4e-4 * random.normal(size=len(t)))[:, None]
+    numbers = {"trajectory": np.zeros(len(t), int), "label": np.array(["run0"])}
+    data = schema.from_arrays({"t": t, "q": measured, "tau": np.zeros((len(t), 1)), **numbers})
+
+    def error(cutoff):
+        return rms(smooth(data, cutoff, trim=1.0).data.qd[:, 0] - qd[500:-500])
+
+    assert error(None) < 1.25 * min(error(cutoff) for cutoff in np.geomspace(2.0, 100.0, 25))
+
+
 def test_rates_of_filtered_encoders_are_far_better_than_differences():
     arrays, qd, qdd = log()
     data = schema.from_arrays(arrays)
