@@ -7,6 +7,7 @@
 4. The network is a structured DeLaN with the same friction laws, fitted by Gauss-Newton (`learning.momentum`).
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -37,8 +38,11 @@ LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
 MOST_DELAY = 4
 ROUNDS = 2
 """Number of fits; the later ones are weighted by the residuals of the one before."""
-DEGREES = {"revolute": 2, "prismatic": 0}
-"""Degrees of the identified model: enough for rigid bodies; displacements along a level rail have no effect."""
+DEGREE = 2
+"""Degree of the identified mass matrix in every angle: enough for rigid bodies. Displacements along a level rail have
+no effect."""
+CHECKED = 500
+"""Number of the recording's positions at which the mass matrix is checked."""
 NETWORK = {"width": 8, "depth": 2}
 STEPS = 40
 FRICTION_START = 0.02
@@ -82,7 +86,7 @@ def prepare(
         recording: several episodes, with the needs of the plant.
         delay: delay of the torques in samples (default: estimated).
         validation: index of the validation episode (default: the middle one).
-        chain: as for `identified`.
+        chain: whether the plant is one for `identified_chain`.
 
     Raises:
         InputError: a recording without needs or with only one episode.
@@ -97,7 +101,8 @@ def prepare(
     if held_out not in present:
         raise InputError(f"validation is {held_out}; expected one of the episodes {present.tolist()}")
     if delay is None:
-        delay = delay_of_torques(build(_linear(recording.needs, chain)), recording, most=MOST_DELAY)
+        form = _chain(recording.needs) if chain else _tree(recording.needs)
+        delay = delay_of_torques(build(form), recording, most=MOST_DELAY)
     chosen = smooth(driven_torques(recording, delay=delay))
     rest = np.setdiff1d(present, held_out)
     return PreparedRecording(select(chosen.data, rest), select(chosen.data, [held_out]), delay, chosen.cutoff)
@@ -107,23 +112,70 @@ def _described(name: str, needs: Needs, **keywords: Any) -> Description:
     return describe(name, precision="f64", needs=needs._replace(joint_friction=LAWS, friction=False), **keywords)
 
 
-def _linear(needs: Needs, chain: bool) -> Description:
-    degree = [DEGREES[joint] for joint in needs.joints]
-    if not chain:
-        return _described("trigonometric", needs, degree=degree)
-    of_potential = [min(n, 1) for n in degree]
-    return _described("trigonometric", needs, degree=[0, *degree[1:]], potential_degree=of_potential)
+def _tree(needs: Needs) -> Description:
+    return _described("trigonometric", needs, degree=_degrees(needs, DEGREE))
 
 
-def identified(data: Trajectories, needs: Needs, *, chain: bool = False) -> FittedPlant:
+def _chain(needs: Needs, degree: int = DEGREE) -> Description:
+    """The mass matrix of a chain on a fixed base does not depend on the first coordinate."""
+    of_mass = [0, *_degrees(needs, degree)[1:]]
+    return _described("trigonometric", needs, degree=of_mass, potential_degree=_degrees(needs, 1))
+
+
+def _planar(needs: Needs) -> list[Description]:
+    """Chains whose links move in one plane, which have far fewer coefficients, for all directions of the later axes."""
+    if "prismatic" in needs.joints:
+        return [_chain(needs, degree=1)]
+    later = itertools.product((1, -1), repeat=len(needs.joints) - 1)
+    return [
+        _described("planar-chain", needs, directions=[1, *signs], symmetric=False, armature=True) for signs in later
+    ]
+
+
+def _degrees(needs: Needs, degree: int) -> list[int]:
+    return [degree if joint == "revolute" else 0 for joint in needs.joints]
+
+
+def identified(data: Trajectories, needs: Needs) -> FittedPlant:
     """Fits the trigonometric model with viscous and dry friction; errors as for `fit_momentum`.
 
     Args:
         data: recording with rates and acting torques.
-        chain: whether the plant is a chain of rigid bodies on a fixed base, in relative coordinates: its mass matrix
-            does not depend on the first coordinate, its potential has degree 1 in every angle; fewer motions suffice.
     """
-    description = _linear(needs, chain)
+    return _fitted(_tree(needs), data)
+
+
+def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
+    """Fits a chain of rigid bodies on a fixed base, in relative coordinates: fewer motions suffice than for `identified`.
+
+    Whether all links move in one plane, and which axes point the other way, is decided by the smallest error in the
+    validation episode: the product over joints of the residuals' root mean squares. Models whose mass matrix is not
+    positive definite at the recording's positions are left out.
+
+    Raises:
+        InputError: as for `fit_momentum`, or all models are left out.
+    """
+    held_out = cut_momentum_windows(prepared.validation)
+    positions = np.concatenate([prepared.train.q, prepared.validation.q])
+    positions = positions[:: max(len(positions) // CHECKED, 1)]
+    best, least, share = None, np.inf, 0.0
+    for form in (*_planar(needs), _chain(needs)):
+        plant = _fitted(form, prepared.train)
+        masses = np.asarray(jax.jit(jax.vmap(plant.dynamics.mass_matrix))(positions))
+        definite = np.linalg.eigvalsh(masses)[:, 0] > 0
+        share = max(share, float(np.mean(definite)))
+        left = float(np.sum(np.log(deviations(plant.dynamics, held_out))))
+        if definite.all() and left < least:
+            best, least = plant, left
+    if best is None:
+        raise InputError(
+            f"the identified mass matrix is positive definite at {share:.1%} of the recording's positions; expected "
+            "all: record more or livelier motions of every joint"
+        )
+    return best
+
+
+def _fitted(description: Description, data: Trajectories) -> FittedPlant:
     model, windows = build(description), cut_momentum_windows(data)
     plant = FittedPlant(description, fit_momentum(model, data).parameters)
     for _ in range(ROUNDS - 1):

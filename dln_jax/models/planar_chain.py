@@ -49,6 +49,7 @@ def make_planar_chain(
     needs: Needs,
     *,
     coordinates: str = "relative",
+    directions: tuple[int, ...] | None = None,
     symmetric: bool = True,
     armature: bool = False,
     velocity_scale: float = 0.05,
@@ -59,12 +60,14 @@ def make_planar_chain(
     Args:
         needs: revolute joints only; friction adds viscous and dry friction in all joints.
         coordinates: "relative" or "absolute": q_i is the angle of link i from the previous link, or from the vertical.
+        directions: 1 or -1 for every joint: -1 if its axis points against that of the first (default: all 1).
         symmetric: whether B and h are left out.
         armature: whether joints 2, .., d have armature (the inertia of motors or gears).
         velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
 
     Raises:
-        InputError: a joint is prismatic, the coordinates are unknown, or a scale is not positive.
+        InputError: a joint is prismatic, the coordinates are unknown, a direction is neither 1 nor -1, or a scale is not
+            positive.
     """
     require_positive(velocity_scale=velocity_scale)
     d = needs.degrees_of_freedom
@@ -72,8 +75,11 @@ def make_planar_chain(
         raise InputError(f"the planar chain has revolute joints only, the needs {needs.joints}; take another model")
     if coordinates not in ("relative", "absolute"):
         raise InputError(f"coordinates are {coordinates!r}; expected 'relative' or 'absolute'")
+    signs = np.ones(d) if directions is None else np.asarray(directions)
+    if signs.shape != (d,) or not (np.abs(signs) == 1).all():
+        raise InputError(f"directions are {directions}; expected 1 or -1 for each of the {d} joints")
     # phi = absolute q, and rates of the joints w = relative qd.
-    absolute: Any = np.tril(np.ones((d, d))) if coordinates == "relative" else np.eye(d)
+    absolute: Any = (np.tril(np.ones((d, d))) if coordinates == "relative" else np.eye(d)) * signs
     relative: Any = np.linalg.inv(np.tril(np.ones((d, d)))) @ absolute
     triangle, below = np.tril_indices(d), np.tril_indices(d, -1)
 

@@ -8,7 +8,7 @@ import pytest
 from dln_jax.control.desktop_plants import desktop_plant, model_of_plant, simulated_plant
 from dln_jax.control.plants import Exploration, explore
 from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
-from dln_jax.learning.recordings import identified, learned, prepare
+from dln_jax.learning.recordings import identified, identified_chain, learned, prepare
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.types import InputError
 
@@ -40,6 +40,13 @@ def test_identified_inertias_and_friction_are_the_plant_s(prepared):
     q, qd = jnp.array([0.0, 0.7]), jnp.array([2.0, 3.0])
     np.testing.assert_allclose(found.mass_matrix(q), TRUTH.mass_matrix(q), rtol=0.03)
     np.testing.assert_allclose(found.friction(q, qd), TRUTH.friction(q, qd), rtol=0.3)
+
+
+def test_the_inertias_of_an_arm_that_does_not_move_in_a_plane_take_the_higher_degree(prepared):
+    found = identified_chain(prepared, PLANT.scene.needs)
+    assert found.description["degree"] == [0, 2]
+    q = jnp.array([0.0, 0.7])
+    np.testing.assert_allclose(found.dynamics.mass_matrix(q), TRUTH.mass_matrix(q), rtol=0.03)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs,
 from dln_jax.control.plants.tuning import Tuned, tune
 from dln_jax.data.encoders import noise_of
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, prepare
+from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified_chain, prepare
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive
 
@@ -46,6 +46,7 @@ def learn_to_swing_up(
     seed: int = 0,
     recover: str = "swing-up",
     say: Callable[[str], None] = lambda _: None,
+    keep: Callable[[Explored], None] = lambda _: None,
 ) -> Learned:
     """Explores a plant, learns its model and tunes its law.
 
@@ -55,9 +56,10 @@ def learn_to_swing_up(
         seed: seed of the noise and of the trials.
         recover: as for `tune`.
         say: called with a line of text after every step.
+        keep: called after the exploration, to store a recording that a later step might refuse.
 
     Raises:
-        InputError: as for `explore`, `prepare`, `identified`, `from_log` and `tune`, or an unknown estimator.
+        InputError: as for `explore`, `prepare`, `identified_chain`, `from_log` and `tune`, or an unknown estimator.
     """
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
@@ -68,8 +70,9 @@ def learn_to_swing_up(
         f"explored: {len(recording.t) / plant.layout.rate:.3g} s in {len(recording.label)} episodes, "
         f"{len(explored.stopped)} stopped"
     )
+    keep(explored)
     prepared = prepare(recording, chain=True)
-    fitted = identified(prepared.train, plant.layout.needs, chain=True)
+    fitted = identified_chain(prepared, plant.layout.needs)
     say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     B = plant.layout.actuation
@@ -91,7 +94,7 @@ def model_of(recording: Trajectories) -> Dynamics:
     """The identified model of a recording of q and commanded torques; `InputError` if it states no needs."""
     if recording.needs is None:
         raise InputError("the recording states no needs of its plant; pass one that explore has made")
-    return identified(prepare(recording, chain=True).train, recording.needs, chain=True).dynamics
+    return identified_chain(prepare(recording, chain=True), recording.needs).dynamics
 
 
 def push_at_half(layout: Layout, rate: float) -> Push | None:

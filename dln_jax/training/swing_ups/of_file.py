@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Push
-from dln_jax.control.plants.exploring import Exploration
+from dln_jax.control.plants.exploring import Exploration, Explored
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun
@@ -67,17 +67,28 @@ def asked(
 
 
 def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, float]:
-    """Explores, learns, tunes, swings up and writes the results; returns the metrics."""
+    """Explores, learns, tunes, swings up and writes the results; returns the metrics.
+
+    The recording is written after the exploration, and stays if a later step refuses it.
+    """
     plant = task.make(task.seed)
     layout = plant.layout
     driven = [name for name, row in zip(layout.names, layout.actuation, strict=True) if row.any()]
     print(f"joints {', '.join(layout.names)}, motor at {', '.join(driven)}; goal {np.round(layout.goal, 4).tolist()}")
-    learned = learn_to_swing_up(
-        plant, task.exploration, estimator=task.estimator, seed=task.seed, recover=task.recover, say=print
-    )  # fmt: skip
-    for reason in learned.explored.stopped:
-        print(f"stopped: {reason}")
-    schema.save(folder / "data.npz", learned.explored.recording)
+    recording = folder / "data.npz"
+
+    def keep(explored: Explored) -> None:
+        schema.save(recording, explored.recording)
+        for reason in explored.stopped:
+            print(f"stopped: {reason}")
+
+    try:
+        learned = learn_to_swing_up(
+            plant, task.exploration, estimator=task.estimator, seed=task.seed, recover=task.recover, say=print,
+            keep=keep,
+        )  # fmt: skip
+    except InputError as error:
+        raise InputError(f"{error}; the recording stays in {recording}" if recording.exists() else str(error)) from None
     save(folder, *learned.fitted)
     trials, runs = try_plant(
         task.make, learned.tuned, starts=task.starts, seed=task.seed + 1000, push=task.push

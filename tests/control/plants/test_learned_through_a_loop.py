@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dln_jax.control.plants import Exploration, explore, hardware_plant, layout
-from dln_jax.learning.recordings import identified, prepare
+from dln_jax.learning.recordings import identified_chain, prepare
 
 RATE, STEP, DELAY = 100.0, 1e-3, 2
 NOISE = 2 * np.pi / 4096 / np.sqrt(12)  # that of an encoder's resolution
@@ -67,6 +67,6 @@ def test_a_plant_in_another_process_is_learned_through_its_loop():
     assert not explored.stopped
     prepared = prepare(explored.recording, chain=True)
     assert prepared.delay == DELAY
-    model = identified(prepared.train, LAYOUT.needs, chain=True).dynamics
+    model = identified_chain(prepared, LAYOUT.needs).dynamics
     M = np.asarray(model.mass_matrix(LAYOUT.hanging))  # blind episodes swing about it, and show nothing of the goal
     np.testing.assert_allclose(M, [[INERTIA, -COUPLING], [-COUPLING, PENDULUM]], rtol=0.05)

@@ -18,7 +18,7 @@ from dln_jax.control.plants import (
 )
 from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of, swing_up_numbers
 from dln_jax.control.swing_up import upright_of
-from dln_jax.learning.recordings import identified, prepare
+from dln_jax.learning.recordings import identified_chain, prepare
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError
@@ -115,7 +115,7 @@ def test_a_plant_is_identified_from_motions_that_no_model_planned():
     plant = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4, delay=1))
 
     def fit(recording):
-        return identified(prepare(recording, chain=True).train, plant.layout.needs, chain=True).dynamics
+        return identified_chain(prepare(recording, chain=True), plant.layout.needs).dynamics
 
     explored = explore(plant, fit, Exploration(seconds=12.0))
     recording = explored.recording
