@@ -133,8 +133,12 @@ def _model(source: Any) -> tuple[Any, Any, dict[str, float]]:
     """Returns MuJoCo, its model, and the largest rates of joints that a URDF states."""
     if isinstance(source, Path) or (isinstance(source, str) and not source.lstrip().startswith("<")):
         root = parsed(Path(source))
-        speeds = velocity_limits(root) if root.tag == "robot" else {}
-        return *opened(Path(source), root, (), inertias=True)[:2], speeds
+        mujoco, model = opened(Path(source), root, (), inertias=True)[:2]
+        if root.tag != "robot":
+            return mujoco, model, {}
+        # A URDF states no integrator, and MuJoCo's default has errors that no rigid body makes.
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        return mujoco, model, velocity_limits(root)
     return *compiled_model(source), {}
 
 

@@ -36,7 +36,7 @@ FINENESS = 15.0
 SHARE = 0.7
 """Largest share of the motors' limits in a plan; the rest is for feedback."""
 INSIDE = 0.8
-"""Share of the limits of the coordinates within which a plan should stay."""
+"""Share of the limits of the coordinates and rates within which a plan should stay."""
 GUESSES, ITERATIONS, LENGTHS = 16, 100, 0.5 ** np.arange(6)
 CLOSE = 0.1
 """Largest error at the end of a plan, in units of the coordinates."""
@@ -44,7 +44,7 @@ EFFORTS = (1.0, 0.1)
 """Weights of the controls in alternate plans: gentle plans, and firm ones."""
 AT_END, RATES, POSTURE, BEYOND = 300.0, 0.003, 0.02, 100.0
 """Weights of the errors at the end, of the rates, of active coordinates away from the goal (where an acrobot's motor
-hardly reaches its passive joint), and of coordinates outside their share of the limits."""
+hardly reaches its passive joint), and of coordinates and rates outside their share of the limits."""
 READY = -1
 """Sample number of a plan while the plant hangs and waits for its start."""
 CALM, PATIENCE = 1 / 36, 4
@@ -96,6 +96,7 @@ def plan_problem(
     d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
     dt, goal, units = every / layout.rate, np.asarray(upright.at.x), _units(scales)
     low, high = INSIDE * layout.limits.position.T
+    fastest = INSIDE * layout.limits.rate
     # Driven joints must not make extra turns, because their cables might not.
     free = circular(layout.joints, 2 * d) & np.isin(np.arange(2 * d), upright.parts.passive) & (soon > 0)
 
@@ -105,11 +106,12 @@ def plan_problem(
     def cost(x: Array, u: Array) -> Array:
         away = off(x)[np.array(upright.parts.active)]
         beyond = jnp.maximum(x[:d] - high, 0.0) + jnp.maximum(low - x[:d], 0.0)
+        faster = jnp.maximum(jnp.abs(x[d:]) - fastest, 0.0)
         running = effort * jnp.sum((u / size) ** 2) + RATES * jnp.sum((x[d:] / units[d:]) ** 2)
         running += POSTURE * jnp.sum(away**2)
         if soon:
             running += soon * jnp.sum(off(x)[:d] ** 2)
-        return dt * scales.fall * running + BEYOND * jnp.sum((beyond / units[:d]) ** 2)
+        return dt * scales.fall * running + BEYOND * (jnp.sum((beyond / units[:d]) ** 2) + jnp.sum((faster / units[d:]) ** 2))
 
     def end(x: Array) -> Array:
         return at_end * jnp.sum(off(x) ** 2)
