@@ -146,7 +146,7 @@ def identified(data: Trajectories, needs: Needs) -> FittedPlant:
 
 
 def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
-    """Fits a chain of rigid bodies on a fixed base, in relative coordinates: fewer motions suffice than for `identified`.
+    """Fits a chain of rigid bodies on a fixed base, in relative coordinates, for which fewer motions suffice.
 
     Whether all links move in one plane, and which axes point the other way, is decided by the smallest error in the
     validation episode: the product over joints of the residuals' root mean squares. Models whose mass matrix is not

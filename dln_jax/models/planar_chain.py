@@ -66,8 +66,8 @@ def make_planar_chain(
         velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
 
     Raises:
-        InputError: a joint is prismatic, the coordinates are unknown, a direction is neither 1 nor -1, or a scale is not
-            positive.
+        InputError: a joint is prismatic, the coordinates are unknown, a direction is neither 1 nor -1, or a scale is
+            not positive.
     """
     require_positive(velocity_scale=velocity_scale)
     d = needs.degrees_of_freedom

@@ -52,7 +52,7 @@ class Arguments(Folder, Drawn):
 
 
 def main(options: Arguments) -> None:
-    """Explores the plant, learns the model, swings up and writes the run folder."""
+    """Explores the plant, learns the model, swings up and writes the run folder; a refused law exits with status 1."""
     from dln_jax.cli.stored_arguments import command_folder
     from dln_jax.training.swing_ups import of_file, run
 
@@ -77,5 +77,7 @@ def main(options: Arguments) -> None:
         options.estimator, options.recover, options.push,
     )  # fmt: skip
     with command_folder(options, "swing_up") as folder:
-        of_file.swing_up_file(of_plant, folder, figures=options.figures)
+        metrics = of_file.swing_up_file(of_plant, folder, figures=options.figures)
         print(f"run folder: {folder}")
+    if metrics["success_share"] < of_file.LEAST_SHARE:
+        raise SystemExit(1)

@@ -111,7 +111,9 @@ def plan_problem(
         running += POSTURE * jnp.sum(away**2)
         if soon:
             running += soon * jnp.sum(off(x)[:d] ** 2)
-        return dt * scales.fall * running + BEYOND * (jnp.sum((beyond / units[:d]) ** 2) + jnp.sum((faster / units[d:]) ** 2))
+        return dt * scales.fall * running + BEYOND * (
+            jnp.sum((beyond / units[:d]) ** 2) + jnp.sum((faster / units[d:]) ** 2)
+        )
 
     def end(x: Array) -> Array:
         return at_end * jnp.sum(off(x) ** 2)

@@ -20,6 +20,8 @@ from dln_jax.training.swing_ups.run import LEAST_SECONDS
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
 
+LEAST_SHARE = 0.5
+"""Smallest share of the starts that come up; with fewer the law is refused."""
 ENCODER_STEP = 2 * np.pi / 4096
 """Resolution of the simulated encoders of revolute joints, rad; that of prismatic joints is 0.1 mm."""
 
@@ -115,6 +117,13 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
         f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s{pushed}: median {median:.2f} "
         f"s, worst {worst:.2f} s"
     )
+    if trials.stopped:
+        print(f"{len(trials.stopped)} of {task.starts} were stopped; the first: {trials.stopped[0]}")
+    if metrics["success_share"] < LEAST_SHARE:
+        print(
+            "refused: fewer than half of the starts came up, although the law swings the learned model up; record "
+            "longer (--seconds-of-data), or widen the limits of the file"
+        )
     complete = [one for one in runs if not one.stopped][:MOST_SHOWN]
     if figures and complete:
         write_figure(folder / "swing-ups.png", _traces(complete, plant))

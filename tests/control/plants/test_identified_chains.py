@@ -1,4 +1,4 @@
-"""Three links in a plane are identified from short motions about hanging, well enough to plan motions far from there."""
+"""Three links in a plane are identified from short motions about hanging, well enough to plan far from there."""
 
 import jax
 import jax.numpy as jnp
