@@ -2,10 +2,23 @@
 
 import json
 
+import jax
+import numpy as np
 import pytest
 from calls import command, refused
 
 from dln_jax.cli.commands import swing_up
+from dln_jax.control.plants.exploring import Explored, recording_of
+from dln_jax.control.plants.runs import PlantRun, Trials
+from dln_jax.control.plants.tuning import Tuned
+from dln_jax.control.regulators import Regulator
+from dln_jax.data import schema
+from dln_jax.learning.recordings import FittedPlant
+from dln_jax.training.swing_ups.any_plant import Learned
+from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build, describe
+
+MOTOR = ("--actuated", "elbow", "--control", 5)
 
 
 @pytest.mark.slow
@@ -59,12 +72,52 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path, arguments, me
     ids=["name", "all", "none", "limit", "negative", "seconds", "model"],
 )
 def test_mistakes_with_a_file_are_one_line_and_leave_nothing(capsys, tmp_path, arguments, message):
+    file = two_links(tmp_path)
+    assert message in refused(capsys, swing_up, "--plant", file, *arguments, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_recording_that_a_later_step_refuses_is_kept(capsys, tmp_path, monkeypatch):
+    def learn(plant, *_, keep, **__):
+        keep(Explored(recording(plant.layout), ()))
+        raise InputError("the noise of q in the log is 0")
+
+    monkeypatch.setattr("dln_jax.training.swing_ups.of_file.learn_to_swing_up", learn)
+    line = refused(capsys, swing_up, "--plant", two_links(tmp_path), *MOTOR, "--out", tmp_path / "run")
+    assert "the noise of q in the log is 0; the recording stays in" in line
+    assert schema.load(tmp_path / "run" / "data.npz").q.shape == (20, 2)
+
+
+def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(capsys, tmp_path, monkeypatch):
+    def learn(plant, *_, **__):
+        description = describe("planar-chain", precision="f64", needs=plant.layout.needs)
+        fitted = FittedPlant(description, build(description).init(jax.random.key(0)))
+        regulator = Regulator(np.zeros((1, 4)), np.zeros((4, 4)))
+        return Learned(None, None, fitted, Tuned(None, "plan", {}, regulator, 256, 1.0, 0.4, 1.4), None, 9.0)
+
+    few = Trials(np.array([np.inf, 1.0, np.inf]), ("'elbow' moves at 31/s",))
+    monkeypatch.setattr("dln_jax.training.swing_ups.of_file.learn_to_swing_up", learn)
+    monkeypatch.setattr("dln_jax.training.swing_ups.of_file.try_plant", lambda *_, **__: (few, []))
+    with pytest.raises(SystemExit) as stop:
+        command(swing_up, "--plant", two_links(tmp_path), *MOTOR, "--starts", 3, "--out", tmp_path / "run")
+    said = capsys.readouterr().out
+    assert stop.value.code == 1 and "33.3% of 3 starts up" in said and "refused: fewer than half" in said
+    assert "1 of 3 were stopped; the first: 'elbow' moves at 31/s" in said
+
+
+def two_links(folder):
+    """The file of two rods without a limit of their motors."""
     pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
     rod = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2"/>'
     links = (
         f'<joint name="shoulder" axis="0 1 0"/>{rod}<body pos="0 0 -.3"><joint name="elbow" axis="0 1 0"/>{rod}</body>'
     )
-    file = tmp_path / "mine.xml"
+    file = folder / "mine.xml"
     file.write_text(f"<mujoco><worldbody><body>{links}</body></worldbody></mujoco>")
-    assert message in refused(capsys, swing_up, "--plant", file, *arguments, "--out", tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+    return file
+
+
+def recording(layout):
+    q = np.random.default_rng(0).normal(size=(20, 2))
+    runs = [PlantRun(np.arange(10) / 500, part, np.zeros((10, 1))) for part in np.split(q, 2)]
+    return recording_of(runs, layout)
