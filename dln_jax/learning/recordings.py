@@ -116,19 +116,25 @@ def _tree(needs: Needs) -> Description:
     return _described("trigonometric", needs, degree=_degrees(needs, DEGREE))
 
 
-def _chain(needs: Needs, degree: int = DEGREE) -> Description:
+def _chain(needs: Needs) -> Description:
     """The mass matrix of a chain on a fixed base does not depend on the first coordinate."""
-    of_mass = [0, *_degrees(needs, degree)[1:]]
+    of_mass = [0, *_degrees(needs, DEGREE)[1:]]
     return _described("trigonometric", needs, degree=of_mass, potential_degree=_degrees(needs, 1))
 
 
 def _planar(needs: Needs) -> list[Description]:
-    """Chains whose links move in one plane, which have far fewer coefficients, for all directions of the later axes."""
-    if "prismatic" in needs.joints:
-        return [_chain(needs, degree=1)]
-    later = itertools.product((1, -1), repeat=len(needs.joints) - 1)
+    """Chains whose links move in one plane, which have far fewer coefficients, for all directions of the later axes.
+
+    Slides that come first may point anywhere.
+    """
+    slides, hinges = (needs.joints.count(joint) for joint in ("prismatic", "revolute"))
+    if "prismatic" in needs.joints[slides:] or not hinges:
+        return []
+    first = [1] * (slides + 1)
+    later = itertools.product((1, -1), repeat=hinges - 1)
     return [
-        _described("planar-chain", needs, directions=[1, *signs], symmetric=False, armature=True) for signs in later
+        _described("planar-chain", needs, directions=[*first, *signs], symmetric=False, armature=True)
+        for signs in later
     ]
 
 

@@ -1,4 +1,4 @@
-"""Chain of links in one plane with unknown lengths, masses and inertias.
+"""Chain of links in one plane with unknown lengths, masses and inertias, on a fixed base, a slide or several.
 
 With the links' absolute angles phi, measured from hanging straight down,
 
@@ -10,6 +10,10 @@ A is symmetric and B skew. B and h vanish if the centres of mass lie on the line
 angles are right; the armature a_1 of the first motor is part of A_11. All parameters enter linearly
 (`learning.linear.fit_linear`) and are identifiable from motions ("base parameters"): for a double pendulum, g_2 / A_12
 is the acceleration of gravity divided by the first link's length. Friction acts in the joints, for any coordinates.
+
+Slides, which come before all hinges, have phi = 0: A_ij and B_ij of a slide and a link are the components of a mass
+times a length along the slide. Their phid in T is the rate of the displacement x, and V has g_i x²/2 - h_i x, a spring
+and the weight along the slide, in place of their other terms.
 """
 
 from typing import Any, NamedTuple
@@ -30,19 +34,19 @@ class PlanarChainParameters(NamedTuple):
     """Parameters of d links; `None` for terms that are left out."""
 
     moments: Any
-    """A: its lower triangle, row by row [d (d + 1) / 2], kg m²."""
+    """A: its lower triangle, row by row [d (d + 1) / 2], kg m², kg m or kg."""
     skew: Any
-    """B: below its diagonal, row by row [d (d - 1) / 2], kg m²."""
+    """B: below its diagonal, row by row [d (d - 1) / 2], kg m², kg m or kg."""
     armature: Any
-    """a_2, .., a_d [d - 1], kg m²."""
+    """a of the hinges after the first, kg m²."""
     weight: Any
-    """g [d], N m."""
+    """g [d], N m, or N/m of a slide."""
     sideways: Any
-    """h [d], N m."""
+    """h [d], N m or N."""
     viscous: Any
-    """b [d], N m s."""
+    """b [d], N m s or N s/m."""
     coulomb: Any
-    """c [d], N m."""
+    """c [d], N m or N."""
 
 
 def make_planar_chain(
@@ -58,29 +62,33 @@ def make_planar_chain(
     """Returns the (init, energies) pair of a planar chain; `init` ignores its key: M_ii = 1, all else is zero.
 
     Args:
-        needs: revolute joints only; friction adds viscous and dry friction in all joints.
+        needs: prismatic joints come first; friction adds viscous and dry friction in all joints.
         coordinates: "relative" or "absolute": q_i is the angle of link i from the previous link, or from the vertical.
         directions: 1 or -1 for every joint: -1 if its axis points against that of the first (default: all 1).
         symmetric: whether B and h are left out.
-        armature: whether joints 2, .., d have armature (the inertia of motors or gears).
+        armature: whether the hinges after the first have armature (the inertia of motors or gears).
         velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
 
     Raises:
-        InputError: a joint is prismatic, the coordinates are unknown, a direction is neither 1 nor -1, or a scale is
-            not positive.
+        InputError: a slide comes after a hinge, the coordinates are unknown, a direction is neither 1 nor -1, or a
+            scale is not positive.
     """
     require_positive(velocity_scale=velocity_scale)
     d = needs.degrees_of_freedom
-    if set(needs.joints) != {"revolute"}:
-        raise InputError(f"the planar chain has revolute joints only, the needs {needs.joints}; take another model")
+    hinge = np.array([joint == "revolute" for joint in needs.joints])
+    if (np.diff(hinge.astype(int)) < 0).any():
+        raise InputError(f"the joints are {needs.joints}; a planar chain has slides before hinges: take another model")
     if coordinates not in ("relative", "absolute"):
         raise InputError(f"coordinates are {coordinates!r}; expected 'relative' or 'absolute'")
     signs = np.ones(d) if directions is None else np.asarray(directions)
     if signs.shape != (d,) or not (np.abs(signs) == 1).all():
         raise InputError(f"directions are {directions}; expected 1 or -1 for each of the {d} joints")
-    # phi = absolute q, and rates of the joints w = relative qd.
-    absolute: Any = (np.tril(np.ones((d, d))) if coordinates == "relative" else np.eye(d)) * signs
-    relative: Any = np.linalg.inv(np.tril(np.ones((d, d)))) @ absolute
+    # phi and displacements = absolute q, and rates of the joints w = relative qd.
+    sums = np.where(hinge[:, None] & hinge, np.tril(np.ones((d, d))), np.eye(d))
+    absolute: Any = (sums if coordinates == "relative" else np.eye(d)) * signs
+    relative: Any = np.linalg.inv(sums) @ absolute
+    turning: Any = hinge[:, None] * absolute
+    geared = np.flatnonzero(hinge)[1:]
     triangle, below = np.tril_indices(d), np.tril_indices(d, -1)
 
     def init(key: Array) -> PlanarChainParameters:
@@ -90,7 +98,7 @@ def make_planar_chain(
         return PlanarChainParameters(
             moments=jnp.asarray((triangle[0] == triangle[1]).astype(float), dtype),
             skew=zeros(len(below[0]), not symmetric),
-            armature=zeros(d - 1, armature),
+            armature=zeros(len(geared), armature),
             weight=zeros(d, needs.gravity),
             sideways=zeros(d, needs.gravity and not symmetric),
             viscous=zeros(d, needs.friction),
@@ -103,24 +111,22 @@ def make_planar_chain(
         A = like.at[triangle].set(moments)
         A = A + A.T - jnp.diag(jnp.diagonal(A))
         B = None if skew is None else like.at[below].set(skew) - like.at[below].set(skew).T
-        fixed = (
-            0.0 if motors is None else relative.T @ jnp.diag(jnp.append(jnp.zeros(1, motors.dtype), motors)) @ relative
-        )
+        fixed = 0.0 if motors is None else relative.T @ jnp.diag(jnp.zeros(d).at[geared].set(motors)) @ relative
 
         def mass_matrix(q: Vector) -> Matrix:
-            between = _between(absolute @ q)
+            between = _between(turning @ q)
             own = A * jnp.cos(between) + (0.0 if B is None else B * jnp.sin(between))
             return absolute.T @ own @ absolute + fixed
 
         def coriolis(q: Vector, qd: Vector) -> Vector:
-            between = _between(absolute @ q)
+            between = _between(turning @ q)
             slopes = A * jnp.sin(between) - (0.0 if B is None else B * jnp.cos(between))
-            return absolute.T @ (slopes @ (absolute @ qd) ** 2)
+            return absolute.T @ (slopes @ (turning @ qd) ** 2)
 
         def potential(q: Vector) -> Scalar:
-            phi = absolute @ q
-            height = weight @ jnp.cos(phi)
-            return -height if sideways is None else -height - sideways @ jnp.sin(phi)
+            place = absolute @ q
+            height = weight @ jnp.where(hinge, jnp.cos(place), -(place**2) / 2)
+            return -height if sideways is None else -height - sideways @ jnp.where(hinge, jnp.sin(place), place)
 
         dissipation = None
         if viscous is not None:

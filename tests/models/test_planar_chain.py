@@ -1,4 +1,4 @@
-"""A planar chain against the textbook's double pendulum and a tree of rigid bodies, in both kinds of coordinates."""
+"""Planar chains against the textbook double pendulum and cart-pole, and a tree of rigid bodies, in both coordinates."""
 
 import functools
 
@@ -12,6 +12,7 @@ from dln_jax.mechanics.closed_form import lagrangian as scalar
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.scenes.pendulums import double_pendulum
+from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError, Needs
 
 NEEDS = Needs(joints=("revolute", "revolute"), friction=True)
@@ -40,6 +41,30 @@ def test_textbook_double_pendulum():
         for each in (model.energies(parameters), double_pendulum(masses=masses, lengths=lengths).energies)
     )
     np.testing.assert_allclose(*(jax.jit(each.inverse_dynamics)(*STATE) for each in (ours, book)), rtol=1e-13)
+
+
+def test_textbook_cart_pole():
+    book = cart_pole().closed_form
+    model = make_planar_chain(Needs(joints=("prismatic", "revolute"), friction=False))
+    M = book.mass_matrix(jnp.zeros(2))
+    below, above = (book.potential(jnp.array([0.0, angle])) for angle in (0.0, np.pi))
+    parameters = model.init(jax.random.key(0))._replace(
+        moments=jnp.array([M[0, 0], M[1, 0], M[1, 1]]), weight=jnp.array([0.0, (above - below) / 2])
+    )
+    ours, theirs = (jax.jit(dynamics(each).inverse_dynamics)(*STATE) for each in (model.energies(parameters), book))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-13)
+
+
+def test_forces_on_two_slides_and_two_hinges_are_derivatives_of_the_energy():
+    needs = Needs(joints=("prismatic", "prismatic", "revolute", "revolute"), friction=False)
+    model = make_planar_chain(needs, directions=(1, 1, 1, -1), symmetric=False, armature=True)
+    random = np.random.default_rng(1)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)), model.init(jax.random.key(0)))
+    assert parameters.armature.shape == (1,)
+    parameters = parameters._replace(moments=parameters.moments + 9 * model.init(jax.random.key(0)).moments)
+    system, state = model.energies(parameters), random.normal(size=(3, 4))
+    by_energy = jax.jit(functools.partial(lagrangian.inverse_dynamics, scalar(system)))(*state)
+    np.testing.assert_allclose(jax.jit(dynamics(system).inverse_dynamics)(*state), by_energy, rtol=1e-10)
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
@@ -74,7 +99,9 @@ def test_friction_acts_in_the_joints():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(InputError, match="revolute joints only"):
-        make_planar_chain(Needs(joints=("prismatic",)))
+    with pytest.raises(InputError, match="slides before hinges"):
+        make_planar_chain(Needs(joints=("revolute", "prismatic")))
+    with pytest.raises(InputError, match=r"directions are \(1, 2\)"):
+        make_planar_chain(NEEDS, directions=(1, 2))
     with pytest.raises(InputError, match="coordinates are 'polar'"):
         make_planar_chain(NEEDS, coordinates="polar")
