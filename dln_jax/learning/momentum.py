@@ -16,6 +16,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.encoders import smooth
+from dln_jax.data.encoders.sampling import delayed
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
@@ -25,6 +26,9 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
+
+WHOLE = 0.05
+"""Distance from a whole number of samples within which an estimated delay is that number."""
 
 
 class MomentumWindows(NamedTuple):
@@ -113,20 +117,21 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
         delay: delay of the commands in samples.
 
     Raises:
-        InputError: a delay that is not a whole number, or negative.
+        InputError: a delay that is negative or not finite.
     """
-    if delay < 0 or delay != int(delay):
-        raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
     acting = np.zeros_like(data.tau)
     for index in np.unique(data.trajectory):
         rows = np.flatnonzero(data.trajectory == index)
-        asked = np.concatenate([np.zeros((int(delay) + 1, data.tau.shape[1])), data.tau[rows]])
-        acting[rows] = (asked[: len(rows)] + asked[1 : len(rows) + 1]) / 2
+        steps = delayed(data.tau[rows], float(delay))
+        acting[rows] = (np.concatenate([np.zeros_like(steps[:1]), steps[:-1]]) + steps) / 2
     return data._replace(tau=acting)
 
 
-def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> int:
+def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> float:
     """Estimates the delay of torques in samples by the smallest residual of a model that is linear in its parameters.
+
+    The square of the residual is taken for a parabola around the best whole number, because the commands of hardware
+    act between samples. An estimate that is within `WHOLE` of a whole number is that number.
 
     Args:
         model: model that is linear in its parameters, such as `models.make_trigonometric`.
@@ -139,8 +144,13 @@ def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> int
     smoothed = smooth(recording)
     unit = np.asarray(torque_scale(smoothed.data))
 
-    def misfit(delay: int) -> float:
+    def misfit(delay: float) -> float:
         late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
-        return fit_momentum(model, late, noise=unit).residual
+        return fit_momentum(model, late, noise=unit).residual ** 2
 
-    return min(range(most + 1), key=misfit)
+    tried = {float(delay): misfit(delay) for delay in range(most + 1)}
+    first = max(min(tried, key=tried.__getitem__) - 0.5, 0.0)
+    below, centre, above = (tried[at] if at in tried else misfit(at) for at in (first, first + 0.5, first + 1.0))
+    bend = below - 2 * centre + above
+    delay = first + 0.5 + float(np.clip(0.25 * (below - above) / bend if bend > 0 else 0.0, -0.5, 0.5))
+    return float(round(delay)) if abs(delay - round(delay)) < WHOLE else delay

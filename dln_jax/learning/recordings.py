@@ -71,14 +71,14 @@ class PreparedRecording(NamedTuple):
     train: Trajectories
     """Episodes to fit, with rates and acting torques."""
     validation: Trajectories
-    delay: int
+    delay: float
     """Delay of the torques in samples."""
     cutoff: float
     """Cut-off frequency of the filter, Hz."""
 
 
 def prepare(
-    recording: Trajectories, *, delay: int | None = None, validation: int | None = None, chain: bool = False
+    recording: Trajectories, *, delay: int | float | None = None, validation: int | None = None, chain: bool = False
 ) -> PreparedRecording:
     """Computes rates and acting torques, and splits the episodes into those to fit and one for validation.
 
@@ -105,7 +105,7 @@ def prepare(
         delay = delay_of_torques(build(form), recording, most=MOST_DELAY)
     chosen = smooth(driven_torques(recording, delay=delay))
     rest = np.setdiff1d(present, held_out)
-    return PreparedRecording(select(chosen.data, rest), select(chosen.data, [held_out]), delay, chosen.cutoff)
+    return PreparedRecording(select(chosen.data, rest), select(chosen.data, [held_out]), float(delay), chosen.cutoff)
 
 
 def _described(name: str, needs: Needs, **keywords: Any) -> Description:

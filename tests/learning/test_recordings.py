@@ -62,11 +62,12 @@ def test_torques_come_late_and_are_held(recording):
     few = recording._replace(t=np.arange(5) / 500, tau=tau, trajectory=np.zeros(5, int))
     np.testing.assert_allclose(driven_torques(few, delay=0).tau[:, 0], [0.5, 1.5, 2.5, 3.5, 4.5])
     np.testing.assert_allclose(driven_torques(few, delay=2).tau[:, 1], [0, 0, 0.5, 1.5, 2.5])
+    np.testing.assert_allclose(driven_torques(few, delay=0.25).tau[:, 0], [0.375, 1.25, 2.25, 3.25, 4.25])
 
 
 def test_mistakes_are_one_line(recording, prepared):
-    with pytest.raises(InputError, match=r"delay is 0\.5"):
-        driven_torques(recording, delay=0.5)
+    with pytest.raises(InputError, match=r"delay is -0\.5"):
+        driven_torques(recording, delay=-0.5)
     with pytest.raises(InputError, match="states no needs"):
         prepare(recording._replace(needs=None))
     with pytest.raises(InputError, match="validation is 7"):

@@ -48,7 +48,7 @@ def with_estimate(
     measurements: int,
     lower: Any = -jnp.inf,
     upper: Any = jnp.inf,
-    delay: int = 0,
+    delay: int | float = 0,
     late: Sequence[int] | int = 0,
     every: Sequence[int] | int = 1,
 ) -> Controller:
@@ -62,20 +62,27 @@ def with_estimate(
         measurements: p.
         lower: lower limits of the controls, which the filter must know.
         upper: upper limits.
-        delay: samples after which a control begins to act.
+        delay: samples after which a control begins to act; it need not be a whole number.
         late: samples by which the channels of y are late, one per channel or one for all.
         every: samples between new measurements of a channel, from the first sample on, one per channel or one for all;
             values in between are ignored.
 
     Raises:
-        InputError: a number of samples is negative or not whole, or `every` is zero.
+        InputError: a number of samples is negative, or not whole where it must be, or `every` is zero.
     """
     require_positive(controls=controls, measurements=measurements)
     lag, period = _samples("late", late, measurements, 0), _samples("every", every, measurements, 1)
-    (wait,) = _samples("delay", delay, 1, 0)
+    if not 0 <= delay < jnp.inf:
+        raise InputError(f"delay is {delay}; expected a number of samples, 0 or more")
+    wait = int(delay)
+    share = float(delay) - wait
     controller = law if isinstance(law, Controller) else stateless(law)
     depth = int(lag.max())
     rows = depth - lag, np.arange(measurements)
+
+    def acting(u: Array) -> Array:
+        """Means of the controls over steps, of which the last share of a sample belongs to the control before."""
+        return (1 - share) * u[1:] + share * u[:-1] if share else u
 
     def act(memory: Estimating, t: Array, y: Array) -> tuple[Estimating, Array]:
         taken = memory.number - jnp.asarray(lag)
@@ -90,22 +97,24 @@ def with_estimate(
             later = jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), later, past)
             return later, later
 
-        base = memory.filter
+        base, known = memory.filter, acting(memory.u)
         if depth:
             numbers = memory.number - depth + jnp.arange(depth)
-            past, afterwards = jax.lax.scan(through, base, (ys[:-1], seen[:-1], memory.u[:depth], numbers))
+            past, afterwards = jax.lax.scan(through, base, (ys[:-1], seen[:-1], known[:depth], numbers))
             base = jax.tree.map(lambda leaf: leaf[0], afterwards)
         else:
             past = base
         past, _ = filter.update(past, ys[-1], seen[-1])
         ahead = past.x
         for number in range(wait):
-            ahead = filter.process.step(ahead, memory.u[depth + number], jnp.zeros_like(nothing(past.x)))
+            ahead = filter.process.step(ahead, known[depth + number], jnp.zeros_like(nothing(past.x)))
+        if share:
+            ahead += share * (filter.process.step(ahead, memory.u[-1], jnp.zeros_like(nothing(past.x))) - ahead)
         inner, u = controller.act(memory.inner, t, ahead)
         u = saturated(u, lower, upper)
         queue = jnp.concatenate([memory.u, u[None]])
         if not depth:
-            base = filter.predict(past, queue[0])
+            base = filter.predict(past, acting(queue)[0])
         return Estimating(past.x, inner, base, ys[1:], seen[1:], queue[1:], memory.number + 1), u
 
     def nothing(x: Array) -> Array:
@@ -114,7 +123,7 @@ def with_estimate(
     zeros = lambda *shape: jnp.zeros(shape, belief.x.dtype)  # noqa: E731
     start = Estimating(
         belief.x, controller.start, filter.start(belief), zeros(depth, measurements),
-        jnp.zeros((depth, measurements), bool), zeros(depth + int(wait), controls), jnp.asarray(0),
+        jnp.zeros((depth, measurements), bool), zeros(depth + wait + (share > 0), controls), jnp.asarray(0),
     )  # fmt: skip
     return Controller(start, act)
 

@@ -20,7 +20,7 @@ from jax import Array
 from dln_jax.control.estimate.extended import extended
 from dln_jax.control.estimate.loop import filtered
 from dln_jax.control.estimate.process import Belief, Filter, Innovation, Process, belief, mechanical
-from dln_jax.data.encoders.sampling import noise_of, step_of, timing
+from dln_jax.data.encoders.sampling import delayed, noise_of, step_of, timing
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, Scalar
@@ -123,7 +123,12 @@ def tuned(
 
 
 def from_log(
-    model: Dynamics | PlainDynamics, log: Trajectories, *, actuation: Any = None, substeps: int = 1, delay: int = 0
+    model: Dynamics | PlainDynamics,
+    log: Trajectories,
+    *,
+    actuation: Any = None,
+    substeps: int = 1,
+    delay: int | float = 0,
 ) -> Tuned:
     """Returns the process of a model with the noise of a log of encoders and torques.
 
@@ -151,7 +156,7 @@ def from_log(
     samples = max(SAMPLES // len(numbers), 8)
     for number in numbers:
         q, tau = (column[log.trajectory == number][:samples] for column in (log.q, log.tau))
-        tau = np.concatenate([np.zeros((delay, tau.shape[1])), tau])[: len(q)]
+        tau = delayed(tau, float(delay))
         start = np.concatenate([q[0], np.zeros_like(q[0])])
         deviation = np.concatenate([np.maximum(noise, step_of(log.q)), np.full(len(noise), FIRST_RATE)])
         logs.append((belief(start, deviation), jnp.asarray(q), jnp.asarray(tau)))

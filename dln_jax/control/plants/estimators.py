@@ -30,7 +30,7 @@ def by_differences(layout: Layout) -> Estimator:
 
 
 def by_filter(
-    layout: Layout, process: Process, *, delay: int = 0, make: Callable[[Process], Filter] = extended
+    layout: Layout, process: Process, *, delay: int | float = 0, make: Callable[[Process], Filter] = extended
 ) -> Estimator:
     """Returns an estimator of the states by a filter of the measurements.
 
@@ -47,7 +47,7 @@ def by_filter(
     return lambda law: with_estimate(law, make(process), start, **settings)
 
 
-def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: int) -> Estimator:
+def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: int | float) -> Estimator:
     """Returns the estimator with a name.
 
     Args:

@@ -3,9 +3,10 @@
 1. Numbers without units (`scales.RANGES`) are drawn; scales of the model turn them into gains and a regulator.
 2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
    are stronger or weaker than the model says. The weight is wrong by the share `WEIGHT` of that, in the opposite
-   direction.
+   direction; stronger motors also act later, by the share `LATE` of a sample.
 3. The best sets are tried again with more errors and starts. The margin of a set is the largest error up to which every
-   trial succeeds; the set with the largest margin is chosen.
+   trial succeeds; of the sets with the largest margin that are not much slower than the fastest, the one is chosen whose
+   controls change least at the goal.
 4. Plans with feedback (`planned`) are tried first, and taken if they tolerate every error. Otherwise energy laws are
    tried as well, with correct models in the first round, because few sets work. One with a margin of `LEAST` or more is
    taken: it acts in any state, and a wrong model only costs it time but throws a plan off. Otherwise the larger margin
@@ -37,6 +38,11 @@ ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 """Relative errors of the motors' strength in the second round."""
 WEIGHT = 0.125
 """Relative error of gravity, divided by that of the motors' strength."""
+LATE = 0.5
+"""Share of a sample by which motors act later than estimated: a law may take longer to compute than those of the
+recording."""
+SLOWER = 1.5
+"""Largest time to the goal of the chosen set, divided by that of the fastest with its margin."""
 STARTS = 2
 """Smallest number of starts of a set with each error in the second round."""
 FINALISTS = 8
@@ -79,6 +85,7 @@ def tune(
     sets: int = 64,
     seconds: float = 6.0,
     substeps: int = 1,
+    late: float = 0.0,
     seed: int = 0,
     recover: str = "swing-up",
 ) -> Tuned:
@@ -92,6 +99,7 @@ def tune(
         sets: number of sets in a first round.
         seconds: duration of a trial, within which a plant must come up and stay for a second.
         substeps: Runge-Kutta steps per sample.
+        late: share of a sample by which motors act later than the hardware's whole number of samples.
         seed: seed of the sets, the starts and the noise.
         recover: "plans" for a law that plans again from where a push leaves the plant, or "swing-up".
 
@@ -112,7 +120,7 @@ def tune(
             way = make(upright, layout, scales, seed)
             trial = trial_of(
                 lambda settings, way=way: estimator(way.controller(settings)), upright.model, layout, hardware,
-                seconds=seconds, substeps=substeps,
+                seconds=seconds, substeps=substeps, late=late,
             )  # fmt: skip
             results.append(_chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed))
         except InputError as error:
@@ -138,8 +146,8 @@ def _chosen(
     times = np.zeros((0, len(way.errors)))
     trials = 0
 
-    def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> np.ndarray:
-        """Returns times [set, error, start]; idle lanes repeat the first trials."""
+    def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns times and changes of the controls [set, error, start]; idle lanes repeat the first trials."""
         nonlocal trials
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
         count = len(chosen) * len(errors) * starts
@@ -148,14 +156,15 @@ def _chosen(
         drawn = layout.hanging + spread_of(layout) * random.normal(size=(starts, len(layout.joints)))
         keys = jax.random.split(jax.random.key(int(random.integers(2**31))), lanes)
         parts = jax.tree.map(lambda leaf: leaf[which], stacked)
-        result = program(parts, drawn[start_of], np.array(errors)[error_of], keys)
+        seconds, changes = program(parts, drawn[start_of], np.array(errors)[error_of], keys)
         trials += count
-        return np.asarray(result)[:count].reshape(len(chosen), len(errors), starts)
+        shape = len(chosen), len(errors), starts
+        return np.asarray(seconds)[:count].reshape(shape), np.asarray(changes)[:count].reshape(shape)
 
     for _ in range(ROUNDS):
         fresh = way.draw(random, sets)
         settings += fresh
-        times = np.concatenate([times, tried(fresh, way.errors, 1)[:, :, 0]])
+        times = np.concatenate([times, tried(fresh, way.errors, 1)[0][:, :, 0]])
         if np.isfinite(times).all(axis=1).sum() >= finalists:
             break
     good = np.isfinite(times).all(axis=1)
@@ -167,11 +176,13 @@ def _chosen(
         )
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(finalists, int(good.sum()))]
     starts = max(STARTS, lanes // (finalists * len(ERRORS)))
-    final = tried([settings[k] for k in best], ERRORS, starts)
+    final, changes = tried([settings[k] for k in best], ERRORS, starts)
     margins = np.array([_margin(np.isfinite(one).all(axis=1)) for one in final])
     share = np.isfinite(final).mean(axis=(1, 2))
     nominal = np.median(final[:, 0], axis=1)
-    choice = int(np.lexsort((nominal, -share, -margins))[0])
+    equal = (margins == margins.max()) & (share >= share[margins == margins.max()].max())
+    slow = nominal > SLOWER * nominal[equal].min()
+    choice = int(np.lexsort((np.median(changes[:, 0], axis=1), slow, ~equal))[0])
     if margins[choice] < 0:
         raise InputError(
             f"of {trials} trials by {way.name}, no set of numbers brings all {starts} starts up at the model's own "
@@ -194,23 +205,29 @@ def trial_of(
     *,
     seconds: float,
     substeps: int,
-) -> Callable[[Any, Array, Array, Array], Array]:
-    """Returns (traced settings, start [d], error of the model, key) -> time in s until the goal, infinite if never."""
+    late: float,
+) -> Callable[[Any, Array, Array, Array], tuple[Array, Array]]:
+    """Returns (traced settings, start [d], error of the model, key) -> (seconds, changes).
+
+    The time until the goal is infinite if the plant does not stay there; the changes of the controls from sample to
+    sample are root mean squares over the last second, relative to the limits.
+    """
     B, d = layout.actuation, len(layout.joints)
     lower, upper = layout.limits.control.T
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
     angles = np.array([kind == "revolute" for kind in layout.joints])
     has_limits = np.isfinite(layout.limits.position).any() or np.isfinite(layout.limits.rate).any()
 
-    def trial(settings: Any, start: Array, wrong: Array, key: Array) -> Array:
+    def trial(settings: Any, start: Array, wrong: Array, key: Array) -> tuple[Array, Array]:
         def field(x: Array, u: Array) -> Array:
             q, qd = jnp.split(x, 2)
             weight = model.inverse_dynamics(q, jnp.zeros(d), jnp.zeros(d))
             tau = (1 + wrong) * (B @ u) + WEIGHT * wrong * weight
             return jnp.concatenate([qd, model.forward_dynamics(q, qd, tau)])
 
+        later = _late(controller(settings), jnp.minimum(late + LATE * (wrong > 0), 1.0), lower, upper)
         run = simulate(
-            field, controller(settings), jnp.concatenate([start, jnp.zeros(d)]), seconds=seconds, rate=layout.rate,
+            field, later, jnp.concatenate([start, jnp.zeros(d)]), seconds=seconds, rate=layout.rate,
             controls=B.shape[1], hardware=limited, key=key, substeps=substeps,
         )  # fmt: skip
         off = jax.vmap(lambda x: error(x[:d], layout.goal, layout.joints))(run.x)
@@ -223,9 +240,22 @@ def trial_of(
             low, high = layout.limits.position.T
             fine &= jnp.all((jnp.minimum(q, ahead) >= low) & (jnp.maximum(q, ahead) <= high))
             fine &= jnp.all(jnp.abs(qd) <= layout.limits.rate)
-        return jnp.where(fine, last, jnp.inf)
+        changes = jnp.diff(run.u[-round(HELD * layout.rate) :], axis=0) / (upper - lower)
+        return jnp.where(fine, last, jnp.inf), jnp.sqrt(jnp.mean(changes**2))
 
     return trial
+
+
+def _late(controller: Controller, share: Array, lower: np.ndarray, upper: np.ndarray) -> Controller:
+    """Returns a controller whose controls act late by a share of a sample: their mean over the sample is the same."""
+
+    def act(memory: Any, t: Array, y: Array) -> tuple[Any, Array]:
+        inner, before = memory
+        inner, u = controller.act(inner, t, y)
+        u = jnp.clip(u, lower, upper)
+        return (inner, u), (1 - share) * u + share * before
+
+    return Controller((controller.start, jnp.zeros(len(lower))), act)
 
 
 def _margin(succeeded: np.ndarray) -> float:

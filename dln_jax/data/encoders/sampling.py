@@ -126,3 +126,22 @@ def _step(channel: np.ndarray) -> float:
     multiples = distances / smallest
     # Rounding in the log moves levels slightly.
     return smallest if np.mean(np.abs(multiples - np.round(multiples)) < 0.05) > 0.99 else 0.0
+
+
+def delayed(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.ndarray, "N k"]:
+    """Returns the mean over the step after every sample of values that are held, and act late by a number of samples.
+
+    What was held before the first sample is zero.
+
+    Args:
+        samples: need not be a whole number.
+
+    Raises:
+        InputError: the delay is negative or not finite.
+    """
+    if not 0 <= samples < np.inf:
+        raise InputError(f"delay is {samples}; expected a number of samples, 0 or more")
+    whole = int(samples)
+    share = samples - whole
+    held = np.concatenate([np.zeros((whole + 1, values.shape[1])), values])[: len(values) + 1]
+    return (1 - share) * held[1:] + share * held[:-1]

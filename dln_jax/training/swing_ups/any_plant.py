@@ -73,16 +73,18 @@ def learn_to_swing_up(
     keep(explored)
     prepared = prepare(recording, chain=True)
     fitted = identified_chain(prepared, plant.layout.needs)
-    say(f"learned: controls {prepared.delay} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
+    say(f"learned: controls {prepared.delay:.3g} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     B = plant.layout.actuation
     process = from_log(fitted.dynamics, recording, actuation=B, delay=prepared.delay).process
     band = np.asarray(process.disturbance)
     # What the model does not explain of the driven joints acts as noise of the motors in the trials.
-    hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=prepared.delay)
+    hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=int(prepared.delay))
     wide = process._replace(disturbance=BAND * band)
     make = estimator_of(estimator, plant.layout, wide, delay=prepared.delay)
-    tuned = tune(fitted.dynamics, plant.layout, hardware, estimator=make, seed=seed, recover=recover)
+    tuned = tune(
+        fitted.dynamics, plant.layout, hardware, estimator=make, late=prepared.delay % 1, seed=seed, recover=recover
+    )
     say(
         f"tuned by {tuned.way}: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin "
         f"{tuned.margin:.0%}, up in {tuned.seconds:.2f} s"
