@@ -148,7 +148,7 @@ def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> flo
         late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
         return fit_momentum(model, late, noise=unit).residual ** 2
 
-    tried = {float(delay): misfit(delay) for delay in range(most + 1)}
+    tried = {delay: misfit(delay) for delay in map(float, range(most + 1))}
     first = max(min(tried, key=tried.__getitem__) - 0.5, 0.0)
     below, centre, above = (tried[at] if at in tried else misfit(at) for at in (first, first + 0.5, first + 1.0))
     bend = below - 2 * centre + above

@@ -7,6 +7,8 @@ import pytest
 
 from dln_jax.control.desktop_plants import desktop_plant, model_of_plant, simulated_plant
 from dln_jax.control.plants import Exploration, explore
+from dln_jax.control.plants.simulated import simulated
+from dln_jax.control.state_space import field_of, integrated
 from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
 from dln_jax.learning.recordings import identified, identified_chain, learned, prepare
 from dln_jax.models.trigonometric import make_trigonometric
@@ -33,6 +35,23 @@ def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
     assert len(np.unique(prepared.train.trajectory)) == 5 and len(np.unique(prepared.validation.trajectory)) == 1
     left = deviations(TRUTH, cut_momentum_windows(prepared.train))
     assert (left < 0.02 * prepared.train.tau[:, 0].std()).all()
+
+
+@pytest.mark.slow
+def test_a_delay_between_samples_is_found():
+    """Motors follow after one sample and a half, so that two commands act within every sample."""
+    half = jax.jit(integrated(field_of(TRUTH, PLANT.layout.actuation), 0.5 / PLANT.layout.rate))
+    state, before = [np.zeros(4)], [np.zeros(1)]
+
+    def begin(q):
+        state[0], before[0] = np.concatenate([q, np.zeros(2)]), np.zeros(1)
+
+    def advance(u):
+        state[0], before[0] = np.asarray(half(half(state[0], before[0]), u)), u
+
+    plant = simulated(PLANT.layout, begin, lambda: state[0][:2], advance, hardware=PLANT.hardware._replace(delay=1))
+    recorded = explore(plant, lambda _: TRUTH, Exploration(seconds=12.0)).recording
+    assert prepare(recorded).delay == pytest.approx(1.5, abs=0.1)
 
 
 def test_identified_inertias_and_friction_are_the_plant_s(prepared):

@@ -157,7 +157,7 @@ def store(folder: Path, got: Obtained) -> None:
 def summarise(task: SwingUpTask, got: Obtained, metrics: dict[str, float]) -> None:
     """Prints the results."""
     if got.prepared is not None:
-        late = f"torques {got.prepared.delay} sample(s) late, q filtered at {got.prepared.cutoff:.0f} Hz"
+        late = f"torques {got.prepared.delay:.3g} sample(s) late, q filtered at {got.prepared.cutoff:.0f} Hz"
         print(f"{task.model}: learned in {got.seconds:.0f} s; {late}")
     print(
         f"nMSE of motions not seen: torque {metrics['torque_nmse']:.2e}, acceleration "

@@ -10,6 +10,7 @@ from dln_jax.control import Hardware, simulate, stateless
 from dln_jax.control.desktop_plants import desktop_rotary_pendulum, model_of_plant, try_starts
 from dln_jax.control.estimate import belief, extended, filtered, mechanical, with_estimate
 from dln_jax.control.plants.estimators import by_filter
+from dln_jax.control.state_space import integrated
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.scenes import cart_pole
@@ -85,6 +86,27 @@ def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effec
     np.testing.assert_allclose(run.u[delay:], asked[delay:], rtol=0, atol=1e-5)
 
 
+def test_a_law_behind_half_a_sample_acts_on_the_state_half_a_sample_later():
+    sharp = PROCESS._replace(noise=np.array([1e-7, 1e-7]), disturbance=np.array([1e-6, 1e-6]))
+    exact = belief([0.0, np.pi, 0.0, 0.0], 1e-6)
+    controller = with_estimate(ASKED, extended(sharp), exact, controls=1, measurements=2, delay=0.5)
+
+    def field(x, u):
+        return jnp.concatenate([x[2:], MODEL.forward_dynamics(x[:2], x[2:], B @ u)])
+
+    half = jax.jit(integrated(field, 0.005))
+    act = jax.jit(controller.act)
+    memory, x, u = controller.start, np.asarray(exact.x), np.zeros(1)
+    errors = []
+    for number in range(50):
+        memory, asked = act(memory, number / 100.0, x[:2])
+        x = half(x, u)  # the control of the sample before still acts
+        errors.append(asked[0] - ASKED.act((), jnp.zeros(()), x)[1][0])
+        x, u = half(x, asked), asked
+    # The plant knows when the control changes; the filter knows the mean over the sample.
+    assert np.abs(errors).max() < 2e-3
+
+
 def test_a_failed_measurement_is_not_hidden():
     controller = with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2)
     _, u = replayed(controller, measurements(6).at[3, 1].set(jnp.nan))
@@ -94,6 +116,8 @@ def test_a_failed_measurement_is_not_hidden():
 def test_wrong_numbers_of_samples_are_refused():
     with pytest.raises(InputError, match="late is"):
         with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, late=(1, -1))
+    with pytest.raises(InputError, match=r"delay is -0\.5; expected a number of samples"):
+        with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, delay=-0.5)
     with pytest.raises(InputError, match="every is 0"):
         with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, every=0)
 

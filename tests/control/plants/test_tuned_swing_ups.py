@@ -1,10 +1,11 @@
 """Gains come from the scales of a model and from trials, and a plant that none of them swings up is refused."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.closed_loop import Hardware
+from dln_jax.control.closed_loop import Hardware, stateless
 from dln_jax.control.plants import (
     Exploration,
     compiled,
@@ -17,6 +18,7 @@ from dln_jax.control.plants import (
     tune,
 )
 from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of, swing_up_numbers
+from dln_jax.control.plants.tuning import trial_of
 from dln_jax.control.swing_up import upright_of
 from dln_jax.learning.recordings import identified_chain, prepare
 from dln_jax.mechanics.equations import dynamics
@@ -98,6 +100,27 @@ def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
     act = compiled(tuned.controller, plant)
     trials = judged_runs(run(plants, act, start_of(tuned.controller, 4), seconds=6.0), plant, seconds=6.0)
     assert trials.up.all() and not trials.stopped
+
+
+def test_trials_with_motors_a_whole_sample_late_are_those_of_hardware_with_that_delay():
+    plant = rail()
+    asked = stateless(lambda x: 3.0 * jnp.cos(5 * x[:1] + x[1:2]))
+
+    def trial(delay, late):
+        made = trial_of(
+            lambda _: asked,
+            model(),
+            plant,
+            Hardware(delay=delay, encoder_noise=1e-4),
+            seconds=2.0,
+            substeps=1,
+            late=late,
+        )
+        return made((), jnp.array([0.0, 0.1]), jnp.array(0.0), jax.random.key(0))
+
+    changes, of_late_motors, between = (float(trial(*late)[1]) for late in ((1, 0.0), (0, 1.0), (0, 0.5)))
+    assert of_late_motors == pytest.approx(changes, rel=1e-9)
+    assert abs(between / changes - 1) > 1e-6
 
 
 @pytest.mark.slow
