@@ -42,8 +42,8 @@ from dln_jax.types import InputError, require_positive
 
 ROUNDS, SETTLED = 12, 1e-4
 """Largest number of linearisations, and the relative decrease of the sum at which they stop."""
-CHUNK = 64
-"""Windows that are linearised at a time."""
+CHUNK = 16
+"""Windows that are linearised at a time; the last ones are filled up to this number."""
 REWEIGHTINGS = 2
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""

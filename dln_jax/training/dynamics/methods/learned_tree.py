@@ -74,6 +74,7 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
     print(f"learned tree: {size}condition {solution.condition:.3g}")
     task, parameters = task._replace(search=solution), solution.parameters
     if getattr(options, "refine", None) == "motions":
+        print("refining bodies and friction by motions, on these axes; inner splits choose the length of the windows")
         refinement = refined_by_motions(needs, task.description, task.sets, parameters)
         task, parameters = task._replace(refinement=refinement), refinement.parameters
     training = training_of(task, parameters, solution.torque_mse, solution.seconds)
