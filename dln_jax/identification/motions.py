@@ -45,6 +45,10 @@ ROUNDS, SETTLED = 12, 1e-4
 CHUNK = 16
 """Windows that are linearised at a time; the last ones are filled up to this number."""
 REWEIGHTINGS = 2
+STABLE = 2.785
+"""Largest product of time step and damping at which a classical Runge-Kutta step is stable."""
+MOST_GROWTH = 1e6
+"""Largest growth of deviations along a window that leaves its derivatives a few digits."""
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""
 TYPICAL_DELAY = 1e-3
@@ -154,6 +158,41 @@ def distances(
     return noise
 
 
+@functools.lru_cache(maxsize=4)
+def _damping(model: Model) -> Callable[..., Array]:
+    """(theta [P], q [n, T, d], qd [n, T, d], tau [n, T, d]) -> d qdd / d qd [n, T, d, d]."""
+    like = jax.eval_shape(model.init, jax.random.key(0))
+
+    def slopes(theta: Array, q: Array, qd: Array, tau: Array) -> Array:
+        system = dynamics(model.energies(unravelled(theta, like)))
+        return jax.jacfwd(lambda qd: system.forward_dynamics(q, qd, tau))(qd)
+
+    along = jax.vmap(jax.vmap(slopes, in_axes=(None, 0, 0, 0)), in_axes=(None, 0, 0, 0))
+    return jax.jit(along, compiler_options=quick_compilation())
+
+
+def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: MotionWindows) -> None:
+    """Raises `InputError` if derivatives of most windows grow without bound, as with steep dry friction near rest.
+
+    A classical Runge-Kutta step multiplies a deviation that decays as exp(-z) by 1 - z + z²/2 - z³/6 + z⁴/24, which
+    exceeds one for z > 2.785. The motions themselves may stay finite.
+    """
+    step = float(np.median(np.diff(windows.t, axis=1)[windows.weight[:, 1:] > 0]))
+    rows = np.linspace(0, len(windows.t) - 1, CHUNK).astype(int)  # one shape, so one program
+    with jax.enable_x64(True):
+        states = (jnp.asarray(array[rows]) for array in (windows.q, windows.qd, windows.tau))
+        damping = np.asarray(_damping(model)(jnp.asarray(theta), *states))
+    if not np.isfinite(damping).all():
+        return  # the motions are not finite either, which has a message of its own
+    z = step * np.abs(np.linalg.eigvals(damping)).max(axis=-1)
+    growth = np.prod(np.maximum(np.abs(1 - z + z**2 / 2 - z**3 / 6 + z**4 / 24), 1.0), axis=1)
+    if np.median(growth) > MOST_GROWTH:
+        raise InputError(
+            f"friction acts up to {z.max() / STABLE:.3g} times faster than the log's step of {step:.3g} s resolves; "
+            "record faster or decimate less, or state a larger --velocity-scale"
+        )
+
+
 def fit_motions(
     model: Model,
     columns: Columns,
@@ -184,9 +223,11 @@ def fit_motions(
         reweightings: number of times that windows are weighted by their distance and the fit is repeated.
 
     Raises:
-        InputError: a noise or share that is not positive, or a start whose motions are not finite.
+        InputError: a noise or share that is not positive, motions too stiff for their time step, or a start whose
+            motions are not finite.
     """
     require_positive(share=share, noise_tau=float(np.min(noise_tau)))
+    _require_resolved(model, start, windows)
     linearised = linearise(model)
     if noise_q is None:
         noise_q = distances(linearised, start, noise_tau, windows)

@@ -69,13 +69,16 @@ class Chosen(NamedTuple):
     """Length of the windows, s; `None` keeps the parameters fitted to torques."""
     seconds: dict[str, float]
     """Mean valid prediction time on inner held-out motions, by "torques" and length; empty without inner splits."""
+    left_out: str = ""
+    """Why lengths were left out."""
 
     @property
     def line(self) -> str:
         """The choice and its reason, as text."""
         shown = ", ".join(f"{name} {value:.3g} s" for name, value in self.seconds.items())
         kept = "parameters by torques" if self.window is None else f"windows of {self.window:g} s"
-        return f"chosen by inner splits of the training data: {kept} (prediction times: {shown})"
+        others = f"; other lengths were left out: {self.left_out}" if self.left_out else ""
+        return f"chosen by inner splits of the training data: {kept} (prediction times: {shown}){others}"
 
 
 def fit_by(
@@ -136,6 +139,7 @@ def chosen_window(
         train, motions = (in_blocks(part, 2 * FOLDS) for part in (train, motions))
     present, variance = np.unique(motions.trajectory), spread_of(motions)
     times: dict[float | None, list[np.ndarray]] = {window: [] for window in (*WINDOWS, None)}
+    reason = ""
     for fold in range(min(FOLDS, len(present))):
         rest = np.delete(present, slice(fold, None, FOLDS))
         inner, moved, held = select(train, rest), select(motions, rest), select(motions, present[fold::FOLDS])
@@ -144,13 +148,16 @@ def chosen_window(
         for window in [window for window in WINDOWS if window in times]:
             try:
                 thetas[window] = fitted(by, model, solution, inner, moved, window, known=known, reweightings=0).theta
-            except InputError:
+            except InputError as error:
                 del times[window]
+                reason = str(error)
         for window, theta in thetas.items():
             times[window].append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
     means = {window: float(np.mean(np.concatenate(parts))) for window, parts in times.items()}
     best = max(means, key=lambda window: means[window])
-    return Chosen(best, {"torques" if window is None else f"{window:g} s": mean for window, mean in means.items()})
+    return Chosen(
+        best, {"torques" if window is None else f"{window:g} s": mean for window, mean in means.items()}, reason
+    )
 
 
 def spread_of(*data: Trajectories) -> Float[np.ndarray, " d"]:

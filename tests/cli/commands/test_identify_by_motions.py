@@ -19,6 +19,7 @@ from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.public import dynamics
+from dln_jax.types import InputError
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 URDF = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.2"/><mass value="1"/>
@@ -81,6 +82,12 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
     )
     assert fit.converged and fit.after < 0.1 * fit.before
     assert fit.theta[-1] == pytest.approx(0.1, abs=0.01)
+    stiff = theta.copy()
+    stiff[-1] = 100.0  # decays at 100 / 0.06 1/s, and a Runge-Kutta step of 10 ms is stable up to 278.5 1/s
+    with pytest.raises(
+        InputError, match=r"friction acts up to 5\.98 times faster than the log's step of 0\.01 s resolves"
+    ):
+        fit_motions(model, columns_of(known), stiff, stiff, windows, noise_tau=scales[1])
 
 
 @pytest.mark.slow
