@@ -43,12 +43,12 @@ from dln_jax.types import InputError, require_positive
 ROUNDS, SETTLED = 12, 1e-4
 """Largest number of linearisations, and the relative decrease of the sum at which they stop."""
 CHUNK = 16
-"""Windows that are linearised at a time; the last ones are filled up to this number."""
+"""Number of windows that are linearised at a time; the last chunk is padded to it."""
 REWEIGHTINGS = 2
 STABLE = 2.785
 """Largest product of time step and damping at which a classical Runge-Kutta step is stable."""
 MOST_GROWTH = 1e6
-"""Largest growth of deviations along a window that leaves its derivatives a few digits."""
+"""Growth of deviations along a window above which its derivatives have too few correct digits."""
 SHORTEST_STEP = 1 / 64
 """Fraction of a step below which the search ends."""
 TYPICAL_DELAY = 1e-3

@@ -28,7 +28,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
 
 WHOLE = 0.05
-"""Distance from a whole number of samples within which an estimated delay is that number."""
+"""Distance from a whole number of samples within which an estimated delay is rounded."""
 
 
 class MomentumWindows(NamedTuple):
@@ -130,8 +130,8 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
 def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> float:
     """Estimates the delay of torques in samples by the smallest residual of a model that is linear in its parameters.
 
-    The square of the residual is taken for a parabola around the best whole number, because the commands of hardware
-    act between samples. An estimate that is within `WHOLE` of a whole number is that number.
+    A parabola through the squared residuals near the best whole number gives the fraction of a sample, because commands
+    of hardware may take effect between samples. Estimates within `WHOLE` of a whole number are rounded to it.
 
     Args:
         model: model that is linear in its parameters, such as `models.make_trigonometric`.

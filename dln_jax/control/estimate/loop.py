@@ -81,7 +81,7 @@ def with_estimate(
     rows = depth - lag, np.arange(measurements)
 
     def acting(u: Array) -> Array:
-        """Means of the controls over steps, of which the last share of a sample belongs to the control before."""
+        """Returns the mean control over each step: the previous control still acts during the first `share` of it."""
         return (1 - share) * u[1:] + share * u[:-1] if share else u
 
     def act(memory: Estimating, t: Array, y: Array) -> tuple[Estimating, Array]:

@@ -39,8 +39,8 @@ ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 WEIGHT = 0.125
 """Relative error of gravity, divided by that of the motors' strength."""
 LATE = 0.5
-"""Share of a sample by which motors act later than estimated: a law may take longer to compute than those of the
-recording."""
+"""Additional delay of stronger motors, in samples: the law may take longer to compute than the one that was active
+during the recording."""
 SLOWER = 1.5
 """Largest time to the goal of the chosen set, divided by that of the fastest with its margin."""
 STARTS = 2
@@ -247,7 +247,7 @@ def trial_of(
 
 
 def _late(controller: Controller, share: Array, lower: np.ndarray, upper: np.ndarray) -> Controller:
-    """Returns a controller whose controls act late by a share of a sample: their mean over the sample is the same."""
+    """Returns a controller whose commands act late by a share of a sample, as their mean over each sample."""
 
     def act(memory: Any, t: Array, y: Array) -> tuple[Any, Array]:
         inner, before = memory

@@ -129,9 +129,9 @@ def _step(channel: np.ndarray) -> float:
 
 
 def delayed(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.ndarray, "N k"]:
-    """Returns the mean over the step after every sample of values that are held, and act late by a number of samples.
+    """Delays held values by a number of samples, and returns their mean over the step that follows each sample.
 
-    What was held before the first sample is zero.
+    Values before the first sample are zero.
 
     Args:
         samples: need not be a whole number.
