@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dln_jax.data.encoders import smooth
 from dln_jax.data.encoders.sampling import delayed
@@ -27,8 +27,8 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
 
-WHOLE = 0.05
-"""Distance from a whole number of samples within which an estimated delay is rounded."""
+SURE = 4.0
+"""Distance of an estimated delay from a whole number, in standard errors, up to which it is rounded."""
 
 
 class MomentumWindows(NamedTuple):
@@ -39,6 +39,7 @@ class MomentumWindows(NamedTuple):
     impulse: Float[np.ndarray, "W d"]
     """Integral of w tau dt, N m or N: a mean torque if the integral of w is 1."""
     dt: float
+    trajectory: Int[np.ndarray, " W"]
 
 
 def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> MomentumWindows:
@@ -56,7 +57,8 @@ def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> Momen
         raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
     chosen = np.stack(rows)
     w, _ = window_weights(steps, dt)
-    return MomentumWindows(data.q[chosen], data.qd[chosen], np.einsum("s,wsd->wd", w, data.tau[chosen]), dt)
+    impulse = np.einsum("s,wsd->wd", w, data.tau[chosen])
+    return MomentumWindows(data.q[chosen], data.qd[chosen], impulse, dt, np.asarray(data.trajectory[chosen[:, 0]]))
 
 
 def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt: float) -> Array:
@@ -127,16 +129,31 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     return data._replace(tau=acting)
 
 
-def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> float:
-    """Estimates the delay of torques in samples by the smallest residual of a model that is linear in its parameters.
+class _Share(NamedTuple):
+    """Share of the step between two whole delays."""
 
-    A parabola through the squared residuals near the best whole number gives the fraction of a sample, because commands
-    of hardware may take effect between samples. Estimates within `WHOLE` of a whole number are rounded to it.
+    share: float
+    error: float
+    """Standard error of the share."""
+    squares: float
+    """Sum of the squared residuals with this share."""
+
+
+def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> float:
+    """Estimates the delay of torques in samples: that with the smallest residuals of a model linear in its parameters.
+
+    Commands of hardware may take effect between samples. The fitted equations' residuals r are linear in the torques:
+    between the whole delays k and k + 1,
+
+        r = r_k - s D,    D = r_k - r_{k+1},    s = r_k . D / D . D
+
+    The episodes' parts of r . D give the standard error of s. A delay within `SURE` standard errors of a whole number
+    is rounded to it.
 
     Args:
         model: model that is linear in its parameters, such as `models.make_trigonometric`.
         recording: q and the commanded torques.
-        most: largest delay that is tried; the smallest is 0.
+        most: largest whole delay that is tried; the smallest is 0.
 
     Raises:
         InputError: as for `smooth` and `fit_momentum`.
@@ -144,13 +161,27 @@ def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> flo
     smoothed = smooth(recording)
     unit = np.asarray(torque_scale(smoothed.data))
 
-    def misfit(delay: float) -> float:
+    def errors(delay: int) -> np.ndarray:
         late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
-        return fit_momentum(model, late, noise=unit).residual ** 2
+        return fit_momentum(model, late, noise=unit).errors / unit
 
-    tried = {delay: misfit(delay) for delay in map(float, range(most + 1))}
-    first = max(min(tried, key=tried.__getitem__) - 0.5, 0.0)
-    below, centre, above = (tried[at] if at in tried else misfit(at) for at in (first, first + 0.5, first + 1.0))
-    bend = below - 2 * centre + above
-    delay = first + 0.5 + float(np.clip(0.25 * (below - above) / bend if bend > 0 else 0.0, -0.5, 0.5))
-    return float(round(delay)) if abs(delay - round(delay)) < WHOLE else delay
+    of_delays = [errors(whole) for whole in range(most + 1)]
+    episode = cut_momentum_windows(smoothed.data).trajectory
+    found = [_between(of_delays[k], of_delays[k + 1], episode) for k in range(most)]
+    best = min(range(most), key=lambda k: found[k].squares)
+    delay = best + found[best].share
+    return float(round(delay)) if abs(delay - round(delay)) < SURE * found[best].error else delay
+
+
+def _between(
+    earlier: Float[np.ndarray, "W d"], later: Float[np.ndarray, "W d"], episode: Int[np.ndarray, " W"]
+) -> _Share:
+    """Returns the share with the smallest residuals; its error is infinite if all windows are of one episode."""
+    change = earlier - later
+    total = float(np.sum(change**2)) or np.inf
+    share = float(np.clip(np.sum(earlier * change) / total, 0.0, 1.0))
+    left = earlier - share * change
+    # Windows of one episode share their errors, so that each episode counts once.
+    parts = [np.sum((left * change)[episode == one]) for one in np.unique(episode)]
+    error = np.sqrt(np.sum(np.square(parts)) * len(parts) / (len(parts) - 1)) / total if len(parts) > 1 else np.inf
+    return _Share(share, float(error), float(np.sum(left**2)))

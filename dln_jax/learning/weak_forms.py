@@ -60,6 +60,8 @@ class WeakFit(NamedTuple):
     """Mean over windows of the squared error of the mean torque, summed over joints, or of the power; (N m)² or W²."""
     residual: float
     """Root of the sum of squares of all equations, divided by the deviations of the noise [1]."""
+    errors: Float[np.ndarray, "W k"]
+    """Error of every window's mean torques, N m or N, or of its power, W."""
 
 
 class Form(NamedTuple):
@@ -118,15 +120,16 @@ def fit_form(
         raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
     weighted = (((A / unit[..., None]).reshape(b.size, -1), (b / unit).ravel()) for A, b, unit in equations)
     solution = least_squares.solve_chunks(weighted, **tolerances)
-    squares = sum(float(np.sum((A @ solution.x - b) ** 2)) for A, b, _ in equations)
+    errors = np.concatenate([A @ solution.x - b for A, b, _ in equations])
     return WeakFit(
         parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), unravelled(solution.x, like), like),
         parameter_count=solution.x.size,
         rank=solution.rank,
         condition=solution.condition,
-        equations=sum(b.size for _, b, _ in equations),
-        mse=squares / sum(len(b) for _, b, _ in equations),
+        equations=errors.size,
+        mse=float(np.sum(errors**2)) / len(errors),
         residual=solution.residual,
+        errors=errors,
     )
 
 
