@@ -1,7 +1,7 @@
 """Swing-ups of plants that share no equation with this library, from 30 s of noisy data each, without a gain by hand.
 
 Three MJCF files of random sizes, an acrobot of Gymnasium with continuous torque, and a rotary pendulum of MuJoCo on a
-tilted base. Each function is all that a user has to write.
+tilted base. Each function is all that a user has to write. `chain_plants` and `urdf_plants` have more plants.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,8 @@ from dln_jax.control.plants.plant import Plant, layout
 from dln_jax.training.swing_ups.any_plant import SECONDS, learn_to_swing_up, try_plant
 from dln_jax.types import InputError
 from scripts.reports.case import Findings
+from scripts.reports.control.chain_plants import CHAIN_PLANTS
+from scripts.reports.control.urdf_plants import URDF_PLANTS
 from scripts.reports.rows import Row
 
 TURN = 2 * np.pi / 4096
@@ -95,9 +97,18 @@ PLANTS: dict[str, Callable[[int, int], Plant]] = {
 """(seed of the sizes, seed of the start and the noise) -> plant, by name."""
 
 
-def measured(name: str, sizes: int, quick: bool = False, *, say: Callable[[str], None] = lambda _: None) -> Findings:
+SUBJECTS: dict[str, dict[str, Callable[[int, int], Plant]]] = {
+    "foreign": PLANTS,
+    "chains": CHAIN_PLANTS,
+    "urdf": URDF_PLANTS,
+}
+
+
+def measured(
+    subject: str, name: str, sizes: int, quick: bool = False, *, say: Callable[[str], None] = lambda _: None
+) -> Findings:
     """Explores, learns, tunes and tries one plant."""
-    make, case = partial(PLANTS[name], sizes), f"foreign/{name}/{sizes}"
+    make, case = partial(SUBJECTS[subject][name], sizes), f"{subject}/{name}/{sizes}"
     starts = 10 if quick else STARTS
     try:
         learned = learn_to_swing_up(make(0), seed=sizes, say=say)
@@ -115,6 +126,7 @@ def measured(name: str, sizes: int, quick: bool = False, *, say: Callable[[str],
             Row(case, "tuning_trials", float(tuned.trials)),
             Row(case, "tuning_worked", tuned.worked),
             Row(case, "tuning_margin", tuned.margin),
+            Row(case, "delay", learned.prepared.delay, "samples"),
             Row(case, "episodes_stopped", float(len(learned.explored.stopped))),
             Row(case, "learning_seconds", learned.seconds, "s"),
         ]
@@ -122,6 +134,9 @@ def measured(name: str, sizes: int, quick: bool = False, *, say: Callable[[str],
 
 
 CASES: dict[str, Callable[[bool], Findings]] = {
-    f"foreign/{name}-{sizes}": partial(measured, name, sizes) for sizes in DRAWS for name in PLANTS
+    f"{subject}/{name}-{sizes}": partial(measured, subject, name, sizes)
+    for subject, plants in SUBJECTS.items()
+    for sizes in DRAWS
+    for name in plants
 }
 """Cases of the control report by name and draw of the sizes."""
