@@ -82,7 +82,8 @@ def report_cases(options: Any, command: str, cases: Sequence[Case], **facts: Any
         def show(done: Done) -> None:
             bound = [row.passed for row in done.findings.rows if row.passed is not None]
             passed = f"{sum(bound)}/{len(bound)} pass  " if bound else ""
-            print(f"{done.place}  {done.case.name:30s} {passed}{done.seconds:.1f} s", flush=True)
+            missed = "".join(f"  {one.quantity} {one.value:.4g}" for one in done.findings.rows if one.passed is False)
+            print(f"{done.place}  {done.case.name:30s} {passed}{done.seconds:.1f} s{missed}", flush=True)
             if getattr(options, "figures", True):
                 draw(folder, done.case, done.findings)
 
