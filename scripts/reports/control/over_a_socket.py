@@ -61,7 +61,10 @@ def connected(seed: int) -> Iterator[IO[str]]:
         try:
             assert process.stdout is not None
             with socket.create_connection(("127.0.0.1", int(process.stdout.readline()))) as connection:
-                yield connection.makefile("rw")
+                # Or TCP holds a short message back until the one before is acknowledged, for up to 40 ms.
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                with connection.makefile("rw") as lines:
+                    yield lines
         finally:
             process.terminate()
 

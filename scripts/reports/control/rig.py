@@ -36,6 +36,7 @@ def main() -> None:
     server = socket.create_server(("127.0.0.1", 0))
     print(server.getsockname()[1], flush=True)
     connection, _ = server.accept()
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     lines = connection.makefile("rw")
     q, v, torque = [0.0, math.pi + 0.05], [0.0, 0.0], 0.0
     commands: deque[tuple[float, float]] = deque()
