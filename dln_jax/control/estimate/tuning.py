@@ -20,7 +20,7 @@ from jax import Array
 from dln_jax.control.estimate.extended import extended
 from dln_jax.control.estimate.loop import filtered
 from dln_jax.control.estimate.process import Belief, Filter, Innovation, Process, belief, mechanical
-from dln_jax.data.encoders.sampling import delayed, noise_of, step_of, timing
+from dln_jax.data.encoders.sampling import delayed, even, noise_of, step_of, timing
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, Scalar
@@ -137,7 +137,7 @@ def from_log(
 
     Args:
         model: known or learned.
-        log: t, q and tau at equal steps.
+        log: t, q and tau, which are resampled to equal steps if they are not.
         actuation: matrix [d, m] of the process that is returned.
         substeps: integrator steps per sample.
         delay: samples after which the log's torques act.
@@ -155,8 +155,8 @@ def from_log(
     logs, numbers = [], np.unique(log.trajectory)
     samples = max(SAMPLES // len(numbers), 8)
     for number in numbers:
-        q, tau = (column[log.trajectory == number][:samples] for column in (log.q, log.tau))
-        tau = delayed(tau, float(delay))
+        t, q, tau = (column[log.trajectory == number][:samples] for column in (log.t, log.q, log.tau))
+        q, tau = np.hsplit(even(t, np.hstack([q, delayed(tau, float(delay))]), rate)[1], 2)
         start = np.concatenate([q[0], np.zeros_like(q[0])])
         deviation = np.concatenate([np.maximum(noise, step_of(log.q)), np.full(len(noise), FIRST_RATE)])
         logs.append((belief(start, deviation), jnp.asarray(q), jnp.asarray(tau)))

@@ -23,7 +23,7 @@ class Stopped(RuntimeError):
 def guarded(plant: Plant, *, late: float = LATE) -> Plant:
     """Wraps a plant so that it stops, with zero controls and `Stopped`, once it leaves its limits or answers wrongly.
 
-    Measured angles may be wrapped; those of the guarded plant are continuous.
+    Measured angles may be wrapped; those of the guarded plant are continuous. Its time is that of the last answer.
 
     Args:
         plant: any.
@@ -36,6 +36,7 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
     circular = np.array([kind == "revolute" for kind in layout.joints])
     seen: deque[tuple[float, np.ndarray]] = deque(maxlen=SPAN + 1)
     reason: list[str] = []
+    acted = [False]
 
     def stop(why: str) -> None:
         if not reason:
@@ -72,6 +73,7 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
     def reset() -> None:
         reason.clear()
         seen.clear()
+        acted[0] = False
         plant.reset()
         q = answer()
         if not np.isfinite(q).all():
@@ -88,9 +90,14 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
         q, t = answer(), plant.time()
         if not np.isfinite(q).all() or not math.isfinite(t):
             stop(f"the plant answers {q.tolist()} at the time {t}, which is not finite")
+        if acted[0] and t <= seen[-1][0]:
+            stop(
+                f"the plant's clock reads {t:.6g} s after {seen[-1][0]:.6g} s; expected it to advance with every sample"
+            )
         if t - seen[-1][0] > late / layout.rate:
             stop(f"an answer is {1e3 * (t - seen[-1][0]):.4g} ms after the last, more than {late:g} samples")
         seen.append((t, q))
+        acted[0] = False
         passed = t - seen[0][0]
         rates = (q - seen[0][1]) / passed if passed > 0 else np.zeros(d)
         if why := outside(q, rates):
@@ -107,5 +114,6 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
         if (u < limits.control[:, 0] - slack).any() or (u > limits.control[:, 1] + slack).any():
             stop(f"the controls are {u.tolist()}, outside {limits.control.tolist()}")
         plant.act(u)
+        acted[0] = True
 
-    return plant._replace(reset=reset, read=read, act=act)
+    return plant._replace(reset=reset, read=read, act=act, time=lambda: seen[-1][0] if seen else plant.time())

@@ -27,6 +27,7 @@ class PlantRun(NamedTuple):
     """Measurements and commands of N samples; fewer than asked for if the plant was stopped."""
 
     t: Float[np.ndarray, " N"]
+    """Times of the measurements by the plant's clock, from the first one on, s: hardware is never exactly on time."""
     y: Float[np.ndarray, "N d"]
     u: Float[np.ndarray, "N m"]
     """Commands, within the limits."""
@@ -66,7 +67,8 @@ def run(
     layout, safe = plants[0].layout, [guarded(plant) for plant in plants]
     d, m = layout.actuation.shape
     samples, count = round(seconds * layout.rate), len(plants)
-    y, u, t = np.zeros((samples, count, d)), np.zeros((samples, count, m)), np.arange(samples) / layout.rate
+    y, u, times = np.zeros((samples, count, d)), np.zeros((samples, count, m)), np.zeros((samples, count))
+    t = np.arange(samples) / layout.rate
     lengths, reasons = np.full(count, samples), [""] * count
     # Compile before a clock runs, or answers would be seconds late. The second call has the types of later memories.
     like = jnp.asarray(np.tile(np.asarray(layout.hanging, float), (count, 1)))
@@ -74,12 +76,17 @@ def run(
     for plant in safe:
         plant.reset()
     going = list(range(count))
+
+    def measure(k: int, i: int) -> None:
+        y[k, i] = safe[i].read()
+        times[k, i] = safe[i].time()
+
     try:
         for k in range(samples):
             if push is not None and k == round(push.seconds * layout.rate):
                 for i in going:
                     plants[i].kick(np.asarray(push.rates, float))  # type: ignore[misc]
-            going = _each(going, k, lengths, reasons, lambda i: y[k].__setitem__(i, safe[i].read()))  # noqa: B023
+            going = _each(going, k, lengths, reasons, lambda i: measure(k, i))  # noqa: B023
             if not going:
                 break
             memories, controls = act(memories, t[k], jnp.asarray(y[k]))
@@ -88,7 +95,7 @@ def run(
     finally:  # also after an interrupt
         for i in going:
             plants[i].act(np.zeros(m))
-    return [PlantRun(t[:n], y[:n, i], u[:n, i], reasons[i]) for i, n in enumerate(lengths)]
+    return [PlantRun(times[:n, i] - times[0, i], y[:n, i], u[:n, i], reasons[i]) for i, n in enumerate(lengths)]
 
 
 def _each(going: list[int], k: int, lengths: Any, reasons: list[str], do: Callable[[int], Any]) -> list[int]:
