@@ -1,6 +1,8 @@
 """Closed loop of plants that are callables: one plant, or several in step, which share every call of the controller."""
 
-from collections.abc import Callable, Sequence
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
@@ -82,20 +84,33 @@ def run(
         times[k, i] = safe[i].time()
 
     try:
-        for k in range(samples):
-            if push is not None and k == round(push.seconds * layout.rate):
-                for i in going:
-                    plants[i].kick(np.asarray(push.rates, float))  # type: ignore[misc]
-            going = _each(going, k, lengths, reasons, lambda i: measure(k, i))  # noqa: B023
-            if not going:
-                break
-            memories, controls = act(memories, t[k], jnp.asarray(y[k]))
-            u[k] = controls
-            going = _each(going, k, lengths, reasons, lambda i: safe[i].act(u[k, i]))  # noqa: B023
+        with _short_collections():
+            for k in range(samples):
+                if push is not None and k == round(push.seconds * layout.rate):
+                    for i in going:
+                        plants[i].kick(np.asarray(push.rates, float))  # type: ignore[misc]
+                going = _each(going, k, lengths, reasons, lambda i: measure(k, i))  # noqa: B023
+                if not going:
+                    break
+                memories, controls = act(memories, t[k], jnp.asarray(y[k]))
+                u[k] = controls
+                going = _each(going, k, lengths, reasons, lambda i: safe[i].act(u[k, i]))  # noqa: B023
     finally:  # also after an interrupt
         for i in going:
             plants[i].act(np.zeros(m))
     return [PlantRun(times[:n, i] - times[0, i], y[:n, i], u[:n, i], reasons[i]) for i, n in enumerate(lengths)]
+
+
+@contextmanager
+def _short_collections() -> Iterator[None]:
+    """Leaves the objects that are there out of garbage collections: to go through those of JAX can take samples."""
+    alone = not gc.get_freeze_count()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        if alone:
+            gc.unfreeze()
 
 
 def _each(going: list[int], k: int, lengths: Any, reasons: list[str], do: Callable[[int], Any]) -> list[int]:
