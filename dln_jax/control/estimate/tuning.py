@@ -145,21 +145,23 @@ def from_log(
     Raises:
         InputError: the log has no motion, or trajectories of fewer than eight samples.
     """
-    noise, rate = noise_of(log.q, log.trajectory), timing(log.t, log.trajectory).rate
+    rate, numbers = timing(log.t, log.trajectory).rate, np.unique(log.trajectory)
+    columns = np.hstack([log.q, log.tau])
+    parts = [even(log.t[rows], columns[rows], rate)[1] for rows in (log.trajectory == number for number in numbers)]
+    part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    noise = noise_of(np.concatenate(parts)[:, : log.q.shape[1]], part_of)
     if not (np.isfinite(noise).all() and (noise > 0).all()):
         raise InputError(
             f"the noise of q in the log is {noise.tolist()}; expected coordinates that move, in eight samples or more"
         )
     band = np.full(log.q.shape[1], 0.01 * max(float(np.ptp(log.tau)), 1e-300))
     first = mechanical(model, rate=rate, band=band, encoder_noise=noise, substeps=substeps)
-    logs, numbers = [], np.unique(log.trajectory)
-    samples = max(SAMPLES // len(numbers), 8)
-    for number in numbers:
-        t, q, tau = (column[log.trajectory == number][:samples] for column in (log.t, log.q, log.tau))
-        q, tau = np.hsplit(even(t, np.hstack([q, delayed(tau, float(delay))]), rate)[1], 2)
+    logs, samples = [], max(SAMPLES // len(numbers), 8)
+    for part in parts:
+        q, tau = np.hsplit(part[:samples], 2)
         start = np.concatenate([q[0], np.zeros_like(q[0])])
         deviation = np.concatenate([np.maximum(noise, step_of(log.q)), np.full(len(noise), FIRST_RATE)])
-        logs.append((belief(start, deviation), jnp.asarray(q), jnp.asarray(tau)))
+        logs.append((belief(start, deviation), jnp.asarray(q), jnp.asarray(delayed(tau, float(delay)))))
     result = tuned(first, logs)
     whole = mechanical(
         model, actuation, rate=rate, band=result.process.disturbance, encoder_noise=noise, substeps=substeps

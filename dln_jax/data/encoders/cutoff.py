@@ -48,6 +48,8 @@ RISES = 3.0
 """A spectrum of accelerations that exceeds its minimum by this factor at high frequencies is noise there."""
 GAP = 3.3
 """Widest gap between the lines of a periodic motion, as a ratio of frequencies: odd harmonics begin with 1 and 3."""
+SHALLOW = 30.0
+"""A spectrum of accelerations has a shallow minimum if its peak is less than this multiple of it."""
 FLAT = 4.0
 """Largest ratio between the thirds of the upper half of a spectrum for it to count as flat."""
 
@@ -85,7 +87,7 @@ def choose_cutoff(
     require_positive(rate=rate)
     f, spectrum = spectra(without_jumps(q, trajectory, noise), trajectory, rate=rate)
     white = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
-    floor = np.maximum(white, _rising(f, spectrum))
+    floor = np.maximum(white, _rising(f, spectrum, white))
     # The motion's spectrum S ends where the mean spectrum falls to the floor and stays there for more than a gap.
     seen = _mean(spectrum) >= SEEN * _mean(floor)
     hidden = np.cumsum(~_highest(seen, 1.0, GAP), axis=0) > 0
@@ -144,11 +146,15 @@ def _flat_top(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) ->
     return np.where(flat, levels.min(axis=0) / MEDIAN, 0.0)
 
 
-def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
+def _rising(
+    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], white: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "F d"]:
     """The part of a spectrum above the minimum of the acceleration power, if that rises up to half the rate; else zero.
 
     Forces of finite power make accelerations with a falling spectrum, so a rising one is noise, white or not: timing
-    jitter of a fraction of a step, for example, is noise proportional to the velocity.
+    jitter of a fraction of a step, for example, is noise proportional to the velocity. Zero, too, if the minimum is
+    shallow and the white floor explains the highest frequencies: what lies between is motion, such as that of motors
+    that chatter.
     """
     accelerations = f[:, None] ** 4 * _smoothed(spectrum)
     envelopes = _highest(f[:, None] ** 4 * _mean(spectrum), math.sqrt(1 / GAP), math.sqrt(GAP))
@@ -158,7 +164,10 @@ def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> F
         lowest, of_envelope = (peak + int(np.argmin(values[peak:])) for values in (power, envelope))
         if math.sqrt(GAP) * f[lowest] < f[of_envelope]:  # a gap
             lowest = of_envelope
-        if power[f > f[-1] / 2].min() > RISES * power[lowest]:
+        top = f > f[-1] / 2
+        explained = np.median(spectrum[top, channel]) < RISES * MEDIAN * white[channel]
+        shallow = power[peak] < SHALLOW * power[lowest]
+        if not (explained and shallow) and power[top].min() > RISES * power[lowest]:
             rising[lowest:, channel] = spectrum[lowest:, channel]
     return rising
 

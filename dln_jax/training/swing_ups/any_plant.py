@@ -80,7 +80,8 @@ def learn_to_swing_up(
     band = np.asarray(process.disturbance)
     # What the model does not explain of the driven joints acts as noise of the motors in the trials.
     hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=int(prepared.delay))
-    wide = process._replace(disturbance=BAND * band)
+    # The filter steps evenly: samples that are late are noise to it. The process has the noise at their own times.
+    wide = process._replace(disturbance=BAND * band, noise=np.maximum(np.asarray(process.noise), noise))
     make = estimator_of(estimator, plant.layout, wide, delay=prepared.delay)
     tuned = tune(
         fitted.dynamics, plant.layout, hardware, estimator=make, late=prepared.delay % 1, seed=seed, recover=recover

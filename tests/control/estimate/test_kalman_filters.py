@@ -160,20 +160,33 @@ def test_the_noise_of_a_log_is_found_by_its_likelihood():
     assert result.consistency == pytest.approx(1.0, abs=0.1)
 
 
-def test_from_a_log_the_step_of_its_encoders_is_the_noise():
-    scene = pendulum()
-    model = dln_jax.dynamics(scene.closed_form)
-    process = mechanical(model, rate=200.0, band=[0.1], encoder_step=0.01)
-    random, x, q = np.random.default_rng(0), jnp.array([0.5, 0.0]), []
+PENDULUM = dln_jax.dynamics(pendulum().closed_form)
+
+
+def pendulum_log(late, resolution):
+    """A log at 200 Hz with an encoder and a band of 0.1 N m; its 400 samples are late by some seconds."""
+    process = mechanical(PENDULUM, rate=200.0, band=[0.1], encoder_step=resolution)
+    random, x, q = np.random.default_rng(0), jnp.array([2.5, 0.0]), []
     tau, step = 0.5 * np.sin(0.07 * np.arange(400))[:, None], jax.jit(process.step)
     for number in range(400):
-        q.append(0.01 * np.round(x[:1] / 0.01))
+        q.append(resolution * np.round((x[:1] + late[number] * x[1:]) / resolution))
         x = step(x, tau[number], 0.1 * random.normal(size=1))
     absent = np.full((400, 1), np.nan)
-    log = Trajectories(np.arange(400) / 200.0, np.stack(q), absent, absent, tau, np.zeros(400, int), np.array(["a"]))
-    result = from_log(model, log)
+    t = np.arange(400) / 200.0 + late
+    return Trajectories(t, np.stack(q), absent, absent, tau, np.zeros(400, int), np.array(["a"]))
+
+
+def test_from_a_log_the_step_of_its_encoders_is_the_noise():
+    result = from_log(PENDULUM, pendulum_log(np.zeros(400), 0.01))
     assert 0.01 / np.sqrt(12) * 0.999 < result.process.noise[0] < 0.01
     assert 0.03 < result.process.disturbance[0] < 0.3
+
+
+def test_samples_that_are_late_do_not_look_like_noise_if_the_log_has_their_times():
+    log = pendulum_log(np.random.default_rng(1).uniform(0, 4e-3, 400), 1e-3)
+    of_times, of_even_times = (from_log(PENDULUM, one).process for one in (log, log._replace(t=np.arange(400) / 200)))
+    assert 1e-3 / np.sqrt(12) * 0.999 < of_times.noise[0] < 5e-4 and of_even_times.noise[0] > 2e-3
+    assert 0.03 < of_times.disturbance[0] < 0.3
 
 
 def test_a_process_without_noise_is_refused_in_one_line():

@@ -1,5 +1,7 @@
 """A plant stops at its limits and at wrong answers, with zero controls and a reason."""
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -38,8 +40,9 @@ class Puppet:
         ({"q": np.array([0.1, np.nan])}, "not finite"),
         ({"t": 0.031}, "an answer is 31 ms after the last"),
         ({"t": np.nan}, "not finite"),
+        ({"t": 0.0}, "expected it to advance with every sample"),
     ],
-    ids=["rail", "nan", "late", "clock"],
+    ids=["rail", "nan", "late", "clock", "standstill"],
 )
 def test_a_wrong_answer_stops_the_plant_with_zero_controls(change, reason):
     puppet = Puppet()
@@ -199,3 +202,18 @@ def test_an_interrupt_or_a_failure_of_the_law_leaves_the_motors_at_zero(failure)
     with pytest.raises(failure):
         run([plant], act, np.zeros(1), seconds=1.0)
     np.testing.assert_array_equal(np.ravel(puppet.commands), [1.0, 1.0, 1.0, 0.0])
+
+
+def test_a_run_states_the_times_of_the_answers_and_leaves_garbage_collection_as_it_was():
+    puppet, late = Puppet(), np.array([0.0, 2e-3, 0.0, 5e-3, 1e-3])
+    puppet.t = 7.0
+
+    def act(u):
+        number = len(puppet.commands) + 1
+        puppet.act(u)
+        puppet.t = 7.0 + 0.01 * number + late[number % len(late)]
+
+    plant = Plant(puppet.layout, lambda: None, lambda: puppet.q, act, lambda: puppet.t)
+    (result,) = run([plant], lambda memory, t, y: (memory, np.zeros((1, 1))), np.zeros(1), seconds=0.05)
+    np.testing.assert_allclose(result.t, 0.01 * np.arange(5) + late, atol=1e-12)
+    assert gc.get_freeze_count() == 0

@@ -143,6 +143,24 @@ def test_lines_of_a_periodic_motion_are_not_cut_off_though_only_noise_is_between
     assert error(None) < 1.25 * min(error(cutoff) for cutoff in np.geomspace(2.0, 100.0, 25))
 
 
+def test_motions_of_a_motor_that_chatters_are_not_cut_off():
+    """Accelerations have a shallow minimum at 5 Hz, and are as large from 20 to 60 Hz as below."""
+    rate, count, random = 500.0, 6000, np.random.default_rng(0)
+    f = np.fft.rfftfreq(count, 1 / rate)
+    density = np.interp(np.log(np.maximum(f, 0.1)), np.log([0.3, 0.5, 3, 5, 20, 60, 100]), [0, 1, 1, 0.25, 1, 1, 0])
+    spectrum = density * np.exp(2j * np.pi * random.uniform(size=len(f))) * np.sqrt(500 * rate * count / 2)
+    w = 2 * np.pi * np.maximum(f, f[1])
+    q, qd = (np.fft.irfft(part, count) for part in (-spectrum / w**2, spectrum / (1j * w)))
+    measured = (q + 4e-4 * random.normal(size=count))[:, None]
+    numbers = {"trajectory": np.zeros(count, int), "label": np.array(["run0"])}
+    data = schema.from_arrays({"t": np.arange(count) / rate, "q": measured, "tau": np.zeros((count, 1)), **numbers})
+
+    def error(cutoff):
+        return rms(smooth(data, cutoff, trim=1.0).data.qd[:, 0] - qd[500:-500])
+
+    assert error(None) < 1.25 * min(error(cutoff) for cutoff in np.geomspace(2.0, 150.0, 25))
+
+
 def test_rates_of_filtered_encoders_are_far_better_than_differences():
     arrays, qd, qdd = log()
     data = schema.from_arrays(arrays)
