@@ -73,13 +73,17 @@ def learn_to_swing_up(
     keep(explored)
     prepared = prepare(recording, chain=True)
     fitted = identified_chain(prepared, plant.layout.needs)
-    say(f"learned: controls {prepared.delay:.3g} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz")
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     B = plant.layout.actuation
     process = from_log(fitted.dynamics, recording, actuation=B, delay=prepared.delay).process
     band = np.asarray(process.disturbance)
     # What the model does not explain of the driven joints acts as noise of the motors in the trials.
     hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=int(prepared.delay))
+    unexplained = np.max(np.atleast_1d(hardware.control_noise) / (np.ptp(plant.layout.limits.control, axis=1) / 2))
+    say(
+        f"learned: controls {prepared.delay:.3g} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz, "
+        f"{unexplained:.1%} of the motors' limits unexplained"
+    )
     # The filter steps evenly: samples that are late are noise to it. The process has the noise at their own times.
     wide = process._replace(disturbance=BAND * band, noise=np.maximum(np.asarray(process.noise), noise))
     make = estimator_of(estimator, plant.layout, wide, delay=prepared.delay)
