@@ -167,10 +167,10 @@ def delay_of_torques(model: Model, recording: Trajectories, *, most: int) -> flo
 
     of_delays = [errors(whole) for whole in range(most + 1)]
     episode = cut_momentum_windows(smoothed.data).trajectory
-    found = [_between(of_delays[k], of_delays[k + 1], episode) for k in range(most)]
-    best = min(range(most), key=lambda k: found[k].squares)
-    delay = best + found[best].share
-    return float(round(delay)) if abs(delay - round(delay)) < SURE * found[best].error else delay
+    shares = [_between(of_delays[k], of_delays[k + 1], episode) for k in range(most)]
+    best = min(range(most), key=lambda k: shares[k].squares)
+    delay = best + shares[best].share
+    return float(round(delay)) if abs(delay - round(delay)) < SURE * shares[best].error else delay
 
 
 def _between(
