@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from scripts.reports.control.plan_problems import Planned, Steps, runge_kutta
+from scripts.reports.rival_modules import casadi
 
 
 class RivalPlan(NamedTuple):
@@ -23,6 +23,7 @@ class RivalPlan(NamedTuple):
 
 def ipopt(problem: Planned) -> Callable[[np.ndarray, np.ndarray], RivalPlan]:
     """Returns (states, controls) -> plan, with exact derivatives and default settings."""
+    ca = casadi()
     n, m, N = len(problem.x0), len(problem.limit), problem.steps
     X, U = ca.SX.sym("x", n, N + 1), ca.SX.sym("u", m, N)
     cost, g, low, high = ca.SX(0), [], [], []

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from scripts.reports.control.plan_problems import Planned, Steps, runge_kutta
+from scripts.reports.rival_modules import casadi
 
 COMPILED = {"jit": True, "compiler": "shell", "jit_options": {"flags": "-O1 -march=native", "compiler": "gcc"}}
 QUIET = {
@@ -47,6 +47,7 @@ def horizon(problem: Planned, residuals: Callable[..., list[Any]]) -> Horizon:
     n, m, N = len(problem.x0), len(problem.limit), problem.steps
     assert isinstance(problem.step, Steps)
     step = runge_kutta(*problem.step)
+    ca = casadi()
     X, U = [ca.SX.sym(f"x{k}", n) for k in range(N + 1)], [ca.SX.sym(f"u{k}", m) for k in range(N)]
     unknowns, roots, gaps, low, high = [], [], [], [], []
     for k in range(N + 1):
@@ -78,6 +79,7 @@ def to_the_end(name: str, problem: Planned, residuals: Callable[..., list[Any]])
     options = {"print_time": 0, **QUIET[name]}
     if name == "fatrop":
         options["equality"] = [True] * of.gaps.numel()
+    ca = casadi()
     solver = ca.nlpsol("solver", name, {"x": of.unknowns, "f": of.cost, "g": of.gaps}, options)
 
     def act(memory: dict[str, Any], x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -103,6 +105,7 @@ def hpipm(problem: Planned, residuals: Callable[..., list[Any]]) -> Make:
     """One Gauss-Newton step of sequential quadratic programming per sample, whose program HPIPM solves to its end."""
     n, m, N = len(problem.x0), len(problem.limit), problem.steps
     of = horizon(problem, residuals)
+    ca = casadi()
     J = ca.jacobian(of.residuals, of.unknowns)
     H, gradient, A = 2 * J.T @ J, 2 * J.T @ of.residuals, ca.jacobian(of.gaps, of.unknowns)
     expand = ca.Function("expand", [of.unknowns], [H, gradient, A, of.gaps], COMPILED)

@@ -20,9 +20,9 @@ from dln_jax.export.c.load import FLAGS, STANDARD, compile_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.discrete import linearised
 from dln_jax.scenes.pendulums import two_link_arm
-from dln_jax.types import InputError
 from scripts.reports.case import Findings
 from scripts.reports.control.plan_problems import Formula, runge_kutta
+from scripts.reports.rival_modules import casadi
 from scripts.reports.rows import Row, expect
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
 from scripts.reports.speed.exported_c import AGREEMENT, QUICK_TURNS, cold_median, hot, ratio
@@ -86,10 +86,7 @@ def casadi_step(folder: Path, *, shared: bool) -> tuple[Path, Counter[str]]:
         folder: of the files.
         shared: let CasADi compute common expressions once.
     """
-    try:
-        import casadi as ca
-    except ImportError as error:
-        raise InputError("the benchmark 'casadi' needs CasADi: pip install casadi") from error
+    ca = casadi()
     x, u, dt = ca.SX.sym("x", 4), ca.SX.sym("u", 2), ca.SX.sym("dt")
     x_next = ca.vertcat(*runge_kutta(textbook_rates(), dt)(ca, x, u))
     # Transposed, because CasADi stores columns and C rows.
