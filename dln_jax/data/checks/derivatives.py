@@ -120,10 +120,17 @@ def at_times_of(data: Trajectories, even: Smoothed, values: np.ndarray) -> np.nd
 
 def _judged(key: str, formula: str, matched: Match, rate: float, moves: np.ndarray) -> list[Finding]:
     alike = (np.abs(matched.correlation) > ALIKE) & moves
-    sizes = np.abs(matched.factor)
-    degrees, radians, milli = (alike & (np.abs(sizes / unit - 1) < 0.05) for unit in (RADIAN, 1 / RADIAN, 1000.0))
+    # Noise of the derived signal lowers the least-squares factor, noise of the measured one does not: the true factor
+    # lies between the regressions of either signal on the other.
+    least = np.abs(matched.factor)
+    most = least / np.maximum(matched.correlation**2, TINY)
+
+    def may_be(unit: float, tolerance: float) -> np.ndarray:
+        return alike & (least < unit * tolerance) & (unit < most * tolerance)
+
+    degrees, radians, milli = (may_be(unit, 1.05) for unit in (RADIAN, 1 / RADIAN, 1000.0))
     opposite = alike & (matched.factor < 0)
-    other = alike & ~(degrees | radians | milli | opposite) & (np.abs(np.log(sizes + 1e-300)) > np.log(1.15))
+    other = alike & ~(degrees | radians | milli | opposite | may_be(1.0, 1.15))
     late = alike & (np.abs(matched.delay) > LATE) & (matched.gained > 1.5)
     worst = max(matched.delay[late], key=abs, default=0.0)
     delayed = f"up to {abs(worst) / rate * 1e3:.3g} ms {'late' if worst > 0 else 'early'}"

@@ -7,9 +7,11 @@ import pytest
 
 from dln_jax.data import schema
 from dln_jax.data.checks import as_recording, examine, quick, read, report
+from dln_jax.data.checks.derivatives import at_times_of, check_derivatives, match
 from dln_jax.data.checks.energies import OF_BODY, STRONGEST, WEAKEST, covariances
 from dln_jax.data.checks.evidence import Explanation
 from dln_jax.data.checks.hypotheses import decisive
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
@@ -269,6 +271,20 @@ def test_times_out_of_order_or_double_are_repaired_and_said(clean, tmp_path):
 def test_spikes_are_not_taken_for_a_delay(clean):
     checks = {finding.check for finding in quick(schema.from_arrays(with_spikes(clean)))}
     assert checks == {"spikes"}
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.7, 180 / np.pi, -1.0])
+def test_noise_of_derived_rates_is_not_taken_for_another_unit(factor):
+    """A poor cut-off leaves so much noise that the least-squares factor is too small by 15 %."""
+    t, q, qd, _ = motions(seed=6)
+    noisy = q[0] + 0.095 * np.random.default_rng(0).normal(size=q[0].shape)
+    data = schema.from_arrays({"t": t, "q": noisy, "qd": factor * qd[0], "trajectory": np.zeros(SAMPLES, int)})
+    even = smooth(data, 7.0, trim=0.0)
+    least = match(at_times_of(data, even, data.qd), even.data.qd, even.data.trajectory, 25).factor
+    assert np.all(least / factor < 1 / 1.15) and np.all(least / factor > 0.8)
+    words = {1.0: [], 0.7: ["times dq/dt"], -1.0: ["opposite sign"]}.get(factor, ["57.3 times"])
+    findings = check_derivatives(data, even)
+    assert len(findings) == len(words) and all(word in findings[0].observation for word in words)
 
 
 @pytest.mark.parametrize("seed", [3, 4])
