@@ -43,7 +43,7 @@ def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
 @pytest.mark.slow
 def test_what_users_run_is_right_as_they_compile_it(pytestconfig):
     if pytestconfig.getoption("--optimised"):
-        pytest.skip("with --optimised all tests are compiled as users do, not only these")
+        pytest.skip("with --optimised every test is compiled with default flags, not only these")
     tests = [f"tests/{name}" for name in AS_USERS_COMPILE]
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     command = [sys.executable, "-m", "pytest", "-n", "0", "--optimised", "--slow", *tests]

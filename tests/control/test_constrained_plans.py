@@ -88,7 +88,7 @@ def test_pressures_are_complementary_and_close_the_lagrangian():
 
 
 def test_ipopt_reaches_the_same_plan():
-    ca = pytest.importorskip("casadi")
+    ca = pytest.importorskip("casadi", reason="the reference is IPOPT by CasADi, of the extra [test]")
     X, U = ca.SX.sym("x", 2, N + 1), ca.SX.sym("u", N)
     after = ca.vertcat(X[0, :-1] + DT * X[1, :-1] + DT**2 / 2 * U.T, X[1, :-1] + DT * U.T)
     g = ca.vertcat(ca.vec(after - X[:, 1:]), X[:, 0], X[:, N] - ca.DM([1, 0]), X[1, :].T - 0.6)
@@ -150,7 +150,7 @@ def test_more_guesses_keep_the_best():
 
 
 def test_limits_come_from_the_file_of_a_robot(tmp_path):
-    pytest.importorskip("mujoco")
+    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     from dln_jax.data.robots import read_robot
 
     file = tmp_path / "arm.urdf"

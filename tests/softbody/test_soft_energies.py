@@ -233,7 +233,7 @@ def test_gradient_and_hessian_equal_finite_differences(answers):
 def test_derivatives_in_parameters_rest_shape_and_control(answers):
     case, random = answers.case, np.random.default_rng(2)
     if not has_parameter_derivatives(case):
-        pytest.skip("solids in space prepare alike; one of them is differentiated")
+        pytest.skip("three-dimensional solids share this code; another one is differentiated")
     inputs = [jax.tree.map(np.asarray, case.term.parameters), answers.rest]
     inputs += [] if case.control is None else [case.control]
     changes = jax.tree.map(lambda value: np.asarray(value * random.normal(size=value.shape)), tuple(inputs))
@@ -266,7 +266,7 @@ def test_internal_forces_and_torques_cancel(answers):
 
 def test_the_rest_shape_is_at_rest(answers):
     if answers.case.name == "muscles":
-        pytest.skip("a driven muscle pulls in the rest shape")
+        pytest.skip("an active muscle has a force in the rest shape")
     scale = np.abs(answers.gradient["stretched"]).max()
     assert abs(answers.energy["rest"]) < 1e-12 * scale
     np.testing.assert_allclose(answers.gradient["rest"], 0.0, atol=1e-12 * scale)
@@ -274,7 +274,7 @@ def test_the_rest_shape_is_at_rest(answers):
 
 def test_small_strains_obey_linear_elasticity(answers):
     if "spring" in answers.case.name or answers.case.name == "muscles":
-        pytest.skip("springs and muscles have no elastic constants of a solid")
+        pytest.skip("springs and muscles have no Lamé constants")
     mesh, rest = MESHES[answers.case.dimension], answers.rest
     stiffness = np.zeros((rest.size, rest.size))
     E, nu = (np.broadcast_to(value, 2) for value in answers.case.term.parameters)

@@ -208,9 +208,9 @@ def differently_finite(got, expected):
 def test_c_equals_jax(case, tmp_path, pytestconfig):
     every = pytestconfig.getoption("--every-export")
     if not every and case not in DEFAULT:
-        pytest.skip("is tried with --every-export")
+        pytest.skip("compared only with --every-export, which takes minutes")
     if case.startswith("chain") and int(case.removeprefix("chain-")) > LARGEST_CHAIN:
-        pytest.skip("takes minutes to compile")
+        pytest.skip("this export takes minutes to compile")
 
     def chosen(precision):
         functions, system = system_of(case, precision)

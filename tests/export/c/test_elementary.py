@@ -196,7 +196,7 @@ def test_ends_of_the_domain(evaluate, precision):
 
 
 @needs_gcc
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the vectors are those of x86")
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the vector instructions exist only on x86")
 @by_precision
 @pytest.mark.parametrize("machine", ["haswell", "skylake-avx512"])
 def test_gcc_vectorises_every_loop(tmp_path, precision, machine):

@@ -332,7 +332,7 @@ def test_arguments_of_another_shape_are_refused_by_name(exported, tmp_path):
 @pytest.mark.parametrize("flags", [("-ffast-math",), ("-ffinite-math-only",), ("-mfpmath=387",)], ids=str)
 def test_flags_that_give_wrong_numbers_do_not_compile(flags, tmp_path):
     if flags == ("-mfpmath=387",) and platform.machine() != "x86_64":
-        pytest.skip("is a flag for x86")
+        pytest.skip("the compiler flag exists only on x86")
     export_c({"f": (jnp.exp, (np.zeros(9),))}, tmp_path)
     with pytest.raises(InputError, match=r"#error .*(-ffast-math|-mfpmath=sse)"):
         load_c(tmp_path, compiler="gcc", flags=flags)
@@ -341,7 +341,7 @@ def test_flags_that_give_wrong_numbers_do_not_compile(flags, tmp_path):
 @needs_compiler
 def test_library_functions_bear_extended_precision(tmp_path):
     if platform.machine() != "x86_64":
-        pytest.skip("is a flag for x86")
+        pytest.skip("the compiler flag exists only on x86")
     export_c({"f": (jnp.exp, (np.zeros(9),))}, tmp_path, libm=True)
     x = np.linspace(-3, 3, 9)
     np.testing.assert_allclose(load_c(tmp_path, compiler="gcc", flags=("-mfpmath=387",)).f(x), np.exp(x), rtol=1e-14)

@@ -195,7 +195,7 @@ LACKING = {
 @pytest.mark.parametrize("case", slow_among(CASES, (*HAMILTONIANS, "cart-pole", "phase-network").__contains__))
 def test_functions_and_their_derivatives_are_those_of_the_mechanics(case, pytestconfig):
     if case not in DEFAULT and not pytestconfig.getoption("--every-export"):
-        pytest.skip("is tried with --every-export")
+        pytest.skip("compared only with --every-export, which takes minutes")
     functions, system, needs = system_of(case)
     # As exported, traced once.
     system = system._replace(**{name: jax.jit(field) for name, field in system._asdict().items() if callable(field)})

@@ -93,7 +93,7 @@ def test_a_few_random_programs_agree_with_jax(finite, tmp_path):
 @pytest.mark.parametrize("seeds", batches(FEW, ALL_SUPPORTED), ids=str)
 def test_random_programs_agree_with_jax(seeds, finite, tmp_path, pytestconfig):
     if finite != (seeds[0] > FEW) and not pytestconfig.getoption("--every-export"):
-        pytest.skip("each batch under the other contract is for --every-export")
+        pytest.skip("the other value of finite is compared only with --every-export, which takes minutes")
     assert not compared(seeds, tmp_path, finite=finite)
 
 
@@ -102,7 +102,7 @@ def test_random_programs_agree_with_jax(seeds, finite, tmp_path, pytestconfig):
 @pytest.mark.parametrize("place, seeds", list(enumerate(batches(ALL_SUPPORTED, EVERY))), ids=str)
 def test_more_random_programs_agree_with_jax(place, seeds, tmp_path, pytestconfig):
     if place % 9 and not pytestconfig.getoption("--every-export"):
-        pytest.skip("eight of nine batches are for --every-export, which takes minutes")
+        pytest.skip("this batch is compared only with --every-export, which takes minutes")
     assert compared(seeds, tmp_path) <= MOST_REFUSED
 
 
@@ -130,7 +130,7 @@ def test_the_text_is_the_same_in_every_process():
 @pytest.mark.slow
 def test_the_text_of_more_programs_is_the_same_in_every_process(pytestconfig):
     if not pytestconfig.getoption("--every-export"):
-        pytest.skip("three times all programs are for --every-export, which takes minutes")
+        pytest.skip("all programs are compared three times only with --every-export, which takes minutes")
     check_text(0, EVERY)
 
 

@@ -25,7 +25,7 @@ def test_the_textbook_rates_are_those_of_the_scene():
 
 @needs_compiler
 def test_casadi_computes_the_same_numbers_by_its_own_derivatives(tmp_path):
-    pytest.importorskip("casadi")
+    pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
     from dln_jax.export.c.source import export_c
 
     model, kinds = casadi_step(tmp_path / "casadi", shared=True)
