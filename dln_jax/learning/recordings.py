@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.data.encoders import smooth
+from dln_jax.data.encoders.sampling import held_at_equal_steps
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.engine.fit import fit
@@ -100,8 +101,9 @@ def prepare(
     held_out = int(present[len(present) // 2] if validation is None else validation)
     if held_out not in present:
         raise InputError(f"validation is {held_out}; expected one of the episodes {present.tolist()}")
+    needs, recording = recording.needs, held_at_equal_steps(recording)
     if delay is None:
-        form = _chain(recording.needs) if chain else _tree(recording.needs)
+        form = _chain(needs) if chain else _tree(needs)
         delay = delay_of_torques(build(form), recording, most=MOST_DELAY)
     chosen = smooth(driven_torques(recording, delay=delay))
     rest = np.setdiff1d(present, held_out)

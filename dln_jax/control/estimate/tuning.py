@@ -20,8 +20,9 @@ from jax import Array
 from dln_jax.control.estimate.extended import extended
 from dln_jax.control.estimate.loop import filtered
 from dln_jax.control.estimate.process import Belief, Filter, Innovation, Process, belief, mechanical
-from dln_jax.data.encoders.sampling import delayed, even, noise_of, step_of, timing
+from dln_jax.data.encoders.sampling import delayed, held_at_equal_steps, noise_of, step_of, timing
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import segments
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, Scalar
 
@@ -69,7 +70,7 @@ def tuned(
 
     Args:
         process: with first values above zero.
-        logs: (belief in the first state, y [N, p], u [N, m]) of every log; those of equal length share a program.
+        logs: (belief in the first state, y [N, p], u [N, m]) of every log; N may differ.
         noise: whether to tune the measurement noise too; by default it is known, such as from an encoder's step.
         make: process -> filter.
         iterations: largest number of L-BFGS iterations.
@@ -91,22 +92,28 @@ def tuned(
             disturbance=values[: len(first)], noise=values[len(first) :] if noise else process.noise
         )
 
-    # Logs of equal length are filtered together.
-    lengths = {len(y) for _, y, _ in logs}
-    groups = [
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(log for log in logs if len(log[1]) == n)) for n in lengths
-    ]
+    # All logs are filtered together; shorter ones end with samples that are not seen.
+    longest = max(len(y) for _, y, _ in logs)
+
+    def filled(rows: Any) -> np.ndarray:
+        return np.pad(np.asarray(rows), ((0, longest - len(rows)), (0, 0)))
+
+    padded = [(x, filled(y), filled(u), (np.arange(longest) < len(y))[:, None]) for x, y, u in logs]
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
+
+    def innovations(process: Process, logs: Any) -> Innovation:
+        return jax.vmap(lambda log: filtered(make(process), *log)[1])(logs)
 
     probes = DIFFERENCE * np.concatenate([np.zeros((1, len(scales))), np.eye(len(scales)), -np.eye(len(scales))])
 
     @jax.jit
     @partial(jax.vmap, in_axes=(0, None))
-    def of_group(theta: Array, group: tuple[Belief, Array, Array]) -> Scalar:
-        return jnp.sum(jax.vmap(lambda log: surprise(filtered(make(scaled(theta)), *log)[1]))(group)) / count
+    def surprise_of(theta: Array, logs: Any) -> Scalar:
+        return surprise(innovations(scaled(theta), logs)) / count
 
     def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
         # Derivatives through the filter would take several times longer to compile than these differences to compute.
-        values = np.asarray(sum(of_group(jnp.asarray(theta + probes), group) for group in groups), float)
+        values = np.asarray(surprise_of(jnp.asarray(theta + probes), together), float)
         above, below = np.split(values[1:], 2)
         return float(values[0]), (above - below) / (2 * DIFFERENCE)
 
@@ -117,9 +124,7 @@ def tuned(
     result = minimize(cost, np.zeros(len(scales)), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     best = scaled(jnp.asarray(result.x))
     best = best._replace(disturbance=np.asarray(best.disturbance), noise=np.asarray(best.noise))
-    ratio = jax.jit(jax.vmap(lambda log: consistency(filtered(make(best), *log)[1])))
-    ratios, weights = [np.mean(ratio(group)) for group in groups], [group[1].size for group in groups]
-    return Tuned(best, float(result.fun), float(np.average(ratios, weights=weights)))
+    return Tuned(best, float(result.fun), float(jax.jit(lambda: consistency(innovations(best, together)))()))
 
 
 def from_log(
@@ -137,7 +142,7 @@ def from_log(
 
     Args:
         model: known or learned.
-        log: t, q and tau, which are resampled to equal steps if they are not.
+        log: t, q and tau, which is held from each sample to the next; steps need not be equal.
         actuation: matrix [d, m] of the process that is returned.
         substeps: integrator steps per sample.
         delay: samples after which the log's torques act.
@@ -145,20 +150,18 @@ def from_log(
     Raises:
         InputError: the log has no motion, or trajectories of fewer than eight samples.
     """
-    rate, numbers = timing(log.t, log.trajectory).rate, np.unique(log.trajectory)
-    columns = np.hstack([log.q, log.tau])
-    parts = [even(log.t[rows], columns[rows], rate)[1] for rows in (log.trajectory == number for number in numbers)]
-    part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    noise = noise_of(np.concatenate(parts)[:, : log.q.shape[1]], part_of)
+    log = held_at_equal_steps(log)
+    rate, pieces = timing(log.t, log.trajectory).rate, segments(log.t, log.trajectory)
+    noise = noise_of(log.q, np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces]))
     if not (np.isfinite(noise).all() and (noise > 0).all()):
         raise InputError(
             f"the noise of q in the log is {noise.tolist()}; expected coordinates that move, in eight samples or more"
         )
     band = np.full(log.q.shape[1], 0.01 * max(float(np.ptp(log.tau)), 1e-300))
     first = mechanical(model, rate=rate, band=band, encoder_noise=noise, substeps=substeps)
-    logs, samples = [], max(SAMPLES // len(numbers), 8)
-    for part in parts:
-        q, tau = np.hsplit(part[:samples], 2)
+    logs, samples = [], max(SAMPLES // len(pieces), 8)
+    for piece in pieces:
+        q, tau = log.q[piece[:samples]], log.tau[piece[:samples]]
         start = np.concatenate([q[0], np.zeros_like(q[0])])
         deviation = np.concatenate([np.maximum(noise, step_of(log.q)), np.full(len(noise), FIRST_RATE)])
         logs.append((belief(start, deviation), jnp.asarray(q), jnp.asarray(delayed(tau, float(delay)))))

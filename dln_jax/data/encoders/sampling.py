@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import GAP
+from dln_jax.data.splits import GAP, segments
 from dln_jax.types import InputError
 
 BRIDGED = 3.5
@@ -75,6 +75,38 @@ def even(
     from scipy.interpolate import make_interp_spline
 
     return uniform, make_interp_spline(t, values, k=min(3, len(t) - 1), axis=0)(np.minimum(uniform, t[-1]))
+
+
+def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajectories:
+    """Converts q and commanded torques, which are held from each sample to the next, to equal steps.
+
+    tau becomes the mean over the step that follows each sample: impulses stay exact, where a spline would overshoot.
+    Gaps that are not bridged remain. Rates become NaN, and other arrays are dropped; `smooth` derives rates from q.
+
+    Args:
+        data: q, tau and the times of the samples.
+        rate: rate of the equal steps, Hz (default: the median of the data).
+    """
+    rate = float(f"{timing(data.t, data.trajectory).rate:.9g}") if rate is None else rate
+    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "tau", "trajectory")}
+    for piece in segments(data.t, data.trajectory, gap=BRIDGED):
+        t, q, tau = data.t[piece], data.q[piece], data.tau[piece]
+        times, positions = even(t, q, rate)
+        rows = times, positions, tau if positions is q else _mean_of_held(t, tau, times, 1 / rate)
+        for key, part in zip(columns, (*rows, np.full(len(times), data.trajectory[piece[0]])), strict=True):
+            columns[key].append(part)
+    joined = {key: np.concatenate(parts) for key, parts in columns.items()}
+    absent = np.full_like(joined["q"], np.nan)
+    others = dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity", "temperature"))
+    return data._replace(**joined, qd=absent, qdd=absent, **others)
+
+
+def _mean_of_held(t: np.ndarray, values: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
+    """Means over steps from `times` on of values that are held from each sample to the next; the last one stays."""
+    ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
+    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(np.diff(ends)[:, None] * values, axis=0)])
+    at = [[np.interp(moments, ends, column) for column in integral.T] for moments in (times, times + step)]
+    return (np.array(at[1]) - np.array(at[0])).T / step
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:

@@ -13,7 +13,7 @@ from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
 from dln_jax.control.plants.tuning import Tuned, tune
-from dln_jax.data.encoders import noise_of
+from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified_chain, prepare
 from dln_jax.mechanics.dynamics import Dynamics
@@ -71,6 +71,7 @@ def learn_to_swing_up(
         f"{len(explored.stopped)} stopped"
     )
     keep(explored)
+    recording = held_at_equal_steps(recording, plant.layout.rate)
     prepared = prepare(recording, chain=True)
     fitted = identified_chain(prepared, plant.layout.needs)
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
@@ -84,8 +85,7 @@ def learn_to_swing_up(
         f"learned: controls {prepared.delay:.3g} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz, "
         f"{unexplained:.1%} of the motors' limits unexplained"
     )
-    # The filter steps evenly: samples that are late are noise to it. The process has the noise at their own times.
-    wide = process._replace(disturbance=BAND * band, noise=np.maximum(np.asarray(process.noise), noise))
+    wide = process._replace(disturbance=BAND * band)
     make = estimator_of(estimator, plant.layout, wide, delay=prepared.delay)
     tuned = tune(
         fitted.dynamics, plant.layout, hardware, estimator=make, late=prepared.delay % 1, seed=seed, recover=recover

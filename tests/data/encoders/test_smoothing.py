@@ -143,6 +143,26 @@ def test_lines_of_a_periodic_motion_are_not_cut_off_though_only_noise_is_between
     assert error(None) < 1.25 * min(error(cutoff) for cutoff in np.geomspace(2.0, 100.0, 25))
 
 
+def test_commands_of_uneven_samples_keep_their_impulse_at_equal_steps():
+    """Commands jump between ±1; a spline through them is wrong by half their size."""
+    random = np.random.default_rng(0)
+    t = (np.arange(300) + random.uniform(0, 0.6, 300)) / 100.0
+    t[200:] += 0.1  # a gap
+    u, q = random.choice([-1.0, 1.0], (300, 1)), np.sin(3 * t)[:, None]
+    numbers = {"trajectory": np.zeros(300, int), "label": np.array(["run0"])}
+    data = schema.from_arrays({"t": t, "q": q, "tau": u, **numbers})
+    even = sampling.held_at_equal_steps(data, 100.0)
+    first, second = np.split(np.arange(len(even.t)), np.flatnonzero(np.diff(even.t) > 0.015) + 1)
+    np.testing.assert_allclose(np.diff(even.t[first]), 0.01, atol=1e-12)
+    np.testing.assert_allclose(even.q, np.sin(3 * even.t)[:, None], atol=1e-5)
+    for rows, part in ((first, slice(0, 200)), (second, slice(200, 300))):
+        fine = even.t[rows[0]] + 1e-5 * (np.arange(1000 * (len(rows) - 1)) + 0.5)
+        held = u[part][np.searchsorted(t[part], fine, side="right") - 1].reshape(-1, 1000).mean(axis=1)
+        np.testing.assert_allclose(even.tau[rows[:-1], 0], held, atol=4e-3)
+    already = data._replace(t=np.arange(300) / 100.0)
+    np.testing.assert_array_equal(sampling.held_at_equal_steps(already).tau, u)
+
+
 def test_motions_of_a_motor_that_chatters_are_not_cut_off():
     """Accelerations have a shallow minimum at 5 Hz, and are as large from 20 to 60 Hz as below."""
     rate, count, random = 500.0, 6000, np.random.default_rng(0)
