@@ -4,6 +4,9 @@ A late measurement belongs to an earlier state. The memory holds the belief at t
 the measurements and controls since then. At every sample the filter goes through them again, so that each measurement
 is used at its own time, and prompt channels at once. The law receives the state predicted for the moment at which its
 control begins to act.
+
+Samples of hardware are never exactly on time. With the nominal rate, the filter uses their own times: the prediction
+over a step of length (1 + e) h, h = 1 / rate, is x + (1 + e) (step(x) - x), with the error ½ e (1 + e) h² d²x/dt².
 """
 
 from collections.abc import Sequence
@@ -37,6 +40,12 @@ class Estimating(NamedTuple):
     """Controls that act from D samples ago on, oldest first."""
     number: Int[Array, ""]
     """Samples so far."""
+    t: Any = None
+    """Time of the last sample, s; `None` if samples count as evenly spaced."""
+    lengths: Any = None
+    """Lengths of the last D + delay steps, in nominal steps, oldest first."""
+    before: Any = None
+    """Estimate from which `filter` was predicted, if no channel is late."""
 
 
 def with_estimate(
@@ -51,6 +60,7 @@ def with_estimate(
     delay: int | float = 0,
     late: Sequence[int] | int = 0,
     every: Sequence[int] | int = 1,
+    rate: float | None = None,
 ) -> Controller:
     """Gives a law the states that a filter estimates from measurements, instead of differences of encoder readings.
 
@@ -66,10 +76,14 @@ def with_estimate(
         late: samples by which the channels of y are late, one per channel or one for all.
         every: samples between new measurements of a channel, from the first sample on, one per channel or one for all;
             values in between are ignored.
+        rate: nominal sampling rate, Hz, to use the times of samples that the controller is called with; by default
+            they count as evenly spaced.
 
     Raises:
-        InputError: a number of samples is negative, or not whole where it must be, or `every` is zero.
+        InputError: a number of samples is negative, or not whole where it must be, or `every` or the rate is zero.
     """
+    if rate is not None:
+        require_positive(rate=rate)
     require_positive(controls=controls, measurements=measurements)
     lag, period = _samples("late", late, measurements, 0), _samples("every", every, measurements, 1)
     if not 0 <= delay < jnp.inf:
@@ -79,10 +93,21 @@ def with_estimate(
     controller = law if isinstance(law, Controller) else stateless(law)
     depth = int(lag.max())
     rows = depth - lag, np.arange(measurements)
+    queued = wait + (share > 0 or rate is not None)
 
-    def acting(u: Array) -> Array:
-        """Returns the mean control over each step: the previous control still acts during the first `share` of it."""
-        return (1 - share) * u[1:] + share * u[:-1] if share else u
+    def shares_of(lengths: Any) -> Any:
+        """Returns the shares of D past steps and of later ones in which the control before still acts."""
+        if rate is None:
+            return jnp.full(depth + wait + 1, share)
+        lengths = jnp.concatenate([lengths, jnp.ones(wait + 1, lengths.dtype)])
+        early = jnp.cumsum(jnp.append(0.0, 1 - lengths))
+        step = jnp.arange(depth + wait + 1)
+        return jnp.clip((share + early[step + wait] - early[step]) / lengths[step + wait], 0, 1)
+
+    def acting(u: Array, shares: Array) -> Array:
+        """Returns the mean control over each step."""
+        shares = shares[: len(u) - 1, None]
+        return (1 - shares) * u[1:] + shares * u[:-1] if queued > wait else u
 
     def act(memory: Estimating, t: Array, y: Array) -> tuple[Estimating, Array]:
         taken = memory.number - jnp.asarray(lag)
@@ -90,20 +115,28 @@ def with_estimate(
         ys = jnp.concatenate([memory.y, jnp.zeros((1, measurements), y.dtype)]).at[rows].set(y)
         seen = jnp.concatenate([memory.seen, jnp.zeros((1, measurements), bool)]).at[rows].set(fresh)
 
-        def through(past: Any, sample: tuple[Array, Array, Array, Array]) -> tuple[Any, Any]:
-            y, seen, u, number = sample
-            later = filter.predict(filter.update(past, y, seen)[0], u)
+        def through(past: Any, sample: tuple[Any, ...]) -> tuple[Any, Any]:
+            y, seen, u, number, length = sample
+            before = past
+            past, _ = filter.update(past, y, seen)
+            later = stretched(past.x, filter.predict(past, u), length)
             # Before the first sample there was no motion to predict.
-            later = jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), later, past)
+            later = jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), later, before)
             return later, later
 
-        base, known = memory.filter, acting(memory.u)
+        base, lengths, newest = memory.filter, None, None
+        if rate is not None:
+            newest = jnp.where(memory.number > 0, (t - memory.t) * rate, 1.0).astype(ys.dtype)
+            lengths = jnp.append(memory.lengths, newest)[1:]
+        shares = shares_of(lengths)
+        known = acting(memory.u, shares)
         if depth:
             numbers = memory.number - depth + jnp.arange(depth)
-            past, afterwards = jax.lax.scan(through, base, (ys[:-1], seen[:-1], known[:depth], numbers))
+            past_lengths = None if lengths is None else lengths[wait:]
+            past, afterwards = jax.lax.scan(through, base, (ys[:-1], seen[:-1], known[:depth], numbers, past_lengths))
             base = jax.tree.map(lambda leaf: leaf[0], afterwards)
         else:
-            past = base
+            past = stretched(memory.before, base, newest)
         past, _ = filter.update(past, ys[-1], seen[-1])
         ahead = past.x
         for number in range(wait):
@@ -114,8 +147,13 @@ def with_estimate(
         u = saturated(u, lower, upper)
         queue = jnp.concatenate([memory.u, u[None]])
         if not depth:
-            base = filter.predict(past, acting(queue)[0])
-        return Estimating(past.x, inner, base, ys[1:], seen[1:], queue[1:], memory.number + 1), u
+            base = filter.predict(past, acting(queue, shares)[0])
+        timed = {} if rate is None else {"t": jnp.asarray(t, ys.dtype), "lengths": lengths, "before": past.x}
+        return Estimating(past.x, inner, base, ys[1:], seen[1:], queue[1:], memory.number + 1, **timed), u
+
+    def stretched(x: Any, later: Any, length: Any) -> Any:
+        """Returns the memory that was predicted from x over a nominal step, over a step of another length."""
+        return later if length is None else later._replace(x=x + length * (later.x - x))
 
     def nothing(x: Array) -> Array:
         return filter.process.deviation(x, jnp.zeros(controls, x.dtype))
@@ -123,8 +161,10 @@ def with_estimate(
     zeros = lambda *shape: jnp.zeros(shape, belief.x.dtype)  # noqa: E731
     start = Estimating(
         belief.x, controller.start, filter.start(belief), zeros(depth, measurements),
-        jnp.zeros((depth, measurements), bool), zeros(depth + wait + (share > 0), controls), jnp.asarray(0),
+        jnp.zeros((depth, measurements), bool), zeros(depth + queued, controls), jnp.asarray(0),
     )  # fmt: skip
+    if rate is not None:
+        start = start._replace(t=zeros(), lengths=jnp.ones(depth + wait, belief.x.dtype), before=belief.x)
     return Controller(start, act)
 
 

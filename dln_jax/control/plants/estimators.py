@@ -32,7 +32,7 @@ def by_differences(layout: Layout) -> Estimator:
 def by_filter(
     layout: Layout, process: Process, *, delay: int | float = 0, make: Callable[[Process], Filter] = extended
 ) -> Estimator:
-    """Returns an estimator of the states by a filter of the measurements.
+    """Returns an estimator of the states by a filter of the measurements, which uses their times.
 
     Args:
         layout: layout of the plant.
@@ -44,7 +44,7 @@ def by_filter(
     d, m = layout.actuation.shape
     start = belief(np.concatenate([layout.hanging, np.zeros(d)]), np.full(2 * d, UNSURE))
     settings: Any = {"controls": m, "measurements": d, "lower": lower, "upper": upper, "delay": delay}
-    return lambda law: with_estimate(law, make(process), start, **settings)
+    return lambda law: with_estimate(law, make(process), start, rate=layout.rate, **settings)
 
 
 def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: int | float) -> Estimator:

@@ -22,7 +22,7 @@ HELD = 1.0
 """Time at the end for which a plant must stay up, s."""
 
 Act = Callable[[Any, Any, Any], tuple[Any, Any]]
-"""(memories, t, measurements [n, d]) -> (memories, controls [n, m]), compiled."""
+"""(memories, times since the first measurements [n], measurements [n, d]) -> (memories, controls [n, m]), compiled."""
 
 
 class PlantRun(NamedTuple):
@@ -45,7 +45,7 @@ def compiled(controller: Controller, layout: Layout) -> Act:
         memory, u = controller.act(memory, t, y)
         return memory, saturated(u, lower, upper)
 
-    return jax.jit(jax.vmap(act, in_axes=(0, None, 0)))
+    return jax.jit(jax.vmap(act))
 
 
 def run(
@@ -70,11 +70,10 @@ def run(
     d, m = layout.actuation.shape
     samples, count = round(seconds * layout.rate), len(plants)
     y, u, times = np.zeros((samples, count, d)), np.zeros((samples, count, m)), np.zeros((samples, count))
-    t = np.arange(samples) / layout.rate
     lengths, reasons = np.full(count, samples), [""] * count
     # Compile before a clock runs, or answers would be seconds late. The second call has the types of later memories.
     like = jnp.asarray(np.tile(np.asarray(layout.hanging, float), (count, 1)))
-    act(act(memories, t[0], like)[0], t[0], like)
+    act(act(memories, jnp.zeros(count), like)[0], jnp.zeros(count), like)
     for plant in safe:
         plant.reset()
     going = list(range(count))
@@ -92,7 +91,7 @@ def run(
                 going = _each(going, k, lengths, reasons, lambda i: measure(k, i))  # noqa: B023
                 if not going:
                     break
-                memories, controls = act(memories, t[k], jnp.asarray(y[k]))
+                memories, controls = act(memories, jnp.asarray(times[k] - times[0]), jnp.asarray(y[k]))
                 u[k] = controls
                 going = _each(going, k, lengths, reasons, lambda i: safe[i].act(u[k, i]))  # noqa: B023
     finally:  # also after an interrupt

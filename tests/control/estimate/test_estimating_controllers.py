@@ -7,6 +7,7 @@ import pytest
 
 import dln_jax
 from dln_jax.control import Hardware, simulate, stateless
+from dln_jax.control.closed_loop import Controller
 from dln_jax.control.desktop_plants import desktop_rotary_pendulum, model_of_plant, try_starts
 from dln_jax.control.estimate import belief, extended, filtered, mechanical, with_estimate
 from dln_jax.control.plants.estimators import by_filter
@@ -107,6 +108,84 @@ def test_a_law_behind_half_a_sample_acts_on_the_state_half_a_sample_later():
     assert np.abs(errors).max() < 2e-3
 
 
+@pytest.fixture(scope="module")
+def uneven_swing():
+    """Times that are up to half a step late, and states of a free swing at these times, exact."""
+    t = (np.arange(150) + np.random.default_rng(1).uniform(0, 0.5, 150)) / 100.0
+    idle = jnp.zeros(1)
+
+    def field(x, u):
+        return jnp.concatenate([x[2:], MODEL.forward_dynamics(x[:2], x[2:], B @ u)])
+
+    step = integrated(field, 1e-3)
+    x = jax.jit(
+        lambda: jax.lax.scan(lambda x, _: (step(x, idle), x), jnp.array([0.0, 1.0, 0.0, 0.0]), jnp.arange(1600))[1]
+    )()
+    number = np.round(t * 1000).astype(int)
+    return number / 1000.0, np.asarray(x)[number]
+
+
+@pytest.mark.parametrize("late", [0, (0, 2)])
+def test_filters_use_the_times_of_samples(uneven_swing, late):
+    t, x = uneven_swing
+    y = x[:, :2].copy()
+    if late:
+        y[2:, 1] = y[:-2, 1]
+    settings = {"controls": 1, "measurements": 2, "late": late}
+    start = belief([0.0, 1.0, 0.0, 0.0], [1e-3, 1e-3, 0.1, 0.1])
+
+    def worst(t, **more):
+        controller = with_estimate(lambda x: 0.0 * x[:1], extended(PROCESS), start, **settings, **more)
+
+        def sample(memory, row):
+            memory, _ = controller.act(memory, *row)
+            return memory, memory.x
+
+        estimates = jax.jit(lambda: jax.lax.scan(sample, controller.start, (jnp.asarray(t), jnp.asarray(y)))[1])()
+        return np.abs(estimates - x)[20:, 2:].max(), estimates
+
+    nominal, known = np.arange(len(t)) / 100.0, worst(t, rate=100.0)[0]
+    ignored, estimates = worst(t)
+    assert known < 0.2 * ignored
+    np.testing.assert_allclose(worst(nominal, rate=100.0)[1], estimates, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [0, 1.3])
+def test_controls_act_when_they_arrive_though_samples_are_late(delay):
+    """The plant takes every control 1.3 nominal steps after its sample; samples are up to half a step late."""
+    t = (np.arange(80) + np.random.default_rng(2).uniform(0, 0.5, 80)) / 100.0
+    t[0] = 0.0
+    planned = jnp.asarray(np.random.default_rng(3).choice([-6.0, 6.0], (80, 1)))
+    law = Controller(jnp.asarray(0), lambda number, t, x: (number + 1, planned[number]))
+
+    def field(x, u):
+        return jnp.concatenate([x[2:], MODEL.forward_dynamics(x[:2], x[2:], B @ u)])
+
+    moments = 1e-4 * np.arange(8100)
+    arrived = np.searchsorted(t + delay / 100.0, moments + 5e-5) - 1
+    held = np.where(arrived[:, None] >= 0, np.asarray(planned)[arrived], 0.0)
+    fine, start = integrated(field, 1e-4), jnp.array([0.0, 1.0, 0.0, 0.0])
+    run = jax.jit(lambda: jax.lax.scan(lambda x, u: (fine(x, u), x), start, jnp.asarray(held))[1])()
+    x = np.asarray(run)[np.round(t * 1e4).astype(int)]
+    sharp = PROCESS._replace(noise=np.array([1e-5, 1e-5]), disturbance=np.array([0.2, 0.01]))
+
+    def worst(**more):
+        controller = with_estimate(
+            law, extended(sharp), belief(start, 1e-4), controls=1, measurements=2, delay=delay, **more
+        )
+
+        def sample(memory, row):
+            memory, _ = controller.act(memory, *row)
+            return memory, memory.x
+
+        rows = jnp.asarray(t), jnp.asarray(x[:, :2])
+        estimates = jax.jit(lambda: jax.lax.scan(sample, controller.start, rows)[1])()
+        return np.abs(estimates - x)[:, 2:].max(axis=0)
+
+    known, ignored = worst(rate=100.0), worst()
+    assert (known < 0.25 * ignored).all()
+
+
 def test_a_failed_measurement_is_not_hidden():
     controller = with_estimate(ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2)
     _, u = replayed(controller, measurements(6).at[3, 1].set(jnp.nan))
@@ -142,19 +221,20 @@ def test_swing_ups_with_a_filter_succeed_and_hold_with_less_torque():
 @pytest.mark.slow
 def test_a_controller_with_a_filter_and_late_measurements_is_the_same_in_c(tmp_path):
     controller = with_estimate(
-        ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, delay=1, late=(0, 1), every=(1, 2)
+        ASKED, extended(PROCESS), PRIOR, controls=1, measurements=2, delay=1, late=(0, 1), every=(1, 2), rate=100.0
     )
     leaves, tree = jax.tree.flatten(controller.start)
 
-    def act(y, *memory):
-        memory, u = controller.act(jax.tree.unflatten(tree, memory), jnp.zeros(()), y)
+    def act(t, y, *memory):
+        memory, u = controller.act(jax.tree.unflatten(tree, memory), t, y)
         return {"u": u, **{f"after_{number}": leaf for number, leaf in enumerate(jax.tree.leaves(memory))}}
 
-    export_c({"act": (act, (np.zeros(2), *map(np.asarray, leaves)))}, tmp_path / "loop")
+    export_c({"act": (act, (np.zeros(()), np.zeros(2), *map(np.asarray, leaves)))}, tmp_path / "loop")
     in_c, in_jax = load_c(tmp_path / "loop", flags=("-O1",)), jax.jit(act)
     memory = memory_in_c = [np.asarray(leaf) for leaf in leaves]
-    for y in np.asarray(measurements(12)):
-        expected, got = in_jax(y, *memory), in_c.act(y, *memory_in_c)
+    for number, y in enumerate(np.asarray(measurements(12))):
+        t = np.asarray(0.01 * number + 0.002 * (number % 3))
+        expected, got = in_jax(t, y, *memory), in_c.act(t, y, *memory_in_c)
         np.testing.assert_allclose(got.u, expected["u"], rtol=1e-9, atol=1e-12)
         memory = [np.asarray(expected[f"after_{number}"]) for number in range(len(leaves))]
         memory_in_c = [np.asarray(getattr(got, f"after_{number}")) for number in range(len(leaves))]
