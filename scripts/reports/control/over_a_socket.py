@@ -21,6 +21,10 @@ from scripts.reports.rows import Row
 
 RATE = 100.0
 STARTS, TO_REACH = 10, 0.99
+ROTARY = layout(
+    ("revolute", "revolute"), [0], goal=(0, 0), hanging=(0, np.pi), rate=RATE, control=rig.LARGEST,
+    position=[[-2.5, 2.5], [-np.inf, np.inf]], speed=(40.0, 60.0),
+)  # fmt: skip
 STILL, SLOW, CENTRED = 50, 0.01, 0.3
 """Number of still samples before a start, and the largest change of an angle and angle of the arm in them, rad."""
 
@@ -46,11 +50,7 @@ def plant_over(lines: IO[str]) -> Plant:
             before = q
         write(np.zeros(1))
 
-    rotary = layout(
-        ("revolute", "revolute"), [0], goal=(0, 0), hanging=(0, np.pi), rate=RATE, control=rig.LARGEST,
-        position=[[-2.5, 2.5], [-np.inf, np.inf]], speed=(40.0, 60.0),
-    )  # fmt: skip
-    return hardware_plant(rotary, reset=reset, read=read, write=write)
+    return hardware_plant(ROTARY, reset=reset, read=read, write=write)
 
 
 @contextmanager
@@ -71,13 +71,18 @@ def connected(seed: int) -> Iterator[IO[str]]:
 
 def in_real_time(seed: int, quick: bool = False, *, say: Callable[[str], None] = lambda _: None) -> Findings:
     """Explores, learns, tunes and tries the rig."""
-    starts, case = 3 if quick else STARTS, f"rig/over-a-socket-{seed}"
     with connected(seed) as lines:
-        plant = plant_over(lines)
-        learned = learn_to_swing_up(plant, seed=seed, say=say)
-        controller = learned.tuned.controller
-        act, memory = compiled(controller, plant.layout), start_of(controller, 1)
-        runs = [run([plant], act, memory, seconds=SECONDS)[0] for _ in range(starts)]
+        return learned_and_tried(plant_over(lines), f"rig/over-a-socket-{seed}", seed, 3 if quick else STARTS, say=say)
+
+
+def learned_and_tried(
+    plant: Plant, case: str, seed: int, starts: int, *, say: Callable[[str], None] = lambda _: None
+) -> Findings:
+    """Explores, learns, tunes and tries a plant that has the rig's pendulum."""
+    learned = learn_to_swing_up(plant, seed=seed, say=say)
+    controller = learned.tuned.controller
+    act, memory = compiled(controller, plant.layout), start_of(controller, 1)
+    runs = [run([plant], act, memory, seconds=SECONDS)[0] for _ in range(starts)]
     trials = judged_runs(runs, plant.layout, seconds=SECONDS)
     seconds, words = trials.seconds[trials.up], f"of {starts} starts up within {SECONDS:g} s; 30 s of data"
     return Findings(

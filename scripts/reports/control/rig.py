@@ -30,31 +30,44 @@ def accelerations(q: list[float], v: list[float], torque: float) -> tuple[float,
     return (c * first - b * second) / determinant, (a * second - b * first) / determinant
 
 
+class Pendulum:
+    """A rotary pendulum that hangs near rest at first."""
+
+    def __init__(self, noise: random.Random, start: float = 0.0) -> None:
+        self.noise, self.torque, self.simulated = noise, 0.0, start
+        self.q, self.v = [noise.gauss(0, 0.05), math.pi + noise.gauss(0, 0.05)], [0.0, 0.0]
+        self.commands: deque[tuple[float, float]] = deque()
+
+    def seen(self, now: float) -> list[float]:
+        """Measured angles at a time."""
+        while self.simulated + STEP <= now:
+            while self.commands and self.commands[0][0] + LATE <= self.simulated:
+                self.torque = self.commands.popleft()[1]
+            rates = accelerations(self.q, self.v, self.torque)
+            self.v = [rate + STEP * change for rate, change in zip(self.v, rates, strict=True)]
+            self.q = [angle + STEP * rate for angle, rate in zip(self.q, self.v, strict=True)]
+            self.simulated += STEP
+        return [math.remainder(angle + NOISE * self.noise.gauss(), 2 * math.pi) for angle in self.q]
+
+    def command(self, now: float, torque: float) -> None:
+        """Sends a torque, which follows late."""
+        self.commands.append((now, max(-LARGEST, min(LARGEST, torque))))
+
+
 def main() -> None:
     """Serves one connection until it closes."""
-    noise = random.Random(int(sys.argv[1]))
+    plant = Pendulum(random.Random(int(sys.argv[1])))
     server = socket.create_server(("127.0.0.1", 0))
     print(server.getsockname()[1], flush=True)
     connection, _ = server.accept()
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     lines = connection.makefile("rw")
-    q, v, torque = [0.0, math.pi + 0.05], [0.0, 0.0], 0.0
-    commands: deque[tuple[float, float]] = deque()
-    start, simulated = time.monotonic(), 0.0
+    start = time.monotonic()
     for line in lines:
-        now = time.monotonic() - start
-        while simulated + STEP <= now:
-            while commands and commands[0][0] + LATE <= simulated:
-                torque = commands.popleft()[1]
-            rates = accelerations(q, v, torque)
-            v = [rate + STEP * change for rate, change in zip(v, rates, strict=True)]
-            q = [angle + STEP * rate for angle, rate in zip(q, v, strict=True)]
-            simulated += STEP
         if line[0] == "u":
-            commands.append((now, max(-LARGEST, min(LARGEST, float(line[1:])))))
+            plant.command(time.monotonic() - start, float(line[1:]))
         else:
-            seen = [math.remainder(angle + NOISE * noise.gauss(), 2 * math.pi) for angle in q]
-            print(*seen, file=lines, flush=True)
+            print(*plant.seen(time.monotonic() - start), file=lines, flush=True)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
 """The plants that the report learns: they hang at rest, draws of their sizes differ, and the rig obeys mechanics."""
 
 import math
+import random
 
 import numpy as np
 import pytest
 
 from scripts.reports.control import rig
 from scripts.reports.control.foreign_plants import SUBJECTS
+from scripts.reports.control.late_answers import late_plant
 
 MADE = [(subject, name) for subject, plants in SUBJECTS.items() for name in plants]
 
@@ -36,6 +38,24 @@ def test_draws_of_the_sizes_differ(subject, name):
             plant.act(plant.layout.limits.control[:, 1] / 2)
         ends.append(plant.read())
     assert np.abs(ends[0] - ends[1]).max() > 1e-3
+
+
+def test_samples_of_the_late_plant_are_late_and_its_motor_follows_ten_milliseconds_after():
+    plant, times = late_plant(3e-3, 0), []
+    plant.reset()
+    for number in range(1000):
+        plant.read()
+        times.append(plant.time())
+        plant.act(np.full(1, 0.01 * (number > 990)))
+    late = np.array(times) - times[0] - 0.01 * np.arange(1000)
+    mean = 3e-3 * (1 - math.exp(-3))  # of what is cut off at 9 ms
+    assert np.mean(late - late.min()) == pytest.approx(mean, rel=0.1) and 8e-3 < np.ptp(late) < 9.1e-3
+    driven, idle = (rig.Pendulum(random.Random(0)) for _ in range(2))
+    driven.command(0.0, 0.05)
+    for now, differ in ((0.010, False), (0.012, True)):
+        for pendulum in (driven, idle):
+            pendulum.seen(now)
+        assert (driven.v[0] - idle.v[0] > 0.1) == differ == (driven.v != idle.v)
 
 
 def test_the_rig_conserves_energy_without_friction(monkeypatch):
