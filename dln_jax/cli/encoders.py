@@ -105,7 +105,7 @@ def checked(
     """Findings of the quick checks of `check_data`, one line per finding.
 
     Args:
-        options: those of the command; with a cut-off, checks of the file's own rates (`FILTERED`) are skipped.
+        options: options of the command; with a cut-off, checks of the file's own rates (`FILTERED`) are skipped.
         data: unfiltered data of the file.
         robot: robot that the log is compared with, if any.
         without: names of checks that do not matter for this command.

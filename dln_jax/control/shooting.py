@@ -90,9 +90,9 @@ def shoot(
         u: guess [N, m].
         iterations: largest number of iterations of a search; leaving a saddle and restoring constraints are separate
             searches.
-        tolerance: of stationarity, feasibility and complementarity, with the cost scaled so that its derivatives at the
-            guess are at most 100. Stationarity and complementarity are divided by a hundredth of the mean multiplier
-            if that is above one.
+        tolerance: tolerance of stationarity, feasibility and complementarity, with the cost scaled so that its
+            derivatives at the guess are at most 100. Stationarity and complementarity are divided by a hundredth of the
+            mean multiplier if that is above one.
         exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton, which
             does not recognise saddles.
         starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: that of

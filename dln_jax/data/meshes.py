@@ -31,7 +31,7 @@ def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
     """Reads and checks a file; never unpickles.
 
     Args:
-        path: of an npz file, or of one that `read_mesh` reads.
+        path: path of an npz file, or of a file that `read_mesh` reads.
         scale: length of the file's unit in m, such as 0.001 for millimetres.
 
     Raises:

@@ -47,7 +47,7 @@ class WeightedFit(NamedTuple):
     unseen: Float[np.ndarray, "K P"]
     """Orthonormal directions along which theta keeps its prior value, in units of the columns' lengths."""
     without_effect: Float[np.ndarray, "M P"]
-    """Those directions of `unseen` that have no effect on the data."""
+    """Returns the directions of `unseen` that have no effect on the data."""
     lengths: Float[np.ndarray, " P"]
     """Lengths of the columns in units of noise; zero for columns without effect."""
 

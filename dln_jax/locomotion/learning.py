@@ -49,7 +49,7 @@ VALIDATION_STARTS, VALIDATION_EPISODES = 16, 5
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
 LANES = "creatures side by side"
-"""What devices share, for messages."""
+"""Name of the items that devices share, for messages."""
 
 Parameters = Any
 

@@ -1,4 +1,4 @@
-"""How episodes differ: perturbed starts, slopes, rough ground and pushes. What a variation lacks is not traced.
+"""How episodes differ: perturbed starts, slopes, rough ground and pushes. Absent ones are not traced.
 
 A slope is a direction of gravity, which is exact for plane ground: x runs along the slope. Rough ground is a sum of
 waves of equal amplitudes with random lengths (half a body length to two), directions and phases. A push is a jump of

@@ -30,7 +30,7 @@ STATES = 512
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to time."""
+    """Calls to time."""
 
     run: Path
     """Folder of a run of train_delan or train_hnn."""

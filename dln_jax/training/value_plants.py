@@ -56,7 +56,7 @@ class Chosen(NamedTuple):
 
 
 class Wishes(NamedTuple):
-    """What a user states about a plant; `None` for the defaults."""
+    """A user's settings for a plant; `None` for the defaults."""
 
     actuated: Sequence[str] = ()
     control: Any = None

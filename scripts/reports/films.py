@@ -160,7 +160,7 @@ FILMS: dict[str, Callable[[int], Film]] = {
     "control by energy": swing_up,
     "soft body: learned gait": crawler,
 }
-"""By their titles, in the order of the strip."""
+"""Films by title, in the order of the strip."""
 
 
 def framed(axis: Axes, points: np.ndarray) -> None:

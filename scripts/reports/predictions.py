@@ -1,4 +1,4 @@
-"""What one system predicts, compiled for this system alone: its torques and motions, and their errors."""
+"""Predictions of one system, compiled for this system alone: its torques and motions, and their errors."""
 
 import jax
 import numpy as np

@@ -170,7 +170,7 @@ def flange_wrench(jacobian: Any, tau: Any, *, length: float = 0.1, smallest: flo
     """Returns the least-squares solution of Jᵀ F = tau for the wrench F.
 
     Args:
-        jacobian: of the flange's linear and angular velocity [6, d], by `mechanics.trees.frame_jacobian`.
+        jacobian: Jacobian of the flange's linear and angular velocity [6, d], by `mechanics.trees.frame_jacobian`.
         tau: external torques [d].
         length: length that makes moments comparable with forces, m.
         smallest: singular values of the scaled Jacobian below this share of the largest count as zero.

@@ -70,7 +70,7 @@ def solve_on_grid(
     """Solves for the value on several grids, the coarsest first, and returns it on the last.
 
     Args:
-        problem: of two states and one control.
+        problem: a problem with two states and one control.
         points: number of nodes per side, for every grid; on a circle the last node is the first.
         low: lower corner of the rectangle [2]. Trajectories that would leave it stay on its edge: make it large enough
             for those of interest.

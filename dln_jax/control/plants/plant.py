@@ -27,7 +27,7 @@ class Limits(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """What is known of a plant before it has moved: no mass, no length."""
+    """Facts about a plant that are known before it has moved; masses and lengths are not among them."""
 
     joints: tuple[JointKind, ...]
     actuation: Float[np.ndarray, "d m"]

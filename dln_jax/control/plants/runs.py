@@ -56,7 +56,7 @@ def run(
     Args:
         plants: one or several; they are guarded.
         act: result of `compiled`.
-        memories: of the controller before the first sample, one for each plant along the leading axis.
+        memories: memories of the controller before the first sample, one for each plant along the leading axis.
         seconds: duration.
         push: acts on every plant that still runs; by default none.
 

@@ -178,7 +178,7 @@ class _Finished(NamedTuple):
     solution: least_squares.LeastSquaresSolution
     trained: Float[np.ndarray, " d"]
     judged: Float[np.ndarray, " d"]
-    """On the validation samples, or on the training samples if there are none."""
+    """Error on the validation samples, or on the training samples if there are none."""
 
 
 def _some(data: Trajectories, most: int, seed: int) -> Samples:

@@ -50,7 +50,7 @@ class Targets(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a child adds to a tile: consecutive rows and columns of its U, which lie in at most two by two tiles."""
+    """Addition of a child to a tile: consecutive rows and columns of its U, which lie in at most two by two tiles."""
 
     upper: Numbers
     lower: Numbers

@@ -42,7 +42,7 @@ class Refinement(NamedTuple):
 
     @property
     def line(self) -> str:
-        """What the refinement did."""
+        """Summary of the refinement."""
         shown = "; ".join(
             f"{name} motions predicted for {after:.3g} s, by torques for {before:.3g} s"
             for name, (before, after) in (("validation", self.validation), ("test", self.test))

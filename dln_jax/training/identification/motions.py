@@ -93,7 +93,7 @@ def fit_by(
         solution: consistent fit of the torques.
         sets: motions; those of `sets.train` have the trajectories of `train`.
         window: length of the windows, s (default: chosen from `WINDOWS` by inner splits).
-        options: of `identify`, for the fits of torques in inner splits.
+        options: options of `identify`, for the fits of torques in inner splits.
 
     Raises:
         InputError: physically inconsistent parameters, or a window of fewer than four samples.

@@ -187,7 +187,7 @@ def figures_of(
 
 
 def write_file(folder: Path, options: Options, case: Case, solution: Identification, verdict: Verdict) -> list[str]:
-    """Writes the robot's file with the parameters kept; returns a line on what it lacks, or why there is none."""
+    """Writes the robot's file with the parameters kept; returns lines on missing parts, or why no file was written."""
     bodies = is_consistent(solution.theta, solution.columns)
     path = folder / f"{options.robot.stem}_identified{options.robot.suffix}"
     if verdict.level == "refused":

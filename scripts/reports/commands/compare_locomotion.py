@@ -47,7 +47,7 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     rivals: Annotated[str, choice(RIVALS, several=True)] = ",".join(RIVALS)
     """Methods to compare with gradients, separated by commas."""
     seeds: int = 3
-    """Of each method, one after the other."""
+    """Seeds of each method, one after the other."""
     steps: Unstated[int] = None
     """Environment steps of each seed (default: 400000 by gradients, 500000 by evolution, 300000 by
     ppo, 20000 by sac)."""

@@ -60,7 +60,7 @@ def model() -> Any:
 
 
 def known() -> Sizes:
-    """What the plans take for the plant: a thin rod."""
+    """The plant as the plans model it: a thin rod."""
     length = 0.95 * LENGTH
     return Sizes(1.05 * CART, ROD, length / 2, ROD * length**2 / 12)
 

@@ -82,7 +82,7 @@ class Replanning(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What is identified on the way: cost to go and gains of the regulator, and the nine numbers."""
+    """Quantities identified on the way: cost to go and gains of the regulator, and the nine numbers."""
 
     S: Array
     K: Array

@@ -27,7 +27,7 @@ class EvolutionSettings(NamedTuple):
     """Creatures of a generation, in pairs."""
     deviation: float = 0.2
     learning_rate: float = 0.2
-    """Of Adam."""
+    """Learning rate of Adam."""
 
 
 class EvolutionState(NamedTuple):

@@ -46,7 +46,7 @@ def recorded_arm(log: Path, robot: Path, quick: bool) -> Findings:
     """Errors of every block by models that have not seen it; a quick run holds out one pair of blocks.
 
     Raises:
-        InputError: what `read_robot` or `schema.load` refuse, or joints that do not agree.
+        InputError: `read_robot` or `schema.load` refuses a file, or the joints do not agree.
     """
     tree = read_robot(robot).tree
     data = with_joints(schema.load(log), tree.names)

@@ -57,7 +57,7 @@ def with_torques(
         windows: windows to fit, as many as there are motions.
         validation: windows that select the parameters.
         noise: standard deviations of the joints' torques [d], or the residuals of a fit of torques alone, N m or N.
-        share: of the torques in the loss.
+        share: share of the torques in the loss.
 
     Raises:
         InputError: another number of windows, or a noise or share that is not positive.

@@ -20,7 +20,7 @@ from scripts.reports.rows import expect
 from scripts.reports.soft_bodies.speed import bar_scene, bar_system, unordered_bar
 
 CELLS = ((10, 4, 4), (17, 6, 6), (36, 13, 13))
-"""Of bars of 1,000, 4,000 and 41,000 tetrahedra."""
+"""Numbers of cells along the edges of bars with 1,000, 4,000 and 41,000 tetrahedra."""
 MODULI, RATIOS, DT = (3e5, 1e7, 1e9), (0.3, 0.49), 1 / 60
 STEPS = 2
 SPREAD, OVER_SCIPY = 2.0, 1.5

@@ -83,7 +83,7 @@ def casadi_step(folder: Path, *, shared: bool) -> tuple[Path, Counter[str]]:
     """Writes and compiles CasADi's C with the interface of ours; returns its object file and its operations by kind.
 
     Args:
-        folder: of the files.
+        folder: folder of the files.
         shared: let CasADi compute common expressions once.
     """
     ca = casadi()

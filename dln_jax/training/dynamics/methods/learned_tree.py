@@ -90,10 +90,10 @@ def refined_by_motions(
     The bodies start as balls, and a fit of torques first makes them physically consistent.
 
     Args:
-        needs: of the tree, as by `needs_of_tree`.
+        needs: needs of the tree, as by `needs_of_tree`.
         description: its parents, acceleration and velocity scale.
         sets: motions to fit, those that decide, and the test, which only measures.
-        parameters: of the tree by torques.
+        parameters: parameters of the tree, fitted to torques.
         window: length of the windows, s (default: chosen by inner splits).
     """
     scale = description["velocity_scale"]

@@ -1,4 +1,4 @@
-"""What all simulators are given, and a reference of its motion that shares no code with any of them.
+"""The body that all simulators receive, and a reference of its motion that shares no code with any of them.
 
 The reference integrates M a = f(x) with Störmer and Verlet's explicit method (order 2) in NumPy, with the first
 Piola-Kirchhoff stress of the material written out, and extrapolates two step lengths. It damps nothing.

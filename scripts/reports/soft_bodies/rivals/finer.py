@@ -22,7 +22,7 @@ CHANGE = 1e-4
 
 
 def cantilever(cells: int, *, quick: bool = False, order: int = 1, law: str = NEO_HOOKEAN) -> Body:
-    """A cantilever with so many cells through its thickness, E = 1e6 Pa, nu = 0.3."""
+    """A cantilever with this number of cells through its thickness, E = 1e6 Pa, nu = 0.3."""
     mesh = box(LENGTHS, (4 * cells, cells, cells))
     mesh = quadratic(mesh) if order == 2 else mesh
     held = vertices_where(mesh, lambda x: x[:, 0] == 0)
