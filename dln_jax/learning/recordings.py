@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.data.encoders import smooth
-from dln_jax.data.encoders.sampling import held_at_equal_steps
+from dln_jax.data.encoders import held_at_equal_steps, smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.engine.fit import fit

@@ -8,7 +8,7 @@ from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
 from dln_jax.data.encoders.filters import derivatives, low_pass
 from dln_jax.data.encoders.local_polynomials import LocalRates, smooth_locally
 from dln_jax.data.encoders.repeats import Repeats, find_repeats, without_repeats
-from dln_jax.data.encoders.sampling import noise_of, step_of, torque_noise
+from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of, step_of, torque_noise
 from dln_jax.data.encoders.smoothing import Smoothed, labels_of_parts, smooth
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "choose_cutoff",
     "derivatives",
     "find_repeats",
+    "held_at_equal_steps",
     "labels_of_parts",
     "low_pass",
     "noise_of",
