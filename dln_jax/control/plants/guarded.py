@@ -11,6 +11,8 @@ from dln_jax.types import InputError
 
 LATE = 2.0
 """Largest time between two answers, in samples."""
+NEAR = 1.0
+"""Largest angle of a passive joint from hanging at a start, rad: a pole that still stands does not hang."""
 SPAN = 5
 """Samples over which a rate is measured, so that an encoder step does not look like a high rate."""
 ROUNDING = 1e-9
@@ -29,11 +31,12 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
         plant: any.
         late: largest time between two answers, in samples.
 
-    The reset raises `InputError` for a start outside the limits or an answer of another shape.
+    The reset raises `InputError` for a start outside the limits or far from hanging, or an answer of another shape.
     """
     layout, limits = plant.layout, plant.layout.limits
     d, m = layout.actuation.shape
     circular = np.array([kind == "revolute" for kind in layout.joints])
+    swinging = circular & ~(layout.actuation != 0).any(axis=1)
     seen: deque[tuple[float, np.ndarray]] = deque(maxlen=SPAN + 1)
     reason: list[str] = []
     acted = [False]
@@ -80,6 +83,12 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
             raise InputError(f"the plant starts at {q.tolist()}; expected finite coordinates: check its sensors")
         if why := outside(q, np.zeros(d)):
             raise InputError(f"{why}: the start is outside the limits; reset the plant to a posture within")
+        away = np.where(swinging, np.abs(q - layout.hanging), 0.0)
+        if away.max() > NEAR:
+            raise InputError(
+                f"'{layout.names[int(np.argmax(away))]}' starts {away.max():.3g} rad from hanging; expected at most "
+                f"{NEAR:g}: let the reset return when the plant has come to rest there, or check the layout's hanging"
+            )
         seen.append((plant.time(), q))
 
     def read() -> np.ndarray:

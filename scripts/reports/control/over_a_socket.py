@@ -25,8 +25,8 @@ ROTARY = layout(
     ("revolute", "revolute"), [0], goal=(0, 0), hanging=(0, np.pi), rate=RATE, control=rig.LARGEST,
     position=[[-2.5, 2.5], [-np.inf, np.inf]], speed=(40.0, 60.0),
 )  # fmt: skip
-STILL, SLOW, CENTRED = 50, 0.01, 0.3
-"""Number of still samples before a start, and the largest change of an angle and angle of the arm in them, rad."""
+STILL, SLOW, NEAR = 50, 0.01, 0.3
+"""Number of still samples before a start, and the largest change and distance from hanging of an angle in them, rad."""
 
 
 def plant_over(lines: IO[str]) -> Plant:
@@ -44,9 +44,9 @@ def plant_over(lines: IO[str]) -> Plant:
         while still < STILL:
             time.sleep(1 / RATE)
             q = read()
-            moved = np.remainder(q - before + np.pi, 2 * np.pi) - np.pi
+            moved, away = (np.remainder(q - other + np.pi, 2 * np.pi) - np.pi for other in (before, ROTARY.hanging))
             write(np.clip(-0.01 * q[:1] - 0.2 * moved[:1], -0.02, 0.02))
-            still = still + 1 if np.abs(moved).max() < SLOW and abs(q[0]) < CENTRED else 0
+            still = still + 1 if np.abs(moved).max() < SLOW and np.abs(away).max() < NEAR else 0
             before = q
         write(np.zeros(1))
 

@@ -33,6 +33,16 @@ class Puppet:
         return guarded(Plant(self.layout, lambda: None, lambda: self.q, self.act, lambda: self.t))
 
 
+def test_a_start_far_from_hanging_is_refused():
+    puppet = Puppet()
+    puppet.q = np.array([0.1, 3.0])
+    with pytest.raises(InputError, match="'hinge' starts 3 rad from hanging; expected at most 1"):
+        puppet.plant().reset()
+    puppet.q = np.array([0.1, 2 * np.pi - 0.9])  # is -0.9
+    puppet.plant().reset()
+    assert not puppet.commands
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
