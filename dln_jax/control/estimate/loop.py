@@ -76,8 +76,8 @@ def with_estimate(
         late: samples by which the channels of y are late, one per channel or one for all.
         every: samples between new measurements of a channel, from the first sample on, one per channel or one for all;
             values in between are ignored.
-        rate: nominal sampling rate, Hz, to use the times of samples that the controller is called with; by default
-            they count as evenly spaced.
+        rate: nominal sampling rate, Hz. With it the filter uses the times with which the controller is called;
+            by default samples count as evenly spaced.
 
     Raises:
         InputError: a number of samples is negative, or not whole where it must be, or `every` or the rate is zero.
@@ -117,16 +117,16 @@ def with_estimate(
 
         def through(past: Any, sample: tuple[Any, ...]) -> tuple[Any, Any]:
             y, seen, u, number, length = sample
-            before = past
-            past, _ = filter.update(past, y, seen)
-            later = stretched(past.x, filter.predict(past, u), length)
+            updated, _ = filter.update(past, y, seen)
+            later = stretched(updated.x, filter.predict(updated, u), length)
             # Before the first sample there was no motion to predict.
-            later = jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), later, before)
+            later = jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), later, past)
             return later, later
 
         base, lengths, newest = memory.filter, None, None
         if rate is not None:
             newest = jnp.where(memory.number > 0, (t - memory.t) * rate, 1.0).astype(ys.dtype)
+            # One length in, one out: without delays there is none to keep.
             lengths = jnp.append(memory.lengths, newest)[1:]
         shares = shares_of(lengths)
         known = acting(memory.u, shares)

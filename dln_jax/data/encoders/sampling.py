@@ -102,7 +102,7 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
 
 
 def _mean_of_held(t: np.ndarray, values: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
-    """Means over steps from `times` on of values that are held from each sample to the next; the last one stays."""
+    """Returns the mean over the step from each of `times` on; values are held to the next sample, the last for ever."""
     ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
     integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(np.diff(ends)[:, None] * values, axis=0)])
     at = [[np.interp(moments, ends, column) for column in integral.T] for moments in (times, times + step)]

@@ -50,7 +50,7 @@ class Targets(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Addition of a child to a tile: consecutive rows and columns of its U, which lie in at most two by two tiles."""
+    """Rows and columns of a child's U that are added to a tile: consecutive ones, in two by two tiles at most."""
 
     upper: Numbers
     lower: Numbers

@@ -26,7 +26,7 @@ ROTARY = layout(
     position=[[-2.5, 2.5], [-np.inf, np.inf]], speed=(40.0, 60.0),
 )  # fmt: skip
 STILL, SLOW, NEAR = 50, 0.01, 0.3
-"""Number of still samples before a start, and the largest change and distance from hanging of an angle in them, rad."""
+"""Number of still samples before a start; largest change of an angle and distance from hanging in them, rad."""
 
 
 def plant_over(lines: IO[str]) -> Plant:
