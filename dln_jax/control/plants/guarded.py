@@ -9,8 +9,6 @@ import numpy as np
 from dln_jax.control.plants.plant import Plant
 from dln_jax.types import InputError
 
-LATE = 2.0
-"""Largest time between two answers, in samples."""
 NEAR = 1.0
 """Largest angle of a passive joint from hanging at a start, rad: a pole that still stands does not hang."""
 SPAN = 5
@@ -22,16 +20,11 @@ class Stopped(RuntimeError):
     """The plant was stopped, with zero controls; the message says why. It acts again after a reset."""
 
 
-def guarded(plant: Plant, *, late: float = LATE) -> Plant:
+def guarded(plant: Plant) -> Plant:
     """Wraps a plant so that it stops, with zero controls and `Stopped`, once it leaves its limits or answers wrongly.
 
-    Measured angles may be wrapped; those of the guarded plant are continuous. Its time is that of the last answer.
-
-    Args:
-        plant: any.
-        late: largest time between two answers, in samples.
-
-    The reset raises `InputError` for a start outside the limits or far from hanging, or an answer of another shape.
+    Measured angles may be wrapped; those of the guarded plant are continuous. Its time is that of the last answer. The
+    reset raises `InputError` for a start outside the limits or far from hanging, or an answer of another shape.
     """
     layout, limits = plant.layout, plant.layout.limits
     d, m = layout.actuation.shape
@@ -103,8 +96,8 @@ def guarded(plant: Plant, *, late: float = LATE) -> Plant:
             stop(
                 f"the plant's clock reads {t:.6g} s after {seen[-1][0]:.6g} s; expected it to advance with every sample"
             )
-        if t - seen[-1][0] > late / layout.rate:
-            stop(f"an answer is {1e3 * (t - seen[-1][0]):.4g} ms after the last, more than {late:g} samples")
+        if t - seen[-1][0] > limits.late / layout.rate:
+            stop(f"an answer is {1e3 * (t - seen[-1][0]):.4g} ms after the last, more than {limits.late:g} samples")
         seen.append((t, q))
         acted[0] = False
         passed = t - seen[0][0]

@@ -24,6 +24,8 @@ class Limits(NamedTuple):
     """Largest rates, 1/s or m/s; infinite for none."""
     stopping: float = 0.0
     """Time ahead for which the present rate must not lead beyond the positions, s: the time that a brake needs."""
+    late: float = 2.0
+    """Largest time between two answers, in samples."""
 
 
 class Layout(NamedTuple):
@@ -74,6 +76,7 @@ def layout(
     position: Any = None,
     speed: Any = np.inf,
     stopping: float = 0.0,
+    late: float = 2.0,
     names: Sequence[str] = (),
     passive: bool = True,
 ) -> Layout:
@@ -89,14 +92,17 @@ def layout(
         position: limits [d, 2], rad or m; by default none.
         speed: largest rates, one for all or one each, 1/s or m/s.
         stopping: as `Limits.stopping`.
+        late: as `Limits.late`.
         names: names of the coordinates; by default joint_0, joint_1, ...
         passive: whether a coordinate without a motor is required, as for a swing-up.
 
     Raises:
         InputError: shapes do not agree, a motor's coordinate does not exist, there is no motor or no passive
-            coordinate, a limit is not positive, or a posture is outside the limits.
+            coordinate, a limit is not positive, answers are late after one sample, or a posture is outside the limits.
     """
     require_positive(rate=rate)
+    if not late > 1:
+        raise InputError(f"late is {late}; expected more than 1, because answers are a sample apart")
     d, chosen = len(joints), sorted(set(actuated))
     names = tuple(names) or tuple(f"joint_{k}" for k in range(d))
     if any(not 0 <= k < d for k in chosen):
@@ -119,7 +125,7 @@ def layout(
     for name, q in postures.items():
         if not np.isfinite(q).all() or (q < ranges[:, 0]).any() or (q > ranges[:, 1]).any():
             raise InputError(f"{name} is {q.tolist()}, outside the limits {ranges.tolist()}; choose a posture within")
-    limits = Limits(np.stack([-size, size], axis=1), ranges, rates, stopping)
+    limits = Limits(np.stack([-size, size], axis=1), ranges, rates, stopping, late)
     return Layout(needs.joints, B, postures["goal"], postures["hanging"], float(rate), limits, names)
 
 

@@ -87,6 +87,17 @@ def test_the_rate_and_the_way_to_stop_count_as_limits():
         assert puppet.q[0] < 0.1
 
 
+def test_a_layout_states_how_late_an_answer_may_be():
+    puppet = Puppet(late=4.0)
+    safe = puppet.plant()
+    safe.reset()
+    puppet.t = 0.039
+    safe.read()
+    puppet.t += 0.041
+    with pytest.raises(Stopped, match="41 ms after the last, more than 4 samples"):
+        safe.read()
+
+
 def test_controls_beyond_the_motor_stop_the_plant():
     for u, reason in (([2.1], "outside"), ([np.nan], "expected 1 finite")):
         puppet = Puppet()
@@ -126,6 +137,7 @@ def test_a_start_outside_the_limits_is_refused():
         ({"rate": 0.0}, "rate is 0"),
         ({"position": [[0.5, -0.5], [-1, 1]]}, "position is"),
         ({"speed": -1.0}, "speed is"),
+        ({"late": 1.0}, "late is 1.*expected more than 1"),
     ],
     ids=lambda case: case if isinstance(case, str) else next(iter(case)),
 )
