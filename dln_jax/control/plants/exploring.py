@@ -1,13 +1,14 @@
 """Motions from which any plant can be learned without a model: first smooth noise, then energy laws of a learned model.
 
 1. Blind episodes: smooth noise, with a spring and a damper that are scaled by the limits of motors and coordinates. An
-   episode that `guarded` stops halves the noise of all later ones.
+   episode that `guarded` stops halves the noise of all later ones, and the rest of its time is tried once more.
 2. A model is fitted. The other episodes follow its energy law, with noise, some to energies below that of the goal and
    some above; the model is fitted again on the way.
 3. If none of these came near the goal, as with an acrobot, whose motor hardly reaches its passive joint, the model does
    not know the weight there. The remaining episodes follow a plan of the model to the goal, with less noise.
 """
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -94,11 +95,13 @@ def explore(
     used = layout.limits._replace(control=exploration.share * layout.limits.control)
     inner = layout._replace(limits=used)
     stages = [*exploration.blind, *exploration.surplus]
-    seconds = exploration.seconds / len(stages)
+    waiting = deque((number, stage, exploration.seconds / len(stages)) for number, stage in enumerate(stages))
+    repeated: set[int] = set()
     runs: list[PlantRun] = []
     stopped: list[str] = []
     weaker, blind, law, by_plan = 1.0, _blind(inner), None, False
-    for number, stage in enumerate(stages):
+    while waiting:
+        number, stage, seconds = waiting.popleft()
         later = number - len(exploration.blind)
         if later >= 0 and (by_plan or later % FITTED_EVERY == 0):
             upright = _upright(inner, fit, runs)
@@ -122,11 +125,16 @@ def explore(
         if one.stopped:
             weaker /= 2
             stopped.append(one.stopped)
+            left = seconds - len(one.t) / layout.rate
+            if number not in repeated and left >= SHORTEST:
+                repeated.add(number)
+                waiting.appendleft((number, stage, left))
         if len(one.t) >= SHORTEST * layout.rate:
             runs.append(one)
     if len(runs) < 2:
+        episodes = len(stages) + len(repeated)
         raise InputError(
-            f"the plant was stopped in {len(stopped)} of {len(stages)} episodes ({stopped[-1]}); expected two of at "
+            f"the plant was stopped in {len(stopped)} of {episodes} episodes ({stopped[-1]}); expected two of at "
             f"least {SHORTEST:g} s: widen its limits or weaken its motors"
         )
     return Explored(recording_of(runs, layout), tuple(stopped))

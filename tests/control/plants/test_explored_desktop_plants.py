@@ -34,6 +34,28 @@ def test_a_recording_is_a_file_of_encoder_readings(recording, tmp_path):
     assert read.estimated == ("qd", "qdd") and read.needs == PLANT.layout.needs and len(read.t) == 1500
 
 
+def test_the_rest_of_a_stopped_episode_is_tried_once_more_with_half_of_the_noise():
+    """The plant answers NaN 0.5 s after its first reset, and is sound after the second."""
+    plant, resets = simulated_plant(PLANT, seed=1), []
+
+    def read():
+        broken = len(resets) == 1 and plant.time() > resets[0] + 0.5
+        return np.full(2, np.nan) if broken else plant.read()
+
+    def reset():
+        plant.reset()
+        resets.append(plant.time())
+
+    explored = explore(plant._replace(read=read, reset=reset), unused, BLIND._replace(seconds=4.0), seed=1)
+    # Half a second is too short to be kept; the others are the rest of the first episode, and the second one.
+    assert len(explored.stopped) == 1 and len(resets) == 3
+    lengths = np.bincount(explored.recording.trajectory)
+    np.testing.assert_allclose(lengths / PLANT.layout.rate, [1.5, 2.0], atol=0.01)
+    undisturbed = explore(simulated_plant(PLANT, seed=1), unused, BLIND._replace(seconds=4.0), seed=1).recording
+    second = [one.tau[one.trajectory == 1, 0].std() for one in (explored.recording, undisturbed)]
+    assert second[0] < 0.7 * second[1]
+
+
 def test_noise_is_smooth():
     noise = smooth_noise((4000, 2), rate=500.0, bandwidth=3.0, random=np.random.default_rng(0))
     power = np.abs(np.fft.rfft(noise, axis=0)) ** 2
