@@ -82,7 +82,7 @@ def _choose(words: list[str], prog: str, package: str, names: list[str], more: s
     if name not in names:
         like = difflib.get_close_matches(name, names, n=1)
         remedy = f"did you mean {like[0]}?" if like else f"choose from {', '.join(names)}"
-        print(f"error: '{first:.80}' is no command; {remedy}".replace("\n", " "), file=sys.stderr)
+        print(f"error: '{first:.80}' is not a command; {remedy}".replace("\n", " "), file=sys.stderr)
         raise SystemExit(2)
     del sys.argv[1 : len(sys.argv) - len(words) + 1]
     command(name, f"{prog} {name}", package=package)

@@ -110,7 +110,7 @@ def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) ->
     for key, value in values.items():
         # An argument of another release that was left unset does not affect the result.
         if key not in expected and value not in (None, False):
-            raise InputError(f"{path}: {key!r:.40} is no argument of this release; {REMEDY}")
+            raise InputError(f"{path}: {key!r:.40} is not an argument of this release; {REMEDY}")
     return _checked(path, values, whole)
 
 

@@ -88,7 +88,7 @@ def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linea
     rest = field(x, u)
     if not bool(jnp.max(jnp.abs(rest)) <= tolerance):
         raise InputError(
-            f"the goal is no equilibrium: dx/dt is {float(jnp.max(jnp.abs(rest))):.3g} there, above {tolerance:g}; "
+            f"the goal is not an equilibrium: dx/dt is {float(jnp.max(jnp.abs(rest))):.3g} there, above {tolerance:g}; "
             "give a state at rest and the controls that hold it"
         )
     A, B = jax.jacfwd(field, argnums=(0, 1))(x, u)

@@ -25,7 +25,7 @@ def stated_test(data: Trajectories, text: str | None) -> tuple[Trajectories, lis
     its last part, so that there is something to validate by.
 
     Raises:
-        InputError: a share that is no percentage between 1 and 90, or a trajectory that is too short for it.
+        InputError: a share that is not a percentage between 1 and 90, or a trajectory that is too short for it.
     """
     if not is_cut(text) or text is None:
         return data, None if text is None else [label.strip() for label in text.split(",")]

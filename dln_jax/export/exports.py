@@ -40,7 +40,7 @@ def write_exports(directory: Path, files: Mapping[str, bytes], *, overwrite: boo
     for name, data in files.items():
         path = directory / name
         if path.exists() and not path.is_file():
-            raise InputError(f"{path} is no file and cannot be replaced; choose another folder or name")
+            raise InputError(f"{path} is not a file and cannot be replaced; choose another folder or name")
         if path.exists() and name.endswith(".json"):
             there, ours = _values(path).get("files"), json.loads(data)["files"]
             if not isinstance(there, dict) or there.keys() != ours.keys():

@@ -182,9 +182,7 @@ def make_gradient_learner(
     require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
     shares(mesh, settings.lanes, LANES)
     if settings.lanes % 2:
-        raise InputError(
-            f"{settings.lanes} creatures are no pairs, in which the gradient takes them; give an even number"
-        )
+        raise InputError(f"lanes is {settings.lanes}; the gradient takes creatures in pairs: give an even number")
     lanes, window, discount = settings.lanes, settings.window, settings.discount
     clipped = optax.clip_by_global_norm(1.0)
     in_all = max(1, steps // (lanes * window))

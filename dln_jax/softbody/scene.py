@@ -218,7 +218,7 @@ def _by_term(scene: SoftScene, control: Any) -> Callable[[str], Any]:
         return lambda name: control
     if unknown := [name for name in control if name not in driven]:
         known = f"expected {', '.join(driven)}" if driven else "it has none: give a term no value, so that it reads one"
-        raise InputError(f"the control names '{unknown[0]}', which is no actuator of the scene; {known}")
+        raise InputError(f"the control names '{unknown[0]}', which is not an actuator of the scene; {known}")
     return control.get
 
 

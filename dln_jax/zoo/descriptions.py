@@ -142,7 +142,7 @@ def functions_of(
         raise InputError("the model has a factory of its own, which the file does not tell; give it as factory=")
     if not trust:
         raise InputError(
-            f"the model is made by {name[:200]}, which is no code of this package; "
+            f"the model is made by {name[:200]}, which is not code of this package; "
             "give that function as factory=, or trust=True to have it imported"
         )
     try:
@@ -150,7 +150,7 @@ def functions_of(
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise InputError(f"{name[:200]} cannot be imported ({error}); expected package.module:function") from error
     if not callable(imported):
-        raise InputError(f"{name[:200]} is no function; expected a factory of models")
+        raise InputError(f"{name[:200]} is not a function; expected a factory of models")
     return (imported,)
 
 

@@ -155,11 +155,11 @@ def stored_findings(folder: Path, cases: Sequence[Case]) -> dict[str, Findings]:
     results = {}
     for name, values in (read_json(path, remedy=REMEDY) if is_file(path) else {}).items():
         if name not in known:
-            raise InputError(f"{path}: {name!r:.60} is no case of this table; {REMEDY}")
+            raise InputError(f"{path}: {name!r:.60} is not a case of this table; {REMEDY}")
         results[name] = _from_json(f"{path}: {name}", values)
         numbers = by_case(results[name].rows)
         if others := [case for case in numbers if case not in known[name].quantities]:
-            raise InputError(f"{path}: {others[0]!r:.60} is no case of {name}; {REMEDY}")
+            raise InputError(f"{path}: {others[0]!r:.60} is not a case of {name}; {REMEDY}")
         for case, quantities in known[name].quantities.items():
             if missing := [quantity for quantity in quantities if quantity not in numbers.get(case, {})]:
                 raise InputError(f"{path}: {case} lacks {missing[0]}; {REMEDY}")

@@ -203,7 +203,7 @@ def test_without_a_name_there_is_a_list_and_an_unknown_one_is_one_line(monkeypat
             main()
         line = capsys.readouterr().err
         assert stop.value.code == 2 and line.count("\n") == 1 and len(line) < 1000
-        assert line.startswith("error: ") and "is no command; choose from" in line
+        assert line.startswith("error: ") and "is not a command; choose from" in line
 
 
 def test_a_name_that_is_nearly_right_is_suggested_and_reports_are_commands_of_a_checkout(monkeypatch, capsys):

@@ -115,7 +115,7 @@ def test_mistakes_are_one_line():
     plant = dynamics(scene.energies)
     with pytest.raises(InputError, match="no controls hold the posture"):
         holding_controls(plant, [0.0, 0.3], scene.needs.actuation)
-    with pytest.raises(InputError, match="no equilibrium"):
+    with pytest.raises(InputError, match="not an equilibrium"):
         linearise(field_of(plant, scene.needs.actuation), [0.0, 0.3, 0.0, 0.0], [0.0])
     with pytest.raises(InputError, match="a coordinate without a motor"):
         parts_of(np.eye(2))

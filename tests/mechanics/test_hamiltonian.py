@@ -266,7 +266,7 @@ def test_a_velocity_without_a_momentum_gives_nan_in_value_and_derivative():
 
 
 def test_a_charged_particle_in_a_magnetic_field():
-    """H = ½ |p - A(q)|² is no natural system: the velocity turns at the cyclotron rate."""
+    """H = ½ |p - A(q)|² is not a natural system: the velocity turns at the cyclotron rate."""
 
     def H(q, p):
         return 0.5 * jnp.sum((p - 0.85 * jnp.array([-q[1], q[0]])) ** 2)

@@ -1,4 +1,4 @@
-"""Verdicts of predicted motions: an explosion is never averaged away, and chaos or noise is no failure."""
+"""Verdicts of predicted motions: an explosion is never averaged away, and neither chaos nor noise is a failure."""
 
 import numpy as np
 import pytest

@@ -50,11 +50,11 @@ def test_a_table_is_continued_with_what_was_measured(tmp_path):
 @pytest.mark.parametrize(
     ("stored", "message"),
     [
-        ({"c": {}}, "'c' is no case"),
+        ({"c": {}}, "'c' is not a case"),
         ({"a": {"error": 1.0}}, "expected rows"),
         ({"a": {"rows": [["a", "error", "small"]], "curves": {}}}, "expected rows"),
         ({"a": {"rows": [["a", "other", 1.0]], "curves": {}}}, "a lacks error"),
-        ({"a": {"rows": [["b", "error", 1.0]], "curves": {}}}, "'b' is no case of a"),
+        ({"a": {"rows": [["b", "error", 1.0]], "curves": {}}}, "'b' is not a case of a"),
         ({"a": {"rows": [["a", "error", 1.0]]}}, "expected rows .* and curves"),
         ({"a": {"rows": [["a", "error", 1.0]], "curves": {"t": ["x"]}}}, "expected rows .* and curves"),
     ],

@@ -325,7 +325,7 @@ def test_controls_are_shared_by_name():
     state = make_step(scene, 0.02).init()
     with pytest.raises(InputError, match="one array, but the scene has the actuators air, tendon"):
         step(scene.params, state, jnp.ones(2))
-    with pytest.raises(InputError, match=r"names 'water', which is no actuator.*air"):
+    with pytest.raises(InputError, match=r"names 'water', which is not an actuator.*air"):
         step(scene.params, state, CONTROL | {"water": jnp.ones(1)})
     with pytest.raises(InputError, match=r"air got no control; expected shape .*: the gauge pressure in Pa"):
         step(scene.params, state, {name: of for name, of in CONTROL.items() if name != "air"})

@@ -240,7 +240,7 @@ def test_a_factory_is_imported_by_name_only_when_it_is_trusted(tmp_path, module)
     description = describe("rods:make_rod", needs=FREE, precision="f64", length=1.0)
     save(tmp_path, description, jnp.array([3.0]))
     sys.modules.pop("rods")
-    with pytest.raises(InputError, match="made by rods:make_rod, which is no code of this package; give"):
+    with pytest.raises(InputError, match="made by rods:make_rod, which is not code of this package; give"):
         load(tmp_path)
     assert not module()
     np.testing.assert_allclose(load(tmp_path, factory=make_rod).dynamics.mass_matrix([0.1]), [[3.0]])

@@ -102,8 +102,8 @@ def own_problem(
         box: half widths [2 d].
 
     Raises:
-        InputError: the limits cannot hold the goal or it is no equilibrium, numbers have the wrong count or sign, or
-            the plant neither falls nor is driven.
+        InputError: the limits cannot hold the goal or it is not an equilibrium, numbers have the wrong count or sign,
+            or the plant neither falls nor is driven.
     """
     B, size = layout.actuation, layout.limits.control[:, 1]
     passive = np.flatnonzero((B == 0).all(axis=1))

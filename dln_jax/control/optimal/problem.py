@@ -133,8 +133,8 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     moving, cost = map(float, at_rest(jnp.asarray(goal)))
     if not moving <= tolerance:
         raise InputError(
-            f"the goal is no equilibrium: dx/dt is {moving:.3g} there with the cheapest control, above {tolerance:g}; "
-            "give a state at rest, or centre the action cost at the control that holds it"
+            f"the goal is not an equilibrium: dx/dt is {moving:.3g} there with the cheapest control, above "
+            f"{tolerance:g}; give a state at rest, or centre the action cost at the control that holds it"
         )
     if not abs(cost) <= tolerance:
         raise InputError(f"a second at the goal costs {cost:.3g}; expected none, as V is zero there")
@@ -162,7 +162,7 @@ def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> C
     moving = float(jnp.max(jnp.abs(drift + B @ u)))
     if not moving <= tolerance:
         raise InputError(
-            f"the goal is no equilibrium: no control makes dx/dt less than {moving:.3g} there; give another"
+            f"the goal is not an equilibrium: no control makes dx/dt less than {moving:.3g} there; give another"
         )
     cost = problem.state_cost
     return checked(

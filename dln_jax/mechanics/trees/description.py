@@ -88,10 +88,10 @@ def make_tree(
     checked = {name: finite_array(name, array, shape) for name, (array, shape) in arrays.items()}
     turned = checked["rotations"]
     if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turned) < 0).any():
-        raise InputError("rotations has a matrix that is no rotation; expected orthonormal columns, right-handed")
+        raise InputError("rotations has a matrix that is not a rotation; expected orthonormal columns, right-handed")
     A = checked["armature"]
     if A.ndim == 2 and (np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] < -1e-9 * A.max()):
-        raise InputError("armature is no symmetric positive semidefinite matrix; expected that of motors' inertias")
+        raise InputError("armature is not a symmetric positive semidefinite matrix; expected that of motors' inertias")
     lengths = np.linalg.norm(checked["axes"], axis=1)
     if not (lengths > 0).all():
         raise InputError(f"joint {int(np.argmin(lengths))} has an axis of length zero; expected a direction")

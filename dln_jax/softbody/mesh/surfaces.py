@@ -138,7 +138,9 @@ def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray,
     place = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
     if len(missing := np.argwhere(keys[place] != wanted)):
         edge = facets[missing[0][0], sides[missing[0][1]]].tolist()
-        raise InputError(f"edge {edge} of a facet is no edge of the quadratic mesh; only linear meshes can have caps")
+        raise InputError(
+            f"edge {edge} of a facet is not an edge of the quadratic mesh; only linear meshes can have caps"
+        )
     return np.concatenate([facets, mesh.midsides.reshape(-1)[place]], axis=1)
 
 

@@ -58,7 +58,7 @@ LIBRARY = (
     *("dln_jax.public", "dln_jax.cli.compilation_cache", "dln_jax.training.dynamics.methods.network"),
     *("dln_jax.training.dynamics.run", "dln_jax.training.identification.run"),
 )
-"""Modules of the library that commands import when they run; imports are no part of a walk."""
+"""Modules of the library that commands import when they run; imports are not part of a walk."""
 
 
 def measured() -> dict[str, Walk]:

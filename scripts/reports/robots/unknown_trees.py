@@ -1,4 +1,4 @@
-"""Five revolute joints that are no rigid chain in the order of their coordinates: torques of unseen motions."""
+"""Five revolute joints that are not a rigid chain in the order of their coordinates: torques of unseen motions."""
 
 from typing import Any
 

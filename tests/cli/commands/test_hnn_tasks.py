@@ -283,7 +283,7 @@ def test_options_and_models_of_other_commands_are_refused(positions, capsys):
     (old / "config.json").write_text(
         json.dumps({**stored_arguments(arguments_of(train_hnn.Arguments)), "task": "spring"})
     )
-    assert "'task' is no argument of this release" in refused(capsys, train_hnn, "--out", str(old), "--resume")
+    assert "'task' is not an argument of this release" in refused(capsys, train_hnn, "--out", str(old), "--resume")
 
 
 @pytest.mark.slow

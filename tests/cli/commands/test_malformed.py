@@ -174,7 +174,7 @@ ARCHIVES = {
     "short data": lambda path, arrays: zipped(path, {f"{key}.npy": npy(arrays[key])[:-3] for key in arrays}),
     "more data": lambda path, arrays: zipped(path, {f"{key}.npy": npy(arrays[key]) + b"1" for key in arrays}),
     "header of another version": with_header(SHAPE % "(20,)", version=9),
-    "header that is no dictionary": with_header("[1, 2]"),
+    "header that is not a dictionary": with_header("[1, 2]"),
     "header without a shape": with_header("{'descr': '<f8', 'fortran_order': False}"),
     "header that is no Python": with_header("{'descr': '<f8', ((("),
     "deeply nested header": with_header("(" * 5000),

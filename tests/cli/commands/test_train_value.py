@@ -44,7 +44,7 @@ MISTAKES = [
     (("--plant", "unicycle"), "plant 'unicycle' is unknown; choose from pendulum"),
     (("--method", "guess"), "choose from fitted, residual"),
     (("--goal", "1.2"), "limits cannot hold the goal"),
-    (("--plant", "cart-pole", "--goal", "0,0.5"), "no equilibrium"),
+    (("--plant", "cart-pole", "--goal", "0,0.5"), "not an equilibrium"),
     (("--goal", "0,0"), "expected the posture of pendulum, which has 1"),
     (("--goal", "up"), "expected finite numbers"),
     (("--width", "0"), "width is 0"),

@@ -94,7 +94,7 @@ def test_a_network_has_the_value_of_limited_controls():
 BAD = [
     ({"discounts": [3.0]}, "ends with the problem's, 0.0"),
     ({"samples": 0}, "samples is 0"),
-    ({"problem": LINE._replace(drift=lambda x: x / 0.0)}, "no equilibrium"),
+    ({"problem": LINE._replace(drift=lambda x: x / 0.0)}, "not an equilibrium"),
     ({"problem": LINE._replace(state_cost=lambda x: x[0] ** 2 / (jnp.abs(x[0]) < 4))}, "not finite"),
 ]
 

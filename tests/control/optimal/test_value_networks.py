@@ -70,7 +70,7 @@ def test_the_equation_is_the_least_over_controls():
 
 
 BAD = [
-    ({"goal": np.array([0.0, 0.5, 0.0, 0.0])}, "no equilibrium"),
+    ({"goal": np.array([0.0, 0.5, 0.0, 0.0])}, "not an equilibrium"),
     ({"goal": np.array([0.0, 9.0, 0.0, 0.0])}, "outside the box"),
     ({"high": -HIGH}, "the box is from"),
     ({"low": np.zeros(3)}, "have shapes"),
@@ -97,11 +97,11 @@ def test_a_goal_that_is_held_by_a_control():
     np.testing.assert_allclose(held, -weight * np.sin(0.4), rtol=1e-12)
     with pytest.raises(InputError, match="limits cannot hold the goal"):
         at_goal(rod._replace(action_cost=scaled(tanh, 0.5)), [0.4, 0.0])
-    with pytest.raises(InputError, match="no equilibrium"):
+    with pytest.raises(InputError, match="not an equilibrium"):
         at_goal(rod, [0.4, 1.0])
     with pytest.raises(InputError, match="shape"):
         at_goal(rod, [0.4])
-    with pytest.raises(InputError, match="no equilibrium"):
+    with pytest.raises(InputError, match="not an equilibrium"):
         checked(aside._replace(action_cost=push))
 
 

@@ -188,7 +188,7 @@ def contents(folder):
 
 def test_what_is_no_file_is_not_replaced(tmp_path):
     (tmp_path / "model.c").mkdir()
-    with pytest.raises(InputError, match=r"model\.c is no file"):
+    with pytest.raises(InputError, match=r"model\.c is not a file"):
         export_c(FUNCTIONS, tmp_path, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["model.c"]
 

@@ -83,7 +83,7 @@ def test_invalid_motors_are_refused():
         (lambda: require_motors(None, ((1, 1),), 3), "coupled is 2:2; expected each pair of different joints"),
         (lambda: make_rigid_tree(arm), "armature couples joints 2 and 3, .* or couple them .--coupled 2:3"),
         (lambda: make_rigid_tree(arm, cooling=0.1), "cooling is 0.1, but friction has no law; add 'viscous'"),
-        (lambda: serial(*FRAMES, LINKS, armature=A - np.eye(3)), "armature is no symmetric positive semidefinite"),
+        (lambda: serial(*FRAMES, LINKS, armature=A - np.eye(3)), "armature is not a symmetric positive semidefinite"),
     ):
         with pytest.raises(InputError, match=message):
             make()

@@ -210,7 +210,7 @@ REFUSED = {
     "kind": ({"joints": ("revolute", "ball")}, "joints are"),
     "shape": ({"inertias": np.ones((2, 9))}, r"inertias has shape \(2, 9\); expected \(2, 10\)"),
     "not finite": ({"positions": np.full((2, 3), np.nan)}, "positions has nan at"),
-    "no rotation": ({"rotations": [np.eye(3), -np.eye(3)]}, "rotations has a matrix that is no rotation"),
+    "no rotation": ({"rotations": [np.eye(3), -np.eye(3)]}, "rotations has a matrix that is not a rotation"),
     "no axis": ({"axes": np.zeros((2, 3))}, "joint 0 has an axis of length zero"),
     "names": ({"names": ("a", "a")}, "names are"),
 }
