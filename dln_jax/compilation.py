@@ -1,4 +1,4 @@
-"""Compilation: XLA options for programs that run for seconds on a CPU, and a thread in which programs compile."""
+"""Compilation: XLA options for programs that run for seconds on a CPU, and a thread that compiles programs."""
 
 import functools
 from collections.abc import Callable

@@ -18,9 +18,9 @@ from dln_jax.types import InputError
 MOST_BYTES = 512 * 2**20
 """Size limit of the cache folder; the least recently used program is evicted first."""
 LEAST_SECONDS = 0.05
-"""Compilation time from which a program is stored; reading one back takes 0.01 s."""
+"""Shortest compilation time of a program that is stored; reading one back takes 0.01 s."""
 LOCK = ".lockfile"
-"""Lock file by which JAX lets one process at a time read or write."""
+"""JAX's lock file: one process at a time reads or writes."""
 
 
 class Compilation(NamedTuple):
@@ -33,7 +33,7 @@ class Compilation(NamedTuple):
 
 
 def enable_double_precision() -> None:
-    """Turns on float64, in which commands hold data and references."""
+    """Turns on float64 for data and references."""
     jax.config.update("jax_enable_x64", True)
 
 

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 SECONDS_BETWEEN_LINES = 5.0
 ROOM_FOR_RATE = 110
-"""Terminal width in columns from which the rate fits beside the count, the time left and the text."""
+"""Smallest terminal width, in columns, that has room for the rate beside the count, the time left and the text."""
 
 
 @contextmanager

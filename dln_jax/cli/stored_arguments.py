@@ -104,7 +104,7 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
 def checked_arguments(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
     """The arguments of a command in a config.json; `InputError` if it is damaged or of another release."""
     values = {key: value for key, value in values.items() if key not in (CHOSEN, FILES)}
-    _checked(path, values, arguments)  # the choices, on which the other options depend
+    _checked(path, values, arguments)  # the other options depend on the choices
     whole = arguments_for(arguments, values)
     expected = stored_arguments(whole())
     for key, value in values.items():

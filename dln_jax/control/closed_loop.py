@@ -21,7 +21,7 @@ from dln_jax.control.tracking import Reference, Tracker
 from dln_jax.types import InputError, require_positive
 
 UP = 0.1
-"""Angle in rad below which a pole counts as upright."""
+"""Largest angle, rad, of a pole that counts as upright."""
 
 
 class Controller(NamedTuple):
@@ -40,7 +40,7 @@ class Hardware(NamedTuple):
     """Lower limits of the controls [m], or one for all."""
     upper: Any = jnp.inf
     encoder_step: Any = 0.0
-    """Resolution to which the coordinates q are rounded, rad or m; 0 for none."""
+    """Resolution of the encoders, rad or m: q is rounded to it; 0 for none."""
     encoder_noise: Any = 0.0
     """Standard deviation of the noise added to q before rounding, rad or m."""
     control_noise: Any = 0.0

@@ -12,7 +12,7 @@ from dln_jax.control.trajectories import TrajectoryProblem, knots_of
 from dln_jax.types import InputError
 
 ROUNDING = 1e-9
-"""Relative and absolute size below which differences count as zero."""
+"""Smaller differences, relative or absolute, count as zero."""
 
 
 def require_start(problem: TrajectoryProblem, x: Any) -> None:

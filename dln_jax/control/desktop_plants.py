@@ -34,9 +34,9 @@ TURN = 2 * np.pi / 2048
 SECONDS = 10.0
 """Duration of a simulated swing-up, s."""
 HOLDING = 1.0
-"""Duration of the last part of a run, in which the pole is held upright, s."""
+"""Time at the end of a run for which the pole must be upright, s."""
 POSTURES = 65
-"""Number of pole angles around the circle at which a model must be usable."""
+"""Number of pole angles around the circle; a model must be usable at all of them."""
 
 
 class DesktopPlant(NamedTuple):

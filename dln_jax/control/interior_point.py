@@ -69,7 +69,7 @@ class Search(NamedTuple):
     damping: Array
     """Damping that was needed last."""
     least: Array
-    """Damping from which the next step starts: positive after a failed search."""
+    """Initial damping of the next step: positive after a failed search."""
     filter: Array
     entries: Array
     largest: Array

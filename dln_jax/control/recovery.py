@@ -58,7 +58,7 @@ def recovery_by_plans(
         plans: first guesses along a leading axis, such as by `jax.vmap(first_plan)`; only their controls count.
         near: x -> u of the regulator.
         cost: x -> cost to go, such as `value(regulator, goal, joints)`.
-        level: cost to go up to which the regulator acts.
+        level: the regulator acts while the cost to go is below it.
         rate: sampling rate, Hz.
         every: samples per step.
         parameters: tree of arrays in the memory, which another controller changes on the way; by default none. If

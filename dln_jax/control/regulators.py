@@ -39,7 +39,7 @@ class SampledRegulators(NamedTuple):
 
 
 class Region(NamedTuple):
-    """Region around a goal in which a regulator's cost to go is at most a level."""
+    """Region around a goal where a regulator's cost to go is at most a level."""
 
     level: float
     """Level of (x - x0)ᵀ S (x - x0)."""

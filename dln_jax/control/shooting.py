@@ -55,7 +55,7 @@ class Shooting(NamedTuple):
     complementarity: Float[Array, ""]
     """Largest product of a slack and its multiplier."""
     scale: Float[Array, ""]
-    """Number by which the cost was divided."""
+    """Divisor of the cost."""
     iterations: Int[Array, ""]
     ending: Int[Array, ""]
     """An `Ending`."""

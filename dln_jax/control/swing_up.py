@@ -40,7 +40,7 @@ class SwingUpNumbers(NamedTuple):
     control_cost: Any
     """R [m, m]."""
     level: float
-    """Cost to go of the regulator up to which the regulator acts."""
+    """Largest cost to go at which the regulator acts."""
     smoothing: Any
     """Smoothing of the friction compensation, rad/s or m/s."""
     compensation: float = GAIN
@@ -128,7 +128,7 @@ def swing_up(
         joints: kinds of the joints.
         goal: posture [d].
         numbers: gains and costs.
-        postures: [n, d], postures of a swing-up, in which the model must be usable.
+        postures: [n, d], postures of a swing-up; the model must be usable in all of them.
         estimator: law -> controller of measurements, such as `plants.by_filter`; by default states are measured.
         lower: lower limits of the controls.
         upper: upper limits of the controls.

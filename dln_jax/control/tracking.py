@@ -149,7 +149,7 @@ class Judgement(NamedTuple):
     nmse: Float[np.ndarray, " d"]
     """Mean squared errors of the joints' torques, divided by their variances."""
     definite: float
-    """Share of the states in which the mass matrix is positive definite."""
+    """Share of the states with a positive definite mass matrix."""
 
 
 def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERANCE) -> Judgement:

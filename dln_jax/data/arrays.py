@@ -31,7 +31,7 @@ MOST_BYTES = 4 * 2**30
 FOLDER = "/"
 """Key of the reader of folders."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-"""Header readers for the format versions in which NumPy writes numbers and strings."""
+"""Header readers for the versions of NumPy's format that hold numbers and strings."""
 MOST_TIMES_TYPICAL = 1e20
 """A number larger than the median by this factor cannot be a measurement: float64 has 16 digits."""
 MARKERS = "remove the samples if they mark missing values"

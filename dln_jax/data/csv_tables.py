@@ -27,7 +27,7 @@ MOST_BYTES = 2**30
 STATED = {"si": {}, "degrees": {"q": "deg", "qd": "deg/s", "qdd": "deg/s2"}}
 """Units that a caller may state for titles without one: by key, SI for all others."""
 DECIMALS = 10
-"""Significant digits written, and decimals to which numbers are rounded."""
+"""Significant digits written, and decimals of rounded numbers."""
 TURN = math.pi / 180
 POSITIONS = {"rad": 1.0, "deg": TURN, "m": 1.0, "cm": 1e-2, "mm": 1e-3}
 FORCES = {"nm": 1.0, "n": 1.0, "mnm": 1e-3, "mn": 1e-3, "knm": 1e3, "kn": 1e3}

@@ -88,11 +88,11 @@ def write_robot(
     place for them: a comment states them.
 
     Args:
-        original: URDF or MJCF file from which the tree's structure was read; it stays unchanged.
+        original: URDF or MJCF file with the tree's structure; it stays unchanged.
         tree: tree with the joints of that file, by name.
         damping: viscous friction of each joint (or motor) [d], N m s or N s/m; by default unchanged.
         coulomb: dry friction [d], N m or N; by default unchanged.
-        motors: matrix S [d, d] of motor rates S qd, at which friction acts; by default each joint has its own motor.
+        motors: matrix S [d, d] of motor rates S qd; friction acts at the motors. By default each joint has its own.
         lock: joints that were locked when the tree was read, as for `read_robot`. The bodies behind a locked joint
             count towards the link before it, in the position in which the joint is locked.
         remarks: lines of the comment at the top of the file.
@@ -122,7 +122,7 @@ def write_robot(
     if root.tag == "robot":
         if np.any(armature):
             numbers = ", ".join(f"{name} {_text(value)}" for name, value in zip(names, armature, strict=True))
-            remarks = (*remarks, f"Armature, for which URDF has no place (kg m² or kg): {numbers}.")
+            remarks = (*remarks, f"Armature, which URDF cannot state (kg m² or kg): {numbers}.")
         for inertia, c in coupled:
             remarks = (*remarks, f"Armature of a motor at {_sum(c, names)}, which URDF lacks: {_text(inertia)}.")
         for motor in of_motors:

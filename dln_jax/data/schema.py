@@ -213,7 +213,9 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
 def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
     """p and pd; raises `InputError` if the data have none."""
     if data.p is None or data.pd is None:
-        raise InputError("the data have no p and pd, to which a field is fitted; add them, or fit trajectories instead")
+        raise InputError(
+            "a field is fitted to p and pd, which the data do not have; add them, or fit trajectories instead"
+        )
     return data.p, data.pd
 
 

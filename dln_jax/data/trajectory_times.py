@@ -8,7 +8,7 @@ from dln_jax.data.arrays import numeric
 from dln_jax.types import InputError
 
 LARGEST_INDEX = 2**53
-"""Largest integer up to which float64 is exact."""
+"""float64 is exact for integers up to this one."""
 
 
 def trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:

@@ -148,7 +148,7 @@ def _artefact(function: Callable[..., Any], examples: Sequence[Any], platforms: 
 
 
 def _shape_of(number: int, example: Any) -> jax.ShapeDtypeStruct:
-    """Returns the shape of an example, and the dtype in which JAX computes."""
+    """Returns the shape of an example, and the dtype of JAX's computation."""
     with contextlib.suppress(TypeError):
         # A list or tuple stays one argument, although JAX would treat it as several.
         if isinstance(shape := jax.eval_shape(lambda x: x, example), jax.ShapeDtypeStruct):

@@ -92,7 +92,7 @@ def phase_portrait(
         rate: their rates [K, T], rad/s.
         energy: angles [a], rates [b] and the energy [b, a] on that grid, drawn as levels.
         goal_energy: energy of the dashed level, along which the pole swings up by itself.
-        caught: S [2, 2] and the level of xᵀ S x below which the regulator takes over.
+        caught: S [2, 2] and a level; the regulator takes over where xᵀ S x is smaller.
     """
     figure, [[axis]] = style.figure(height=4.2)
     angle, rate = _wrapped(np.asarray(angle)), np.asarray(rate)

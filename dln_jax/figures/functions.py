@@ -110,7 +110,7 @@ def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 def parity(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
     """Model against truth for any number of inputs and outputs, with all components of a quantity in one panel.
 
-    Pass both in standard units, in which components are of comparable size.
+    Pass both in standard units, so that components are of comparable size.
     """
     keys = _keys(truth)
     figure, axes = style.figure(1, len(keys), height=7.0 / max(len(keys), 2) + 0.3)

@@ -33,7 +33,7 @@ _LIGHT = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
 _HIGHEST = 3.6
 """Largest height of a panel in inches."""
 _FADED = 0.75
-"""Share by which the earliest snapshot fades towards the background."""
+"""Fading of the earliest snapshot towards the background, as a share."""
 
 
 class Moments(NamedTuple):

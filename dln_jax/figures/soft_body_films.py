@@ -63,7 +63,7 @@ def write_slab_film(
         positions: positions of the vertices, m.
         t: time of every frame, s.
         depth: depth of the bodies in the drawing, m.
-        ground: points of the line below which all is ground, from left to right, m; vertical parts of it are walls.
+        ground: points of the ground's surface, from left to right, m; vertical parts of it are walls.
         colours: colour of every element, or a function of the frame.
         slabs: function of the frame that returns rigid outlines.
         label: function of the frame that returns text next to the time.

@@ -16,7 +16,7 @@ from dln_jax.identification.equations import Columns
 
 Determinacy = Literal["alone", "in combination", "not at all"]
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
-"""The ten parameters of a body, in the order in which they are kept."""
+"""The ten parameters of a body, in their stored order."""
 DEPENDENT = 1e-8
 """Columns whose residual after projection on the others is shorter than this fraction of their length count as linearly
 dependent; so do singular values below this fraction of the largest. For random states this lies well between rounding

@@ -30,11 +30,11 @@ SMALLEST = 1e-6
 UNKNOWN_SHARE = 0.01
 """Fraction of the torque that the initial value of a coefficient explains if its prior is zero."""
 FALL = 5.0
-"""Factor by which the regularisation falls from one minimum to the next."""
+"""Ratio of the regularisation at one minimum to that at the next."""
 CENTRED = 0.1
-"""Newton decrement, in units of the regularisation, at which an intermediate minimum counts as reached."""
+"""An intermediate minimum counts as reached at this Newton decrement, in units of the regularisation."""
 TOLERANCE = 1e-10
-"""Newton decrement (expected decrease of F in another iteration), relative to 1 + F, at which to stop."""
+"""The search stops at this Newton decrement (expected decrease of F in another iteration), relative to 1 + F."""
 _ABOVE = np.triu_indices(4, 1)
 _BASIS = np.array(
     [np.outer(row, row) for row in np.eye(4)]

@@ -131,7 +131,7 @@ def regressor_of(
 
     Args:
         model: a model that is linear in its parameters.
-        parameters: point at which the model is differentiated and its linearity checked.
+        parameters: point where the model is differentiated and its linearity checked.
         data: samples with tau.
         free: [P]; columns where it is zero are set to zero, for parameters known to be zero.
         linearise: `learning.linear.design(model)`, to reuse a compiled one.

@@ -25,7 +25,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, JointKind
 
 STATES = 40
-"""Number of random states per joint from which the structure is computed."""
+"""Number of random states per joint for computing the structure."""
 UNSEEN_SHARE = 0.02
 """Tolerance on the squared fraction of a parameter's identifiable part that the data miss: up to this fraction missed
 counts as seen, and up to this fraction seen counts as missed."""
@@ -78,7 +78,7 @@ def identify(
         model: such as `models.make_rigid_tree`.
         known: prior parameters, such as those of a robot file; directions that the data do not determine keep them.
         data: training data with tau; hold out other motions to judge the result.
-        joints: kinds of the joints, from which the random states are drawn; all revolute by default.
+        joints: kinds of the joints, for drawing the random states; all revolute by default.
         at: parameters at which the model is linearised, for friction by load, whose forces are linear as long as the
             links' torques keep their signs: those of `learning.friction.fit_friction`.
         noise: standard deviation of the torque of each joint [d], N m or N; estimated by default.

@@ -41,16 +41,16 @@ from dln_jax.solvers.least_squares import triangular_factor
 from dln_jax.types import InputError, require_positive
 
 ROUNDS, SETTLED = 12, 1e-4
-"""Largest number of linearisations, and the relative decrease of the sum at which they stop."""
+"""Largest number of linearisations, and the smallest relative decrease of the sum that continues them."""
 CHUNK = 16
 """Number of windows that are linearised at a time; the last chunk is padded to it."""
 REWEIGHTINGS = 2
 STABLE = 2.785
-"""Largest product of time step and damping at which a classical Runge-Kutta step is stable."""
+"""Largest product of time step and damping of a stable classical Runge-Kutta step."""
 MOST_GROWTH = 1e6
-"""Growth of deviations along a window above which its derivatives have too few correct digits."""
+"""If deviations grow more along a window, its derivatives have too few correct digits."""
 SHORTEST_STEP = 1 / 64
-"""Fraction of a step below which the search ends."""
+"""The search ends below this fraction of a step."""
 TYPICAL_DELAY = 1e-3
 """Unit of the delay among the unknowns, s."""
 
@@ -74,7 +74,7 @@ class MotionFit(NamedTuple):
 
     theta: Float[np.ndarray, " P"]
     delay: float
-    """Time by which motions follow the logged torques, s; 0 if it was not fitted."""
+    """Delay of the motions behind the logged torques, s; 0 if it was not fitted."""
     before: float
     """Root mean square distance of the motions from the measurements at the initial parameters, in units of noise_q."""
     after: float

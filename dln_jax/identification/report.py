@@ -13,7 +13,7 @@ STILL = 0.01
 LARGE_CONDITION = 300.0
 """Above this condition number, errors grow much more along some combinations than along others."""
 LONG_CORRELATION = 10.0
-"""Correlation time of the residuals in samples, above which they indicate model error rather than noise."""
+"""Residuals with a longer correlation time, in samples, indicate model error rather than noise."""
 
 
 def base_rows(result: Identification) -> list[dict[str, Any]]:
@@ -90,7 +90,7 @@ def summary(result: Identification) -> list[str]:
     """How many parameters are identifiable, in two lines."""
     counts = ", ".join(f"{result.structure.count(kind)} {kind}" for kind in get_args(Determinacy))
     return [
-        f"{len(result.structure)} parameters, of which motions show {counts}: {len(result.base.words)} base parameters",
+        f"{len(result.structure)} parameters; motions determine {counts}: {len(result.base.words)} base parameters",
         f"these data determine {result.fit.rank} combinations, condition {result.fit.condition:.3g}",
     ]
 

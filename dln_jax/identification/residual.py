@@ -75,11 +75,11 @@ def fit_residual(
     Args:
         rigid: such as `models.make_rigid_tree`.
         parameters: identified parameters, which stay fixed.
-        train: data from which the tree was identified.
+        train: data that the tree was identified from.
         validation: other motions, used for selection; judge the result on yet others.
         candidates: candidates in order of size, the first without terms.
         iterations: upper limit of Gauss-Newton iterations; the parameters with the lowest validation error are kept.
-        seconds: time limit, after which the current network stops training and no other one is tried.
+        seconds: time limit; then the current network stops training, and no other one is tried.
 
     Raises:
         InputError: the first candidate has terms, or the torques do not vary.

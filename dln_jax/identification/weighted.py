@@ -29,7 +29,7 @@ THRESHOLD = 1.345
 TO_DEVIATION = 1.4826
 """Ratio of the standard deviation of normal errors to their median absolute value."""
 REWEIGHTINGS, SETTLED = 30, 1e-4
-"""Largest number of robust reweightings, and the relative change of the residuals at which they stop."""
+"""Largest number of robust reweightings, and the smallest relative change of the residuals that continues them."""
 
 
 class WeightedFit(NamedTuple):

@@ -88,7 +88,7 @@ def samples(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[A
 def identity_of(
     optimiser: Optimiser, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0
 ) -> dict[str, Any]:
-    """Returns the identity by which a `Checkpoint` recognises a training."""
+    """Returns the identity of a training, for `Checkpoint`."""
     return identity(optimiser, (getattr(data, key) for data in sets for key in objective.keys), seeds=seeds)
 
 
@@ -151,6 +151,6 @@ def _read(model: Model, sets: Split, objective: Objective) -> tuple[Array, list[
 
 
 def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: Array) -> Array:
-    """Squared error of every sample of a batch, in the units in which the objective selects parameters."""
+    """Squared error of every sample of a batch, in the units of the validation error."""
     errors = objectives.residuals(objective, model.energies(parameters), batch)
     return jnp.sum((errors if objective.selects_by == "torque" else errors / scale) ** 2, axis=1)

@@ -49,7 +49,7 @@ class FrictionFit(NamedTuple):
     condition: float
     """Condition number of their scaled columns."""
     reference_temperature: float | None
-    """Temperature to which viscous friction refers, °C; `None` if it depends on none."""
+    """Reference temperature of viscous friction, °C; `None` if friction does not depend on temperature."""
     torque_mse: float
     """Mean over samples of the sum of squared errors over joints; (N m)² or N²."""
     converged: bool

@@ -20,7 +20,7 @@ from dln_jax.mechanics.trees.description import Tree
 FOLDS = 4
 MOST_SAMPLES = 2_000
 MARGIN = 2.0
-"""Number of standard errors by which a term must lower the error; about one log in forty does so by chance."""
+"""A term must lower the error by this number of standard errors; about one log in forty does so by chance."""
 
 
 class TriedTerm(NamedTuple):

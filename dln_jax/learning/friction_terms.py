@@ -43,7 +43,7 @@ MOST_ROUNDS = 5
 WARMER = 10.0
 """Unit of temperature in the nonlinear unknowns, K."""
 LEAST_WARMTH = 1.0
-"""Smallest standard deviation of each joint's temperature for which the effect of temperature is fitted, K."""
+"""The effect of temperature is fitted if each joint's temperature has at least this standard deviation, K."""
 
 
 class Terms(NamedTuple):
@@ -99,7 +99,9 @@ class Log(NamedTuple):
 def reference_temperature(data: Trajectories) -> float:
     """Mean temperature of a log to 0.1 °C; `InputError` if there is none, or that of a joint hardly varies."""
     if data.temperature is None:
-        raise InputError("the data have no temperature, on which friction is to depend; add it (°C), or leave that out")
+        raise InputError(
+            "friction is to depend on temperature, which the data do not have; add it (°C), or leave that out"
+        )
     deviations = data.temperature.std(axis=0)
     if not deviations.min() >= LEAST_WARMTH:
         joint, deviation = int(np.argmin(deviations)) + 1, deviations.min()

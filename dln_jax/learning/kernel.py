@@ -27,7 +27,7 @@ from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 
 NOISIER = 3.0
-"""Factor by which the noise is raised if the covariance is not positive definite to rounding."""
+"""The noise is multiplied by this if the covariance is not positive definite to rounding."""
 
 
 class KernelFit(NamedTuple):

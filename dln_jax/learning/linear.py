@@ -36,7 +36,7 @@ LARGEST_DEGREE = 4
 MOST_PARAMETERS = 1_500
 """Largest basis that is tried; a fit takes about N d P² operations."""
 ROUNDING = 1e-10
-"""Error, relative to the torque, below which bases count as equally good."""
+"""Bases with a smaller error, relative to the torque, count as equally good."""
 # The model's force may differ from Phi theta by the rounding of its sum, relative to the sum of absolute terms.
 _LINEARITY_TOLERANCE = 1e-9
 _NOT_LINEAR = (

@@ -97,7 +97,7 @@ def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknown
 
 
 def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.ndarray) -> KernelScales:
-    """Returns logarithms of scales at which the energies explain torques of the measured size, with random frames.
+    """Returns logarithms of scales that make the energies explain torques of the measured size, with random frames.
 
     A randomly rotated vector keeps on average a third of its squared length along the joint's axis.
     """

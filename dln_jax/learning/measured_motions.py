@@ -68,7 +68,7 @@ class Gauge(NamedTuple):
     """Fixes the multiple of an energy, which motions without torques leave free."""
 
     q: tuple[float, ...]
-    """Position at which the mass matrix is evaluated."""
+    """Position where the mass matrix is evaluated."""
     mass: float = 1.0
     """Mean of its diagonal there, kg m² or kg."""
 

@@ -28,7 +28,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
 
 SURE = 4.0
-"""Distance of an estimated delay from a whole number, in standard errors, up to which it is rounded."""
+"""An estimated delay is rounded if it is within this number of standard errors of a whole number."""
 
 
 class MomentumWindows(NamedTuple):

@@ -179,7 +179,7 @@ def learn_online(
     """Alternates driving the robot along a reference and refitting the model to all samples recorded so far.
 
     Args:
-        references: in the order in which they are driven; only `drive` reads them.
+        references: in the order of driving; only `drive` reads them.
         drive: (parameters, reference) -> outcome, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
         refit: result of `make_refit` or `make_linear_refit`.
         parameters: parameters that drive the first reference.

@@ -58,7 +58,7 @@ def spectrum(
 
     Args:
         rows: columns and residuals of the training data.
-        unit: scales by which the fit divided the joints' residuals.
+        unit: scales of the joints' residuals in the fit.
         rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: as for `solvers.least_squares.solve`.
     """
@@ -130,7 +130,7 @@ def leading_directions(rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], 
 
     Args:
         rows: iterates over the training data anew at every call.
-        unit: scales by which the fit divided the joints' residuals.
+        unit: scales of the joints' residuals in the fit.
         count: K.
     """
     squares = sum(np.sum((columns / unit[:, None]) ** 2, axis=(0, 1)) for columns, _ in rows())

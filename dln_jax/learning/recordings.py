@@ -42,7 +42,7 @@ DEGREE = 2
 """Degree of the identified mass matrix in every angle: enough for rigid bodies. Displacements along a level rail have
 no effect."""
 CHECKED = 500
-"""Number of the recording's positions at which the mass matrix is checked."""
+"""Number of the recording's positions for checking the mass matrix."""
 NETWORK = {"width": 8, "depth": 2}
 STEPS = 40
 FRICTION_START = 0.02

@@ -90,7 +90,7 @@ def estimate(
         train: data of the fit.
         validation: other trajectories, used for model selection at most.
         ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.
-        unit: scales by which the fit divided the joints' residuals, N m or N; by default `torque_scale`.
+        unit: scales of the joints' residuals in the fit, N m or N; by default `torque_scale`.
         rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: the value that `fit_linear` used.
         quantile: quantile of the data that sets the thresholds of `out_of_distribution`.
@@ -170,7 +170,7 @@ def calibration(
 
 
 def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
-    """Returns the factor, at least 1, by which a variance that is right on average is raised for a new motion.
+    """Returns the factor, at least 1, that raises a variance that is right on average, for a new motion.
 
     With s_m the mean square of the relative residuals of motion m, of M, and n_m their effective samples,
 

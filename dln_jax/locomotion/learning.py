@@ -43,7 +43,7 @@ from dln_jax.zoo import parameter_files as checkpoints
 WIDTH = 64
 """Number of hidden units of the policy."""
 VALIDATION = 2_000_000
-"""Seed of the starts by which a policy is selected; neither training nor `perturbed` draws them."""
+"""Seed of the starts for selecting a policy; neither training nor `perturbed` draws them."""
 VALIDATION_STARTS, VALIDATION_EPISODES = 16, 5
 """Number of starts, and length of their walks in episodes."""
 CHECKPOINT = "checkpoint"
@@ -79,7 +79,7 @@ class Record(NamedTuple):
 
 
 def rank(record: Record | None) -> tuple[float, float]:
-    """Returns the key by which evaluations are compared: successful starts, then distance."""
+    """Returns the key for comparing evaluations: successful starts, then distance."""
     if record is None or not math.isfinite(record.distance):
         return -math.inf, -math.inf
     return record.succeeded, record.distance

@@ -58,9 +58,9 @@ UPRIGHT = 0.05
 SPEED = 0.04
 """s, in body lengths per step; 0 for no limit."""
 CROUCHED = 0.8
-"""Mean height relative to that at rest below which crouching is penalised."""
+"""Crouching is penalised below this mean height, relative to that at rest."""
 FALLEN = 1.0
-"""Tilt in rad beyond which a body has fallen."""
+"""Largest tilt of a body that has not fallen, rad."""
 CLOCK_PERIOD = 16.0
 """P in steps; 0 for no clock."""
 FALL = 1.0

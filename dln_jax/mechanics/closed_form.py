@@ -3,7 +3,7 @@
     tau = M(q) qdd + c(q, qd) + g(q) [+ dD/dqd]
 
 `ClosedForm` has the terms one by one, `RecursiveSystem` their sum from one recursion over bodies. Both take less time
-than derivatives of the energy, in which M is a second derivative.
+than derivatives of the energy, because M is a second derivative of it.
 """
 
 from collections.abc import Callable

@@ -29,7 +29,7 @@ Energy = Callable[[Array, Array], Array]
 Guess = Callable[[Array, Array], Array]
 """(q, slope [d]) -> initial value of a Newton iteration [d]."""
 MOST_STEPS = 30
-"""Number of Newton steps after which the Legendre transform is NaN."""
+"""Largest number of Newton steps; the Legendre transform is NaN if they do not suffice."""
 
 
 class HamiltonianSystem(NamedTuple):

@@ -28,7 +28,7 @@ from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_positive
 
 GRID = 180
-"""Number of angles of the full circle at which the search starts; a Gauss-Newton step is at most their distance."""
+"""Number of initial angles of the search, around the circle; a Gauss-Newton step is at most their distance."""
 ITERATIONS = 20
 LATE = 1000 + np.arange(32.0)
 """Frame numbers of late predictions."""

@@ -129,7 +129,7 @@ def predict_measured(
 
     Args:
         model: a model of any energies, or of accelerations.
-        fitted: number of samples to which the initial state is fitted, at least 2.
+        fitted: number of samples for fitting the initial state, at least 2.
         torque: torque between samples, "held" or "interpolated".
         substeps: RK4 steps between two samples.
         momenta: whether the model is a flow of (q, p), without torques, with p close to qd; its p is returned as qd.

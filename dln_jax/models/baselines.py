@@ -108,7 +108,7 @@ def make_helmholtz(
 
     Args:
         field: parts of the field: "solenoidal" is a Hamiltonian network, "conservative" a gradient, or "both".
-        momentum_scale: typical size of p, by which the networks' input is divided.
+        momentum_scale: typical size of p; the networks' input is divided by it.
         needs, width, depth, activation, dtype: as described in `models.model`; friction in the needs has no effect.
 
     Raises:

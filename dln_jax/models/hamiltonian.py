@@ -81,7 +81,7 @@ def make_black_box_hamiltonian(
     derivative by p. Leaving out gravity saves nothing.
 
     Args:
-        momentum_scale: typical size of p, by which the network's input is divided.
+        momentum_scale: typical size of p; the network's input is divided by it.
         iterations: Newton steps to p(q, qd), as in `mechanics.hamiltonian.conjugate`.
         initial_guess: (q, qd) -> initial p [d] of these steps; zero by default.
         needs, width, depth, activation, dtype: as described in `models.model`.

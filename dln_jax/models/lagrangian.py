@@ -82,7 +82,7 @@ def make_black_box_lagrangian(
     The activation needs curvature in qd, since M is the second derivative by qd.
 
     Args:
-        rate_scale: typical size of qd, by which the network's input is divided.
+        rate_scale: typical size of qd; the network's input is divided by it.
         needs, width, depth, activation, dtype: as described in `models.model`.
     """
     rates = per_coordinate(needs, "rate_scale", rate_scale)

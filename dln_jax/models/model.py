@@ -115,7 +115,7 @@ def inputs_of(needs: Needs, q: Vector, *scaled: tuple[Vector, tuple[float, ...]]
 
 
 def unsaturated(x: Float[Array, " inputs"]) -> Float[Array, " inputs"]:
-    """Returns x with NaN in place of infinities, from which a saturated network would make a plausible number."""
+    """Returns x with NaN in place of infinities: a saturated network would make a plausible number of them."""
     return x + 0 * x
 
 

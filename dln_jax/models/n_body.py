@@ -50,7 +50,7 @@ def make_pairwise_hamiltonian(
         order: order of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
         alike: whether all bodies share one mass and all pairs one energy; otherwise they have their own.
         features: names from `FEATURES`.
-        distance_scale: typical distance in m, by which distances are divided.
+        distance_scale: typical distance in m; distances are divided by it.
         width, depth, activation, dtype: as described in `models.model`.
 
     Raises:

@@ -44,7 +44,7 @@ WARM = ("viscous", "viscous_forward", "viscous_backward")
 
 
 class RigidTreeParameters(NamedTuple):
-    """All parameters of a tree of d joints in which forces are linear. Absent friction is `None`."""
+    """All parameters of a tree of d joints; forces are linear in them. Absent friction is `None`."""
 
     inertias: Any
     """[d, 10], as `mechanics.trees.PARAMETERS`."""
@@ -93,9 +93,9 @@ def make_rigid_tree(
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
         load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
         cooling: k, 1/K; not fitted.
-        reference_temperature: T_ref, °C, to which the viscous coefficients refer.
+        reference_temperature: T_ref of the viscous coefficients, °C.
         temperature: T, °C, of all functions (default: T_ref). `energies(parameters, T)` takes another, also per joint.
-        motors: rows of S in motor rates S qd, on which armature and friction act; by default one motor per joint.
+        motors: rows of S in motor rates S qd; armature and friction act on the motors. By default one per joint.
         coupled: pairs of motors, counted from 0, with an off-diagonal entry of the armature, which is a parameter.
 
     Raises:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 REPETITIONS = 5
 EXPENSIVE = 4.0
-"""Cost of float64, relative to float32, from which a user is advised to consider float32."""
+"""Above this cost of float64, relative to float32, a user is advised to consider float32."""
 
 
 def backend_started() -> bool:

@@ -20,15 +20,15 @@ from jax.experimental import multihost_utils
 from dln_jax.errors import InputError, ProcessLost
 
 HEARTBEAT = 10
-"""Seconds without a heartbeat after which JAX treats a process as lost and ends the others."""
+"""After this many seconds without a heartbeat JAX treats a process as lost and ends the others."""
 SHUTDOWN = 300
 """Seconds that the processes may take to shut down; process 0 may still write its figures."""
 JOINING = 120
-"""Seconds within which all processes must have started."""
+"""Time limit for the start of all processes, s."""
 MOST_OPTIONS = 256
 """Largest number of options and versions that the processes compare."""
 _TASKS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
-"""Environment variables in which `srun` and `mpirun` state the number of their processes."""
+"""Environment variables of `srun` and `mpirun` that state the number of their processes."""
 _ADDRESS = re.compile(r"(\[[0-9a-fA-F:.%\w]+\]|[^\s:\[\]/]+):(\d{1,5})")
 _OF_PEERS = re.compile(r"gloo|nccl|coordination|unavailable|deadline_exceeded", re.IGNORECASE)
 
@@ -93,7 +93,7 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
     Args:
         member: how this process joins.
         options: JSON values by name that decide the result; they must be equal in all processes.
-        seconds: time within which all processes must have started.
+        seconds: time limit for the start of all processes.
 
     Raises:
         InputError: the address cannot be used, a process is missing, or two differ. JAX may go on connecting in a

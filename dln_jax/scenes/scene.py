@@ -77,7 +77,7 @@ def textbook(
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Returns the acceleration qdd [d] by textbook formulas and LAPACK, on which datasets' last digits depend."""
+    """Returns the acceleration qdd [d] by textbook formulas and LAPACK; the last digits of datasets depend on them."""
     bias = closed_form.inverse_dynamics(scene.closed_form, q, qd, jnp.zeros_like(qd))
     return jnp.linalg.solve(scene.mass_matrix(q), tau - bias)
 

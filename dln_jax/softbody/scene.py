@@ -80,7 +80,7 @@ class State(NamedTuple):
     previous: Previous | None = None
     """Previous state, for two-step methods."""
     growth: Growth | None = None
-    """Energy created so far, from which `Info.converged` detects slow divergence; `None` judges single steps only."""
+    """Energy created so far, for `Info.converged` to detect slow divergence; `None` judges single steps only."""
 
 
 def make_scene(
@@ -131,7 +131,7 @@ def make_scene(
 
 
 def require_apart(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> None:
-    """Refuses positions at which surfaces cross, naming the first pair by its vertices."""
+    """Refuses positions with crossing surfaces, naming the first pair by its vertices."""
     if pairs := crossings(mesh, x):
         (one, other), count = pairs[0], len(pairs)
         raise InputError(

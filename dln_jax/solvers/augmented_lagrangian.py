@@ -61,7 +61,7 @@ def make_minimiser(
             and f has changed by at most 1e-3 of its size.
         iterations: largest number of L-BFGS iterations per round.
         penalty: rho of the first round; f and g should be of order one.
-        growth: factor by which rho grows.
+        growth: factor of rho from one iteration to the next.
         tolerance: largest accepted g.
 
     Raises:

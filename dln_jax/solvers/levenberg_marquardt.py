@@ -42,7 +42,7 @@ FIRST_DAMPING = 1e-3
 """Initial damping, relative to the largest diagonal entry of the first A."""
 LOWER_DAMPING = 1e-16
 UPPER_ACCELERATION = 0.75
-"""Largest |a| / |v| at which the acceleration is used; 0 disables it."""
+"""Largest |a| / |v| of accelerations that are used; 0 disables them."""
 PROBE = 0.5
 """Step h of the finite difference for the second derivative along v."""
 CHUNK = 256
@@ -86,7 +86,7 @@ class LevenbergMarquardtState(NamedTuple):
     trials: Array
     """Number of steps tried so far."""
     fallbacks: Array
-    """Number of factorisations so far for which Cholesky failed."""
+    """Number of failed Cholesky factorisations so far."""
 
 
 def init(parameters: Any) -> LevenbergMarquardtState:

@@ -65,7 +65,7 @@ def find_root(
         arguments: pytrees passed to the function.
         tolerance: largest |f_i| that counts as zero, in the unit of f; rounding, 16 eps |J| |x|, always does. The
             accepted point is improved by one more step, which about squares its error.
-        iterations: number of Newton steps after which the search gives up.
+        iterations: largest number of Newton steps.
 
     Raises:
         InputError: a negative tolerance, no iterations, or a start that is not a vector.

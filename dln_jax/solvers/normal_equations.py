@@ -1,8 +1,8 @@
 """Normal equations of a least-squares problem, summed over chunks of samples, and their factorisation.
 
 A problem is a function of ONE sample, `sample_residual(parameters, *sample) -> [r]`. For N samples and P parameters the
-Jacobian has N r rows; here it is J [P, rows], parameters first, the layout in which J Jᵀ multiplies fastest. Only one
-piece of it is alive at a time, unless the caller wants to keep it; `jacobian_bytes` returns the memory.
+Jacobian has N r rows; here it is J [P, rows], parameters first, because J Jᵀ multiplies fastest in this layout. Only
+one piece of it is alive at a time, unless the caller wants to keep it; `jacobian_bytes` returns the memory.
 """
 
 from collections.abc import Callable

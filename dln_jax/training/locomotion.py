@@ -31,7 +31,7 @@ from dln_jax.zoo.parameter_files import save_tree
 from dln_jax.zoo.run import MODEL
 
 GOAL = 5.0
-"""Distance in body lengths at which the effort of learning is measured."""
+"""The effort of learning is measured up to this distance, in body lengths."""
 STEPS = 400_000
 FILMED = 160
 """Steps of the film."""
@@ -104,7 +104,7 @@ def write_run(
     """Writes model, metrics, figure and GIF (of the first steps) of the best seed; returns the metrics.
 
     Args:
-        policies: trained policies, of which at least one has a finite distance.
+        policies: trained policies; at least one has a finite distance.
         settings: settings of the training, stored with the model.
 
     Raises:

@@ -19,7 +19,7 @@ from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree
 NAME = "locomotion-gradient"
 """Name of the model in its manifest."""
 GOOD, REFUSED = 0.95, 0.5
-"""Share of episodes without a fall from which a policy is good, and below which it is refused."""
+"""A policy is good from the first share of episodes without a fall on, and refused below the second."""
 
 
 class StoredPolicy(NamedTuple):

@@ -19,11 +19,11 @@ class LocomotionOptions:
     steps: Unstated[int] = None
     """Environment steps of each seed (default: 400000)."""
     until: Unstated[float] = None
-    """Distance in body lengths at which the training of a seed ends (default: no limit)."""
+    """The training of a seed ends at this distance, in body lengths (default: no limit)."""
     upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
     speed: float = 0.04
-    """Speed at which the reward saturates, body lengths per step; 0 for no limit."""
+    """The reward saturates at this speed, body lengths per step; 0 for no limit."""
     clock_period: float = 16.0
     """Period of the policy's clock, in steps of 0.033 s; 0 for no clock."""
     episode: int = 400

@@ -22,7 +22,7 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[2]
-"""Folder of the package, from which the process imports it."""
+"""Folder of the package, for the process to import it."""
 LIMIT = 120.0
 """Time limit of the process, s."""
 STATES = 512

@@ -44,7 +44,7 @@ FACETS = {2: "edges", 3: "triangles"}
 CHUNKS = 20
 """Number of chunks a motion is split into; progress is shown after every chunk."""
 LARGEST_SIZE = 10.0
-"""Length, m, above which a mesh is probably in millimetres."""
+"""Longer meshes, m, are probably in millimetres."""
 ALL = "all"
 GALLERY = (0, 3, 2, 1, 4)
 """Order of the scenes in the combined picture."""

@@ -66,7 +66,7 @@ def describe_for(
 
 
 def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dict[str, float | list[float]]:
-    """Typical sizes by which a model divides, to three digits: standard deviations of the data.
+    """Typical sizes that a model divides by, to three digits: standard deviations of the data.
 
     Args:
         pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have all

@@ -45,7 +45,7 @@ class Run:
     parameters: Parameters
     """Parameters of the model."""
     description: Description
-    """Description from which the model is built."""
+    """Description to build the model from."""
     uncertainty: Uncertainty | None = None
     """Uncertainty of the model, if the run has one."""
 

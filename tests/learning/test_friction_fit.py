@@ -97,7 +97,7 @@ def test_what_is_held_stays():
     "laws, options, message",
     [
         (("coulomb",), {"cooling": True}, "friction has coulomb, which no temperature changes; add viscous"),
-        (("viscous",), {"cooling": True}, "the data have no temperature, on which friction is to depend"),
+        (("viscous",), {"cooling": True}, "friction is to depend on temperature, which the data do not have"),
         (("coulomb",), {"noise": 0.0}, "noise is 0.0; expected a positive number"),
     ],
 )

@@ -32,7 +32,7 @@ class Arguments(Folder, Drawn):
     trajectories: int = 3
     """Number of motions for identification; one more is for validation."""
     starts: int = 4
-    """Number of random motions from which each motion is optimised."""
+    """Number of random starting motions for each optimised motion."""
     criterion: Annotated[str, choice(("information", "condition"))] = "information"
     """information: minimise the product of the parameters' errors; condition: the regressor's condition number."""
     friction: bool = True
@@ -55,7 +55,7 @@ class Arguments(Folder, Drawn):
     noise: str = "1"
     """Standard deviation of the torque's noise; only the ratios of joints matter."""
     height: Unstated[float] = None
-    """Height of a plane, m, above which the origins of all moving links stay (default: no plane)."""
+    """Height of a plane, m; the origins of all moving links stay above it (default: no plane)."""
     payload: Unstated[float] = None
     """Mass fixed to the last link, kg (default: 0)."""
     payload_position: str = "0,0,0"

@@ -28,7 +28,7 @@ class Arguments:
     precision: Unstated[Literal["f32", "f64"]] = None
     """float or double (default: the precision of the training)."""
     name: str = "model"
-    """C name with which files and functions start."""
+    """Prefix of the files' and functions' names in C."""
     iterations: int = 3
     """Newton steps of the implicit midpoint rule."""
     temperature: Unstated[float] = None

@@ -35,7 +35,7 @@ class Arguments(Folder, Drawn):
     control: Unstated[float] = None
     """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
     model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None
-    """The model from which the controller is designed (default: delan; of a file, identified)."""
+    """Model for the design of the controller (default: delan; for a file, identified)."""
     estimator: Annotated[str, choice(("extended", "unscented", "differences"))] = "extended"
     """Where the law's states come from: a Kalman filter of the encoders' readings, or their differences."""
     recover: Annotated[str, choice(("swing-up", "plans"))] = "swing-up"

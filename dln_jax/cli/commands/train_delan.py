@@ -30,7 +30,7 @@ class Arguments(Options):
             "auto",
         ]
     ] = None
-    """Model to learn; auto: several models, of which validation chooses one (default: auto for --data,
+    """Model to learn; auto: validation chooses among several models (default: auto for --data,
     structured-delan for the embedded letters and scenes)."""
 
 

@@ -253,7 +253,7 @@ def _unfinished(results: Results) -> str:
     """Counts of the jobs that are not done, by state; empty if all are done."""
     states = [entry.status.state for entry in results.entries if entry.status.state != "done"]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
-    return f"{len(results.entries)} jobs, of which {counts}" if states else ""
+    return f"{len(results.entries)} jobs: {counts}" if states else ""
 
 
 def _short(text: str) -> str:

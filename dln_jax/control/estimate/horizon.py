@@ -37,7 +37,7 @@ class Window(NamedTuple):
     y: Float[Array, "N+1 p"]
     seen: Bool[Array, "N+1 p"]
     w: Float[Array, "N k"]
-    """Disturbances in units of their standard deviations, from which the next solution starts."""
+    """Disturbances in units of their standard deviations; the next solution starts from them."""
     first: Float[Array, " n"]
     """Estimate of the oldest state."""
     steps: Int[Array, ""]

@@ -45,7 +45,7 @@ class Estimating(NamedTuple):
     lengths: Any = None
     """Lengths of the last D + delay steps, in nominal steps, oldest first."""
     before: Any = None
-    """Estimate from which `filter` was predicted, if no channel is late."""
+    """Estimate before the prediction to `filter`, if no channel is late."""
 
 
 def with_estimate(
@@ -73,7 +73,7 @@ def with_estimate(
         lower: lower limits of the controls, which the filter must know.
         upper: upper limits.
         delay: samples after which a control begins to act; it need not be a whole number.
-        late: samples by which the channels of y are late, one per channel or one for all.
+        late: delays of the channels of y in samples, one per channel or one for all.
         every: samples between new measurements of a channel, from the first sample on, one per channel or one for all;
             values in between are ignored.
         rate: nominal sampling rate, Hz. With it the filter uses the times with which the controller is called;

@@ -34,7 +34,7 @@ from dln_jax.scale.mesh import local, program, spread
 from dln_jax.types import InputError, require_positive
 
 VALIDATED = 256
-"""Number of states from which the policy's cost is compared between iterations."""
+"""Number of starts for comparing the policy's cost between iterations."""
 
 
 class Iteration(NamedTuple):
@@ -44,7 +44,7 @@ class Iteration(NamedTuple):
     starts: int = 1024
     """States drawn per iteration."""
     seconds: float = 3.0
-    """Time in s for which the policy is followed from every state."""
+    """Duration of the policy's runs from every state, s."""
     dt: float = 0.02
     """Time step, s."""
     memory: float = 3.0
@@ -63,7 +63,7 @@ class Iteration(NamedTuple):
     floor: float = 0.02
     """Share of the 90 % quantile of the targets that is added to every target in relative misfits."""
     followed: float = 2.0
-    """Time for which the validation follows the policy, in units of `seconds`; V stands for the costs after it."""
+    """Duration of runs in validation, in units of `seconds`; V stands for the costs after it."""
     margin: float = 1.25
     """Factor on the box for drawing states and clipping trajectories; 1 as published, but then the edges of the box
     affect the value inside."""
@@ -135,7 +135,7 @@ def fit_values(
         parameters: initial parameters; random by default.
         double: whether to compute in float64, which takes twice as long.
         disturbance: worst-case disturbance, for a robust value.
-        mesh: devices that share the states from which the policy is followed; all devices do the whole fits.
+        mesh: devices that share the policy's runs; all devices do the whole fits.
         report: called after every iteration.
         restore: returns the state of a seed to resume from.
         store: called with the state of a seed after every iteration.

@@ -43,7 +43,7 @@ SHARE, HORIZON = 0.8, 40.0
 FASTEST = 2.4
 """Rates of the box, in units of lambda times the size of a joint."""
 WALL, STEEPNESS = 0.8, 10.0
-"""Share of half a range at which its barrier begins, and the barrier's steepness in units of half the range."""
+"""Start of a barrier, as a share of half the range, and its steepness in units of half the range."""
 NEAR = 0.2
 """Largest angle from the goal that counts as up, rad."""
 SLOWEST = 1e-6

@@ -36,7 +36,7 @@ from dln_jax.types import JointKind, Scalar
 MARGIN = 1e-3
 """Margin of the action cost's range beyond the limit."""
 HORIZON = 5.0
-"""Time in s after which a cost has the weight `share`."""
+"""Time until a cost has the weight `share`, s."""
 EULER = Tableau(((0.0,),), (1.0,))
 Where = Literal["down", "uniform"]
 

@@ -42,7 +42,7 @@ class ControlProblem(NamedTuple):
     discount: float
     """rho, 1/s; a cost at time T has the weight exp(-rho T)."""
     low: Any
-    """Lower corner of the box of states [n] on which V is wanted."""
+    """Lower corner of the box of states [n]; V is fitted inside it."""
     high: Any
     """Upper corner."""
     joints: tuple[JointKind, ...]

@@ -4,7 +4,7 @@ The fit minimises the mean square over the box of
 
     (rho V + g*(-Bᵀ V_x) - q - aᵀ V_x) / (mean of q)
 
-The equation has several solutions, only one of which is the cost to go. With a large discount that one is near q / rho
+The equation has several solutions, and only one is the cost to go. With a large discount that one is near q / rho
 and the others are far away. Training starts there and follows it while the discount decreases to the problem's own
 (continuation: Lutter, Belousov et al. 2019). Every fit draws new samples; unseen samples select the parameters.
 """

@@ -35,7 +35,7 @@ from dln_jax.types import InputError, require_positive, require_seed
 DAMPING = 0.15
 """Damping of the spring in blind episodes, divided by its stiffness, s."""
 FITTED_EVERY = 2
-"""Number of later episodes after which the model is fitted again."""
+"""Number of later episodes between two fits of the model."""
 NEAR = 0.5
 """Largest distance of every angle from the goal that counts as near, rad."""
 SHORTEST = 1.0

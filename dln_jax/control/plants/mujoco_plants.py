@@ -36,7 +36,7 @@ def mujoco_plant(
 
     Args:
         source: path of an MJCF or URDF file, text of MJCF, or a `mujoco.MjModel`.
-        actuated: joints with a motor, by name or number from 0; by default those on which an actuator acts.
+        actuated: joints with a motor, by name or number from 0; by default those with an actuator.
         control: largest forces of the motors, N m or N; by default those of the file.
         goal: posture to hold [d]; by default the highest one.
         hanging: posture of rest [d]; by default the lowest one.

@@ -36,7 +36,7 @@ FINENESS = 15.0
 SHARE = 0.7
 """Largest share of the motors' limits in a plan; the rest is for feedback."""
 INSIDE = 0.8
-"""Share of the limits of the coordinates and rates within which a plan should stay."""
+"""A plan should stay within this share of the limits of the coordinates and rates."""
 GUESSES, ITERATIONS, LENGTHS = 16, 100, 0.5 ** np.arange(6)
 CLOSE = 0.1
 """Largest error at the end of a plan, in units of the coordinates."""

@@ -23,7 +23,7 @@ class Limits(NamedTuple):
     rate: Float[np.ndarray, " d"]
     """Largest rates, 1/s or m/s; infinite for none."""
     stopping: float = 0.0
-    """Time ahead for which the present rate must not lead beyond the positions, s: the time that a brake needs."""
+    """Time that a brake needs, s: at its present rate the plant must stay within the positions for so long."""
     late: float = 2.0
     """Largest time between two answers, in samples."""
 
@@ -37,7 +37,7 @@ class Layout(NamedTuple):
     goal: Float[np.ndarray, " d"]
     """Posture to hold, an equilibrium to within a few hundredths of a radian."""
     hanging: Float[np.ndarray, " d"]
-    """Posture in which the plant comes to rest, and starts."""
+    """Posture of the plant at rest, and at a start."""
     rate: float
     """Sampling rate, Hz."""
     limits: Limits

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 TURNS = 8
-"""Number of angles of a joint from which the highest and the lowest posture are searched."""
+"""Number of initial angles of a joint for the search of the highest and the lowest posture."""
 LEVEL = 1e-3
 """Smallest change of energy by a passive joint that counts as gravity, as a share of the range of the energies."""
 

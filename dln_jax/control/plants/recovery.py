@@ -43,7 +43,7 @@ def recovering(
         scales: scales of the model.
         settings: compensation of the friction and its smoothing.
         regulator: regulator at the goal; it may be traced.
-        level: cost to go up to which the regulator acts.
+        level: the regulator acts while the cost to go is below it.
     """
     every, size = steps_of(layout, scales, FINENESS), np.abs(layout.limits.control).min(axis=1)
     dt = every / layout.rate

@@ -139,7 +139,7 @@ class Trials(NamedTuple):
 
     @property
     def up(self) -> Bool[np.ndarray, " n"]:
-        """Mask of the starts from which the plant ends up."""
+        """Mask of the starts that ended up."""
         return np.isfinite(self.seconds)
 
 

@@ -87,7 +87,7 @@ def scales_of(upright: Upright, layout: Layout) -> Scales:
     energies = jax.jit(jax.vmap(lambda q: passive_energy(model, upright.parts, home)(q, rest)))(circle(layout))
     energy = -float(np.min(energies))
     if not (fall > 0 and energy > 0):
-        raise InputError("the passive joints do not fall from the goal; expected a posture in which they stand")
+        raise InputError("the passive joints do not fall from the goal; expected a goal where they stand upright")
     largest = np.abs(layout.limits.control).min(axis=1)
     mobility = np.linalg.solve(M, layout.actuation)[active]
     acceleration = float(np.min(np.abs(np.diag(mobility)) * largest))

@@ -49,7 +49,7 @@ FINALISTS = 8
 ROUNDS = 4
 """Largest number of first rounds until `FINALISTS` sets have succeeded."""
 WITHIN = 0.5
-"""Share of the tolerance within which a trial must end: a plant whose dry friction sticks hunts farther from the goal
+"""A trial must end within this share of the tolerance: a plant whose dry friction sticks hunts farther from the goal
 than the model, whose friction is smooth."""
 LEAST = 0.1
 """Smallest margin of an energy law that is taken in place of a plan."""

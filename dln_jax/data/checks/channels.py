@@ -16,13 +16,13 @@ UNEQUAL = 0.2
 TURNS = 4 * np.pi
 """rad: two turns; larger angles of an arm are suspicious."""
 WEAK = 0.03
-"""Fraction of the median joint's velocity below which a joint is hardly excited."""
+"""A joint with less than this fraction of the median joint's velocity is hardly excited."""
 COARSE = 3e-4
 """rad: smallest encoder step reported, 1/20000 of a turn."""
 RUN = 4
 """Samples at exactly the same extreme value that count as a flat top."""
 SHARE = 2e-3
-"""Fraction of samples in flat tops above which a channel counts as saturated."""
+"""A channel with a larger fraction of its samples in flat tops counts as saturated."""
 SPIKE = 4.0
 """A spike exceeds the usual change of the channel over two samples by this factor."""
 CLEAR = 3.0

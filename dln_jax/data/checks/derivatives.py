@@ -11,9 +11,9 @@ from dln_jax.data.schema import Trajectories
 
 RADIAN = 180 / np.pi
 ALIKE = 0.9
-"""Correlation, after scaling and delay, above which two signals count as equal."""
+"""Two signals with a higher correlation, after scaling and delay, count as equal."""
 UNLIKE = 0.5
-"""Correlation below which two signals count as unrelated."""
+"""Two signals with a lower correlation count as unrelated."""
 EXCHANGED = 0.3
 """qd and qdd count as exchanged if the error as the other rate is below this fraction of the error as their own."""
 LATE = 0.5

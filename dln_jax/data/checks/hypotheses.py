@@ -34,7 +34,7 @@ MOST_FAULTS = 3
 SCANNED, ROUGHLY, CANDIDATES = 250, 3, 2
 """Ranking of single faults: equations, iterations, and the number of faults of a kind that are then tested fully."""
 INERTIAS = 8
-"""Number of configurations at which the sign of the inertias is tested."""
+"""Number of configurations for testing the sign of the inertias."""
 NEGATIVE = -5.0
 """Inertias are negative if their sum over joints is below this many standard deviations."""
 
@@ -133,7 +133,7 @@ def examine_torques(
         equations: number n d of equations used.
         ambiguous: whether the prior fits any robot. It then allows negative inertias, so the common sign of all torques
             is tested too, and couples joints so weakly that a fault is judged by the joints it concerns.
-        others: proposes further faults, as logs in which they are repaired.
+        others: proposes further faults, as repaired logs.
     """
     d = data.degrees_of_freedom
     inside = away_from_ends(data.trajectory, farthest + 1)

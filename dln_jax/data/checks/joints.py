@@ -14,7 +14,7 @@ from dln_jax.data.schema import Trajectories
 TOLERANCE = 0.05
 """rad or m: tolerance beyond a limit."""
 EXPLAINED = 0.02
-"""Unexplained fraction of the torques' variance below which their order counts as correct."""
+"""If less than this fraction of the torques' variance is unexplained, their order counts as correct."""
 BETTER = 0.3
 """Another order of the joints must lower the unexplained variance to this fraction."""
 TRUSTED = 0.8

@@ -25,18 +25,18 @@ MOST = 800
 PADDED = 200
 """Batches are padded to a multiple of this number of samples."""
 RELATED = 0.5
-"""Correlation with the tree's torque, without friction, above which a measured torque belongs to the same joint."""
+"""A measured torque whose correlation with the tree's torque, without friction, is higher belongs to the same joint."""
 GEAR = 5.0
 """A measured torque that exceeds the model's by more than this factor (or falls below its inverse) was probably
 measured on the other side of the gear."""
 TILTED = 4.0
-"""Degrees between the data's gravity and the description's, above which a tilt is tested."""
+"""Larger angles between the data's gravity and the description's, in degrees, are tested as a tilt."""
 PACE = 0.03
-"""Log ratio of the speeds that the robot and t imply, above which a wrong clock is tested."""
+"""A wrong clock is tested if the log ratio of the speeds that the robot and t imply is larger."""
 LENGTH = 0.1
 """m: uncertainty of a body's centre of mass relative to its file."""
 ILL = 1000.0
-"""Condition of the scaled regressor above which noise dominates the parameters."""
+"""Noise dominates the parameters if the condition of the scaled regressor is larger."""
 RANK = 1e-7
 """Singular values below this fraction of the largest count as undetermined."""
 FRICTION_SCALE = 0.05
@@ -191,7 +191,7 @@ def _base_and_clock(torques: Torques, down: np.ndarray) -> list[Finding]:
         observation = (
             f"the robot's inertia implies motions about {speed:.2g} times as fast as t states ({torques.gain})"
         )
-        remedy = "check whether t is in seconds, and the rate at which the log was taken"
+        remedy = "check that t is in seconds, and the sampling rate of the log"
         return [Finding("error", "clock", observation, remedy)]
     return []
 

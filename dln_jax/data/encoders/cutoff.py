@@ -12,7 +12,7 @@ of the differences, so that the motion does not leak into the floor.
 Spectra are means of squares, which a single jump can dominate; the noise is a median, which no jump changes. Jumps are
 therefore interpolated before spectra are taken. If the top of a spectrum is flat and above the median's floor, it is
 the floor. Noise need not be white: where the spectrum of accelerations rises up to the highest frequency, it is noise.
-A periodic motion has lines with gaps between them, in which there is only noise: neither rule ends a motion in a gap.
+A periodic motion has lines, and only noise in the gaps between them: neither rule ends a motion in a gap.
 """
 
 import math
@@ -35,7 +35,7 @@ TOP = 0.45
 MOVES = 2.0
 """A joint counts as moving if its standard deviation exceeds this multiple of its noise."""
 WORTH = 1e-4
-"""Relative error of unfiltered accelerations up to which no filter is applied; above it there always is a cut-off."""
+"""No filter is applied up to this relative error of unfiltered accelerations; above it there always is a cut-off."""
 JUMP = 8.0
 """A jump differs from its neighbours' prediction by more than this many standard deviations."""
 RARE = 0.1

@@ -20,11 +20,11 @@ LONGEST = 5
 COMPARABLE = 0.3
 """The steps before and after a repeat must be at least this fraction of the step that ends it."""
 CLEAR = 3.0
-"""Encoder steps by which a joint must move on, so that resolution cannot explain equal readings."""
+"""A joint must move on by so many encoder steps that resolution cannot explain equal readings."""
 CHANCE = 3.0
 """Equal rows must exceed the number expected by chance, for independent channels, by this factor."""
 NEAR = 5
-"""Number of steps on either side of a repeat from which the usual step is computed."""
+"""The usual step is computed from this number of steps on either side of a repeat."""
 LOST = 1.5
 """If the step after a repeat is at least this multiple of the usual one, a row was lost."""
 

@@ -19,7 +19,7 @@ from dln_jax.types import InputError
 BRIDGED = 3.5
 """Gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory."""
 EVEN = 1e-3
-"""Relative deviation from equal steps up to which samples are not resampled."""
+"""Samples are not resampled up to this relative deviation from equal steps."""
 ORDERS = (2, 3, 4, 5, 6)
 NORMAL = 0.67448975
 """Median absolute value of a standard normal variable."""

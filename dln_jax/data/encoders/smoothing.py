@@ -30,7 +30,7 @@ from dln_jax.types import InputError, require_positive
 SHORTEST = 4.0
 """Shortest segment kept, in periods of the cut-off."""
 TRIMMED = 1.5
-"""Trimmed length in periods of the cut-off, beyond which accelerations are as accurate as in the middle."""
+"""Trimmed length in periods of the cut-off; beyond it accelerations are as accurate as in the middle."""
 PART = "/"
 """Separator between a trajectory's label and the number of its part."""
 

@@ -23,7 +23,7 @@ from dln_jax.export.c.text import C_TYPES, PRECISIONS, literal
 _FRAME = 512
 """Bytes allowed for saved registers, spilled vectors and helper functions."""
 _ALIGNMENT = 32
-"""Bytes to which gcc aligns arrays for vectors."""
+"""Alignment of gcc's arrays for vectors, bytes."""
 
 
 class Called(NamedTuple):
@@ -48,7 +48,7 @@ class Source:
     finite: bool = False
     """Whether arguments and intermediate results are finite."""
     loop_bound: int | None = None
-    """Number of iterations after which a loop without a known bound ends with NaN."""
+    """A loop without a known bound ends with NaN after this number of iterations."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
     functions: set[str] = field(default_factory=set)
     """Elementary functions called on scalars."""

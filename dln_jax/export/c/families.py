@@ -74,7 +74,7 @@ def functions_of_run(
     """Returns the functions of a trained model.
 
     Args:
-        precision: f32 or f64, to which the parameters are converted.
+        precision: f32 or f64; the parameters are converted to it.
         names: names of the functions to return; default: all.
         iterations: as for `functions_of_system`.
 

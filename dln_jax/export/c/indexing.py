@@ -67,7 +67,7 @@ def _windows(
         indices: corners of the windows [batch, axes].
         sizes: size of a window along each axis of the operand.
         mode: mode of `lax.gather` or `lax.scatter`, for windows outside.
-        axes: axes of the operand to which the indices refer.
+        axes: axes of the operand that the indices refer to.
         dropped: axes of the operand that a window lacks.
         batched: corresponding axes of the operand and of the indices.
         order: order of the result's axes, among those of the batch followed by those of a window.

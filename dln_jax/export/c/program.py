@@ -54,7 +54,7 @@ class Program:
     floor: Region = ()
     """Region of the branch under construction: its nodes stay in it even if they read nothing computed there."""
     real: Any = np.float64
-    """NumPy type of real numbers, in which constants are folded."""
+    """NumPy type of real numbers; constants are folded in it."""
     repeated: Collection[int] = ()
     """`id` values of jaxprs whose calls stay calls."""
     parts: dict[bytes, Part] = field(default_factory=dict)

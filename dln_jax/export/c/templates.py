@@ -227,7 +227,7 @@ def stated(cost: Cost) -> str:
     """Returns the cost of a call in words."""
     names = ("additions", "multiplications", "divisions", "square_roots", "functions")
     kinds = [f"{name.replace('_', ' ')} {getattr(cost, name)}" for name in names if getattr(cost, name)]
-    kinds += [f"unbounded loops, of which one iteration is counted {cost.unbounded_loops}"] * bool(cost.unbounded_loops)
+    kinds += [f"unbounded loops, with one iteration counted {cost.unbounded_loops}"] * bool(cost.unbounded_loops)
     text = f"at most {cost.operations} floating-point operations, {cost.stack_bytes} bytes of stack"
     return text + f"\n   ({', '.join(kinds)})" * bool(kinds)
 

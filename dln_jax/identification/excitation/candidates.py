@@ -1,6 +1,6 @@
 """Candidate motions: check them against the limits, measure their information, and draw random ones.
 
-A motion is checked at ten times the samples at which it is designed, and keeps a margin for the times between.
+A motion is checked at ten times as many samples as it is designed at, and keeps a margin for the times between.
 """
 
 from collections.abc import Iterator
@@ -17,13 +17,13 @@ from dln_jax.identification.excitation.task import Task
 from dln_jax.types import InputError, require_positive, require_seed
 
 FINER = 10
-"""Refinement of the time grid on which motions are checked."""
+"""Refinement of the time grid for checking motions."""
 MARGIN = 1e-3
 """Margin kept to every limit at the checked samples (relative; m for clearances) to cover the times between them."""
 DRAWS = 50
-"""Number of failed draws per motion found after which drawing stops."""
+"""Drawing stops after this number of failed draws per motion found."""
 SMALLEST, BISECTIONS = 0.05, 8
-"""Smallest amplitude to which a motion is shrunk, relative to the original, and the number of bisection steps."""
+"""Smallest amplitude of a shrunk motion, relative to the original, and the number of bisection steps."""
 
 
 class Design(NamedTuple):

@@ -67,7 +67,7 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
     """
     if not 2 <= harmonics <= MOST_HARMONICS:
         raise InputError(
-            f"harmonics is {harmonics}; expected 2, with which a motion can start and end at rest, to {MOST_HARMONICS}"
+            f"harmonics is {harmonics}; expected 2 to {MOST_HARMONICS}: with 1 a motion cannot start and end at rest"
         )
     orders = np.arange(1.0, harmonics + 1)
     # All but the first right singular vector of an equation are orthogonal to it.

@@ -30,7 +30,7 @@ DEPENDENT = 1e-2
 """The design ignores columns whose residual after projection on the others is below this fraction of the largest:
 right angles that a file writes as 1.57 leave 8e-4."""
 STATES = 300
-"""Number of random states from which the independent columns are found."""
+"""Number of random states for finding the independent columns."""
 
 
 class Task(NamedTuple):

@@ -32,7 +32,7 @@ class Adam(NamedTuple):
     weight_decay: float = 1e-5
     """Decoupled weight decay."""
     patience: int = 10_000
-    """Steps without a lower score after which training stops."""
+    """Training stops after this many steps without a lower score."""
     second_moment_decay: float = 0.99
     warm_up_share: float = 0.02
     """Share of the steps in the warm-up; 0 with a final share of 1 gives a constant rate."""
@@ -58,7 +58,7 @@ class GaussNewton(NamedTuple):
     improvement: float = 0.0
     """A stage ends when an iteration decreases the loss by less than this fraction."""
     target: float = -math.inf
-    """Score at which to stop; with several seeds, all must reach it."""
+    """Training stops at this score; with several seeds, all must reach it."""
     steps_per_dispatch: int = 5
     """Iterations between two scores."""
 

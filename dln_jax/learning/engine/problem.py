@@ -109,7 +109,7 @@ class Best(NamedTuple):
     validation: Array
     """Score of the parameters; inf before the first."""
     step: Array
-    """Step at which the score was reached."""
+    """Step that reached the score."""
 
 
 def no_best(parameters: Any) -> Best:

@@ -20,7 +20,7 @@ SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
 SAME_ERROR = 0.1
 """Largest relative difference of the validation errors of two descents that agree."""
 TURNS = 8
-"""Angles about an axis from which the comparison starts, for arms whose axes are parallel."""
+"""Initial angles of the comparison about an axis, for arms whose axes are parallel."""
 
 
 class Difference(NamedTuple):

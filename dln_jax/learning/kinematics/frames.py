@@ -22,7 +22,7 @@ FIELDS = {"axes": 3, "points": 3, "dh_rows": 4}
 ROUGHNESS = {"angle_degrees": 30.0, "length": 0.05}
 EXPECTED = (
     'expected {"axes": [[x, y, z], ...], "points": [[x, y, z], ...]} or {"dh_rows": [[alpha, a, d, theta], ...]}, a '
-    'row for each joint, and if known "angle_degrees" and "length" by which they are off'
+    'row for each joint, and if known their errors, "angle_degrees" and "length"'
 )
 REACH = 0.15
 """Standard deviation in m of the coordinates of a random joint's position."""

@@ -197,7 +197,7 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
 
 
 def unseen(frames: Frames, linear: int, directions: int) -> Descent:
-    """Returns a state from which the first iteration only evaluates the frames, without a step."""
+    """Returns an initial state; the first iteration only evaluates the frames, without a step."""
     d = len(frames.positions)
     at = Projection(
         loss=jnp.asarray(jnp.inf),

@@ -36,7 +36,7 @@ class Search(NamedTuple):
     samples: int = 160
     """Samples drawn from the data for the search; the best frames are refined on all."""
     seconds: float = float("inf")
-    """Time after which the best frames so far are taken; at least one wave of starts runs."""
+    """Time limit of the search; then the best frames so far are taken. At least one wave of starts runs."""
     confirm: bool = True
     """Whether to search until two descents end at the same arm, with the same validation error."""
     seed: int = 0
@@ -72,7 +72,7 @@ def search(
 
     Args:
         program: descent of the structure, from `compiled`.
-        until: reading of `time.perf_counter` at which the search ends.
+        until: reading of `time.perf_counter` at the end of the search.
         before: an earlier search, which another wave of starts continues.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The ten inertial parameters of a rigid body, in which its energies and forces are linear.
+"""The ten inertial parameters of a rigid body; its energies and forces are linear in them.
 
     theta = (m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz)
 

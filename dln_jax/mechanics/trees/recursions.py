@@ -171,7 +171,7 @@ def potential_energy(tree: Tree, q: Vector) -> Scalar:
 
 
 def lagrangian(tree: Tree) -> Lagrangian:
-    """Returns L(q, qd) = T - V, from which all dynamics follow."""
+    """Returns L(q, qd) = T - V; all dynamics follow from it."""
     return lambda q, qd: kinetic_energy(tree, q, qd) - potential_energy(tree, q)
 
 

@@ -35,7 +35,7 @@ LETTERS = "abcdeghlmnopqrsuvwyz"
 """Letters of the embedded dataset `characters`."""
 
 _SAMPLES = 4096
-"""Number of points per contour from which the Fourier series is computed."""
+"""Number of points per contour for computing the Fourier series."""
 _HARMONICS = 96
 """Highest harmonic of the series; with the default smoothing the remainder is below a micrometre."""
 

@@ -72,7 +72,7 @@ def body_contact(
 
     Args:
         mesh: its boundary is in contact.
-        distance: h in m, within which surfaces repel each other; well below the edge length.
+        distance: h in m; surfaces repel each other when closer. Well below the edge length.
         stiffness: kappa in Pa. The gap at which the contact carries a pressure p depends only on p / kappa and h: with
             kappa = p about half of h remains. Bodies never cross, whatever the stiffness.
         friction: Coulomb's coefficient, reached at the threshold speed in m/s.
@@ -192,7 +192,7 @@ def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pai
 
 
 def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
-    """Returns the largest fraction of the step in which no listed pair crosses."""
+    """Returns the largest fraction of the step without a crossing of a listed pair."""
     at, moved, number = x[elements.indices], step[elements.indices], elements.data.kind
 
     def distances(t: Array) -> Array:

@@ -14,7 +14,7 @@ class ContactParameters(NamedTuple):
     """Parameters of a barrier contact."""
 
     distance: Float[Array, ""]
-    """h in m, within which surfaces repel each other."""
+    """h in m; surfaces repel each other when closer."""
     stiffness: Float[Array, ""]
     """kappa in Pa."""
     friction: Float[Array, ""] | None

@@ -169,7 +169,7 @@ def facet_points(
 
 
 def _ridges(facets: Int[np.ndarray, "f dim"]) -> tuple[Int[np.ndarray, "f dim d"], Int[np.ndarray, "f dim"]]:
-    """Returns the facets' ends or edges, with sorted vertices, and the direction (±1) in which facets pass them."""
+    """Returns the facets' ends or edges, with sorted vertices, and their direction (±1) in each facet."""
     if facets.shape[1] == 2:
         return facets[:, :, None], np.broadcast_to([-1, 1], facets.shape)
     ends = facets[:, np.array(SIDES[2])]

@@ -87,7 +87,7 @@ class Slip(NamedTuple):
     force: Float[Array, "*m"]
     """Largest friction force mu lambda_n, in N."""
     threshold: Float[Array, "*m"]
-    """Slip e per step, in m, at which friction reaches its largest force."""
+    """Slip e per step, in m, where friction reaches its largest force."""
 
 
 def plane_contact(

@@ -38,7 +38,7 @@ MASS = 6.0714288
 TIME_STEP = 0.033
 """In s."""
 FRICTION_HEIGHT = 0.01
-"""Height below which the ground exerts friction, in m."""
+"""The ground exerts friction up to this height, m."""
 
 
 class CreatureMaterial(NamedTuple):

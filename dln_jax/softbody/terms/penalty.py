@@ -35,7 +35,7 @@ def penalty_integral(distance: Float[Array, "*m"], width: float) -> Float[Array,
 
 
 def damping_of_restitution(restitution: float, speed: float) -> float:
-    """Returns the damping c in s/m with which a point mass rebounds at `restitution` times its speed, in m/s.
+    """Returns the damping c in s/m that makes a point mass rebound at `restitution` times its speed, in m/s.
 
     c suits this speed only: slower impacts rebound faster, at 1 - 2/3 c u for small c u. A body also turns some of the
     energy into its own vibrations, which is not a loss of the contact.

@@ -29,7 +29,7 @@ Indices = ArrayLike | Sequence[int | np.integer] | Sequence[Sequence[int | np.in
 
 
 class Context(NamedTuple):
-    """Data of a time step from which terms prepare their elements."""
+    """Data of a time step that terms prepare their elements from."""
 
     rest: Float[Array, "n dim"]
     """Rest shape in m."""
@@ -42,7 +42,7 @@ class Context(NamedTuple):
     control: Any = None
     """Control of the step for this term, if any: an array; for the scene's only actuator the whole control."""
     lag: Float[Array, "n dim"] | None = None
-    """Positions in m at which friction takes its normal forces and directions; by default those at the start."""
+    """Positions in m for friction's normal forces and directions; by default those at the start."""
 
 
 class Term(NamedTuple):

@@ -42,11 +42,11 @@ from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 # one; measured with 56 to 120 unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
 _LOWER_BANDS = 4
-# Number of unknowns below which a part of the body is not dissected, and rows of a tile: the fastest of 48 to 96 and 96
-# to 192 on bodies of 800 to 20,000 unknowns.
+# Parts of the body with fewer unknowns are not dissected; and rows of a tile. They are the fastest of 48 to 96 and of
+# 96 to 192 on bodies of 800 to 20,000 unknowns.
 _LEAF_UNKNOWNS = 128
 TILE = 64
-# Relative residuals of the conjugate gradients, and the number of products after which they give up.
+# Relative residuals of the conjugate gradients, and their largest number of products.
 _SOLVE_RESIDUAL = 1e-10
 SEARCH_RESIDUAL = 1e-2
 _UPPER_PRODUCTS = 10_000

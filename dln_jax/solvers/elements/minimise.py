@@ -60,7 +60,7 @@ def minimise(
         free: [n, b], which unknowns are solved for (default: all); the others keep their value in x0.
         scale: positive unit of the gradient's rows, [n] or a number; with masses the residual is an acceleration.
         tolerance: largest |dE/dx| / scale that counts as a minimum; a gradient at the level of rounding always does.
-        iterations: number of Newton steps after which the search gives up; see `SolverInfo.converged`.
+        iterations: largest number of Newton steps; see `SolverInfo.converged`.
         linear_solver: `by_size`, or one of `solvers.elements.linear_solvers`: `dense`, `block_tridiagonal`,
             `sparse`, `matrix_free`. Moving energies have their own solver.
         at: the energies' pattern, if already computed.

@@ -52,7 +52,7 @@ class MovingEnergy(NamedTuple):
     hessian: Callable[[Float[Array, "k b"], Any], Float[Array, "s s"]]
     """(unknowns of one element, its data) -> its Hessian, s = k b."""
     longest: Callable[[Blocks, Blocks, Elements, Any], Float[Array, ""]]
-    """(x, step, elements, data) -> largest fraction of the step, at most 1, up to which the energy stays finite."""
+    """(x, step, elements, data) -> largest fraction of the step, at most 1, that keeps the energy finite."""
 
 
 Lists = tuple[Elements, ...]

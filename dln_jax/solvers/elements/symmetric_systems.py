@@ -87,7 +87,7 @@ def conjugate_gradients(
     Args:
         product: x -> A x, A symmetric.
         precondition: r -> an approximation of A⁻¹ r, symmetric positive definite.
-        iterations: number of products after which the search gives up.
+        iterations: largest number of products.
     """
     enough = tolerance * jnp.linalg.norm(b.reshape(-1))
 

@@ -36,7 +36,7 @@ class Plant:
     """Joints and terms of the plant, such as '{"joints": ["revolute"], "friction": true}' (default: those of the scene
     or file, else revolute joints, gravity and friction)."""
     velocity_scale: Unstated[float] = None
-    """Velocity below which dry friction is smooth, rad/s or m/s (default: 0.01)."""
+    """Dry friction is smooth below this velocity, rad/s or m/s (default: 0.01)."""
     seed: int = 0
     """Seed of parameters, shuffling and validation split."""
 

@@ -135,7 +135,7 @@ def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:
         objective = SCALED_TORQUE
     description, solver = method_of(kind).plan(options, kind, recorded, objective)
     if description:
-        build(description)  # refuses descriptions of which no model can be built
+        build(description)  # refuses descriptions without a model
     return Task(recorded, kind, description, objective, solver, seeds_of(options), until)
 
 

@@ -65,7 +65,7 @@ def announce(task: Task) -> Iterator[str]:
 
 
 def fit(task: Task, options: Options, folder: Path, mesh: Mesh | None) -> Fitted:
-    """Trains at the requested width or at growing ones, of which validation selects one."""
+    """Trains at the requested width, or at growing ones and selects one by validation."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
     optimiser, total = task.optimiser, task.optimiser.steps
     if isinstance(optimiser, GaussNewton) and optimiser.has_coarse_stage(len(standard.train.x)):

@@ -32,7 +32,7 @@ HORIZON_WINDOWS = 20
 LEAST_NOISE = 1e-6
 """Measurements with noise below this fraction of their spread count as exact."""
 FREE_OF_NOISE = 1e-3
-"""Noise of the states over their spread below which the bias of a fit of rates, its square, is negligible."""
+"""Below this ratio of the states' noise to their spread the bias of a fit of rates, its square, is negligible."""
 LEAST_RATE_NOISE = 0.01
 """Lower limit of the noise of measured rates, relative to their spread, since no model has them exactly."""
 ANCHOR = 30.0

@@ -35,13 +35,13 @@ FRICTION_WIDTH = 4
 VALIDATION_SHARE = 0.15
 """Fraction of the training trajectories used for validation."""
 EXACT = 1e-8
-"""Error, relative to the mean square of measured rates, below which no other model and no fit of motions is needed."""
+"""With a smaller error, relative to the mean square of measured rates, no other model or fit of motions is needed."""
 TRIED_DEGREES = (2, 4)
 """Degrees of the polynomial candidates in model selection."""
 TRIAL_STEPS = 20
 """Gauss-Newton iterations used to compare candidates."""
 MOST_POLYNOMIAL = 2
-"""Largest number of coordinates for which a polynomial is a candidate: its number of terms grows with their power."""
+"""A polynomial is a candidate up to this number of coordinates: its number of terms grows with their power."""
 
 
 class Candidate(NamedTuple):
@@ -134,7 +134,7 @@ def choose_model(
     Args:
         problem: measured motions.
         networks: whether only networks are candidates.
-        seconds: time after which no other candidate is tried.
+        seconds: time limit; then no other candidate is tried.
         report: called with one line per candidate tried, or the reason for trying none.
         keywords: as for `description_of`.
     """

@@ -88,7 +88,7 @@ class BodiesOptions:
     """Bodies that attract each other in pairs."""
 
     order: Unstated[Literal["bodies", "axes"]] = None
-    """Order of the coordinates: x1, y1, x2, y2 or x1, x2, y1, y2 (default: the order in which forces balance)."""
+    """Order of the coordinates: x1, y1, x2, y2 or x1, x2, y1, y2 (default: the order that balances the forces)."""
 
 
 @dataclass(frozen=True)

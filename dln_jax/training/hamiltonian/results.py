@@ -75,7 +75,7 @@ MEANINGS = {
     "train_loss": ("(qd, pd) at training states, mean square error", "units of qd² and pd²"),
     "test_loss": ("(qd, pd) at test states, mean square error", "units of qd² and pd²"),
     "clean_field_mse": ("(qd, pd) against the exact field, mean square error", "units of qd² and pd²"),
-    "vpt": ("time for which motions are predicted right", "s"),
+    "vpt": ("time of correct prediction of motions", "s"),
     "lyapunov_seconds": ("Lyapunov time of the model", "s"),
     "predicted_seconds": ("duration of the predicted motions", "s"),
     "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),

@@ -35,7 +35,7 @@ from dln_jax.zoo.run import save
 FILTERED_HERE = ("raw-differences",)
 """Checks that do not apply here: estimated rates come from local polynomials, and motions are fitted to the states."""
 CHOICE_SHARE = 0.2
-"""Fraction of the time limit after which model selection starts no further candidate."""
+"""After this fraction of the time limit model selection starts no further candidate."""
 KEYWORDS = ("width", "depth", "activation", "degree", "coordinates", "order", "field")
 """Options that are keywords of a model."""
 

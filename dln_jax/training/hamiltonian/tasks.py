@@ -43,7 +43,7 @@ TASKS = (*PROTOCOLS, REAL, MEASURED)
 STARTS = 50
 """Largest number of test motions predicted."""
 POINTS = 251
-"""Number of times at which they are compared."""
+"""Number of times for comparing them."""
 HORIZONS = {
     **{"spring": 20.0, "pendulum": 20.0, "damped-spring": 20.0, "damped-pendulum": 20.0},
     **{"henon-heiles": 30.0, "double-pendulum": 5.0, "two-body": 25.0, "three-body": 3.0},

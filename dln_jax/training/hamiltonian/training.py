@@ -40,7 +40,7 @@ WINDOWS_OF_A_STEP = 64
 MOTIONS_COMPILE = 6.0
 """Approximate ratio of the compile times of motions and rates (5 to 7): a compilation cannot be interrupted."""
 FLAT = 1e-5
-"""Relative decrease of the loss per Gauss-Newton iteration below which the fit of motions ends."""
+"""The fit of motions ends when the relative decrease of the loss per Gauss-Newton iteration is smaller."""
 
 
 class Trained(NamedTuple):

@@ -36,7 +36,7 @@ HORIZON, EVERY = 2.2, 0.5
 TOGETHER = 32
 """Number of segments predicted at a time."""
 FITTED = 0.1
-"""Length of the part of a segment to which its initial state is fitted, s."""
+"""Length of the first part of a segment, s, for fitting its initial state."""
 
 
 class MotionSets(NamedTuple):

@@ -208,13 +208,13 @@ def write_file(folder: Path, options: Options, case: Case, solution: Identificat
     friction = {"damping": coefficients.pop("viscous", None), "coulomb": coefficients.pop("coulomb", None)}
     for name, values in coefficients.items():
         pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(case.names, values.tolist(), strict=True))
-        remarks.append(f"Of friction, for which there is no place, {name}: {pairs}.")
+        remarks.append(f"Friction that the file cannot state, {name}: {pairs}.")
     remarks += [f"Not in this file: {line}." for line in shape_lines(case) if line.startswith(("load", "cooling"))]
     try:
         write_robot(path, options.robot, tree, **friction, motors=motors, lock=case.locked, remarks=tuple(remarks))
     except InputError as error:
         return [f"no {path.name}: {error}"]
-    lacks = " without armature, for which URDF has no place (a comment in it states it)" * (path.suffix == ".urdf")
+    lacks = " without armature, which URDF cannot state (a comment in the file has it)" * (path.suffix == ".urdf")
     return [f"{path.name}: the robot's file with these values{lacks}"]
 
 

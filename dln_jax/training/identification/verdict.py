@@ -17,7 +17,7 @@ HEAVIER, MUCH_HEAVIER = 5.0, 50.0
 """Factors by which the bodies' torques may differ from those of the robot's file: beyond the first the fit is doubtful,
 beyond the second refused. Payloads and rough files stay below; wrong units (N mm, mN m) do not."""
 IMPOSSIBLE = 0.1
-"""Mean nMSE in excess of least squares at which a physically consistent robot is ruled out."""
+"""A physically consistent robot is ruled out if its mean nMSE exceeds that of least squares by this."""
 COUNTS = 0.02
 """Friction is judged if its standard deviation exceeds this fraction of the torque's."""
 FAST = 0.9
@@ -25,7 +25,7 @@ FAST = 0.9
 SPIKE = 10.0
 """A spike deviates from the median of five neighbours by more than this many typical deviations."""
 SPIKES = 5e-4
-"""Fraction of spikes above which they are reported."""
+"""Spikes are reported if their fraction is larger."""
 
 
 def judged(

@@ -52,7 +52,7 @@ def learn_to_swing_up(
 
     Args:
         plant: plant to swing up; exploration guards it.
-        estimator: one of `plants.ESTIMATORS`, from which the law gets its states.
+        estimator: one of `plants.ESTIMATORS`, for the law's states.
         seed: seed of the noise and of the trials.
         recover: as for `tune`.
         say: called with a line of text after every step.

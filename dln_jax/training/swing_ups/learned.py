@@ -49,7 +49,7 @@ def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: in
     Args:
         plant: the plant; only "analytic" and "known" use its nominal model and friction.
         model: one of `MODELS`.
-        recording: data from which the other two models are learned.
+        recording: data for learning the other two models.
         seed: seed of the network's initial parameters.
         report: called with the progress of its training.
 

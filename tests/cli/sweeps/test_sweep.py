@@ -298,12 +298,12 @@ def test_another_grid_is_refused(tmp_path, executor, capsys):
 
 def test_the_figure_shows_every_run_and_rings_the_best():
     points = [Point(1.0, 1e-3, "4"), Point(2.0, 1e-5, "8", best=True), Point(1.5, 1e-4, median=True)]
-    drawn = error_against_seconds(points, x="training, s", y="torque", colour="width", note="3 jobs, of which 1 failed")
+    drawn = error_against_seconds(points, x="training, s", y="torque", colour="width", note="3 jobs: 1 failed")
     (axis,) = drawn.axes
     assert [line.get_xydata()[0].tolist() for line in axis.lines].count([2.0, 1e-5]) == 2
     assert len(axis.lines) == 4 and axis.get_yscale() == "log"
     (legend,) = drawn.legends
-    assert legend.get_title().get_text() == "3 jobs, of which 1 failed"
+    assert legend.get_title().get_text() == "3 jobs: 1 failed"
 
 
 def kill_as_it_begins(job):

@@ -63,7 +63,7 @@ def test_a_while_loop_is_bounded_by_the_counter_in_its_condition(tmp_path):
         assert cost.unbounded_loops == 0 and cost.divisions == 2 * limit
     cost = cost_of(until(None), np.zeros(()), folder=tmp_path)
     assert cost.unbounded_loops == 1
-    assert "unbounded loops, of which one iteration is counted 1" in (tmp_path / "model.h").read_text()
+    assert "unbounded loops, with one iteration counted 1" in (tmp_path / "model.h").read_text()
 
 
 @needs_gcc

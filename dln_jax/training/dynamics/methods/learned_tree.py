@@ -25,7 +25,7 @@ from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe_for
 
 BALL = np.array([2.0, 0, 0, 0, 0.02, 0, 0, 0.02, 0, 0.02])
-"""Inertial parameters from which bodies start, in kg and kg m²."""
+"""Initial inertial parameters of bodies, in kg and kg m²."""
 
 
 def needs_of_tree(needs: Needs) -> Needs:

@@ -39,7 +39,7 @@ from dln_jax.zoo.descriptions import Description, build, describe
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
 """Default time limits, s: for the whole selection, and for one search or network in it."""
 MOST_SAMPLES = 4_000
-"""Largest number of samples to which residual networks are fitted."""
+"""Largest number of samples for fitting residual networks."""
 EXPLICIT, KERNEL = "trigonometric", "trigonometric-kernel"
 BESIDE = "-residual"
 """Suffix of the name of a model with a residual network."""
