@@ -37,7 +37,7 @@ LARGEST_FOLDER = 512 * 2**20
 
 
 def programs_folder():
-    """Returns the folder in which compiled programs are kept between runs of the tests, one for each jaxlib."""
+    """Returns the folder of compiled programs, which stay between runs of the tests; each jaxlib has its own."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     folder = cache / "dln_jax" / "test-programs" / jaxlib.__version__
     try:

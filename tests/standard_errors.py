@@ -7,7 +7,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 SURE = 4.0
-"""Standard errors, within which all of a few numbers are but once in a thousand times."""
+"""All of a few numbers are within so many standard errors, but for once in a thousand times."""
 
 
 class Statistics(NamedTuple):

@@ -75,7 +75,7 @@ INLINE = {
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
-    """A folder with the reader's own data, in which the README's first command has run."""
+    """A folder with the reader's own data, where the README's first command has run."""
     folder = tmp_path_factory.mktemp("reader")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -1,4 +1,4 @@
-"""A swing-up takes any model of which it can be made, and says in one line why it cannot be of another."""
+"""A swing-up takes any model that it can use, and says in one line why it cannot use another."""
 
 import jax
 import jax.numpy as jnp

@@ -68,7 +68,7 @@ def test_a_joint_that_never_moves_is_said():
 
 def test_words_and_rows(clean):
     page = text(clean)
-    for words in ("h_x_1 + 0.5 m_2", "of which motions show 11 alone, 4 in combination, 13 not at all: 13 base", "±"):
+    for words in ("h_x_1 + 0.5 m_2", "motions determine 11 alone, 4 in combination, 13 not at all: 13 base", "±"):
         assert words in page
     rows = {row["name"]: row for row in parameter_rows(clean)}
     assert rows["m_1"]["data"] == "not at all" and rows["m_1"]["standard_error"] is None

@@ -1,4 +1,4 @@
-"""A double pendulum with friction in its joints, of which noisy angles and times are known, and one that is driven."""
+"""A double pendulum with friction in its joints, from noisy angles and times, and one that is driven."""
 
 from typing import Any, NamedTuple
 
@@ -41,7 +41,7 @@ GAUGE = Gauge((0.0, 0.0), 1.5)
 
 
 def recorded(count, *, driven=False):
-    """So many motions of 1.2 s, of which only angles were measured, or torques too."""
+    """Motions of 1.2 s with measured angles, and with or without torques."""
     random, t = np.random.default_rng(0), DT * jnp.arange(LENGTH)
     starts = np.concatenate([random.uniform(-2.0, 2.0, (count, 2)), random.normal(size=(count, 2))], axis=1)
     size = float(driven) * np.sin(random.uniform(2, 6, (count, 1, 2)) * np.asarray(t)[:, None])

@@ -1,4 +1,4 @@
-"""Windows and gaps; a noisy oscillator, and a damped one of which only q is known, recovered from their motions."""
+"""Windows and gaps; a noisy oscillator and a damped one, recovered from their motions, the second from q alone."""
 
 import jax.numpy as jnp
 import numpy as np

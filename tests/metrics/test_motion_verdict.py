@@ -18,7 +18,7 @@ def level(predicted, *, angle=False, noise=None):
 
 
 def spoiled(place, value):
-    """The true motions, of which one has another q from a place in time on."""
+    """The true motions, but one has another q from a sample on."""
     q = TRUE.q.copy()
     q[3, place:] = value
     return TRUE._replace(q=q)

@@ -15,7 +15,7 @@ from dln_jax.scale.processes import Membership, membership
 from dln_jax.types import InputError
 
 TINY = '''
-"""A command that iterates a map whose every step needs all devices, and in which a process may be lost."""
+"""A command that iterates a map; every step needs all devices, and a process may be lost."""
 import dataclasses, os, signal, subprocess, sys
 import jax
 import jax.numpy as jnp
@@ -149,7 +149,7 @@ def slurm_pair(*more):
 RUNS = {"alone": lambda: [((), {})], "two": pair, "1 SIGKILL": pair}
 LOST = ("1 SIGSTOP", "0 SIGKILL", "1 error")
 MORE_RUNS = {"slurm": lambda: slurm_pair("--devices", "2"), **dict.fromkeys(LOST, pair)}
-"""Processes by the way in which they are started, or in which one of them is lost."""
+"""Processes by how they are started, or by how one of them is lost."""
 
 
 def started(run_tiny, runs):
@@ -159,13 +159,13 @@ def started(run_tiny, runs):
 
 @pytest.fixture(scope="module")
 def trained(run_tiny):
-    """One process, two, and two of which one is lost."""
+    """One process, two, and two with one that is lost."""
     return started(run_tiny, RUNS)
 
 
 @pytest.fixture(scope="module")
 def trained_more(run_tiny):
-    """Two processes by Slurm, and two of which one is lost in other ways."""
+    """Two processes by Slurm, and two with one that is lost in other ways."""
     return started(run_tiny, MORE_RUNS)
 
 

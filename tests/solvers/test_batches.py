@@ -104,7 +104,7 @@ def test_cholesky_of_a_batch(condition):
 
 @pytest.mark.parametrize(("transposed", "right"), SIDES)
 def test_substitution_in_nested_batches(transposed, right):
-    """Every way in which the factor, the right-hand sides or both may be a batch, within a batch or not."""
+    """Every way that the factor, the right-hand sides or both may be a batch, within a batch or not."""
     random = np.random.default_rng(0)
     factor, b = random.normal(size=(2, 3, 5, 5)) + 6 * np.eye(5), random.normal(size=(2, 3, 5, 2))
     b = b.swapaxes(2, 3) if right else b

@@ -280,7 +280,7 @@ def test_a_run_in_parts_equals_a_whole_one_bit_for_bit():
 
 
 STOPPING = 0.05
-"""Improvement at which seeds stop at different iterations."""
+"""An improvement that stops seeds at different iterations."""
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ LIMITS = np.array([25.0, 15.0])
 CUTOFF = 50.0
 """Cut-off of the low-pass after differences of noisy readings, Hz."""
 LOST = 1.0
-"""Tracking error of a joint, rad, above which the letter counts as lost; its run is cut off there."""
+"""A letter counts as lost once the tracking error of a joint is larger, rad; its run is cut off there."""
 
 
 class Condition(NamedTuple):

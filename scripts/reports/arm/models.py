@@ -34,7 +34,7 @@ TRIGONOMETRIC = "trigonometric"
 TORQUE_NOISE = 0.05
 """Standard deviation of the torque noise in the trigonometric model's second fit, N m."""
 TARGETS = (1.35e-5, 1e-8, 1e-9, 1e-10)
-"""Test errors in (N m)² to which training is timed; the published code reaches the first after 108 s."""
+"""Training is timed to these test errors, (N m)²; the published code reaches the first after 108 s."""
 
 
 WIDTHS = {

@@ -39,7 +39,7 @@ MODELS = (*WIDTHS, TRIGONOMETRIC)
 LAGRANGIAN = "structured-delan"
 STRUCTURED = (LAGRANGIAN, "structured-hnn")
 STRUCTURED_FACTOR = 100.0
-"""Factor by which structured models must beat the published errors."""
+"""Structured models must beat the published errors by this factor."""
 FROM_MOMENTA = "torque_from_momenta_mse"
 SHOWN = (
     *("torque_mse", FROM_MOMENTA, "inertial_mse", "coriolis_mse", "gravity_mse", "vpt_seconds"),

@@ -36,7 +36,7 @@ class Arguments(Resumable):
     split_seeds: int = 3
     """Seeds of the structured Lagrangian on each further split; other models have one."""
     steps: Unstated[int] = None
-    """Iterations of Gauss-Newton (default: 150, after which the validation errors have levelled off)."""
+    """Iterations of Gauss-Newton (default: 150; then the validation errors have levelled off)."""
     adam_steps: int = 20_000
     """Steps of Adam for one seed of 64x64 networks on the letters; 0 leaves Adam out."""
     timed_seeds: int = 5

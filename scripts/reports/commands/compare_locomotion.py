@@ -52,7 +52,7 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     """Environment steps of each seed (default: 400000 by gradients, 500000 by evolution, 300000 by
     ppo, 20000 by sac)."""
     until: Unstated[float] = 6.0
-    """Body lengths at which a seed ends (default: 6)."""
+    """A seed ends at this distance, in body lengths (default: 6)."""
     start: float = 0.0
     """Standard deviation of the vertices' initial positions, m; rivals start at rest."""
     lanes: Unstated[int] = None

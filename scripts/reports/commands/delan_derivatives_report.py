@@ -17,7 +17,7 @@ class Arguments(Folder):
     """How long to measure."""
 
     repetitions: int = 40
-    """Interleaved timings of each way, of which the median counts."""
+    """Interleaved timings of each way; the median counts."""
     width: int = 64
     """Hidden units of the two layers of each network."""
 

@@ -37,7 +37,7 @@ class Arguments(Folder):
     """Where the report goes."""
 
     files: bool = False
-    """Also print the files of each walk, in the order in which they are entered."""
+    """Also print the files of each walk, in the order of entering them."""
 
 
 def main(options: Arguments) -> None:

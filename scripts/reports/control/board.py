@@ -42,7 +42,7 @@ class Criteria(NamedTuple):
     """Criteria of a run; smaller is better."""
 
     time: float
-    """Time from which the tip stays up, s; infinite if it does not."""
+    """Time until the tip stays up, s; infinite if it does not."""
     energy: float
     """Sum of |dq tau|, J."""
     torque_cost: float

@@ -3,7 +3,7 @@
 Numbers are those of the board's own program (`leaderboard/acrobot/robustness_v2` of Wiebe et al. 2022, and its
 `analysis/benchmark.py`). The disturbances take 21 values:
 
-    ten parameters of the plant, of which the controller assumes the nominal values
+    ten parameters of the plant; the controller assumes their nominal values
     the standard deviation of the noise on measured rates, 0 to 0.5 rad/s; more than half of ten runs must succeed
     the standard deviation of the noise on torques, 0 to 1.1 N m; likewise
     the response k of the motor, u_k = u_{k-1} + k (wanted - u_{k-1}), 0.1 to 2

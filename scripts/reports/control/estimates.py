@@ -32,7 +32,7 @@ from scripts.reports.case import Findings
 from scripts.reports.rows import Row
 
 HELD = 2.0
-"""s: last part of a run, in which the torque is judged."""
+"""Last part of a run, for judging the torque, s."""
 STARTS = 1000
 """Starts with the default filter and with differences, by the known model."""
 FEWER_STARTS, QUICK_STARTS = 100, 30
@@ -61,7 +61,7 @@ class Held(NamedTuple):
 
 
 def models(plant: DesktopPlant, recording: Any) -> dict[str, Callable[[], Dynamics]]:
-    """Models from which the law and the filter are made."""
+    """Models for the law and the filter."""
     return {
         "known": lambda: model_of_plant(plant),
         "identified": lambda: obtain(plant, "identified", recording, seed=0).dynamics,

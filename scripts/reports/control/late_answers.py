@@ -15,7 +15,7 @@ from scripts.reports.control import rig
 from scripts.reports.control.over_a_socket import ROTARY, learned_and_tried
 
 MEANS = (0.0, 1e-3, 3e-3)
-"""Mean times by which samples are late, s."""
+"""Mean delays of samples, s."""
 LONGEST, ANSWERING, COMPUTING = 9e-3, 2e-4, 3e-4
 """Largest lateness, and times that an answer and a law take, s."""
 

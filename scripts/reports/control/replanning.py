@@ -72,7 +72,7 @@ class Replanning(NamedTuple):
     angles_at_end: float = 300.0
     rates_at_end: float = 30.0
     level: float = 100.0
-    """Value of the regulator below which it acts."""
+    """The regulator acts below this value of its cost to go."""
     control_cost: float = 1.0
     """Control cost of the regulator."""
     pumps: tuple[float, ...] = (0.0, 3.0, -3.0)

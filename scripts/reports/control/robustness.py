@@ -54,7 +54,7 @@ PUBLISHED = {
 }
 """Published percentages by criterion, and the mean (version 2; the board rounds the mean)."""
 HORIZON, DRAWS = 1.6, 300
-"""Horizon of the plan, s, and number of random energy laws, from which the best nominal score is chosen."""
+"""Horizon of the plan, s, and number of random energy laws; the one with the best nominal score is chosen."""
 # Gains, the regulator's level, the share of a new torque and the largest one; the sweep and its period. Chosen from
 # hundreds of random draws by the number of random states that swing up undisturbed, then from eighty draws about the
 # best by disturbances drawn like those of the table, but not the same ones.

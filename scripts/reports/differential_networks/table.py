@@ -30,7 +30,7 @@ LOSSES = ("type1", "type2")
 ACTIVATIONS = ("relu", "softplus", "tanh", "cos")
 QUANTITIES = ("value_mse", "gradient_mse", "hessian_mse")
 FACTORS = {"sin": 30.0, "cos_sin": 10.0}
-"""Factor by which our best error of a row must beat the best published one."""
+"""Our best error of a row must beat the best published one by this factor."""
 
 
 def cases(

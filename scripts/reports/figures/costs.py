@@ -213,7 +213,7 @@ def _front(axis: Axes, points: list[tuple[float, float]]) -> None:
 
 
 def exact_ground(heights: Sequence[float], exact: float | None) -> float:
-    """Height at which exact results are drawn: two decades below the lowest other one."""
+    """Height of exact results in the drawing: two decades below the lowest other one."""
     if exact is None:
         return 0.0
     inexact = [height for height in heights if height >= exact]

@@ -35,7 +35,7 @@ LOGS, OF_PLANTS = 20, 5
 
 
 def added_terms(quick: bool) -> Findings:
-    """Shares of logs in which a term is kept, by plant and term."""
+    """Shares of logs that keep a term, by plant and term."""
     options: dict[str, Any] = {"cooling": False, "motors": None, "coupled": ()}
     terms = terms_of(LAWS, None, (), **options)
     candidates = {

@@ -216,7 +216,7 @@ def sound(few: bool, *, with_robot: bool) -> Findings:
 
 
 def faulty(few: bool, *, kind: str) -> Findings:
-    """The share of faulty logs in which the fault is detected and named."""
+    """The share of faulty logs whose fault is detected and named."""
     count, detected = 1 if few else FAULTY, []
     fault, checks, inputs = FAULTS[kind]
     for number in range(count):

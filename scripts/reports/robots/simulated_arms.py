@@ -47,7 +47,7 @@ _LIMITS = [[-2.9, 2.9], [-1.8, 1.8], [-2.9, 2.9], [-3.0, 0.0], [-2.9, 2.9], [0.0
 
 SINES = 50
 TRIES = 10
-"""Draws of a joint's motion after which amplitudes are reduced."""
+"""Amplitudes are reduced after this number of draws of a joint's motion."""
 
 
 class Arm(NamedTuple):

@@ -16,7 +16,7 @@ from dln_jax.scale.mesh import batch_mesh
 from scripts.reports.scale.work import WORK
 
 LIMIT = 600.0
-"""Time limit of an answer, s, after which the process ends."""
+"""Time limit of an answer, s; then the process ends."""
 
 
 def main(devices: int, processes: int, process: int, port: int) -> None:

@@ -37,7 +37,7 @@ STIFFNESS = 1e6
 """Stiffness of the ground, N/m."""
 MASS = 10.0
 THRESHOLD = 1e-4
-"""Speed below which friction is smooth, m/s."""
+"""Friction is smooth below this speed, m/s."""
 SPEED, FRICTION, SLOPE = 1.0, 0.3, 0.5
 
 

@@ -126,7 +126,7 @@ def solver_choice(quick: bool) -> Findings:
         text = f"{chosen} chosen; a step by {other} takes {seconds[other] / STEPS:.3g} s"
         where = f"speed/choice-{len(mesh.elements)}-tetrahedra/E={modulus:.0e}/nu={ratio}/dt={dt:.3g}"
         rows.append(expect(where, "chosen_over_other", text, over, WORSE))
-    text = "share of these bodies for which the fastest solver is chosen"
+    text = "share of these bodies that get the fastest solver"
     return Findings([*rows, expect("speed/choice", "share_right", text, np.mean(right), RIGHT, at_least=True)])
 
 

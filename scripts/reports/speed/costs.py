@@ -26,7 +26,7 @@ SIZES = (2, 4, 7, 12)
 TRAINING_BATCH = 512
 JOINTS = (1, 2, 3, 4, 6, 8, 10, 12, 30)
 FITTED = (2, 12)
-"""Range of joints in which exponents of growth are fitted."""
+"""Range of joints for fitting exponents of growth."""
 UNITS = {"inverse_p50_us": "us", "training_step_ms": "ms", "training_compile_seconds": "s"}
 
 

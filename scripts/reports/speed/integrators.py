@@ -25,7 +25,7 @@ SCENES = {"pendulum": 0.2, "double-pendulum": 0.04, "henon-heiles": 0.4, "two-bo
 SEPARABLE = ("pendulum", "henon-heiles", "two-body")
 HALVINGS = 6
 POINTS = 26
-"""Times at which states are compared."""
+"""Times for comparing states."""
 MOTIONS = 16
 """Number of motions, from the first test starts, in one batch."""
 METHODS = ("explicit-euler", "symplectic-euler", "stormer-verlet", "rk4", "implicit-midpoint", "gauss-legendre-4")

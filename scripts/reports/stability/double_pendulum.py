@@ -32,7 +32,7 @@ DT = 0.002
 COARSE = 5
 """Time step of the coarser motion, in steps of the finer."""
 SEPARATION = 1e-7
-"""Distance at which the second motion is kept, rad."""
+"""Constant distance of the second motion, rad."""
 STARTS = np.array([[2.0, 2.5], [2.2, -1.5], [-2.6, 2.0], [1.8, 3.0]])
 """Initial angles at rest, rad; all above the energy where the motion becomes chaotic."""
 
@@ -119,7 +119,7 @@ def _distance(chaos: Chaos, system: Dynamics, *, every: int) -> np.ndarray:
 
 
 def _horizon(distance: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """First times at which motions are 1 rad off; infinite if they never are."""
+    """First times when motions are 1 rad off; infinite if they never are."""
     lost = ~(distance < 1.0)
     return np.where(lost.any(axis=0), t[np.argmax(lost, axis=0)], np.inf)
 

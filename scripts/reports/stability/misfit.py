@@ -16,7 +16,7 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 LEAST_SIGNIFICANCE = 5.0
-"""Standard errors from zero at which the mean power is significant."""
+"""The mean power is significant at this number of standard errors from zero."""
 LEAST_SHARE = 0.01
 """Share of the residual's mean square that velocity must explain."""
 

@@ -28,7 +28,7 @@ SAMPLES = 600
 FRICTION = 0.2
 """Viscous friction, N m s."""
 DEVIATIONS = 4.0
-"""Standard deviations by which a sum of squares of noise may exceed its mean."""
+"""A sum of squares of noise may exceed its mean by this number of standard deviations."""
 
 
 def noise() -> Findings:
@@ -72,7 +72,7 @@ def missing_friction() -> Findings:
         name = f"friction/model-{kind}-it"
         missing = misfit.missing.sum()
         if kind == "having":
-            text = "a model with friction leaves noise, in which nothing is found"
+            text = "a model with friction leaves noise, and nothing is found in it"
             rows.append(expect(name, "joints_reported", text, missing, 0.0))
             continue
         text = "both joints are reported, by the power that the residual takes"

@@ -20,7 +20,7 @@ TURNS = 1_000
 WIDTH = 16
 LAYERS = 3
 RANGES = (np.pi, 3.0, 10.0)
-"""Ranges of q, qd and qdd (or tau), for which all parts of the torque matter."""
+"""Ranges of q, qd and qdd (or tau) where all parts of the torque matter."""
 
 
 def turned_angles() -> Findings:

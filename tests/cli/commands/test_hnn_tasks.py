@@ -194,7 +194,7 @@ def test_mistakes_are_one_line(workplace, capsys):
 
 @pytest.fixture(scope="module")
 def positions(workplace):
-    """Six swings of which only q was measured, two with a gap."""
+    """Six swings with q alone, two with a gap."""
     t = np.arange(40) * 0.1
     parts = [(np.delete(t, range(15, 18)) if number < 2 else t) for number in range(6)]
     q = [np.cos(2 * part + number) for number, part in enumerate(parts)]

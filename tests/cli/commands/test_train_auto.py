@@ -1,4 +1,4 @@
-"""--model auto end to end: which model is kept of which arm, what is printed and stored, and what is refused."""
+"""--model auto end to end: the model that each arm gets, what is printed and stored, and what is refused."""
 
 import json
 from pathlib import Path

@@ -36,7 +36,7 @@ def motion(t, joint):
 
 
 def log(*, noise=NOISE_Q, rate=RATE, trajectories=3, t=None, seed=0, d=2):
-    """Arrays of a log and the true rates, the trajectories of which follow each other in one long motion."""
+    """Arrays of a log and the true rates; its trajectories follow each other in one long motion."""
     random = np.random.default_rng(seed)
     t = np.arange(round(SECONDS * rate)) / rate if t is None else t
     parts = [[motion(t + SECONDS * k, joint) for joint in range(d)] for k in range(trajectories)]

@@ -195,7 +195,7 @@ def differences(got, expected):
 
 
 def differently_finite(got, expected):
-    """States on which only one of both is finite, by result."""
+    """States where only one of the two results is finite, by result."""
     return {
         (name, place): np.unique(np.argwhere(np.isfinite(ours) != np.isfinite(theirs))[:, 0])
         for name, results in expected.items()

@@ -76,7 +76,7 @@ def evaluate(tmp_path_factory):
 
 
 def points(name: str, precision: str) -> np.ndarray:
-    """Random numbers of every binade in which the function is defined and not constant, and the hard ones."""
+    """Random numbers of every binade where the function is defined and not constant, and the hard ones."""
     numpy_type, random = TYPES[precision][0], np.random.default_rng(VECTORISED.index(name))
     limits, half_pi = np.finfo(numpy_type), np.pi / 2
     exponents = np.concatenate([np.arange(limits.minexp - limits.nmant, limits.maxexp), np.arange(-6, 18).repeat(30)])
@@ -112,7 +112,7 @@ def units_in_the_last_place(y, x, name: str) -> float:
 
 
 def units_of_single(y, x, name: str) -> np.ndarray:
-    """The same of single-precision arrays, for which double precision is exact enough."""
+    """The same for single-precision arrays; double precision is exact enough for them."""
     limits = np.finfo(np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         exact = getattr(np, name)(x.astype(float))

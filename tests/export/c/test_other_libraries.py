@@ -21,7 +21,7 @@ STATES = [tuple(row) for row in RANDOM.uniform(-1, 1, size=(20, 1, 2))]
 
 
 def implicit(y, a):
-    """Two equations of which no closed form is known."""
+    """Two equations without a known closed form."""
     return jnp.stack([y[0] ** 3 + 2 * y[0] + y[1] - a[0], 3 * y[1] + jnp.sin(y[0]) - a[1]])
 
 

@@ -262,7 +262,7 @@ INDEXED = {
         *(x.at[1].set(0.0), x.at[:, 2].add(x[0, 0]), x.at[1:3, ::2].mul(3.0), x.at[np.array([1, 1, 2])].add(1.0)),
         *(x.at[2, 3].set(i[0]), x.at[np.array([1, 1])].min(0.0)),
     ),
-    "scatter_triangles": lambda x, i: jax.vmap(  # of which a loop cannot follow the places
+    "scatter_triangles": lambda x, i: jax.vmap(  # a loop cannot follow its places
         lambda row: jnp.zeros((4, 4), x.dtype).at[np.tril_indices(4)].add(jnp.tile(row, 2)[:10]).at[1].mul(row[1])
     )(x),
     "lower_triangles": lambda x, i: jnp.tril(jnp.broadcast_to(x[:, None], (5, 7, 7))) * 2.0,
@@ -566,7 +566,7 @@ NaN by LU, and XLA of 0 times NaN where 0 is a truth value that is false: C does
 
 
 def states_of(name, examples):
-    """The example, some more, and some in which one number is not finite."""
+    """The example, some more, and some with one number that is not finite."""
     random = np.random.default_rng(6)
     states = [examples, *(jax.tree.map(lambda leaf: drawn(leaf, random), examples) for _ in range(3))]
     leaves, tree = jax.tree.flatten(examples)
@@ -593,7 +593,7 @@ STATES = {name: states_of(name, examples) for name, (_, examples) in CASES.items
 SINGLE = {
     *(f"of_{name}" for name in UNARY), *(f"of_two_{name}" for name in ON_TWO_MORE), *INTERFACES, *list(CASES)[::8]
 }  # fmt: skip
-"""Tried in single precision too by default: elementary functions, of which there are two sorts, types, some others."""
+"""Tried in single precision too by default: both sorts of elementary functions, types, some others."""
 
 
 def pytest_generate_tests(metafunc):

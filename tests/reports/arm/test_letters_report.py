@@ -1,4 +1,4 @@
-"""Experiments on letters: time scaling, few letters, and the loop in which the model is learned."""
+"""Experiments on letters: time scaling, few letters, and learning in the control loop."""
 
 from functools import partial
 

@@ -47,7 +47,7 @@ def letter(request):
 
 
 def junctions(path):
-    """Times at which strokes begin, and the end: contours are strokes 0, 2, 4, ..."""
+    """Times when strokes begin, and the end: contours are strokes 0, 2, 4, ..."""
     starts = np.asarray(path.position.args[0].starts) * path.duration
     return np.append(starts, path.duration)
 

@@ -37,7 +37,7 @@ CLOSE = 1e-2
 LEAST = 1e-2
 """States whose V is below this share of the largest are left out of relative errors, as their V is near zero."""
 HORIZON, FOLLOWED = 2.5, 8.0
-"""Horizon of the direct optimisations, s, and time for which policies are followed."""
+"""Horizon of the direct optimisations and of the policies' runs, s."""
 GRIDS = (101, 201, 401)
 EDGE = 12.0
 """Rate that no trajectory from the box exceeds, rad/s."""

@@ -59,7 +59,7 @@ def direct_values(
         limit: limit of the control.
         dt: length of a step, s.
         iterations: maximum number of iterations.
-        tolerance: relative change of the cost at which the optimisation ends.
+        tolerance: the optimisation ends at this relative change of the cost.
     """
     move, tail = flow(problem, dt), regulator_value(problem)
     discount, half = math.exp(-problem.discount * dt), math.exp(-problem.discount * dt / 2)

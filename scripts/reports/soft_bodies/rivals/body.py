@@ -28,11 +28,11 @@ class Body(NamedTuple):
     ratio: float
     """Poisson's ratio."""
     times: Float[np.ndarray, " s"]
-    """Times at which positions are compared, multiples of all steps, s."""
+    """Times for comparing positions, multiples of all steps, s."""
     floor: bool = False
     law: str = NEO_HOOKEAN
     near: float = 0.0
-    """Distance within which the surfaces of the components of the mesh repel each other, m; 0 for no contact."""
+    """Largest distance, m, of surfaces of the mesh's components that repel each other; 0 for no contact."""
     v: Float[np.ndarray, "n 3"] | float = 0.0
     """Velocities at the start, m/s."""
 

@@ -30,7 +30,7 @@ LABELS: dict[str, tuple[str, str, int, tuple[float, float]]] = {
     "newton-50": ("Newton VBD, 50 sweeps", "#44AA99", 0, (8, 2)),
     "newton-explicit": ("Newton, explicit", style.PURPLE, -1, (-2, -13)),
 }
-"""Label of a curve, its colour, the point at which it stands, and its offset from there in points."""
+"""Label of a curve, its colour, its point, and its offset from there in points."""
 
 
 def swing(quick: bool) -> Findings:

@@ -16,7 +16,7 @@ from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, KIRCHHOFF,
 
 VERSION = mujoco.__version__
 RADIUS = 1e-4
-"""Radius of the vertices, m, by which the floor is lowered."""
+"""Radius of the vertices, m; the floor is lowered by it."""
 
 
 def model_of(body: Body, integrator: str, dt: float, solref: tuple[float, float] = (0.02, 1.0)) -> Any:

@@ -21,7 +21,7 @@ from scripts.reports.soft_bodies.rivals.body import DENSITY, GRAVITY, Body, Run,
 from scripts.reports.soft_bodies.rivals.simulators import number, rivals
 
 STEP, NEAR = 2e-3, 5e-3
-"""Time step, s, and distance within which surfaces repel each other, m."""
+"""Time step, s, and largest distance of surfaces that repel each other, m."""
 
 
 def blocks(quick: bool) -> Findings:
