@@ -1,4 +1,4 @@
-"""What a model costs: no term that a scene lacks may show here."""
+"""Costs of a model: a term that a scene lacks must not show here."""
 
 import jax
 import jax.numpy as jnp

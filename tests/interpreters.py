@@ -53,18 +53,18 @@ runpy.run_path(program["path"], run_name="__main__")
 
 
 class Program(NamedTuple):
-    """What `python PATH ARGUMENTS` runs."""
+    """A program for `python PATH ARGUMENTS`."""
 
     path: Path
     folder: Path
-    """In which it runs."""
+    """Working folder."""
     environment: dict[str, str]
-    """All of it; what is read as JAX is imported is that of the first interpreter."""
+    """The whole environment; variables that JAX reads on import are those of the first interpreter."""
     arguments: tuple[str, ...] = ()
 
 
 class Result(NamedTuple):
-    """What came of a program."""
+    """Outcome of a program."""
 
     returncode: int
     stdout: str

@@ -7,14 +7,14 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 SURE = 4.0
-"""All of a few numbers are within so many standard errors, but for once in a thousand times."""
+"""Number of standard errors that all of a few numbers stay within, except once in a thousand times."""
 
 
 class Statistics(NamedTuple):
-    """Of a problem's residuals in units of their noise, at some parameters."""
+    """Statistics of a problem's residuals in units of their noise, at some parameters."""
 
     squares: float
-    """Of measurements; noise alone has as many as `freedom`."""
+    """Sum of the squares for measurements; noise alone gives `freedom`."""
     freedom: int
     """Measurements less unknowns: the starts of windows, and all that motions tell of P parameters."""
     slope: np.ndarray
@@ -26,7 +26,7 @@ class Statistics(NamedTuple):
 
 
 def statistics(task, parameters):
-    """Of a problem of `learning.measured_motions` whose velocities were not measured."""
+    """Returns the statistics of a problem of `learning.measured_motions` without measured velocities."""
     flat, unravel = ravel_pytree(parameters)
 
     def both(flat, *window):

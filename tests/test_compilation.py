@@ -29,7 +29,7 @@ AS_USERS_COMPILE = (
     "cli/commands/test_stability.py::test_hard_cases_meet_their_bounds[float32]",
     "cli/commands/test_train_models.py::test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes",
 )
-"""What fusion, fast approximations and reordering could break, cheap enough to compile with them."""
+"""Tests that fusion, fast approximations and reordering could break, and that compile quickly with them."""
 
 
 def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):

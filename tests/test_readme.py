@@ -28,7 +28,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}
 PROSE = {name: re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE) for name, text in PAGES.items()}
 MOST_WORDS = 900
-"""Of the README."""
+"""Largest number of words of the README."""
 BARE = "--no-figures --no-low-latency"
 SMALL = {
     "train_delan": f"--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 {BARE}",
@@ -39,7 +39,7 @@ SMALL = {
 QUICKLY = "__import__('dln_jax.compilation').compilation._OPTIONS = {}; "
 """Leaves XLA's options to the tests, whose programs compile sooner; in this process a fixture does so."""
 NOT_RUN = (("pip", "install"), ("python", "-m", "pytest"))
-"""What installs, and what checks this very repository."""
+"""Commands that install, or test this very repository."""
 
 
 class Block(NamedTuple):

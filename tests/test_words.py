@@ -44,7 +44,7 @@ def test_a_replaced_word_is_not_used(word, term):
 
 
 def test_variables_are_named_by_nouns():
-    """What `each`, `given` or `found` is has a name: joint, options, solution."""
+    """A variable is named by a noun (joint, options, solution), not `each`, `given` or `found`."""
     named = []
     for path in FILES:
         if path.suffix != ".py" or "examples" in path.parts:

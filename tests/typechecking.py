@@ -31,7 +31,7 @@ def checked(function):
 
 
 def _same(hint):
-    """What is equal for arrays of the same type, shape and numbers, of which jaxtyping makes a class each time."""
+    """Returns a key that is equal for equal array types: jaxtyping makes a new class for them each time."""
     if inspect.isclass(hint) and issubclass(hint, jaxtyping.AbstractArray):
         return hint.array_type, hint.dtypes, hint.dim_str
     return hint

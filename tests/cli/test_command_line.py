@@ -1,4 +1,4 @@
-"""What all command lines share: one line for a mistake, help that says what an option takes, bars that fit."""
+"""All command lines: one line for a mistake, help that says what an option takes, bars that fit."""
 
 import importlib
 import io
@@ -26,12 +26,12 @@ from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {**dict.fromkeys(COMMANDS, "dln_jax.cli.commands"), **dict.fromkeys(report_names(), REPORTS)}
-"""Of every command, by name."""
+"""Package of every command, by name."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Of a command that does nothing."""
+    """Arguments of a command that does nothing."""
 
     kind: Literal["this", "that"] = "this"
     """Which."""
@@ -124,7 +124,7 @@ def test_a_bar_shows_count_text_and_time_left_whole(width):
 
 
 def test_a_closed_pipe_ends_a_command_without_a_word():
-    """What it prints stays in a buffer that nobody takes, and is flushed as the command ends."""
+    """Its output stays in a buffer that nobody reads, and is flushed as the command ends."""
     program = (
         "import sys; sys.argv = ['command']; sys.path.append('tests/cli'); "
         "from test_command_line import *; run(say, Arguments, prog='command')"
@@ -139,7 +139,7 @@ def test_a_closed_pipe_ends_a_command_without_a_word():
 
 
 CONSOLE = "import sys\nfrom dln_jax.__main__ import main\nsys.exit(main())\n"
-"""What pip makes of the package's entry."""
+"""The console script that pip writes for the package."""
 
 
 def ways(folder):
@@ -228,7 +228,7 @@ def test_a_list_that_nobody_reads_ends_without_a_word():
 
 @dataclass(frozen=True)
 class Resumable:
-    """Of a command that can continue."""
+    """Arguments of a command that can continue."""
 
     resume: bool = False
     """Continue."""

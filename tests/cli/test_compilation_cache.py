@@ -20,7 +20,7 @@ compilation_cache.LEAST_SECONDS = 0.0
 class Arguments:
     """What to compile."""
     size: int = 3
-    """Of a vector."""
+    """Size of the vector."""
 
 def main(given):
     before = compilation_cache.compilation()

@@ -42,7 +42,7 @@ PARTS = parts_of(B)
 
 
 def laws():
-    """All of the room, as functions of x [4]."""
+    """All laws under test, as functions of x [4]."""
     at = linearise(FIELD, GOAL, np.zeros(1))
     regulator = lqr(at.A, at.B, np.eye(4), np.eye(1))
     near, cost = regulated(regulator, GOAL, at.u, JOINTS), value(regulator, GOAL, JOINTS)

@@ -17,7 +17,7 @@ def rates(x, u):
 
 
 def controller():
-    """Of a pendulum of 1 kg m² whose motor holds it up to 0.42 rad from upright; the parameter is its strength."""
+    """For a pendulum of 1 kg m² whose motor holds it up to 0.42 rad from upright; the parameter is its strength."""
     regulator = lqr([[0, 1], [9.81, 0]], [[0], [1]], np.diag([10.0, 1.0]), np.eye(1))
     dt = EVERY / RATE
     step = integrated(rates, dt)

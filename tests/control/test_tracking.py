@@ -31,7 +31,7 @@ def reference(t):
 
 
 def errors(law, t, off):
-    """Of coordinates along the closed loop, from a start that is off by so much."""
+    """Errors of the coordinates along the closed loop, from a start that deviates by `off`."""
     field = second_order(lambda t, q, qd: ARM.forward_dynamics(q, qd, law(q, qd, reference(t))))
     start = reference(0.0)
     q, _ = rollout(runge_kutta(CLASSICAL, field), (start.q + off, start.qd), t)

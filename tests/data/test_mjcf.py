@@ -1,4 +1,4 @@
-"""What is written as MJCF reads back as the same robot."""
+"""A robot that is written as MJCF reads back as the same robot."""
 
 import jax
 import numpy as np

@@ -49,7 +49,7 @@ def reduced(path: Path) -> str:
 
 
 def first_and_last(*arguments, frames, **options):
-    """Of a film, whose drawing has tests of its own."""
+    """Writes the first and the last frame of a film; its drawing has tests of its own."""
     write_gif(*arguments, frames=[frames[0], frames[-1]], **options)
 
 

@@ -46,7 +46,7 @@ def test_triangles_have_all_that_data_say():
 
 
 def test_standard_errors_are_those_of_repeated_experiments():
-    """Of 300 repetitions, and noise is found as it was; what is dependent has no error of its own."""
+    """300 repetitions; the noise is recovered as well, and dependent parameters have no error of their own."""
     Phi = design(1, dependent=True)
     combinations = np.array([[0, 0, 1.0, 0, 0], [0, 0, 0, 1, 0], [1, 0, 0, 0, 1], [0, 1, 0, 0, 1]])
     fitted, errors, noises = [], [], []

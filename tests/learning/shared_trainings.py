@@ -1,4 +1,4 @@
-"""What trainings come to on the devices that JAX sees: `shared_trainings.py FOLDER NAME [PROCESS PORT]`.
+"""Results of trainings on the devices that JAX sees: `shared_trainings.py FOLDER NAME [PROCESS PORT]`.
 
 Writes FOLDER/NAME.npz and FOLDER/NAME.json. The first run leaves in FOLDER/half what it has trained half way, and every
 run continues it.
@@ -117,7 +117,7 @@ def recomputed(mesh):
 
 
 def predicted(mesh):
-    """What a pendulum's energies say of seven states."""
+    """Predictions of a pendulum's energies for seven states."""
     states = [np.random.default_rng(seed).normal(size=(7, 1)) for seed in range(4)]
     data = Trajectories(np.arange(7.0), *states, np.zeros(7, int), np.array(["fall"]))
     return predictions(pendulum().energies, data, jnp.float64, mesh=mesh)

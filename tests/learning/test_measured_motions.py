@@ -66,9 +66,9 @@ class Fitted(NamedTuple):
     data: Any
     task: Any
     first: Any
-    """Of accelerations."""
+    """Result of the fit to accelerations."""
     second: Any
-    """Of motions."""
+    """Result of the fit to motions."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What is learned from encoders and late torques is the plant, in weak form, by linear and by learned energies."""
+"""Encoders and late torques give the true plant, in weak form, by linear and by learned energies."""
 
 import jax
 import jax.numpy as jnp

@@ -18,7 +18,7 @@ ROUNDING = 1e-12
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """What each run said, and its arrays; four devices come first, whose half trainings all others continue."""
+    """Output and arrays of each run. Four devices come first, and all others continue their half trainings."""
     folder = tmp_path_factory.mktemp("shared")
     run_on_all(PATH, folder)
     names = ("one device", *SHARED)

@@ -1,4 +1,4 @@
-"""What a soft body is made of, found from how it moves; a rest shape, from how it hangs."""
+"""Materials of soft bodies are identified from motions, and a rest shape from how it hangs."""
 
 import functools
 

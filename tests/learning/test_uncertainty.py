@@ -1,4 +1,4 @@
-"""What a model does not know equals closed forms and refits, covers held-out noise, and tells near states from far."""
+"""Uncertainties equal closed forms and refits, cover held-out noise, and tell near states from far ones."""
 
 import jax
 import jax.numpy as jnp

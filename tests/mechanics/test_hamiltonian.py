@@ -253,7 +253,7 @@ def test_the_default_transform_is_right_without_a_choice():
 
 
 def test_a_velocity_without_a_momentum_gives_nan_in_value_and_derivative():
-    """Of H = sqrt(1 + p²) no momentum makes |qd| = 1 or more; just below, p = qd / sqrt(1 - qd²)."""
+    """With H = sqrt(1 + p²) no momentum makes |qd| = 1 or more; just below, p = qd / sqrt(1 - qd²)."""
 
     def momentum(qd):
         return conjugate(lambda q, p: jnp.sum(jnp.sqrt(1 + p**2)), qd, qd)[0]

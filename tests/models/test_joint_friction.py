@@ -163,7 +163,7 @@ def test_what_a_model_cannot_have_is_refused(kind, laws, message):
 
 
 def test_load_of_a_plant_is_undone_in_its_map():
-    """What a wrapped model is fitted to: the same record as of known energies."""
+    """A wrapped model is fitted to the same record as known energies."""
     scene = double_pendulum()
     system = with_friction(scene.closed_form, None, Load(0.2, 0.05, np.array(ABSOLUTE)))
     q, qd, qdd = STATE

@@ -21,7 +21,7 @@ STATE = tuple(map(np.array, ([0.4, -1.3], [1.1, 2.0], [0.3, -0.7])))
 
 
 def random_parameters(model):
-    """Of a mass matrix that is definite."""
+    """Returns parameters with a definite mass matrix."""
     like = model.init(jax.random.key(0))
     random = np.random.default_rng(0)
     drawn = jax.tree.map(lambda leaf: jnp.asarray(0.1 + 0.2 * random.uniform(size=leaf.shape)), like)

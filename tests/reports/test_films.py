@@ -21,7 +21,7 @@ def test_a_strip_without_frames_is_refused(option, capsys, tmp_path):
 
 @pytest.mark.slow
 def test_the_strip_is_written(tmp_path, monkeypatch):
-    """Of the film that trains nothing; examples of the documentation train what the others show."""
+    """The film that trains nothing; examples of the documentation train for the others."""
     title = "control by energy"
     monkeypatch.setattr(film_strip, "FILMS", {title: FILMS[title]})
     command(film_strip, "--frames", "3", "--out", tmp_path / "strip")

@@ -1,4 +1,4 @@
-"""What creatures and values come to on the devices that JAX sees: `shared_batches.py FOLDER NAME [PROCESS PORT]`.
+"""Results for creatures and values on the devices that JAX sees: `shared_batches.py FOLDER NAME [PROCESS PORT]`.
 
 Writes FOLDER/NAME.npz. What the first run has learned half way it leaves in FOLDER/half, and every run continues.
 """
@@ -54,7 +54,7 @@ def walked(folder, name, compiled):
 
 
 def stiffness(mesh):
-    """Of a spring, from three motions, which neither two nor four devices divide; a body would be traced for long."""
+    """Identifies a spring from three motions, which neither two nor four devices divide; a body takes long to trace."""
 
     def step(stiffness, state, control):
         v = state.v - 0.1 * stiffness * jnp.sin(state.x)

@@ -36,7 +36,7 @@ LOST, JOINING = os.environ.get("LOST", ""), int(os.environ.get("JOINING", "60"))
 class Arguments(Resumable, Scaled):
     """What to iterate."""
     seed: int = 0
-    """Of nothing."""
+    """Unused."""
 
 def lose(process):
     who, _, how = LOST.partition(" ")

@@ -59,7 +59,7 @@ class RodOptions:
 
 @dataclass(frozen=True)
 class Arguments(Options):
-    """Of a command that trains it."""
+    """Arguments of a command that trains it."""
 
     VARIANTS: ClassVar = VARIANTS
     model: str = "rod"

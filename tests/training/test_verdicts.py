@@ -1,4 +1,4 @@
-"""What verdicts add to errors on held-out motions: agreement of descents, heavy bodies, friction, spikes."""
+"""Verdicts beyond errors on held-out motions: agreement of descents, heavy bodies, friction, spikes."""
 
 import numpy as np
 import pytest

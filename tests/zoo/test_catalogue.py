@@ -300,7 +300,7 @@ def test_typical_sizes_are_those_of_the_data():
 
 
 def test_properties_are_those_of_the_energies():
-    """What the catalogue says of a model is what its energies are."""
+    """The catalogue describes a model by its energies."""
     for name, entry in CATALOGUE.items():
         if "needs" not in MODELS[name]:
             continue

@@ -1,4 +1,4 @@
-"""What a model does not know comes back with its run, in C too, or is refused in one line."""
+"""Uncertainties come back with their run, in C too, or are refused in one line."""
 
 import json
 import shutil

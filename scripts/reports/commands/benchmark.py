@@ -44,7 +44,7 @@ class Arguments(Folder):
     subject: tyro.conf.Positional[Literal["one-step", "throughput", "scaling", "integrators", "c", "casadi", "all"]] = (
         "all"
     )
-    """What is measured."""
+    """Subject of the measurements."""
     quick: bool = False
     """Fewer cases and repetitions: a look at whether everything runs, in two minutes."""
     against: Unstated[Path] = None

@@ -28,7 +28,7 @@ class Horizon(NamedTuple):
     unknowns: Any
     cost: Any
     residuals: Any
-    """Whose squares sum to the cost."""
+    """Residuals; the sum of their squares is the cost."""
     gaps: Any
     lower: np.ndarray
     upper: np.ndarray

@@ -21,7 +21,7 @@ NUMBERS = {
     **{"vpt_seconds": 3.0, "train_seconds": 4.0, "parameters": 260.0, "one_step_p50_us": 12.0},
 }
 TIMES = {"seconds_to_1e-08": 21.0, "seconds_to_1e-10": np.inf}
-"""Of one run after the other; an error that was never reached is null in the file, and continued from there."""
+"""Times of two runs in turn; an error that was never reached is null in the file, also after a continuation."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What is wrong in a file or on a command line is one line and exit status 2, and nothing is written."""
+"""Errors in files and on command lines: one line, exit status 2, and nothing is written."""
 
 import dataclasses
 import hashlib

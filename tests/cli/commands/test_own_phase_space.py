@@ -37,7 +37,7 @@ def files(tmp_path_factory):
 
 
 def test_noise_of_states_and_rates_weighs_motions(files):
-    """What the named task was told, own data show: sd 0.1 of q and p, and rates that are exact."""
+    """Own data show what the named task states: sd 0.1 of q and p, and exact rates."""
     problem = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
     assert problem.trust is not None and not problem.trust.free_of_noise
     np.testing.assert_allclose(problem.trust.weights.state, 0.1, rtol=0.15)

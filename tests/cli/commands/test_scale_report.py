@@ -1,4 +1,4 @@
-"""What hosts gain on paper, teams of processes that take turns, and the report of both."""
+"""Expected gain of several hosts, teams of processes that take turns, and the report of both."""
 
 import contextlib
 import json

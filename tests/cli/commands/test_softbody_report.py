@@ -15,7 +15,7 @@ from scripts.reports.commands.softbody_report import cases
 # Cases that take minutes. In one of them, the twisted bar snaps in a step that reports that it has not converged.
 LONGEST = tuple(f"contact/{name}" for name in ("folding-beam", "ring", "twisted-bar", "gradients", "stack", "bounce"))
 TESTED = ("references/locking", "references/slender", "contact/impact", "contact/gripper")
-"""Of quadratic elements, of bodies that collide, and by the example of a gripper."""
+"""Cases that other tests cover: quadratic elements, colliding bodies, and the example of a gripper."""
 CASES = [
     case.name for case in cases() if not case.name.startswith(("speed/", "compilation/", "rivals/", *TESTED, *LONGEST))
 ]

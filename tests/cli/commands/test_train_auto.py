@@ -31,7 +31,7 @@ PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'
 
 
 def torques(system, states):
-    """Of states [N, 2] each."""
+    """Returns the torques at states, arrays [N, 2]."""
     return np.asarray(jax.jit(jax.vmap(dynamics(system).inverse_dynamics))(*states))
 
 

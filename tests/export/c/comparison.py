@@ -48,7 +48,7 @@ def in_c(
 
 
 def in_jax(functions: Functions, states: Mapping[str, list[Any]], *, precision="f64"):
-    """The same of the functions, compiled at once and mapped over the states."""
+    """The same results from JAX: the functions are compiled together and mapped over the states."""
     stacked = {
         name: at_precision(jax.tree.map(lambda *leaves: np.stack(leaves), *states[name]), precision)
         for name in functions

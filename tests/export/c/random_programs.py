@@ -66,7 +66,7 @@ def _of(random: np.random.Generator, shape: Any, dtype: Any) -> np.ndarray:
 
 
 def _computed(random: np.random.Generator, known: Arrays, *, steps: int, depth: int) -> Arrays:
-    """What is known, and what so many steps add."""
+    """Returns the known arrays and those that the steps add."""
     for _ in range(steps):
         step = STEPS[random.choice(len(STEPS), p=WEIGHTS)]
         results = step(random, known, depth)

@@ -92,7 +92,7 @@ def elastic_beam(q, qd):
 
 
 def ball_in_a_bowl(q, qd):
-    """Whose height is a series, and whose slope is solved for with the metric of the bowl."""
+    """The bowl's height is a series, and its slope is solved for with the bowl's metric."""
     height = lax.fori_loop(0, 4, lambda k, total: 0.3 * total * (q @ q) + 0.5 * q @ q, 0.0)
     slope = jax.grad(lambda q: jnp.tanh(q @ q))(q)
     metric = jnp.eye(2) + jnp.outer(slope, slope)
@@ -119,7 +119,7 @@ DEFAULT |= {*BY_HAND, "pendulum", "three-body"}
 """The other cases repeat what is in these."""
 SLOW = {"black-box-hnn", "latent-phase", "three-body", "spherical_pendulum", "relativistic_particle", "kepler"}
 SLOW |= {"structured-delan", "double_pendulum"}
-"""Those of `DEFAULT` whose primitives occur in another, too."""
+"""Cases of `DEFAULT` whose primitives occur in another case, too."""
 BRIEFLY = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian", "mass_matrix")
 BRIEFLY += ("rates", "hamiltonian", "encode", "decode")
 HAMILTONIANS = ("black-box-hnn",)
@@ -151,7 +151,7 @@ def system_of(case, precision):
 
 
 def states_of(functions, system):
-    """Of each function, a thousand states, and the first with each of its numbers in turn not finite."""
+    """Returns a thousand states of each function, and the first with each of its numbers in turn not finite."""
     random = np.random.default_rng(1)
     drawn: dict[str, np.ndarray] = {}
     states = {}
@@ -179,7 +179,7 @@ def states_of(functions, system):
 
 
 def differences(got, expected):
-    """Of each result, the largest difference over its largest number, where both are finite."""
+    """Returns the largest difference of each result over its largest number, where both are finite."""
     worst = {}
     for name, results in expected.items():
         for place, (ours, theirs) in enumerate(zip(got[name], results, strict=True)):

@@ -63,7 +63,7 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
 
 @pytest.mark.parametrize("m, n", [(3, 4), (40, 70), (64, 64)])
 def test_operations_are_counted(m, n):
-    """Of a product: m n multiplications and as many additions, less those of the first terms where written out."""
+    """A product takes m n multiplications and as many additions, less those of the first terms where written out."""
     functions = {"product": (lambda a, x: a @ x, (np.zeros((m, n)), np.zeros(n)))}
     stated = json.loads(source_files(functions, name="model")["model.json"])["functions"]["product"]
     assert stated["operations"] in (2 * m * n, 2 * m * n - m)

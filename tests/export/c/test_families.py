@@ -1,4 +1,4 @@
-"""What is exported of each kind of model and of scenes: values of its dynamics, and derivatives of those values."""
+"""Exports of each kind of model and of scenes: values of the dynamics, and derivatives of those values."""
 
 import functools
 import inspect
@@ -179,7 +179,7 @@ DEFAULT = ("black-box-delan", "black-box-hnn", "feed-forward", "phase-network", 
 STEPPED = ("cart-pole",)
 """Steps call the same functions of every system, and take long to compile."""
 HAMILTONIANS = ("black-box-hnn", "separable-hnn", "polynomial-hamiltonian")
-"""Of one record, whose Newton iterations take long to trace: what is differentiated as for others is left out."""
+"""Models of one record. Newton iterations take long to trace, so derivatives like those of others are left out."""
 LACKING = {
     "structured-delan": set(),
     "trigonometric": {"gravity", "friction"},
@@ -240,7 +240,7 @@ def test_what_a_system_lacks_is_not_exported(case):
 
 
 def test_a_step_has_the_derivatives_of_finite_differences():
-    """Of an under-actuated scene, and by dt too."""
+    """The scene is under-actuated; derivatives by dt are compared, too."""
     scene = SCENES["cart-pole"]()
     functions = functions_of_system(scene.closed_form, 2, dtype=float, actuation=scene.needs.actuation)
     step, state = functions["step_implicit_midpoint"][0], jnp.array([0.1, 2.0, -0.4, 1.5, 0.7, DT])

@@ -561,7 +561,7 @@ NOT_FINITE = {
     **{f"{name}_{n}": () for name in ORTHOGONAL for n in (1, 3, 9)},
     "gradient_of_max": (),
 }
-"""What some cases are tried on; others on NaN and infinities. LAPACK makes finite numbers of infinities, and of
+"""Inputs of some cases; the others get NaN and infinities. LAPACK makes finite numbers of infinities, and of
 NaN by LU, and XLA of 0 times NaN where 0 is a truth value that is false: C does not."""
 
 
@@ -597,7 +597,7 @@ SINGLE = {
 
 
 def pytest_generate_tests(metafunc):
-    """Of the cases in each precision; all of them by `--every-export`."""
+    """Draws from the cases in each precision; `--every-export` takes all of them."""
     if "case" in metafunc.fixturenames:
         every = metafunc.config.getoption("--every-export")
         cases = [(kind, name) for kind in BOUND for name in CASES if every or kind == "f64" or name in SINGLE]

@@ -117,7 +117,7 @@ print(digest(range(int(sys.argv[2]), int(sys.argv[3]))))
 
 
 def digest(seeds):
-    """Of the C of programs."""
+    """Returns the digest of the programs' C."""
     programs = {f"program_{seed}": random_programs.program(seed) for seed in seeds}
     return hashlib.sha256(source_files(programs, name="model")["model.c"]).hexdigest()
 

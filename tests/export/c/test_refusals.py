@@ -1,4 +1,4 @@
-"""What has no C is refused in one line that says what and where, and nothing is written."""
+"""Functions without a C equivalent are refused in one line that says what and where, and nothing is written."""
 
 import jax
 import jax.numpy as jnp
@@ -96,7 +96,7 @@ NAMES += ("malloc", "NULL", "NAN", "INFINITY", "errno", "j1", "2x", "a b", "a;b"
 
 @pytest.mark.parametrize("name", NAMES)
 def test_names_that_c_or_its_libraries_have_are_refused(name, tmp_path):
-    """Of the export, of a function, and of a result."""
+    """Names of the export, of a function, and of a result."""
     for options in (
         {"name": name},
         {"functions": {name: (jnp.sin, (X,))}},

@@ -119,7 +119,7 @@ def test_jacobians_equal_those_of_the_generic_way():
 
 
 def test_learned_numbers_give_what_known_ones_give():
-    """Of JAX and traced, where nothing is known to be zero."""
+    """Learned numbers are JAX arrays or traced, and nothing is known to be zero."""
     tree = TREES["arm"]
     state = np.random.default_rng(9).normal(size=(3, tree.degrees_of_freedom))
 

@@ -1,4 +1,4 @@
-"""What the cases of the equation take for true."""
+"""True values in the cases of the equation."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""What the report of uncertainties draws and reads is what it says, and its cases give their rows."""
+"""The report of uncertainties draws and reads the data that it names, and its cases give their rows."""
 
 import pytest
 
