@@ -152,7 +152,7 @@ def test_mistakes_are_named(swing):
     refused = [
         (lambda: problem(model, data, data, most_samples=0), "most_samples is 0"),
         (lambda: problem(model, data, data, seed=-1), "seed is -1"),
-        (lambda: problem(model, data._replace(p=None), data), "no p and pd"),
+        (lambda: problem(model, data._replace(p=None), data), "p and pd, which the data do not have"),
         (lambda: hold_out(data, 1.5, 0), "validation_share is 1.5"),
         (lambda: hold_out(data._replace(trajectory=0 * data.trajectory), 0.1, 0), "there are 1 trajectories"),
         (lambda: make_polynomial_hamiltonian(needs, degree=1), "degree is 1"),
