@@ -55,11 +55,6 @@ class ConsistentFit(NamedTuple):
     """Whether the Newton decrement fell below the tolerance; otherwise the iterations or the line search ran out."""
 
 
-def motors_are_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> bool:
-    """Whether the armature matrices of coupled motors are positive definite."""
-    return all(np.linalg.eigvalsh(_armature(theta, group))[0] > 0 for group in columns.motors)
-
-
 def _armature(theta: np.ndarray, group: list[tuple[int, int, int]]) -> np.ndarray:
     """Armature matrix of coupled motors, without the others."""
     motors = sorted({motor for _, motor, _ in group})
