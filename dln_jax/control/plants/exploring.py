@@ -99,28 +99,21 @@ def explore(
     repeated: set[int] = set()
     runs: list[PlantRun] = []
     stopped: list[str] = []
-    weaker, blind, law, by_plan = 1.0, _blind(inner), None, False
+    weaker, blind, law = 1.0, _blind(inner), _Law()
     while waiting:
         number, stage, seconds = waiting.popleft()
         later = number - len(exploration.blind)
-        if later >= 0 and (by_plan or later % FITTED_EVERY == 0):
-            upright = _upright(inner, fit, runs)
-            planned = None
-            if upright and later and (by_plan or not any((distances(one.y, inner) < NEAR).any() for one in runs)):
-                planned = _plan_law(inner, *upright, seed=seed)
-            if planned:
-                law, by_plan = planned, True
-            elif upright and not by_plan:
-                law = _energy_law(inner, *upright)
-        if later >= 0 and law is not None:
-            act, noise = law, exploration.along_plans if by_plan else exploration.noise
+        if later >= 0 and (law.by_plan or later % FITTED_EVERY == 0):
+            law = _fitted_law(inner, fit, runs, law, may_plan=later > 0, seed=seed)
+        if later >= 0 and law.act is not None:
+            act, noise = law.act, exploration.along_plans if law.by_plan else exploration.noise
         else:
             act, noise = blind, exploration.blind[min(number, len(exploration.blind) - 1)]
         samples = round(seconds * layout.rate)
         signal = smooth_noise((samples, layout.actuation.shape[1]), rate=layout.rate, bandwidth=exploration.bandwidth,
                               random=random)  # fmt: skip
         size = weaker * noise * used.control[:, 1]
-        memory = (_start(inner, READY if by_plan else stage), jnp.asarray(size * signal))
+        memory = (_start(inner, READY if law.by_plan else stage), jnp.asarray(size * signal))
         (one,) = run([plant], act, jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], memory), seconds=seconds)
         if one.stopped:
             weaker /= 2
@@ -198,6 +191,29 @@ def _spring(layout: Layout, centre: np.ndarray) -> Callable[[Array], Array]:
 def _blind(layout: Layout) -> Any:
     spring, size = _spring(layout, layout.hanging), layout.limits.control[:, 1]
     return _with_noise(Controller(None, lambda stage, t, x: (stage, jnp.asarray(-size * spring(x)))), layout)
+
+
+class _Law(NamedTuple):
+    """Compiled law of the later episodes; `None` until there is a model."""
+
+    act: Any = None
+    by_plan: bool = False
+
+
+def _fitted_law(
+    layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun], before: _Law, *, may_plan: bool,
+    seed: int,
+) -> _Law:  # fmt: skip
+    """Returns the law of a model of the runs so far, or the one before if there is no model or plan."""
+    upright = _upright(layout, fit, runs)
+    if upright is None:
+        return before
+    near = any((distances(one.y, layout) < NEAR).any() for one in runs)
+    if before.by_plan or (may_plan and not near):
+        planned = _plan_law(layout, *upright, seed=seed)
+        if planned is not None:
+            return _Law(planned, by_plan=True)
+    return before if before.by_plan else _Law(_energy_law(layout, *upright))
 
 
 def _upright(layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun]) -> Any:
