@@ -26,6 +26,8 @@ NORMAL = 0.67448975
 SLOW = 5e-3
 """If differences of a log give a noise above this fraction of the positions' standard deviation, sampling is so slow
 that they are differences of the motion."""
+TINY = 1e-280
+"""Smaller channels count as constant: twelve of their digits cannot be rounded to."""
 
 
 class Timing(NamedTuple):
@@ -149,8 +151,10 @@ def by_trajectory(values: np.ndarray, trajectory: np.ndarray) -> list[np.ndarray
 
 def _step(channel: np.ndarray) -> float:
     size = np.abs(channel).max(initial=0.0)
+    if size < TINY:
+        return 0.0
     # Twelve significant digits, so that rounding errors do not split a level.
-    levels = np.unique(np.round(channel, 12 - int(np.ceil(np.log10(size)))) if size > 0 else channel)
+    levels = np.unique(np.round(channel, 12 - int(np.ceil(np.log10(size)))))
     if len(levels) < 3:
         return 0.0
     distances = np.diff(levels)
