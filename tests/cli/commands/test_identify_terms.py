@@ -105,7 +105,7 @@ def test_all_terms_are_identified_and_written(place, capsys):
         (("--motors", "1,1;1,1"), "--motors is .* that can be inverted"),
         (("--coupled", "1-2"), "--coupled has '1-2'; expected pairs of joints such as 2:3"),
         (("--coupled", "1:3"), "--coupled is 1:3; expected each pair of different joints"),
-        (("--temperature",), "the data have no temperature"),
+        (("--temperature",), "friction is to depend on temperature, which the data do not have"),
         (("--temperature", "--friction", "coulomb"), "--temperature changes viscous friction"),
     ],
 )
