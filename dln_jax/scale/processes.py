@@ -100,7 +100,7 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
             thread, so that the caller should end the process at once.
     """
     where = member.coordinator or "the cluster"
-    _require_address(member)
+    claim = _claimed_address(member)
     # JAX's handler of SIGTERM would keep a process alive that is asked to end.
     jax.config.update("jax_enable_preemption_service", False)
     errors = []
@@ -120,6 +120,7 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
     thread = threading.Thread(target=connect, daemon=True)
     thread.start()
     thread.join(seconds)
+    claim.close()
     if thread.is_alive():
         count = "the processes" if member.processes is None else f"the {member.processes} processes"
         raise InputError(
@@ -136,16 +137,25 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
         print(f"{jax.process_count()} processes, {local} {kind} device{'s' * (local > 1)} each")
 
 
-def _require_address(member: Membership) -> None:
-    """Raises `InputError` for a host without an address, or a port that is not free; JAX would wait in both cases."""
+def _claimed_address(member: Membership) -> contextlib.ExitStack:
+    """Returns what keeps other processes 0 away until it is closed.
+
+    Raises:
+        InputError: the host has no address, or the port is not free; JAX would wait in both cases.
+    """
     if member.coordinator is None:
-        return
+        return contextlib.ExitStack()
     host, _, port = member.coordinator.rpartition(":")
     try:
-        if member.process:
-            socket.getaddrinfo(host.strip("[]"), int(port))
-        else:
-            socket.create_server(("", int(port))).close()
+        with contextlib.ExitStack() as claim:
+            if member.process:
+                socket.getaddrinfo(host.strip("[]"), int(port))
+            else:
+                # JAX's servers share a port, and a process that finds another of its index aborts. The UDP port has one
+                # owner until JAX listens.
+                claim.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)).bind(("", int(port)))
+                socket.create_server(("", int(port))).close()
+            return claim.pop_all()
     except socket.gaierror as error:
         raise InputError(f"cannot reach {member.coordinator} ({error.strerror}); check --coordinator") from None
     except OSError as error:

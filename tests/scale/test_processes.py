@@ -241,7 +241,7 @@ def test_a_broken_run_continues_in_one_process_or_without_its_first(run_tiny, tr
 REFUSED = {
     "arguments": ("--seed differs between process 0 and process 1; it is 1", "it is 2 in this one"),
     "devices": ("--devices: process 0 has 1, process 1 has 3",) * 2,
-    "twice": ("the 2 processes did not meet at 127.0.0.1:",),
+    "twice": ("the 2 processes did not meet at 127.0.0.1:", "of --coordinator is not free"),
     "absent": ("the 2 processes did not meet at 127.0.0.1:",),
     "port": ("of --coordinator is not free", "did not meet at localhost"),
     "address": ("did not meet at no-such-host.invalid", "cannot reach no-such-host.invalid"),
