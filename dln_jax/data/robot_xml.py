@@ -39,6 +39,7 @@ class _Elements(ET.TreeBuilder):
     depth = count = 0
 
     def start(self, tag: Any, attrs: Any, /) -> ET.Element:
+        tag = tag.rpartition("}")[2]  # some URDF files name a default namespace
         self.depth, self.count = self.depth + 1, self.count + 1
         if self.depth > DEEPEST:
             raise InputError(f"its elements are nested more than {DEEPEST} deep; expected the file of a robot")
@@ -51,7 +52,7 @@ class _Elements(ET.TreeBuilder):
 
     def end(self, tag: Any, /) -> ET.Element:
         self.depth -= 1
-        return super().end(tag)
+        return super().end(tag.rpartition("}")[2])
 
 
 def parsed(path: Path) -> ET.Element:

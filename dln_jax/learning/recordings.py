@@ -21,13 +21,14 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Report, silent
 from dln_jax.learning.momentum import (
+    acceleration_misfit,
     cut_momentum_windows,
     delay_of_torques,
     deviations,
     driven_torques,
     momentum_problem,
 )
-from dln_jax.learning.weak_forms import fit_momentum
+from dln_jax.learning.weak_forms import fit_reweighted
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.types import FrictionLaw, InputError, Needs
@@ -36,8 +37,6 @@ from dln_jax.zoo.descriptions import Description, build, describe
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
 """Friction laws of the models; other friction of the plant, near rest, is not modelled."""
 MOST_DELAY = 4
-ROUNDS = 2
-"""Number of fits; the later ones are weighted by the residuals of the one before."""
 DEGREE = 2
 """Degree of the identified mass matrix in every angle: enough for rigid bodies. Displacements along a level rail have
 no effect."""
@@ -144,7 +143,7 @@ def _degrees(needs: Needs, degree: int) -> list[int]:
 
 
 def identified(data: Trajectories, needs: Needs) -> FittedPlant:
-    """Fits the trigonometric model with viscous and dry friction; errors as for `fit_momentum`.
+    """Fits the trigonometric model with viscous and dry friction; errors as for `fit_reweighted`.
 
     Args:
         data: recording with rates and acting torques.
@@ -155,12 +154,12 @@ def identified(data: Trajectories, needs: Needs) -> FittedPlant:
 def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
     """Fits a chain of rigid bodies on a fixed base, in relative coordinates, for which fewer motions suffice.
 
-    Whether all links move in one plane, and which axes point the other way, is decided by the smallest error in the
-    validation episode: the product over joints of the residuals' root mean squares. Models whose mass matrix is not
-    positive definite at the recording's positions are left out.
+    Whether all links move in one plane, and which axes point the other way, is decided by the smallest
+    `acceleration_misfit` in the validation episode. Models whose mass matrix is not positive definite at the
+    recording's positions are left out.
 
     Raises:
-        InputError: as for `fit_momentum`, or all models are left out.
+        InputError: as for `fit_reweighted`, or all models are left out.
     """
     held_out = cut_momentum_windows(prepared.validation)
     positions = np.concatenate([prepared.train.q, prepared.validation.q])
@@ -171,9 +170,8 @@ def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
         masses = np.asarray(jax.jit(jax.vmap(plant.dynamics.mass_matrix))(positions))
         definite = np.linalg.eigvalsh(masses)[:, 0] > 0
         share = max(share, float(np.mean(definite)))
-        left = float(np.sum(np.log(deviations(plant.dynamics, held_out))))
-        if definite.all() and left < least:
-            best, least = plant, left
+        if definite.all() and (misfit := acceleration_misfit(plant.dynamics, held_out)) < least:
+            best, least = plant, misfit
     if best is None:
         raise InputError(
             f"the identified mass matrix is positive definite at {share:.1%} of the recording's positions; expected "
@@ -183,12 +181,7 @@ def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
 
 
 def _fitted(description: Description, data: Trajectories) -> FittedPlant:
-    model, windows = build(description), cut_momentum_windows(data)
-    plant = FittedPlant(description, fit_momentum(model, data).parameters)
-    for _ in range(ROUNDS - 1):
-        noise = deviations(plant.dynamics, windows)
-        plant = plant._replace(parameters=fit_momentum(model, data, noise=noise).parameters)
-    return plant
+    return FittedPlant(description, fit_reweighted(build(description), data).parameters)
 
 
 def learned(

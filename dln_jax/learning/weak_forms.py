@@ -44,6 +44,10 @@ OVERLAP = 5
 """Number of windows that start within the length of one; more would be nearly redundant."""
 CHUNK = 4096
 """Samples whose columns are in memory at a time."""
+ROUNDS = 10
+"""Largest number of fits of `fit_reweighted`; three to five are usual."""
+SETTLED = 0.01
+"""Relative change of the errors' covariance that ends them."""
 
 
 class WeakFit(NamedTuple):
@@ -95,8 +99,7 @@ def fit_momentum(
     Raises:
         InputError: unequal steps, no segment as long as a window, torques that do not vary, or settings out of range.
     """
-    form = Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
-    return fit_form(form, model, data, window=window, noise=noise, **tolerances)
+    return fit_form(MOMENTUM, model, data, window=window, noise=noise, **tolerances)
 
 
 def fit_form(
@@ -109,8 +112,39 @@ def fit_form(
     **tolerances: Any,
 ) -> WeakFit:
     """Fits any equations of windows; arguments and errors as for `fit_momentum`."""
+    equations = _all_equations(form, model, data, window, noise)
+    return _solved(model, equations, lambda rows, unit: rows / unit[..., None], tolerances)
+
+
+def fit_reweighted(model: Model, data: Trajectories, *, window: float = WINDOW, **tolerances: Any) -> WeakFit:
+    """Fits momenta, with equations weighted by the covariance of their own errors until it settles.
+
+    Iterated generalised least squares (Zellner 1962). Noise of encoders enters the equations of all joints through the
+    mass matrix. Without its correlations, equations without a motor, which zero parameters satisfy, pull those of a
+    plant with weak motors towards zero. Arguments and errors as for `fit_momentum`, which gives the first fit.
+    """
+    equations = _all_equations(MOMENTUM, model, data, window, None)
+    fit = _solved(model, equations, lambda rows, unit: rows / unit[..., None], tolerances)
+    factor = None
+    for _ in range(1, ROUNDS):
+        covariance = fit.errors.T @ fit.errors / len(fit.errors)
+        if factor is not None:
+            change = np.linalg.solve(factor, np.linalg.solve(factor, covariance).T) - np.eye(len(covariance))
+            if np.abs(change).max() < SETTLED:
+                break
+        try:
+            factor = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            break  # exact data leave no errors
+        fit = _solved(model, equations, lambda rows, _, factor=factor: np.linalg.solve(factor, rows), tolerances)
+    return fit
+
+
+def _all_equations(
+    form: Form, model: Model, data: Trajectories, window: float, noise: Float[np.ndarray, " d"] | None
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     require_positive(window=window)
-    d, like = data.degrees_of_freedom, _shapes(model)
+    d = data.degrees_of_freedom
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(data)) if noise is None else np.asarray(noise, float)
         if scale.shape != (d,) or not (scale > 0).all():
@@ -118,9 +152,19 @@ def fit_form(
         equations = list(_equations(_columns(form.left, model), data, form, scale, window))
     if not equations:
         raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
-    weighted = (((A / unit[..., None]).reshape(b.size, -1), (b / unit).ravel()) for A, b, unit in equations)
-    solution = least_squares.solve_chunks(weighted, **tolerances)
-    errors = np.concatenate([A @ solution.x - b for A, b, _ in equations])
+    return equations
+
+
+def _solved(
+    model: Model,
+    equations: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    weighted: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    tolerances: dict[str, Any],
+) -> WeakFit:
+    """Least squares of equations weighted by (rows [W, k, P], deviations [W, k]) -> rows."""
+    chunks = ((weighted(A, unit).reshape(b.size, -1), weighted(b[..., None], unit).ravel()) for A, b, unit in equations)
+    solution = least_squares.solve_chunks(chunks, **tolerances)
+    errors, like = np.concatenate([A @ solution.x - b for A, b, _ in equations]), _shapes(model)
     return WeakFit(
         parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), unravelled(solution.x, like), like),
         parameter_count=solution.x.size,
@@ -137,6 +181,10 @@ def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, V
     """p = M qd and s = tau(q, qd, 0) - dM/dt qd of one state: tau = dp/dt + s."""
     p, change = jax.jvp(lambda place: plant.mass_matrix(place) @ qd, (q,), (qd,))
     return p, plant.inverse_dynamics(q, qd, jnp.zeros_like(qd)) - change
+
+
+MOMENTUM = Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
+"""The equations of the momenta, for `fit_momentum`."""
 
 
 def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:

@@ -69,7 +69,9 @@ def test_a_file_keeps_what_is_not_identified(tmp_path):
     tree = read_robot(original).tree
     write_robot(path, original, tree._replace(armature=np.array([0.5, 0.25])))
     text = path.read_text()
-    assert "kept" in text and "nowhere.stl" in text and "URDF cannot state (kg m² or kg): shoulder 0.5, elbow 0.25" in text
+    assert (
+        "kept" in text and "nowhere.stl" in text and "URDF cannot state (kg m² or kg): shoulder 0.5, elbow 0.25" in text
+    )
     root = ET.parse(path).getroot()
     masses = {link.get("name"): link.find("inertial/mass") for link in root.findall("link")}
     assert masses["base"].get("value") == "9" and masses["hand"] is masses["finger"] is None

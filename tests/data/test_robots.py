@@ -55,7 +55,8 @@ BRANCHED = """
     </body>
   </body>
 </worldbody></mujoco>"""
-FILES = {"arm.urdf": ARM, "branched.xml": BRANCHED}
+IN_NAMESPACE = ARM.replace("<robot", '<robot xmlns="https://drake.mit.edu"')
+FILES = {"arm.urdf": ARM, "in_namespace.urdf": IN_NAMESPACE, "branched.xml": BRANCHED}
 
 
 def written(folder, name, text):

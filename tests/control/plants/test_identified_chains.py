@@ -1,4 +1,4 @@
-"""Three links in a plane are identified from short motions about hanging, well enough to plan far from there."""
+"""Chains of links are identified from short motions about hanging, well enough to plan far from there."""
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +8,10 @@ import pytest
 from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.plants import Exploration, explore
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
-from dln_jax.learning.recordings import identified_chain, prepare
+from dln_jax.learning.recordings import FittedPlant, identified_chain, prepare
+from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
 LENGTHS, MASSES = (0.2, 0.22, 0.25), (0.5, 0.4, 0.3)
@@ -52,6 +54,30 @@ def test_the_mass_matrix_is_right_all_over_though_motions_stay_near_hanging(prep
             mujoco.mj_mulM(model, data, column, unit)
     M = jax.vmap(found.dynamics.mass_matrix)(jnp.asarray(q))
     np.testing.assert_allclose(M, truth, atol=0.1 * truth.max())
+
+
+WEAK = """<mujoco><option timestep=".01" integrator="RK4"/><default><joint axis="0 1 0" damping=".05"/>
+  <geom type="capsule" fromto="0 0 0 0 0 1" size=".05" mass="1" contype="0"/></default>
+  <worldbody><body><joint/><geom/><body pos="0 0 1"><joint name="elbow"/><geom/></body></body></worldbody>
+  <actuator><motor joint="elbow" ctrlrange="-2 2"/></actuator></mujoco>"""
+"""An acrobot whose motor lifts a fifth of the weight of its link."""
+
+
+def test_noise_does_not_shrink_the_inertias_of_a_plant_with_a_weak_motor():
+    """An equation without a motor holds for zero parameters, too."""
+    plant = mujoco_plant(WEAK, hardware=Hardware(encoder_step=2 * np.pi / 4096, delay=1))
+    recording = explore(plant, lambda _: pytest.fail("no model is needed"), BLIND).recording
+    ready = prepare(recording, delay=1, chain=True)
+    found = identified_chain(ready, plant.layout.needs)
+    assert found.description["name"] == "planar-chain"
+    model = mujoco.MjModel.from_xml_string(WEAK)
+    data, truth = mujoco.MjData(model), np.zeros((2, 2))
+    mujoco.mj_forward(model, data)
+    for column, unit in zip(truth, np.eye(2), strict=True):
+        mujoco.mj_mulM(model, data, column, unit)
+    np.testing.assert_allclose(found.dynamics.mass_matrix(jnp.zeros(2)), truth, rtol=0.15)
+    by_joints = FittedPlant(found.description, fit_momentum(build(found.description), ready.train).parameters)
+    assert (by_joints.dynamics.mass_matrix(jnp.zeros(2)) < 0.8 * truth).all()
 
 
 def test_a_recording_that_says_too_little_is_refused_with_a_share(prepared):
