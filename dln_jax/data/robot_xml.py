@@ -78,6 +78,10 @@ def parsed(path: Path) -> ET.Element:
         raise InputError(f"{path}: not XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    # Drake and Bullet know a link "world" that no file has to define; MuJoCo does not.
+    parents = {parent.get("link") for joint in root.findall("joint") for parent in joint.findall("parent")}
+    if "world" in parents and all(link.get("name") != "world" for link in root.findall("link")):
+        root.append(ET.Element("link", name="world"))
     return root
 
 
@@ -185,6 +189,11 @@ def velocity_limits(root: ET.Element) -> dict[str, float]:
     stated = {joint.get("name", ""): joint.find("limit") for joint in root.findall("joint")}
     numbers = {name: _number(limit.get("velocity", "0")) for name, limit in stated.items() if limit is not None}
     return {name: number for name, number in numbers.items() if number > 0}
+
+
+def driven_joints(root: ET.Element) -> list[str]:
+    """Names of the joints of a URDF that a <transmission> connects to a motor."""
+    return [joint.get("name", "") for motor in root.findall("transmission") for joint in motor.findall("joint")]
 
 
 def _require_range(name: str, kind: str, stated: Sequence[str]) -> None:

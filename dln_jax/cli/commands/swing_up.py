@@ -31,7 +31,8 @@ class Arguments(Folder, Drawn):
     plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta", "FILE"))] = "rotary-pendulum"
     """The plant; furuta is another name of the rotary pendulum. FILE is the path of an MJCF or URDF file."""
     actuated: Unstated[str] = None
-    """Joints of the file with a motor, comma-separated names or numbers from 0 (default: those with an actuator)."""
+    """Joints of the file with a motor, comma-separated names or numbers from 0 (default: those with an actuator or
+    a transmission)."""
     control: Unstated[float] = None
     """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
     model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None

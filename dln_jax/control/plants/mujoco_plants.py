@@ -1,6 +1,6 @@
 """Plants from MJCF and URDF files, or MuJoCo models: layout, goal and limits are read from the model."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from dln_jax.control.mujoco_loop import compiled_model
 from dln_jax.control.plants.plant import Layout, Plant, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.plants.simulated import simulated
-from dln_jax.data.robot_xml import parsed, velocity_limits
+from dln_jax.data.robot_xml import driven_joints, parsed, velocity_limits
 from dln_jax.data.robots import joint_names, opened, quiet
 from dln_jax.types import InputError
 
@@ -36,7 +36,8 @@ def mujoco_plant(
 
     Args:
         source: path of an MJCF or URDF file, text of MJCF, or a `mujoco.MjModel`.
-        actuated: joints with a motor, by name or number from 0; by default those with an actuator.
+        actuated: joints with a motor, by name or number from 0; by default those with an actuator, or in a URDF with a
+            transmission.
         control: largest forces of the motors, N m or N; by default those of the file.
         goal: posture to hold [d]; by default the highest one.
         hanging: posture of rest [d]; by default the lowest one.
@@ -77,7 +78,7 @@ def _described(
     passive: bool,
 ) -> tuple[Any, Any, Any, Layout, int]:
     """Returns MuJoCo, its model, its data, the layout of the plant, and the number of time steps in a sample."""
-    mujoco, model, speeds = _model(source)
+    mujoco, model, speeds, transmissions = _model(source)
     names = joint_names(model)
     speed = [speeds.get(name, np.inf) for name in names] if speed is None else speed
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
@@ -88,7 +89,8 @@ def _described(
         which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
         raise InputError(f"the plant has {len(names)} joint(s); expected {which}")
     joints = [kinds[int(kind)] for kind in model.jnt_type]
-    driven = _numbers(actuated, names) if len(actuated) else sorted(_actuators(mujoco, model))
+    stated = actuated if len(actuated) else [name for name in transmissions if name in names]
+    driven = _numbers(stated, names) if len(stated) else sorted(_actuators(mujoco, model))
     per_second = float(1 / model.opt.timestep if rate is None else rate)
     steps = 1 / (per_second * model.opt.timestep)
     if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
@@ -97,7 +99,10 @@ def _described(
     ranges = np.where(np.asarray(model.jnt_limited, bool)[:, None], model.jnt_range, [-np.inf, np.inf])
     if goal is None or hanging is None:
         lowest, highest = extremes(lambda q: _potential(mujoco, model, data, q), joints, driven, ranges)
-        goal, hanging = highest if goal is None else goal, lowest if hanging is None else hanging
+        goal = highest if goal is None else goal
+        if hanging is None:
+            hanging = lowest
+            _require_free_hanging(hanging, ranges, set(range(len(joints))) - set(driven) if passive else set(), names)
     refused = passive and len(driven) == len(joints)  # by the layout
     size = _control(mujoco, model, driven, names) if control is None and not refused else control
     described = layout(
@@ -105,6 +110,18 @@ def _described(
         names=names, passive=passive,
     )  # fmt: skip
     return mujoco, model, data, described, round(steps)
+
+
+def _require_free_hanging(
+    hanging: np.ndarray, ranges: np.ndarray, passive: Collection[int], names: Sequence[str]
+) -> None:
+    """Raises `InputError` if a passive joint cannot hang, because its lowest position is a limit of its range."""
+    for k in sorted(passive):
+        if hanging[k] in ranges[k]:
+            raise InputError(
+                f"'{names[k]}' cannot hang within its range of {ranges[k, 0]:.4g} to {ranges[k, 1]:.4g}, where a "
+                "swing-up starts; widen the range, or remove it"
+            )
 
 
 def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, hardware: Hardware, seed: int) -> Plant:
@@ -129,17 +146,17 @@ def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, ha
     return simulated(described, begin, lambda: data.qpos, advance, kick=kick, hardware=hardware, seed=seed)
 
 
-def _model(source: Any) -> tuple[Any, Any, dict[str, float]]:
-    """Returns MuJoCo, its model, and the largest rates of joints that a URDF states."""
+def _model(source: Any) -> tuple[Any, Any, dict[str, float], list[str]]:
+    """Returns MuJoCo, its model, and what a URDF states besides: largest rates by joint, joints with a transmission."""
     if isinstance(source, Path) or (isinstance(source, str) and not source.lstrip().startswith("<")):
         root = parsed(Path(source))
         mujoco, model = opened(Path(source), root, (), inertias=True)[:2]
         if root.tag != "robot":
-            return mujoco, model, {}
+            return mujoco, model, {}, []
         # A URDF states no integrator, and MuJoCo's default has errors that no rigid body makes.
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-        return mujoco, model, velocity_limits(root)
-    return *compiled_model(source), {}
+        return mujoco, model, velocity_limits(root), driven_joints(root)
+    return *compiled_model(source), {}, []
 
 
 def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:

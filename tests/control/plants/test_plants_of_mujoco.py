@@ -17,6 +17,8 @@ ROD = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2" contype=
 CART_POLE = f"""<mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0" range="-.5 .5" limited="true"/>
 <geom type="box" size=".05 .05 .05" mass="1"/><body><joint name="hinge" axis="0 1 0"/>{ROD}</body></body></worldbody>
 <actuator><motor joint="rail" gear="2" ctrllimited="true" ctrlrange="-5 5"/></actuator></mujoco>"""
+STANDING = CART_POLE.replace('name="hinge"', 'name="hinge" range="-90 90"').replace("0 0 -.3", "0 0 .3")
+"""A pole that stands at zero and cannot fall farther than to the level of its cart, as Gymnasium's."""
 SLIDE = 'type="slide" axis="1 0 0" range="-.5 .5" limited="true"'
 TWO_LINKS = f"""<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/>{ROD}<body pos="0 0 -.3">
 <joint name="elbow" axis="0 1 0"/>{ROD}</body></body></worldbody></mujoco>"""
@@ -72,8 +74,9 @@ def test_the_energy_of_an_idle_plant_is_kept_and_controls_act_late():
         ("<mujoco><worldbody><body/></mujoco>", [0], 1.0, "MuJoCo refuses the model"),
         (f"<mujoco><worldbody><body><joint/>{ROD}</body></worldbody></mujoco>", [0], 1.0, "has 1 joint"),
         (CART_POLE.replace(SLIDE, 'type="ball"'), [1], 1.0, "neither a hinge"),
+        (STANDING, [], None, "'hinge' cannot hang within its range of -1.571 to 1.571"),
     ],
-    ids=["name", "number", "actuated", "none", "limit", "gravity", "xml", "single", "ball"],
+    ids=["name", "number", "actuated", "none", "limit", "gravity", "xml", "single", "ball", "stop"],
 )  # fmt: skip
 def test_a_file_that_is_no_plant_is_one_line(file, actuated, control, message):
     with pytest.raises(InputError, match=message):
@@ -106,6 +109,16 @@ def test_a_urdf_plant_has_the_masses_and_the_limits_of_its_file(tmp_path):
         plant.act([2.0])
         x = step(x, jnp.array([2.0]))
         np.testing.assert_allclose(plant.read(), x[:2], rtol=1e-9)
+
+
+def test_transmissions_state_the_motors_of_a_urdf_that_hangs_from_a_world(tmp_path):
+    file = tmp_path / "acrobot.urdf"
+    motor = '<transmission name="motor"><joint name="elbow"/><actuator name="any"/></transmission>'
+    weld = '<joint name="weld" type="fixed"><parent link="world"/><child link="base"/></joint>'
+    file.write_text(URDF.replace("</robot>", f"{motor}{weld}</robot>"))
+    layout = mujoco_plant(file).layout
+    np.testing.assert_array_equal(layout.actuation, [[0.0], [1.0]])
+    assert layout.names == ("shoulder", "elbow")
 
 
 def test_a_urdf_plant_with_a_link_of_no_mass_is_one_line(tmp_path):
