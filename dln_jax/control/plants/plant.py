@@ -65,6 +65,10 @@ class Plant(NamedTuple):
     """Adds to the rates [d], as a push does; `None` for plants that cannot."""
 
 
+ROOM = 0.2
+"""Least distance of the goal from the limits of a revolute joint, rad: as far as a plant that is up may be away."""
+
+
 def layout(
     joints: Sequence[str],
     actuated: Sequence[int],
@@ -98,7 +102,8 @@ def layout(
 
     Raises:
         InputError: shapes do not agree, a motor's coordinate does not exist, there is no motor or no passive
-            coordinate, a limit is not positive, answers are late after one sample, or a posture is outside the limits.
+            coordinate, a limit is not positive, answers are late after one sample, a posture is outside the limits, or
+            the goal of a swing-up is at the end of a range.
     """
     require_positive(rate=rate)
     if not late > 1:
@@ -125,6 +130,14 @@ def layout(
     for name, q in postures.items():
         if not np.isfinite(q).all() or (q < ranges[:, 0]).any() or (q > ranges[:, 1]).any():
             raise InputError(f"{name} is {q.tolist()}, outside the limits {ranges.tolist()}; choose a posture within")
+    room = np.min(np.abs(ranges - postures["goal"][:, None]), axis=1)
+    least = np.where([kind == "revolute" for kind in needs.joints], ROOM, 0.0)
+    if passive and (room <= least).any():
+        k = int(np.argmax(room <= least))
+        raise InputError(
+            f"the goal of '{names[k]}', {postures['goal'][k]:.4g}, is at the end of its range of {ranges[k, 0]:.4g} to "
+            f"{ranges[k, 1]:.4g}; a swing-up needs room on both sides: widen the range, or make the joint continuous"
+        )
     limits = Limits(np.stack([-size, size], axis=1), ranges, rates, stopping, late)
     return Layout(needs.joints, B, postures["goal"], postures["hanging"], float(rate), limits, names)
 

@@ -133,6 +133,8 @@ def test_a_start_outside_the_limits_is_refused():
     [
         ({"goal": (1.0, np.pi)}, "goal is .* outside the limits"),
         ({"goal": (0.0, 0.0, np.pi)}, "goal is"),
+        ({"goal": (0.5, np.pi), "position": [[-0.5, 0.5], [-4, 4]]}, "the goal of 'rail', 0.5, is at the end"),
+        ({"position": [[-0.5, 0.5], [-np.pi, np.pi]]}, "the goal of 'hinge', 3.142, is at the end of its range"),
         ({"control": np.inf}, "finite, positive limits"),
         ({"rate": 0.0}, "rate is 0"),
         ({"position": [[0.5, -0.5], [-1, 1]]}, "position is"),
