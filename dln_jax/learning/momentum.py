@@ -70,22 +70,21 @@ def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt:
 
 def deviations(plant: Dynamics, windows: MomentumWindows) -> Float[np.ndarray, " d"]:
     """Root mean square over windows of the residuals of the joints' equations, N m or N."""
-    return np.sqrt(np.mean(_residuals(plant, windows) ** 2, axis=0))
+    return np.sqrt(np.mean(np.asarray(jax.jit(lambda: _residuals(plant, windows))()) ** 2, axis=0))
 
 
-def acceleration_misfit(plant: Dynamics, windows: MomentumWindows) -> float:
+def acceleration_misfit(plant: Dynamics, windows: MomentumWindows) -> Array:
     """Half the log determinant of the covariance of acceleration errors: residuals divided by M in a window's middle.
 
     It compares models of one plant. Residuals alone favour models with small parameters if a joint has no motor.
     """
-    middle = windows.q[:, windows.q.shape[1] // 2]
-    masses = np.asarray(jax.jit(jax.vmap(plant.mass_matrix))(middle))
-    errors = np.linalg.solve(masses, _residuals(plant, windows)[..., None])[..., 0]
-    return float(np.linalg.slogdet(errors.T @ errors / len(errors))[1]) / 2
+    masses = jax.vmap(plant.mass_matrix)(jnp.asarray(windows.q[:, windows.q.shape[1] // 2]))
+    errors = jnp.linalg.solve(masses, _residuals(plant, windows)[..., None])[..., 0]
+    return jnp.linalg.slogdet(errors.T @ errors / len(errors))[1] / 2
 
 
-def _residuals(plant: Dynamics, windows: MomentumWindows) -> Float[np.ndarray, "W d"]:
-    return np.asarray(jax.jit(jax.vmap(lambda *window: momentum_errors(plant, *window, dt=windows.dt)))(*windows[:3]))
+def _residuals(plant: Dynamics, windows: MomentumWindows) -> Float[Array, "W d"]:
+    return jax.vmap(lambda *window: momentum_errors(plant, *window, dt=windows.dt))(*map(jnp.asarray, windows[:3]))
 
 
 def momentum_problem(

@@ -8,11 +8,13 @@
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from dln_jax.data.encoders import held_at_equal_steps, smooth
 from dln_jax.data.schema import Trajectories
@@ -28,9 +30,10 @@ from dln_jax.learning.momentum import (
     driven_torques,
     momentum_problem,
 )
-from dln_jax.learning.weak_forms import fit_reweighted
+from dln_jax.learning.weak_forms import fit_momentum, fit_reweighted
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
 from dln_jax.types import FrictionLaw, InputError, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
@@ -59,9 +62,7 @@ class FittedPlant(NamedTuple):
     @property
     def dynamics(self) -> Dynamics:
         """Dynamics of the model."""
-        of_model = dynamics(build(self.description).energies(self.parameters))
-        assert isinstance(of_model, Dynamics)  # both models have energies
-        return of_model
+        return _dynamics(build(self.description), self.parameters)
 
 
 class PreparedRecording(NamedTuple):
@@ -77,7 +78,12 @@ class PreparedRecording(NamedTuple):
 
 
 def prepare(
-    recording: Trajectories, *, delay: int | float | None = None, validation: int | None = None, chain: bool = False
+    recording: Trajectories,
+    *,
+    delay: int | float | None = None,
+    validation: int | None = None,
+    chain: bool = False,
+    cutoffs: Sequence[float] = (1.0,),
 ) -> PreparedRecording:
     """Computes rates and acting torques, and splits the episodes into those to fit and one for validation.
 
@@ -86,6 +92,8 @@ def prepare(
         delay: delay of the torques in samples (default: estimated).
         validation: index of the validation episode (default: the middle one).
         chain: whether the plant is one for `identified_chain`.
+        cutoffs: multiples of the cut-off that `smooth` chooses; of several, the one whose identified model predicts
+            validation best (`acceleration_misfit`) is taken.
 
     Raises:
         InputError: a recording without needs or with only one episode.
@@ -100,12 +108,30 @@ def prepare(
     if held_out not in present:
         raise InputError(f"validation is {held_out}; expected one of the episodes {present.tolist()}")
     needs, recording = recording.needs, held_at_equal_steps(recording)
+    model = build(_chain(needs) if chain else _tree(needs))
     if delay is None:
-        form = _chain(needs) if chain else _tree(needs)
-        delay = delay_of_torques(build(form), recording, most=MOST_DELAY)
-    chosen = smooth(driven_torques(recording, delay=delay))
-    rest = np.setdiff1d(present, held_out)
-    return PreparedRecording(select(chosen.data, rest), select(chosen.data, [held_out]), float(delay), chosen.cutoff)
+        delay = delay_of_torques(model, recording, most=MOST_DELAY)
+    driven, rest = driven_torques(recording, delay=delay), np.setdiff1d(present, held_out)
+    chosen = smooth(driven)
+    prepared = []
+    for multiple in cutoffs:
+        cutoff = multiple * chosen.cutoff
+        if multiple != 1 and not cutoff < chosen.rate / 2:
+            continue
+        data = chosen.data if multiple == 1 else smooth(driven, cutoff).data
+        prepared.append(PreparedRecording(select(data, rest), select(data, [held_out]), float(delay), cutoff))
+    return prepared[0] if len(prepared) == 1 else min(prepared, key=lambda one: _misfit(model, one))
+
+
+def _misfit(model: Model, prepared: PreparedRecording) -> float:
+    parameters, windows = fit_momentum(model, prepared.train).parameters, cut_momentum_windows(prepared.validation)
+    return float(jax.jit(lambda: acceleration_misfit(_dynamics(model, parameters), windows))())
+
+
+def _dynamics(model: Model, parameters: Parameters) -> Dynamics:
+    of_model = dynamics(model.energies(parameters))
+    assert isinstance(of_model, Dynamics)  # models of recordings have energies
+    return of_model
 
 
 def _described(name: str, needs: Needs, **keywords: Any) -> Description:
@@ -143,45 +169,50 @@ def _degrees(needs: Needs, degree: int) -> list[int]:
 
 
 def identified(data: Trajectories, needs: Needs) -> FittedPlant:
-    """Fits the trigonometric model with viscous and dry friction; errors as for `fit_reweighted`.
+    """Fits the trigonometric model with viscous and dry friction; errors as for `fit_momentum`.
 
     Args:
         data: recording with rates and acting torques.
     """
-    return _fitted(_tree(needs), data)
+    form = _tree(needs)
+    errors = fit_momentum(build(form), data).errors
+    return FittedPlant(form, fit_momentum(build(form), data, noise=np.sqrt(np.mean(errors**2, axis=0))).parameters)
 
 
 def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
     """Fits a chain of rigid bodies on a fixed base, in relative coordinates, for which fewer motions suffice.
 
-    Whether all links move in one plane, and which axes point the other way, is decided by the smallest
-    `acceleration_misfit` in the validation episode. Models whose mass matrix is not positive definite at the
-    recording's positions are left out.
+    Whether all links move in one plane, which axes point the other way, and how the equations are weighted is decided
+    by the smallest `acceleration_misfit` in the validation episode. Models whose mass matrix is not positive definite
+    at the recording's positions are left out.
 
     Raises:
-        InputError: as for `fit_reweighted`, or all models are left out.
+        InputError: as for `fit_momentum`, or all models are left out.
     """
     held_out = cut_momentum_windows(prepared.validation)
     positions = np.concatenate([prepared.train.q, prepared.validation.q])
     positions = positions[:: max(len(positions) // CHECKED, 1)]
     best, least, share = None, np.inf, 0.0
     for form in (*_planar(needs), _chain(needs)):
-        plant = _fitted(form, prepared.train)
-        masses = np.asarray(jax.jit(jax.vmap(plant.dynamics.mass_matrix))(positions))
-        definite = np.linalg.eigvalsh(masses)[:, 0] > 0
-        share = max(share, float(np.mean(definite)))
-        if definite.all() and (misfit := acceleration_misfit(plant.dynamics, held_out)) < least:
-            best, least = plant, misfit
+        model = build(form)
+
+        @jax.jit
+        def judged(parameters: Parameters, model: Model = model) -> tuple[Array, Array]:
+            plant = _dynamics(model, parameters)
+            masses = jax.vmap(plant.mass_matrix)(jnp.asarray(positions))
+            return jnp.linalg.eigvalsh(masses)[:, 0] > 0, acceleration_misfit(plant, held_out)
+
+        for fitted in (fit_momentum(model, prepared.train), fit_reweighted(model, prepared.train)):
+            definite, misfit = map(np.asarray, judged(fitted.parameters))
+            share = max(share, float(np.mean(definite)))
+            if definite.all() and misfit < least:
+                best, least = FittedPlant(form, fitted.parameters), float(misfit)
     if best is None:
         raise InputError(
             f"the identified mass matrix is positive definite at {share:.1%} of the recording's positions; expected "
             "all: record more or livelier motions of every joint"
         )
     return best
-
-
-def _fitted(description: Description, data: Trajectories) -> FittedPlant:
-    return FittedPlant(description, fit_reweighted(build(description), data).parameters)
 
 
 def learned(

@@ -76,6 +76,13 @@ def test_a_network_comes_close_in_a_few_iterations(prepared):
     assert np.linalg.eigvalsh(jax.vmap(found.dynamics.mass_matrix)(jnp.zeros((1, 2)))).min() > 0
 
 
+def test_a_cut_off_that_takes_the_motion_away_is_not_chosen(recording, prepared):
+    chosen = prepare(recording, delay=prepared.delay, chain=True, cutoffs=(0.1, 1.0, 1e4))
+    assert chosen.cutoff == prepared.cutoff
+    slow = prepare(recording, delay=prepared.delay, cutoffs=(0.1,))
+    assert slow.cutoff == pytest.approx(0.1 * prepared.cutoff)
+
+
 def test_torques_come_late_and_are_held(recording):
     tau = np.arange(1.0, 6.0)[:, None] * np.ones(2)
     few = recording._replace(t=np.arange(5) / 500, tau=tau, trajectory=np.zeros(5, int))

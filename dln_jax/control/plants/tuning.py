@@ -51,6 +51,8 @@ ROUNDS = 4
 WITHIN = 0.5
 """A trial must end within this share of the tolerance: a plant whose dry friction sticks hunts farther from the goal
 than the model, whose friction is smooth."""
+SECONDS, FALLS = 6.0, 26.0
+"""Duration of a trial, s, and the least one in units of 1 / lambda: the longest plan, with time to come to rest."""
 LEAST = 0.1
 """Smallest margin of an energy law that is taken in place of a plan."""
 
@@ -83,7 +85,7 @@ def tune(
     *,
     estimator: Estimator | None = None,
     sets: int = 64,
-    seconds: float = 6.0,
+    seconds: float | None = None,
     substeps: int = 1,
     late: float = 0.0,
     seed: int = 0,
@@ -97,7 +99,8 @@ def tune(
         hardware: noise, resolution and delay; the limits are those of the layout.
         estimator: makes a controller of measurements from one of states, such as `by_filter`; by default differences.
         sets: number of sets in a first round.
-        seconds: duration of a trial, within which a plant must come up and stay for a second.
+        seconds: duration of a trial, within which a plant must come up and stay for a second; by default 6 s, or longer
+            for large plants, which fall slowly.
         substeps: Runge-Kutta steps per sample.
         late: share of a sample by which motors act later than the hardware's whole number of samples.
         seed: seed of the sets, the starts and the noise.
@@ -108,12 +111,13 @@ def tune(
     """
     require_positive(sets=sets, substeps=substeps)
     require_seed(seed)
-    if not seconds > HELD:
+    if seconds is not None and not seconds > HELD:
         raise InputError(f"seconds is {seconds}; expected more than the {HELD:g} s for which a plant has to stay up")
     require_recovery(recover)
     lower, upper = layout.limits.control.T
     upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
     scales, estimator = scales_of(upright, layout), estimator or by_differences(layout)
+    seconds = max(SECONDS, FALLS / scales.fall) if seconds is None else seconds
     results, refused = [], []
     for make in RECOVERIES[recover]:
         try:
@@ -170,7 +174,7 @@ def _chosen(
     good = np.isfinite(times).all(axis=1)
     if not good.any():
         raise InputError(
-            f"none of {len(settings)} sets of numbers swings the model up by {way.name} within {seconds:g} s and its "
+            f"none of {len(settings)} sets of numbers swings the model up by {way.name} within {seconds:.3g} s and its "
             f"limits in {trials} trials, of which {np.isfinite(times).mean():.0%} came up; try a stronger motor, wider "
             "limits, more time or a better model"
         )

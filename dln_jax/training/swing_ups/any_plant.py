@@ -11,7 +11,7 @@ from dln_jax.control.estimate import from_log
 from dln_jax.control.plants.estimators import ESTIMATORS, estimator_of
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Layout, Plant
-from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
+from dln_jax.control.plants.runs import HELD, PlantRun, Trials, compiled, judged_runs, run, start_of
 from dln_jax.control.plants.tuning import Tuned, tune
 from dln_jax.data.encoders import held_at_equal_steps, noise_of
 from dln_jax.data.schema import Trajectories
@@ -20,7 +20,9 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive
 
 SECONDS = 10.0
-"""Duration of a trial, s."""
+"""Duration of a run, s; longer for plants that need more than half of it to come up, see `run_seconds`."""
+CUTOFFS = (1.0, 2.0)
+"""Multiples of the usual cut-off that are compared: fast motions of a short log may be too rare to raise it."""
 BAND = 10.0
 """Factor that widens the filter's torque band, for model errors that a short log does not show."""
 
@@ -72,7 +74,7 @@ def learn_to_swing_up(
     )
     keep(explored)
     recording = held_at_equal_steps(recording, plant.layout.rate)
-    prepared = prepare(recording, chain=True)
+    prepared = prepare(recording, chain=True, cutoffs=CUTOFFS)
     fitted = identified_chain(prepared, plant.layout.needs)
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     B = plant.layout.actuation
@@ -102,6 +104,11 @@ def model_of(recording: Trajectories) -> Dynamics:
     if recording.needs is None:
         raise InputError("the recording states no needs of its plant; pass one that explore has made")
     return identified_chain(prepare(recording, chain=True), recording.needs).dynamics
+
+
+def run_seconds(tuned: Tuned) -> float:
+    """Duration of a run, s: long enough for a second attempt."""
+    return max(SECONDS, 2 * tuned.seconds + HELD)
 
 
 def push_at_half(layout: Layout, rate: float) -> Push | None:

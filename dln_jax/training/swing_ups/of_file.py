@@ -15,7 +15,7 @@ from dln_jax.control.plants.ways import require_recovery
 from dln_jax.data import schema
 from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
-from dln_jax.training.swing_ups.any_plant import SECONDS, learn_to_swing_up, push_at_half, try_plant
+from dln_jax.training.swing_ups.any_plant import learn_to_swing_up, push_at_half, run_seconds, try_plant
 from dln_jax.training.swing_ups.run import LEAST_SECONDS
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
@@ -92,10 +92,12 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
     except InputError as error:
         raise InputError(f"{error}; the recording stays in {recording}" if recording.exists() else str(error)) from None
     save(folder, *learned.fitted)
+    tuned, duration = learned.tuned, run_seconds(learned.tuned)
+    push = None if task.push is None else task.push._replace(seconds=duration / 2)
     trials, runs = try_plant(
-        task.make, learned.tuned, starts=task.starts, seed=task.seed + 1000, push=task.push
+        task.make, tuned, starts=task.starts, seed=task.seed + 1000, seconds=duration, push=push
     )  # fmt: skip
-    seconds, tuned = trials.seconds[trials.up], learned.tuned
+    seconds = trials.seconds[trials.up]
     median, worst = (float(np.median(seconds)), float(np.max(seconds))) if len(seconds) else (np.inf, np.inf)
     metrics = {
         "success_share": float(trials.up.mean()),
@@ -112,10 +114,10 @@ def swing_up_file(task: FileTask, folder: Path, *, figures: bool) -> dict[str, f
         folder / "law.json",
         {"way": tuned.way, **tuned.numbers, "K": np.asarray(tuned.regulator.K).tolist()},
     )
-    pushed = "" if task.push is None else f", pushed after {task.push.seconds:g} s"
+    pushed = "" if push is None else f", pushed after {push.seconds:.3g} s"
     print(
-        f"{metrics['success_share']:.1%} of {task.starts} starts up after {SECONDS:g} s{pushed}: median {median:.2f} "
-        f"s, worst {worst:.2f} s"
+        f"{metrics['success_share']:.1%} of {task.starts} starts up after {duration:.3g} s{pushed}: median "
+        f"{median:.2f} s, worst {worst:.2f} s"
     )
     if trials.stopped:
         print(f"{len(trials.stopped)} of {task.starts} were stopped; the first: {trials.stopped[0]}")

@@ -19,6 +19,7 @@ from dln_jax.control.plants import (
 )
 from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of, swing_up_numbers
 from dln_jax.control.plants.tuning import trial_of
+from dln_jax.control.plants.ways import by_energy
 from dln_jax.control.swing_up import upright_of
 from dln_jax.learning.recordings import identified_chain, prepare
 from dln_jax.mechanics.equations import dynamics
@@ -121,6 +122,22 @@ def test_trials_with_motors_a_whole_sample_late_are_those_of_hardware_with_that_
     changes, of_late_motors, between = (float(trial(*late)[1]) for late in ((1, 0.0), (0, 1.0), (0, 0.5)))
     assert of_late_motors == pytest.approx(changes, rel=1e-9)
     assert abs(between / changes - 1) > 1e-6
+
+
+def test_trials_of_a_plant_that_falls_slowly_last_longer(monkeypatch):
+    """With a pole of 36 times the length everything takes six times as long."""
+    durations = []
+
+    def refuse(*_, seconds=None, **__):
+        durations.append(seconds)
+        raise InputError("no trial")
+
+    monkeypatch.setattr("dln_jax.control.plants.tuning.trial_of", refuse)
+    monkeypatch.setattr("dln_jax.control.plants.tuning.RECOVERIES", {"swing-up": (by_energy,)})
+    for length in (0.25, 36 * 0.25):
+        with pytest.raises(InputError, match="no trial"):
+            tune(model(length=length), rail())
+    assert durations == [6.0, pytest.approx(26 / np.sqrt(9.81 / 9.0))]
 
 
 @pytest.mark.slow
