@@ -129,9 +129,14 @@ int main(int arguments_, char **argument_)
 """
 _TIMED = """        if (calls_ > 0) {{
             const clock_t start_ = clock();
-            for (long k_ = 0; k_ < calls_; ++k_) {{ {moved}{call}; }}
-            const double seconds_ = (double)(clock() - start_) / CLOCKS_PER_SEC;
-            const double each_ = seconds_ / (double)calls_;
+            clock_t end_ = start_;
+            double made_ = 0;
+            while (end_ == start_) {{ /* again if the clock has not moved */
+                for (long k_ = 0; k_ < calls_; ++k_) {{ {moved}{call}; }}
+                made_ += (double)calls_;
+                end_ = clock();
+            }}
+            const double each_ = (double)(end_ - start_) / CLOCKS_PER_SEC / made_;
             printf("{function}: %.0f calls/s, %.3f us each\\n", 1 / each_, 1e6 * each_);
         }}
 """
