@@ -161,12 +161,25 @@ def label_indices(data: Trajectories, labels: Sequence[str]) -> np.ndarray:
 
 
 def split(
-    data: Trajectories, *, test: Sequence[str] | None = None, validation_share: float = 0.1, seed: int = 0
+    data: Trajectories,
+    *,
+    test: Sequence[str] | None = None,
+    validation_share: float = 0.1,
+    seed: int = 0,
+    motion: Int[np.ndarray, " T"] | None = None,
 ) -> Split:
     """Splits trajectories into test, validation and training sets.
 
     Without test labels every sixth trajectory is a test. The validation trajectories (at least one) are drawn by the
     seed from the rest, so model selection never sees the test.
+
+    Args:
+        data: trajectories.
+        test: labels of the test trajectories.
+        validation_share: share of the other trajectories that is for validation.
+        seed: seed of the draw.
+        motion: number of the motion that each trajectory shows, as from `repeated_motions.motions`: trajectories of one
+            motion stay together, if there are enough motions. By default every trajectory shows its own.
 
     Raises:
         InputError: a label is unknown or has no samples, fewer than two trajectories remain for training and
@@ -174,9 +187,7 @@ def split(
     """
     require_seed(seed)
     present = np.unique(data.trajectory)
-    test_indices = present[5::6] if test is None else label_indices(data, test)
-    if test is None and len(present) < 6:
-        test_indices = present[-1:]
+    test_indices = by_motion(present, motion, slice(5, None, 6)) if test is None else label_indices(data, test)
     empty = np.setdiff1d(test_indices, present)
     if len(empty):
         raise InputError(f"trajectory '{data.label[empty[0]]}' has no samples to test by; choose other test labels")
@@ -187,12 +198,34 @@ def split(
             "and validation; at least 3 in all are needed: record more, or cut long ones and index the parts"
         )
     require_no_copies(select(data, rest), select(data, test_indices))
-    train, validation = hold_out(select(data, rest), validation_share, seed)
+    train, validation = hold_out(select(data, rest), validation_share, seed, motion)
     return Split(train, validation, test=select(data, test_indices))
 
 
-def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories, Trajectories]:
-    """Training and validation trajectories, at least one of each, drawn by the seed.
+def by_motion(
+    present: Int[np.ndarray, " t"],
+    motion: Int[np.ndarray, " T"] | None,
+    chosen: slice | Int[np.ndarray, " c"],
+    *,
+    least: int = LEAST_TRAJECTORIES,
+) -> Int[np.ndarray, " h"]:
+    """Returns the trajectories of the chosen motions, or of the last one if the choice is empty.
+
+    If motions are repeated, a choice of more than half of the trajectories is replaced by the motion with the fewest.
+    If there are fewer than `least` motions, every trajectory counts as one.
+    """
+    of = present if motion is None or len(np.unique(motion[present])) < least else motion[present]
+    every, counts = np.unique(of, return_counts=True)
+    some = every[chosen] if len(every[chosen]) else every[-1:]
+    if len(every) < len(present) and 2 * np.isin(of, some).sum() > len(present):
+        some = every[counts == counts.min()][-1:]
+    return present[np.isin(of, some)]
+
+
+def hold_out(
+    data: Trajectories, share: float, seed: int, motion: Int[np.ndarray, " T"] | None = None
+) -> tuple[Trajectories, Trajectories]:
+    """Training and validation trajectories, at least one of each, drawn by the seed; `motion` as for `split`.
 
     Raises:
         InputError: fewer than two trajectories, a share outside (0, 1), or a seed out of range.
@@ -200,7 +233,12 @@ def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories,
     require_seed(seed)
     present = np.unique(data.trajectory)
     count = held_out(len(present), share, "trajectories")
-    held = np.random.default_rng(seed).choice(present, size=count, replace=False)
+    if motion is not None and (motions := len(np.unique(motion[present]))) > 1:
+        count = held_out(motions, share, "motions")
+        chosen = np.random.default_rng(seed).choice(motions, size=count, replace=False)
+        held = by_motion(present, motion, np.sort(chosen), least=2)
+    else:
+        held = np.random.default_rng(seed).choice(present, size=count, replace=False)
     return select(data, np.setdiff1d(present, held)), select(data, held)
 
 

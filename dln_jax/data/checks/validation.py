@@ -16,6 +16,7 @@ from dln_jax.data.checks.tree import OnTree, against_tree
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.encoders.sampling import step_of, timing
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
+from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
@@ -131,7 +132,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
                 f"the robot has {len(joints)} joints, but the data have {d}; lock those that do not move: "
                 "--lock NAME,NAME"
             )
-    findings = [*recording.repaired, *check_times(data)]
+    findings = [*recording.repaired, *check_times(data), *_repeated_motions(data)]
     data, repeats = without_repeats(data)
     findings += _repeated(repeats)
     try:
@@ -178,6 +179,16 @@ def _repeated(repeats: Repeats) -> list[Finding]:
     why = "the log is faster than its source" if repeats.inserted else "messages were lost"
     observation = f"{count} sample(s) repeat the one before while the robot moves ({counted}): {why}"
     return [Finding("warning", "repeated", observation, "resample over them with smooth() or --cutoff auto")]
+
+
+def _repeated_motions(data: Trajectories) -> list[Finding]:
+    recordings, numbers = len(np.unique(data.trajectory)), motion_numbers(data.q, data.trajectory)
+    motions = len(np.unique(numbers[numbers >= 0]))
+    if motions == recordings:
+        return []
+    observation = f"{recordings} recordings show {motions} motion{'s' * (motions > 1)}"
+    remedy = "errors on other motions are known only if some are held out; record more of them"
+    return [Finding("note", "repeated-motions", observation, remedy)]
 
 
 def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:

@@ -16,6 +16,7 @@ from dln_jax.cli.encoders import (
 )
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
+from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split, with_joints
@@ -91,7 +92,7 @@ def read(options: Options) -> Recorded:
     data = data._replace(needs=needs)
     rubbing = bool(needs.friction or needs.joint_friction)
     cut = labels is None and (parts or len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES)
-    settled = (*["split"] * bool(cut), *["friction"] * rubbing)
+    settled = ("repeated-motions", *["split"] * bool(cut), *["friction"] * rubbing)
     findings = [] if options.data is None else checked(options, data, options.data, robot=robot, without=settled)
     filtered = smoothed(options, data)
     lines = [*preparation(data, filtered), *findings]
@@ -104,8 +105,11 @@ def read(options: Options) -> Recorded:
     elif cut and recordings < LEAST_TRAJECTORIES:
         data = in_blocks(data, BLOCKS)
     parents = parents_of(options, needs.degrees_of_freedom)
-    sets = split(data, test=labels, seed=options.seed)
-    if len(np.unique(data.trajectory)) > recordings:
+    whole = len(np.unique(data.trajectory)) == recordings
+    motion = motion_numbers(data.q, data.trajectory) if whole else None  # blocks of one motion may look alike
+    sets = split(data, test=labels, seed=options.seed, motion=motion)
+    lines += filter(None, [remark_on_repeats([sets.train, sets.validation], sets.test)])
+    if not whole:
         counts = [f"{len(np.unique(part.trajectory))} for {use}" for part, use in zip(sets, USES, strict=True)]
         which = "one recording" if recordings == 1 else f"{recordings} recordings"
         lines.append(f"{which}: cut into blocks of time, {', '.join(counts)}")

@@ -14,8 +14,9 @@ from dln_jax.data import schema
 from dln_jax.data.arrays import spread
 from dln_jax.data.bodies import find_bodies
 from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
+from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.schema import Trajectories, column
-from dln_jax.data.splits import label_indices, require_no_copies, segments, select, select_samples
+from dln_jax.data.splits import by_motion, label_indices, require_no_copies, segments, select, select_samples
 from dln_jax.data.stated_tests import stated_test
 from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
@@ -106,8 +107,10 @@ def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[
         return select_samples(data, slice(0, count)), select_samples(data, slice(count, None))
     data, labels = stated_test(data, test)
     present = np.unique(data.trajectory)
-    chosen = present[5::6] if len(present) >= 6 else present[-1:]
-    if labels is not None:
+    if labels is None:
+        motion = motion_numbers(data.q, data.trajectory) if test is None else None
+        chosen = by_motion(present, motion, slice(5, None, 6), least=2)
+    else:
         chosen = label_indices(data, labels)
     rest = np.setdiff1d(present, chosen)
     if not len(rest):

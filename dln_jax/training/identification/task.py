@@ -10,9 +10,19 @@ from dln_jax.cli.arguments import names_in, names_listed, numbers_of, refuse_giv
 from dln_jax.cli.encoders import checked, facts, fitted_torque, preparation, smoothed, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
+from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select, with_joints
+from dln_jax.data.splits import (
+    BLOCKS,
+    by_motion,
+    every,
+    in_blocks,
+    label_indices,
+    require_no_copies,
+    select,
+    with_joints,
+)
 from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.learning.friction import FrictionFit, fit_friction
 from dln_jax.mechanics.friction import FrictionShape, require_laws
@@ -24,7 +34,7 @@ from dln_jax.training.identification.terms import Wanted, at_reference, chosen, 
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
 
-SETTLED = ("split", "friction", "condition")
+SETTLED = ("split", "repeated-motions", "friction", "condition")
 """Checks of a log that the robot's file and this command make unnecessary."""
 MOST_SAMPLES = 4_000
 """Largest number of samples used to fit the shapes of friction."""
@@ -96,9 +106,11 @@ def prepare(options: Options) -> Case:
         light = lightly_filtered(data, filtered)
     if filtered is not None:
         data = filtered.data
-    sets, motions = held_out(data, options.test or None, in_parts=filtered is not None), None
+    motion, motions = motion_numbers(data.q, data.trajectory), None
+    sets = held_out(data, options.test or None, motion, in_parts=filtered is not None)
+    lines = (*lines, *filter(None, [remark_on_repeats([sets.train], sets.test)]))
     if light is not None:
-        motions = MotionSets(*held_out(light, options.test or None, in_parts=filtered is not None)[:2])
+        motions = MotionSets(*held_out(light, options.test or None, motion, in_parts=filtered is not None)[:2])
     terms = wanted(options, cast(tuple[FrictionLaw, ...], laws), data)
     needs = robot.tree.needs._replace(joint_friction=cast(tuple[FrictionLaw, ...], laws))
     scale = {} if options.velocity_scale is None else {"velocity_scale": options.velocity_scale}
@@ -165,22 +177,25 @@ def for_residual(train: Trajectories) -> tuple[Trajectories, Trajectories]:
     return select(train, np.setdiff1d(present, chosen)), select(train, chosen)
 
 
-def held_out(data: Trajectories, test: str | None, *, in_parts: bool) -> Sets:
-    """Training and held-out data as --test states them; `in_parts` if a filter cut trajectories at gaps."""
-    if not is_cut(test):
-        labels = stated_test(data, test)[1]
-        return split(data, labels_of_parts(data, labels) if in_parts and labels else labels)
-    return split(*stated_test(data, test))
+def held_out(data: Trajectories, test: str | None, motion: np.ndarray | None = None, *, in_parts: bool) -> Sets:
+    """Training and held-out data as --test states them; `in_parts` if a filter cut trajectories at gaps.
+
+    `motion` as for `data.splits.split`: blocks and last parts of recordings of one motion need not stay together.
+    """
+    if is_cut(test):
+        return split(*stated_test(data, test))
+    labels = stated_test(data, test)[1]
+    return split(data, labels_of_parts(data, labels) if in_parts and labels else labels, motion)
 
 
-def split(data: Trajectories, test: list[str] | None) -> Sets:
+def split(data: Trajectories, test: list[str] | None, motion: np.ndarray | None = None) -> Sets:
     """Training and held-out trajectories, or blocks of time if there is only one trajectory."""
     if len(np.unique(data.trajectory)) == 1:
         if test is not None:
             raise InputError("--test names trajectories, and the data have one only; give last:30%, or leave it out")
         return split(in_blocks(data, BLOCKS), None)._replace(blocks=True)
     present = np.unique(data.trajectory)
-    held = present[HELD_OUT] if len(present) > 2 else present[-1:]
+    held = by_motion(present, motion, HELD_OUT, least=2)
     if test is not None:
         held = label_indices(data, test)
     rest = np.setdiff1d(present, held)
