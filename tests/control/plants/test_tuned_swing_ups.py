@@ -124,6 +124,24 @@ def test_trials_with_motors_a_whole_sample_late_are_those_of_hardware_with_that_
     assert abs(between / changes - 1) > 1e-6
 
 
+@pytest.mark.parametrize(("noise", "fine"), [(1e-3, True), (1e-2, False)])
+def test_a_trial_fails_where_noise_makes_a_plant_look_faster_than_its_limit(noise, fine):
+    """A plant at rest at its goal, for which rates over five samples have the standard deviation 28 noise."""
+    still = rail()
+    still = still._replace(limits=still.limits._replace(rate=np.array([0.2, 0.2])))
+    trial = trial_of(
+        lambda _: stateless(lambda x: jnp.zeros(1)),
+        model(),
+        still,
+        Hardware(encoder_noise=noise),
+        seconds=2.0,
+        substeps=1,
+        late=0.0,
+    )
+    seconds, _ = trial((), jnp.asarray(still.goal), jnp.array(0.0), jax.random.key(0))
+    assert np.isfinite(seconds) == fine
+
+
 def test_trials_of_a_plant_that_falls_slowly_last_longer(monkeypatch):
     """With a pole of 36 times the length everything takes six times as long."""
     durations = []
