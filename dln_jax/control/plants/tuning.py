@@ -4,7 +4,7 @@
 2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
    are stronger or weaker than the model says. The weight is wrong by the share `WEIGHT` of that, in the opposite
    direction; stronger motors also act later, by the share `LATE` of a sample.
-3. The best sets are tried again with more errors, and from more and farther starts. The margin of a set is the largest
+3. The best sets are tried again with more errors, and from more starts. The margin of a set is the largest
    error up to which every trial succeeds. Among the sets that come up from most starts, with the largest margin and not
    much slower than the fastest, the one whose controls change least at the goal is chosen.
 4. Plans with feedback (`planned`) are tried first, and taken if they tolerate every error. Otherwise energy laws are
@@ -52,8 +52,9 @@ ROUNDS = 4
 WITHIN = 0.5
 """A trial must end within this share of the tolerance: a plant whose dry friction sticks hunts farther from the goal
 than the model, whose friction is smooth."""
-FARTHER = 1.5
-"""Factor on the distance from hanging of the further starts, which are fewer than those of a plant in use."""
+RESERVE = 0.95
+"""A trial must keep within this share of the ranges and of the largest rates: a plant starts more often than the trials,
+and from farther away."""
 SECONDS, FALLS = 6.0, 26.0
 """Duration of a trial, s, and the least one in units of 1 / lambda: the longest plan, with time to come to rest."""
 LEAST = 0.1
@@ -153,16 +154,14 @@ def _chosen(
     times = np.zeros((0, len(way.errors)))
     trials = 0
 
-    def tried(
-        chosen: list[Any], errors: tuple[float, ...], starts: int, farther: float = 1.0
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns times and changes of the controls [set, error, start]; idle lanes repeat the first trials."""
         nonlocal trials
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
         count = len(chosen) * len(errors) * starts
         place = np.arange(lanes) % count
         which, error_of, start_of = np.unravel_index(place, (len(chosen), len(errors), starts))
-        drawn = layout.hanging + farther * spread_of(layout) * random.normal(size=(starts, len(layout.joints)))
+        drawn = layout.hanging + spread_of(layout) * random.normal(size=(starts, len(layout.joints)))
         keys = jax.random.split(jax.random.key(int(random.integers(2**31))), lanes)
         parts = jax.tree.map(lambda leaf: leaf[which], stacked)
         seconds, changes = program(parts, drawn[start_of], np.array(errors)[error_of], keys)
@@ -186,7 +185,7 @@ def _chosen(
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(finalists, int(good.sum()))]
     starts = max(STARTS, lanes // (finalists * len(ERRORS)))
     final, changes = tried([settings[k] for k in best], ERRORS, starts)
-    more = tried([settings[k] for k in best], (0.0,), max(starts, lanes // len(best)), FARTHER)[0]
+    more = tried([settings[k] for k in best], (0.0,), max(starts, lanes // len(best)))[0]
     margins = np.array([_margin(np.isfinite(one).all(axis=1)) for one in final])
     share = np.isfinite(final).mean(axis=(1, 2))
     nominal = np.median(final[:, 0], axis=1)
@@ -229,12 +228,14 @@ def trial_of(
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
     angles = np.array([kind == "revolute" for kind in layout.joints])
     low, high = layout.limits.position.T
+    spare = np.where(np.isfinite(high - low), (1 - RESERVE) / 2 * (high - low), 0.0)
+    low, high = low + spare, high - spare
     has_limits = np.isfinite(layout.limits.position).any() or np.isfinite(layout.limits.rate).any()
 
     def within(q: Array, qd: Array) -> Array:
         ahead = q + layout.limits.stopping * qd
         inside = (jnp.minimum(q, ahead) >= low) & (jnp.maximum(q, ahead) <= high)
-        return jnp.all(inside & (jnp.abs(qd) <= layout.limits.rate))
+        return jnp.all(inside & (jnp.abs(qd) <= RESERVE * layout.limits.rate))
 
     def trial(settings: Any, start: Array, wrong: Array, key: Array) -> tuple[Array, Array]:
         def field(x: Array, u: Array) -> Array:
