@@ -10,6 +10,7 @@ from dln_jax.cli.arguments import names_listed, numbers_of, refuse_given
 from dln_jax.cli.options import Checked, Filtered, Logged
 from dln_jax.data.checks import quick
 from dln_jax.data.encoders import Smoothed, smooth
+from dln_jax.data.encoders.clock import clock_line
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stated_needs import needs_from_text
@@ -18,7 +19,7 @@ from dln_jax.types import InputError, Needs
 AUTO = "auto"
 FILTERED = (
     "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
-    "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated",
+    "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated", "clock",
 )  # fmt: skip
 """Checks for faults that filtering q replaces or repairs."""
 
@@ -82,6 +83,8 @@ def preparation(data: Trajectories, filtered: Smoothed | None) -> list[str]:
     lines.append(f"noise of q {sizes[0]}; of tau {sizes[1]} ({torque})")
     if count := int((filtered.repeats.q | filtered.repeats.tau).sum()):
         lines.append(f"{count} samples repeat the one before and are resampled over")
+    if filtered.clock is not None:
+        lines.append(f"{clock_line(filtered.clock)}: t follows q and qd")
     if filtered.left_out:
         lines.append(f"{filtered.left_out} segments are too short for the filter and left out")
     return lines

@@ -24,6 +24,8 @@ lies within it. A real arm of six joints repeated motions within 0.03 to 0.15; t
 apart."""
 POINTS = 50
 """Number of positions of a recording that are compared with the others."""
+MOVING = 1.0
+"""Recordings that move less than this multiple of `CLOSE` join a motion that passes their posture, but connect none."""
 SHORTEST, MOST = 50, 300
 """Fewest samples of a recording that is compared, and the largest number of recordings."""
 
@@ -31,48 +33,75 @@ SHORTEST, MOST = 50, 300
 def motion_numbers(q: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"]) -> Int[np.ndarray, " T"]:
     """Returns the number of the motion that each trajectory shows, by the trajectory's index.
 
-    Motions are numbered by their first trajectories; absent trajectories have -1. Motionless, short, or very many
-    trajectories, and those of one coordinate, count as motions of their own: with a single coordinate, different
-    motions pass the same states.
+    Motions are numbered by their first trajectories; absent trajectories have -1. Motionless and short trajectories,
+    very many, and those of one coordinate count as motions of their own: with a single coordinate, different motions
+    pass the same states.
     """
-    present, inverse = np.unique(trajectory, return_inverse=True)
-    rows = np.split(np.argsort(inverse, kind="stable"), np.cumsum(np.bincount(inverse))[:-1])
-    number = np.arange(len(present))
-    moving = [k for k, own in enumerate(rows) if len(own) >= SHORTEST and np.ptp(q[own], axis=0).any()]
-    if q.shape[1] > 1 and 1 < len(moving) <= MOST:
-        step = int(DURATION * min(len(rows[k]) for k in moving) / (TIMES - 1))
-        spread = q.std(axis=0)
-        scaled = q[:, spread > 0] / spread[spread > 0] / np.sqrt(TIMES * np.sum(spread > 0))
-        embedded = [_embedded(scaled[rows[k]], step) for k in moving]
-        some = np.concatenate([own[np.linspace(0, len(own) - 1, POINTS).astype(int)] for own in embedded])
-        for own in embedded:
-            distances = cKDTree(own).query(some, distance_upper_bound=CLOSE)[0].reshape(-1, POINTS)
-            joined = number[moving][np.mean(distances <= CLOSE, axis=1) >= SHARE]
-            number[np.isin(number, joined)] = joined.min()
-    numbers = np.full(present.max() + 1, -1)
-    numbers[present] = np.unique(number, return_inverse=True)[1]
+    present = np.unique(trajectory)
+    number = np.arange(present.max() + 1)
+    embedded = _embedded(q, trajectory)
+    if embedded:
+        compared = np.array(list(embedded))
+        some = np.concatenate([_some(own) for own in embedded.values()])
+        moving = np.array([np.linalg.norm(own.std(axis=0)) >= MOVING for own in embedded.values()])
+        free = ~moving
+        for k in np.flatnonzero(moving):
+            near = _near(embedded[compared[k]], some).reshape(-1, POINTS).mean(axis=1) >= SHARE
+            joined = number[compared[near & moving]]
+            number[np.isin(number, joined) | np.isin(np.arange(len(number)), compared[near & free])] = joined.min()
+            free &= ~near
+    numbers = np.full(len(number), -1)
+    numbers[present] = np.unique(number[present], return_inverse=True)[1]
     return numbers
 
 
-def remark_on_repeats(trained: Sequence[Trajectories], test: Trajectories) -> str:
-    """Returns a line on recordings of one motion: they stay together, or the test repeats trained ones."""
+def remark_on_repeats(trained: Sequence[Trajectories], test: Trajectories, *, together: bool = True) -> str:
+    """Returns a line on recordings of one motion: the test repeats trained ones, or they were kept together."""
     sets = [*trained, test]
-    motion = motion_numbers(np.concatenate([part.q for part in sets]), np.concatenate([s.trajectory for s in sets]))
+    q, trajectory = (np.concatenate([getattr(part, key) for part in sets]) for key in ("q", "trajectory"))
     seen, held = np.unique(np.concatenate([part.trajectory for part in trained])), np.unique(test.trajectory)
-    repeating = held[np.isin(motion[held], motion[seen])]
-    if len(repeating):
-        twin = seen[motion[seen] == motion[repeating[0]]][0]
+    embedded = _embedded(q, trajectory)
+    twins = {}
+    for index in [index for index in held.tolist() if index in embedded]:
+        near = {k: _near(embedded[k], _some(embedded[index])) for k in seen.tolist() if k in embedded}
+        if near and np.any(list(near.values()), axis=0).mean() >= SHARE:
+            twins[index] = max(near, key=lambda k: near[k].sum())
+    if twins:
+        first = min(twins)
         return (
-            f"warning: {len(repeating)} of {len(held)} held-out motions repeat trained ones, such as "
-            f"'{test.label[repeating[0]]}' and '{test.label[twin]}'; errors on other motions may be larger: hold out "
+            f"warning: {len(twins)} of {len(held)} held-out motions repeat trained ones, such as "
+            f"'{test.label[first]}' and '{test.label[twins[first]]}'; errors on other motions may be larger: hold out "
             "other motions by --test, or record more"
         )
-    recordings, different = len(seen) + len(held), len(np.unique(motion[np.concatenate([seen, held])]))
-    if different == recordings:
+    recordings, motion = len(seen) + len(held), motion_numbers(q, trajectory)
+    different = len(np.unique(motion[motion >= 0]))
+    if not together or different == recordings:
         return ""
     return f"{recordings} recordings show {different} motions; recordings of one motion stay together in the split"
 
 
-def _embedded(q: np.ndarray, step: int) -> np.ndarray:
-    count = len(q) - (TIMES - 1) * step
-    return np.hstack([q[k * step : k * step + count] for k in range(TIMES)])
+def _embedded(q: np.ndarray, trajectory: np.ndarray) -> dict[int, np.ndarray]:
+    """Returns the embedded positions of the trajectories that are compared, by index, in units of `CLOSE`."""
+    spread = q.std(axis=0)
+    if q.shape[1] < 2 or not spread.any():
+        return {}
+    scaled = q[:, spread > 0] / spread[spread > 0] / np.sqrt(np.sum(spread > 0))
+    order = np.argsort(trajectory, kind="stable")
+    present, first = np.unique(trajectory[order], return_index=True)
+    parts = zip(present.tolist(), np.split(scaled[order], first[1:]), strict=True)
+    long = {k: x for k, x in parts if len(x) >= SHORTEST and np.ptp(x, axis=0).any()}
+    if not 1 < len(long) <= MOST:
+        return {}
+    step = int(DURATION * min(map(len, long.values())) / (TIMES - 1))
+    size, span = CLOSE * np.sqrt(TIMES), (TIMES - 1) * step
+    return {
+        k: np.hstack([x[j * step : len(x) - span + j * step] for j in range(TIMES)]) / size for k, x in long.items()
+    }
+
+
+def _some(points: np.ndarray) -> np.ndarray:
+    return points[np.linspace(0, len(points) - 1, POINTS).astype(int)]
+
+
+def _near(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    return cKDTree(points).query(others, distance_upper_bound=1.0)[0] <= 1.0

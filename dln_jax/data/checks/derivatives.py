@@ -21,7 +21,7 @@ LATE = 0.5
 FARTHEST = 0.25
 """s: largest delay tested."""
 TINY = np.finfo(float).tiny
-RATE_REMEDY = "leave qd and qdd out of the file, and let --cutoff auto derive them from q"
+RATE_REMEDY = "let --cutoff auto derive qd and qdd from q"
 
 
 class Match(NamedTuple):

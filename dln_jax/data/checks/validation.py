@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.data import schema
-from dln_jax.data.checks.channels import check_channels, check_times
+from dln_jax.data.checks.channels import FILTER, check_channels, check_times
 from dln_jax.data.checks.derivatives import check_derivatives
 from dln_jax.data.checks.energies import any_energy
 from dln_jax.data.checks.findings import Finding, by_severity
 from dln_jax.data.checks.hypotheses import Torques, examine_torques
 from dln_jax.data.checks.joints import check_degrees, check_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
+from dln_jax.data.encoders.clock import clock_line
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.encoders.sampling import step_of, timing
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
@@ -139,6 +140,9 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
         even = smooth(data, trim=0.0)
     except InputError:  # single states, or motions of a few samples: their rates cannot be checked
         even = None
+    if even is not None and even.clock is not None:
+        findings = [finding for finding in findings if finding.check != "jitter"]
+        findings.append(Finding("warning", "clock", clock_line(even.clock), FILTER))
     findings += check_channels(recording.data, None if even is None else even.data.qd)
     driven = "tau" not in data.estimated and bool(np.ptp(data.tau, axis=0).any())
     farthest = 0 if even is None else int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))

@@ -70,8 +70,8 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
     if not (repeats.q.any() or repeats.tau.any()):
         return data, repeats
     t, trajectory = data.t, data.trajectory
-    q = _interpolated(t, data.q, trajectory, repeats.q & ~repeats.rows)
-    tau = _interpolated(t, data.tau, trajectory, repeats.tau & ~repeats.rows)
+    q = interpolated(t, data.q, trajectory, repeats.q & ~repeats.rows)
+    tau = interpolated(t, data.tau, trajectory, repeats.tau & ~repeats.rows)
     if repeats.inserted:
         t = _source_times(t, trajectory, repeats.rows)
     return select_samples(data._replace(t=t, q=q, tau=tau), ~repeats.rows), repeats
@@ -113,7 +113,7 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
     return repeating, along / usual_squared if usual_squared > 0 else np.inf
 
 
-def _interpolated(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong: np.ndarray) -> np.ndarray:
+def interpolated(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong: np.ndarray) -> np.ndarray:
     """Replaces the wrong samples by a cubic spline through the others of their trajectory."""
     if not wrong.any():
         return values

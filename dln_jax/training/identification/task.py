@@ -108,7 +108,8 @@ def prepare(options: Options) -> Case:
         data = filtered.data
     motion, motions = motion_numbers(data.q, data.trajectory), None
     sets = held_out(data, options.test or None, motion, in_parts=filtered is not None)
-    lines = (*lines, *filter(None, [remark_on_repeats([sets.train], sets.test)]))
+    together = not (sets.blocks or is_cut(options.test))
+    lines = (*lines, *filter(None, [remark_on_repeats([sets.train], sets.test, together=together)]))
     if light is not None:
         motions = MotionSets(*held_out(light, options.test or None, motion, in_parts=filtered is not None)[:2])
     terms = wanted(options, cast(tuple[FrictionLaw, ...], laws), data)

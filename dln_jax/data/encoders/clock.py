@@ -1,0 +1,125 @@
+"""Times on the clock of a log's source, for regular rows that were stamped when they arrived.
+
+A program that reads a robot over a network stamps each row late, by a varying time. Measured positions and velocities
+tell how long the robot moved between two rows:
+
+    step = sum_j w_j dq_j v_j / sum_j w_j v_j²,    v the mean of both rows' qd,    1 / w_j = mean of qd_j²
+
+If these steps are whole multiples of one period and the stamps are not, rows are moved to the multiples. Where the
+robot hardly moves, they are interpolated. All times are late by the mean lateness of the stamps.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dln_jax.data.schema import Trajectories
+
+JITTER = 0.05
+"""Smallest standard deviation of the stamps' steps that is repaired, in periods."""
+REGULAR, SHARE = 0.1, 0.98
+"""Largest deviation of a step from a whole number of periods, and the share of the steps that keeps within it."""
+BETTER = 0.3
+"""Largest standard deviation of the steps from whole numbers, relative to that of the stamps."""
+MOVING = 0.3
+"""Steps are computed where the joints move faster than this multiple of their root mean square speed."""
+LEAST = 100
+"""Fewest steps that tell a period."""
+SAME = 0.02
+"""Largest relative difference of the total durations by steps and by stamps: beyond, units of qd or t are in doubt."""
+LATE = 0.1
+"""s: largest correction of a stamp."""
+
+
+class Clock(NamedTuple):
+    """Times of N rows on their source's clock."""
+
+    t: Float[np.ndarray, " N"]
+    period: float
+    """s."""
+    jitter: float
+    """Standard deviation of the stamps' steps about whole numbers of periods, in periods."""
+
+
+def clock_line(clock: Clock) -> str:
+    """Returns a line that says what replaced the stamps, and why."""
+    return (
+        f"t jitters by {clock.jitter:.0%} of a step, while q and qd show that rows are whole multiples of "
+        f"{1e3 * clock.period:.4g} ms apart"
+    )
+
+
+def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None = None) -> Clock | None:
+    """Returns the times on the source's clock; `None` if stamps are regular, or the motions do not tell otherwise.
+
+    Args:
+        data: rows without repeats, with measured qd.
+        interpolated: rows whose q was not measured.
+    """
+    known = np.arange(len(data.t)) if interpolated is None else np.flatnonzero(~interpolated)
+    if "qd" in data.estimated or len(known) <= LEAST:
+        return None
+    t, q, qd, trajectory = data.t[known], data.q[known], data.qd[known], data.trajectory[known]
+    size = np.mean(qd**2, axis=0)
+    weights = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    v = (qd[1:] + qd[:-1]) / 2
+    speed = v**2 @ weights
+    moving = (np.diff(trajectory) == 0) & (speed > MOVING**2 * np.sum(weights > 0))
+    if moving.sum() < LEAST:
+        return None
+    stamped, steps = np.diff(t), (np.diff(q, axis=0) * v) @ weights / np.where(speed > 0, speed, 1.0)
+    period = float(np.median(steps[moving]))
+    if not period > 0:
+        return None
+    whole = np.round(steps / period)
+    period = float(steps[moving].sum() / max(whole[moving].sum(), 1.0))
+    off, off_stamps = (np.abs(of / period - whole)[moving] for of in (steps, stamped))
+    regular = np.mean((off <= REGULAR) & (whole[moving] >= 1)) >= SHARE
+    same = abs(period * whole[moving].sum() / stamped[moving].sum() - 1) <= SAME
+    jitter = float(np.sqrt(np.mean(off_stamps**2)))
+    if not (regular and same and jitter >= JITTER and np.median(off) <= BETTER * np.median(off_stamps)):
+        return None
+    # Steps that cannot be counted end a run.
+    runs = np.flatnonzero(np.diff(np.r_[0, (moving & (whole >= 1)).astype(int), 0])).reshape(-1, 2)
+    counts = [np.r_[0.0, np.cumsum(whole[first:last])] for first, last in runs]
+    period = _common_slope(counts, [t[first : last + 1] for first, last in runs])
+    rows, grids = [], []
+    for index in np.unique(trajectory[runs[:, 0]]):
+        own = [k for k, (first, _) in enumerate(runs) if trajectory[first] == index]
+        rows.append(np.concatenate([np.arange(runs[k, 0], runs[k, 1] + 1) for k in own]))
+        grids.append(_on_one_grid([t[runs[k, 0] : runs[k, 1] + 1] for k in own], [counts[k] for k in own], period))
+    period = _common_slope(grids, [t[own] for own in rows])
+    corrected = data.t.copy()
+    for own, grid in zip(rows, grids, strict=True):
+        times = t[own].mean() + period * (grid - grid.mean())
+        every = np.flatnonzero(data.trajectory == trajectory[own[0]])
+        corrected[every] = _between(every, known[own], times, data.t[every])
+    return Clock(corrected, period, jitter) if np.abs(corrected - data.t).max() <= LATE else None
+
+
+def _common_slope(counts: list[np.ndarray], stamps: list[np.ndarray]) -> float:
+    """Returns the period on the clock of the stamps: their common slope over the counts, by least squares."""
+    centred = [(count - count.mean(), t - t.mean()) for count, t in zip(counts, stamps, strict=True)]
+    return float(sum(count @ t for count, t in centred) / sum(count @ count for count, _ in centred))
+
+
+def _on_one_grid(stamps: list[np.ndarray], counts: list[np.ndarray], period: float) -> np.ndarray:
+    """Returns the counts of all runs of one trajectory from one start, so that they are late as their stamps are."""
+    starts = np.array([np.mean(t / period - count) for t, count in zip(stamps, counts, strict=True)])
+    whole = np.round(starts - starts[int(np.argmax([len(count) for count in counts]))])
+    placed: list[np.ndarray] = []
+    for start, count in zip(whole, counts, strict=True):
+        earliest = placed[-1][-1] + 1 if placed else -np.inf  # short runs are late by another time in the mean
+        placed.append(max(start, earliest) + count)
+    return np.concatenate(placed)
+
+
+def _between(rows: np.ndarray, known: np.ndarray, times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    """Returns the times of rows: the known ones, equal steps between them, and stamps, shifted, before and after."""
+    result = np.interp(rows, known, times)
+    before, after = rows < known[0], rows > known[-1]
+    at = np.searchsorted(rows, known[[0, -1]])
+    result[before] = stamps[before] + times[0] - stamps[at[0]]
+    result[after] = stamps[after] + times[-1] - stamps[at[1]]
+    return result
