@@ -53,8 +53,8 @@ WITHIN = 0.5
 """A trial must end within this share of the tolerance: a plant whose dry friction sticks hunts farther from the goal
 than the model, whose friction is smooth."""
 RESERVE = 0.95
-"""A trial must keep within this share of the ranges and of the largest rates: a plant starts more often than the trials,
-and from farther away."""
+"""A trial must keep within this share of the ranges and of the largest rates: a plant starts more often, and from
+farther away, than the trials."""
 SECONDS, FALLS = 6.0, 26.0
 """Duration of a trial, s, and the least one in units of 1 / lambda: the longest plan, with time to come to rest."""
 LEAST = 0.1

@@ -28,6 +28,8 @@ LEAST = 100
 """Fewest steps that tell a period."""
 SAME = 0.02
 """Largest relative difference of the total durations by steps and by stamps: beyond, units of qd or t are in doubt."""
+ROUNDS = 5
+"""Largest number of comparisons of all runs with one line."""
 LATE = 0.1
 """s: largest correction of a stamp."""
 
@@ -105,13 +107,25 @@ def _common_slope(counts: list[np.ndarray], stamps: list[np.ndarray]) -> float:
 
 
 def _on_one_grid(stamps: list[np.ndarray], counts: list[np.ndarray], period: float) -> np.ndarray:
-    """Returns the counts of all runs of one trajectory from one start, so that they are late as their stamps are."""
+    """Returns the counts of all runs of one trajectory from one start, so that they are late as their stamps are.
+
+    Neighbouring runs are compared first, since the period is not yet accurate over many runs; then each with the line
+    through all stamps, so that a short run cannot displace those after it.
+    """
     starts = np.array([np.mean(t / period - count) for t, count in zip(stamps, counts, strict=True)])
-    whole = np.round(starts - starts[int(np.argmax([len(count) for count in counts]))])
+    shifts = np.r_[0.0, np.cumsum(np.round(np.diff(starts)))]
+    for _ in range(ROUNDS):
+        grid = np.concatenate([count + shift for count, shift in zip(counts, shifts, strict=True)])
+        slope, start = np.polyfit(grid, np.concatenate(stamps), 1)
+        late = zip(stamps, counts, shifts, strict=True)
+        wrong = np.round([np.mean((t - start) / slope - count - shift) for t, count, shift in late])
+        if not wrong.any():
+            break
+        shifts += wrong
     placed: list[np.ndarray] = []
-    for start, count in zip(whole, counts, strict=True):
+    for shift, count in zip(shifts, counts, strict=True):
         earliest = placed[-1][-1] + 1 if placed else -np.inf  # short runs are late by another time in the mean
-        placed.append(max(start, earliest) + count)
+        placed.append(max(shift, earliest) + count)
     return np.concatenate(placed)
 
 
