@@ -29,6 +29,9 @@ CLEAR = 3.0
 """A spike exceeds the range of its four neighbours by this factor."""
 ABRUPT = 0.5
 """A channel enters or leaves a clipping limit by more than this fraction of the typical step."""
+FAST, HIDDEN = 0.3, 0.5
+"""A joint moves if it is faster than the first multiple of its root mean square speed; zero torques in a larger share
+of such samples than the second are reported."""
 FILTER = "interpolate to equal steps with smooth() or --cutoff auto"
 
 
@@ -81,6 +84,15 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
             "warning", "dead-torque", dead,
             f"the torque of {{}} is zero in all samples, although {'it moves' if dead.sum() == 1 else 'they move'}",
             "log that torque; or state in needs, by actuation, that the joint has no motor",
+        )  # fmt: skip
+        fast = np.abs(data.qd) > FAST * np.sqrt(np.mean(data.qd**2, axis=0))
+        zero = np.sum((data.tau == 0) & fast, axis=0) / np.maximum(fast.sum(axis=0), 1)
+        hidden = driven & (zero > HIDDEN) & ~dead & ~still
+        findings += on_joints(
+            "warning", "hidden-torque", hidden,
+            f"the torque of {{}} is exactly zero in up to {zero[hidden].max(initial=0.0):.0%} of the samples in which "
+            f"{'it moves' if hidden.sum() == 1 else 'they move'}",
+            "unless the motors were off, the drivers hide small torques: leave such joints out (--lock)",
         )  # fmt: skip
         findings += on_joints(
             "warning", "constant-torque", constant, "the torque of {} is constant",

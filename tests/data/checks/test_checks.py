@@ -159,6 +159,10 @@ LOG_FAULTS = {
     ),
     "torques exchanged": (lambda a: {**a, "tau": a["tau"][:, [0, 2, 1]]}, "order", (1, 2), "1, 3, 2"),
     "dead torque": (lambda a: {**a, "tau": column(a["tau"], 1, np.zeros_like)}, "dead-torque", (1,), "zero"),
+    "small torques hidden": (
+        lambda a: {**a, "tau": column(a["tau"], 2, lambda x: np.where(np.abs(x) > np.quantile(np.abs(x), 0.7), x, 0))},
+        *("hidden-torque", (2,), "exactly zero in up to"),
+    ),
     "all torques dead": (lambda a: {**a, "tau": 0 * a["tau"]}, "dead-torque", (0, 1, 2), "zero"),
     "qd and qdd exchanged": (
         lambda a: {**a, "qd": motions(seed=1)[3].reshape(-1, 3), "qdd": a["qd"]}, "qd-exchanged", (), "exchange"
