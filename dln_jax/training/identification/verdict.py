@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.encoders import torque_noise
+from dln_jax.data.splits import every
 from dln_jax.identification.identify import Identification, parameters_of
+from dln_jax.identification.shared_motors import MOST, shared_motor
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.rigid_tree import RigidTreeParameters
@@ -44,16 +46,26 @@ def judged(
     rows = ~peaks.any(axis=1) if robust else np.ones(len(test.t), bool)
     noise = torque_noise(case.sets.train) if case.noise is None else case.noise
     errors = held_out(torques[kept][rows], test.tau[rows], noise=noise, file=torques["file"][rows])
-    every = [judge(errors, case.names), existing(solution, torques, kept, test.tau)]
+    verdicts = [judge(errors, case.names), existing(solution, torques, kept, test.tau)]
     mine = parameters_of(solution.theta, case.known)
     still = np.zeros_like(test.q)
     friction = predict(mine, still, test.qd, still).friction
     scales = case.description.get("velocity_scale") if {"coulomb", "stribeck"} & set(case.laws) else None
     fitted = np.array(scales) if isinstance(scales, list) else None
-    every += [friction_verdict(case.names, test.qd, test.tau, friction, fitted)]
+    verdicts += [friction_verdict(case.names, test.qd, test.tau, friction, fitted)]
     bodies = [predict(without_joints(theta), test.q, test.qd, test.qdd).torque for theta in (mine, case.known)]
-    every += [weight_verdict(*bodies)]
-    verdict = worst(*every)
+    verdicts += [weight_verdict(*bodies)]
+    verdict = worst(*verdicts)
+    if verdict.level != "good" and case.description["motors"] is None:
+        train = every(case.sets.train, -(-len(case.sets.train.t) // MOST))
+        found = shared_motor(train.tau - predict(mine, train.q, train.qd, train.qdd).torque, train.qd)
+        if found is not None:
+            names = [case.names[k] for k in (found.joint, found.other)]
+            remedy = (
+                f"friction of a motor that turns with {names[0]} and {found.ratio:g} times {names[1]} would explain "
+                f"{found.share:.0%} of what is left in both: try --motors '{found.rates(d)}'"
+            )
+            verdict = Verdict(verdict.level, verdict.reason, f"{remedy}; else {verdict.remedy}")
     share = spikes(case.sets.train.tau).mean(axis=0)
     if verdict.level != "good" and not robust and share.max() > SPIKES:
         which = ", ".join(case.names[k] for k in range(d) if share[k] > SPIKES)
