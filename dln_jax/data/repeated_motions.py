@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dln_jax.data.schema import Trajectories
 
@@ -104,4 +104,4 @@ def _some(points: np.ndarray) -> np.ndarray:
 
 
 def _near(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    return cKDTree(points).query(others, distance_upper_bound=1.0)[0] <= 1.0
+    return KDTree(points).query(others, distance_upper_bound=1.0)[0] <= 1.0
