@@ -6,8 +6,9 @@ samples (the one-standard-error rule of Breiman et al. 1984, paired). `grow` tra
 
 `select_model` fits models of one recording, most structured and cheapest first. They are compared on the validation
 motions by squared torque errors in units of the joints' variances, so that a wrist counts as much as a shoulder, and
-the differences are taken over time segments. The selection ends early if the errors equal the noise of the torques, or
-rounding, and when time is up.
+the differences are taken over time segments. Models that explain the torques of every joint, and whose mass matrices
+are positive definite, come before others: without such a matrix, accelerations are wrong. The selection ends early if
+the errors equal the noise of the torques, or rounding, and when time is up.
 """
 
 import time
@@ -29,6 +30,10 @@ EXACT = 1e-12
 LEAST_NOISE, MOST_NOISE = 0.5, 1.2
 """Range of a joint's error, relative to the noise's share of the torque's variance, that counts as that noise. A lower
 error shows that the estimate of the noise is wrong."""
+
+
+EXPLAINED = 0.05
+"""Largest normalised error of a joint whose torque counts as explained, as in `metrics.verdict`."""
 
 
 class Trial(NamedTuple):
@@ -134,6 +139,13 @@ class Assessment(NamedTuple):
     reason: str = ""
     """Reason why there is no model."""
     tried: bool = True
+    definite: bool = True
+    """Whether the mass matrix is positive definite; true for models without one."""
+
+    @property
+    def sound(self) -> bool:
+        """Whether the model explains the torque of every joint with a positive definite mass matrix."""
+        return self.definite and self.nmse is not None and bool(np.all(self.nmse <= EXPLAINED))
 
 
 class Selection(NamedTuple):
@@ -154,9 +166,10 @@ def select_model(
     *,
     noise: Float[np.ndarray, " d"] | None = None,
     seconds: float = float("inf"),
+    definite: Callable[[FittedModel], bool] = lambda fitted: True,
     report: Callable[[Assessment], None] = lambda step: None,
 ) -> Selection:
-    """Fits candidates in order and chooses the first that no other betters significantly.
+    """Fits candidates in order and chooses the first that no other betters significantly, among sound ones if any is.
 
     Args:
         candidates: candidates, most structured first; of two equally good ones the first is chosen.
@@ -164,6 +177,7 @@ def select_model(
         validation: other motions.
         noise: standard deviation of the joints' torque noise, N m or N, if known; the selection ends at such errors.
         seconds: time limit; at least the first candidate that can be fitted is.
+        definite: whether a model's mass matrix is positive definite; true for models without one.
         report: called with the result of every candidate.
 
     Raises:
@@ -178,7 +192,7 @@ def select_model(
             ended = ended or "time is out"
             step = Assessment(candidate.name, None, None, None, 0.0, ended, tried=False)
         else:
-            step = _tried(candidate, max(left, 1e-3), scale, train, validation)
+            step = _tried(candidate, max(left, 1e-3), scale, train, validation, definite)
             ended = _ended(step, None if noise is None else (noise / scale) ** 2)
         steps.append(step)
         report(step)
@@ -189,12 +203,17 @@ def select_model(
     ]
     if not trials or not np.isfinite(min(trial.validation for trial in trials)):
         raise InputError("no model could be fitted: " + "; ".join(f"{step.name}: {step.reason}" for step in steps))
-    best = smallest_enough(trials)
+    best = smallest_enough([trial for trial in trials if trial.candidate.sound] or trials)
     return Selection(best.candidate, best.outcome, tuple(steps), ended)
 
 
 def _tried(
-    candidate: Candidate, left: float, scale: Float[np.ndarray, " d"], train: Trajectories, validation: Trajectories
+    candidate: Candidate,
+    left: float,
+    scale: Float[np.ndarray, " d"],
+    train: Trajectories,
+    validation: Trajectories,
+    definite: Callable[[FittedModel], bool],
 ) -> Assessment:
     since = time.perf_counter()
     try:
@@ -210,12 +229,12 @@ def _tried(
     errors = np.stack([np.bincount(segment, column) / counts for column in squares.T], axis=1)
     if not np.isfinite(errors).all():
         return Assessment(candidate.name, None, None, None, spent, "its torques are not finite on validation motions")
-    return Assessment(candidate.name, fitted, errors, squares.mean(axis=0), spent)
+    return Assessment(candidate.name, fitted, errors, squares.mean(axis=0), spent, definite=definite(fitted))
 
 
 def _ended(step: Assessment, share: Float[np.ndarray, " d"] | None) -> str:
     """Returns the reason why no other candidate can be better, or an empty string."""
-    if step.nmse is None:
+    if step.nmse is None or not step.definite:
         return ""
     if (step.nmse <= EXACT).all():
         return f"{step.name} is exact"

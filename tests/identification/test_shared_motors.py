@@ -24,13 +24,13 @@ def test_a_motor_of_two_joints_is_found(joint, other, ratio):
     torque = friction(qd[:, joint] + ratio * qd[:, other], 0.4, 1.5)
     left[:, joint] += torque - friction(qd[:, joint], 0.3, 1.0)  # a fit explains part of it by the joints' own rates
     left[:, other] += ratio * torque - friction(qd[:, other], 0.2, 0.5)
-    found = shared_motor(left, qd)
-    assert found is not None and found[:3] == (joint, other, ratio) and 0.3 <= found.share <= 1
+    motor = shared_motor(left, qd)
+    assert motor is not None and motor[:3] == (joint, other, ratio) and 0.3 <= motor.share <= 1
 
 
 def test_the_rows_of_the_rates_are_those_of_the_option():
-    found = shared_motor(*of_wrist())
-    assert found is not None and found.rates(2) == "1,0;1,1"
+    motor = shared_motor(*of_wrist())
+    assert motor is not None and motor.rates(2) == "1,0;1,1"
 
 
 def of_wrist():

@@ -123,3 +123,20 @@ def test_better_means_beyond_the_paired_standard_error():
 def test_the_smallest_sufficient_candidate_is_chosen(levels, patience, target, chosen, trained):
     trial, trials = grow(range(len(levels)), lambda n: (n, errors_of(levels[n])), patience=patience, target=target)
     assert trial.candidate == trial.outcome == chosen and len(trials) == trained
+
+
+def test_models_with_indefinite_masses_come_last_among_those_that_explain_the_torques():
+    candidates = [candidate("rough", 3.0, 3.0), candidate("near", 1.1, 1.1), candidate("true", 1, 1)]
+
+    def chosen(indefinite):
+        masses = [tuple(UNIT * shares) for shares in indefinite]
+        selection = select_model(
+            candidates,
+            TRAIN,
+            VALIDATION,
+            definite=lambda fitted: tuple(np.asarray(fitted.parameters)) not in masses,
+        )
+        return selection.chosen.name
+
+    assert chosen([]) == "true" and chosen([1.0]) == "near"
+    assert chosen([1.0, 1.1]) == "true", "the rough one explains too little to come first"

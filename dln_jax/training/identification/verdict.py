@@ -58,12 +58,12 @@ def judged(
     verdict = worst(*verdicts)
     if verdict.level != "good" and case.description["motors"] is None:
         train = every(case.sets.train, -(-len(case.sets.train.t) // MOST))
-        found = shared_motor(train.tau - predict(mine, train.q, train.qd, train.qdd).torque, train.qd)
-        if found is not None:
-            names = [case.names[k] for k in (found.joint, found.other)]
+        motor = shared_motor(train.tau - predict(mine, train.q, train.qd, train.qdd).torque, train.qd)
+        if motor is not None:
+            names = [case.names[k] for k in (motor.joint, motor.other)]
             remedy = (
-                f"friction of a motor that turns with {names[0]} and {found.ratio:g} times {names[1]} would explain "
-                f"{found.share:.0%} of what is left in both: try --motors '{found.rates(d)}'"
+                f"friction of a motor that turns with {names[0]} and {motor.ratio:g} times {names[1]} would explain "
+                f"{motor.share:.0%} of what is left in both: try --motors '{motor.rates(d)}'"
             )
             verdict = Verdict(verdict.level, verdict.reason, f"{remedy}; else {verdict.remedy}")
     share = spikes(case.sets.train.tau).mean(axis=0)

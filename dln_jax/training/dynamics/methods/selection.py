@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jax.sharding import Mesh
 from rich.console import Console
@@ -15,6 +16,7 @@ from rich.table import Table
 from dln_jax.cli.arguments import class_with, require_positive_if_given
 from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.robots import Robot
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
 from dln_jax.files import write_json
 from dln_jax.identification.identify import identify, parameters_of
@@ -23,7 +25,10 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
 from dln_jax.learning.model_selection import Assessment, Candidate, FittedModel, Selection, select_model
 from dln_jax.learning.objectives import SCALED_TORQUE, Objective, require_scales
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_to_json
+from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
 from dln_jax.models.serial_tree import tree_of
@@ -75,11 +80,21 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
         validation,
         noise=noise if np.isfinite(noise).all() and noise.all() else None,
         seconds=SELECTION_SECONDS if options.seconds is None else task.seconds,
+        definite=lambda fitted: is_definite(fitted, validation),
         report=report,
     )
     print_selection(selection)
     write_json(folder / "model_selection.json", as_json(selection))
     return selection.fitted.outcome
+
+
+def is_definite(fitted: FittedModel, data: Trajectories) -> bool:
+    """Whether a model has positive definite mass matrices at the states of the data, or none at all."""
+    with jax.enable_x64(True):
+        mechanics = dynamics(fitted.model.energies(fitted.parameters))
+        if not isinstance(mechanics, Dynamics):
+            return True
+        return definiteness(mechanics, data.q, data.qd).share_not_definite == 0
 
 
 def report(step: Assessment) -> None:
@@ -103,7 +118,8 @@ def print_selection(selection: Selection) -> None:
         )
         if step.nmse is not None:
             numbers.append(f"{step.seconds:.1f}")
-        state = "kept" if step is selection.chosen else "not tried" if not step.tried else "none" * (step.nmse is None)
+        state = "none" if step.nmse is None else "" if step.definite else "indefinite masses"
+        state = "kept" if step is selection.chosen else state if step.tried else "not tried"
         table.add_row(step.name, *numbers, state)
     Console(highlight=False, soft_wrap=True).print(table)
     if selection.ended:
@@ -118,7 +134,14 @@ def as_json(selection: Selection) -> dict[str, Any]:
         joints = None if step.nmse is None else step.nmse.tolist()
         errors = {"validation_nmse": mean, "validation_nmse_joints": joints}
         candidates.append(
-            {"name": step.name, "tried": step.tried, **errors, "seconds": step.seconds, "reason": step.reason}
+            {
+                "name": step.name,
+                "tried": step.tried,
+                **errors,
+                "definite": step.definite,
+                "seconds": step.seconds,
+                "reason": step.reason,
+            }
         )
     return {"kept": selection.chosen.name, "ended": selection.ended, "candidates": candidates}
 
