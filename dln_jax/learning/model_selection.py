@@ -32,8 +32,9 @@ LEAST_NOISE, MOST_NOISE = 0.5, 1.2
 error shows that the estimate of the noise is wrong."""
 
 
-EXPLAINED = 0.05
-"""Largest normalised error of a joint whose torque counts as explained, as in `metrics.verdict`."""
+EXPLAINED, PRICE = 0.05, 10.0
+"""Largest normalised error of a joint whose torque counts as explained, as in `metrics.verdict`, and the largest factor
+on the least mean error that a positive definite mass matrix may cost."""
 
 
 class Trial(NamedTuple):
@@ -203,7 +204,9 @@ def select_model(
     ]
     if not trials or not np.isfinite(min(trial.validation for trial in trials)):
         raise InputError("no model could be fitted: " + "; ".join(f"{step.name}: {step.reason}" for step in steps))
-    best = smallest_enough([trial for trial in trials if trial.candidate.sound] or trials)
+    affordable = PRICE * min(trial.validation for trial in trials)
+    sound = [trial for trial in trials if trial.candidate.sound and trial.validation <= affordable]
+    best = smallest_enough(sound or trials)
     return Selection(best.candidate, best.outcome, tuple(steps), ended)
 
 

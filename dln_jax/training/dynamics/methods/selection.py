@@ -38,7 +38,7 @@ from dln_jax.training.dynamics.options import NETWORK, Options, SelectionOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task, method_of, planned
 from dln_jax.training.identification.additions import with_network
-from dln_jax.training.identification.task import Case, Sets, with_description, with_terms
+from dln_jax.training.identification.task import Case, Sets, for_residual, with_description, with_terms
 from dln_jax.zoo.descriptions import Description, build, describe
 
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
@@ -216,20 +216,24 @@ def _rigid_tree(options: Any, recorded: Recorded, robot: Robot) -> FittedModel:
 
 
 def _with_network(recorded: Recorded, base: FittedModel | None, left: float) -> FittedModel | str:
-    """Adds a residual network to a model if held-out motions justify it."""
+    """Adds a residual network to a model if held-out motions justify it.
+
+    Its size is chosen on a part of the training set: chosen on the motions that the candidates are compared by, it
+    would fit them.
+    """
     if base is None:
         return "there is no model to add a network to"
     began = time.perf_counter()
     if base.outcome[0].kind == "learned-tree":
         base = _as_rigid(base, recorded)
-    train_set, validation, _ = recorded.sets
+    train_set, chosen_by = for_residual(recorded.sets.train)
     thin = -(-len(train_set.t) // MOST_SAMPLES)
     added = fit_residual(
         base.model,
         base.parameters,
         recorded.needs,
         every(train_set, thin),
-        validation,
+        chosen_by,
         seconds=min(left, CANDIDATE_SECONDS),
     )
     if not added.settings:
