@@ -74,7 +74,7 @@ class HeldOut(NamedTuple):
     error: Float[np.ndarray, " d"]
     """Error of the model's torques."""
     mean: Float[np.ndarray, " d"]
-    """Error of predicting the mean: the torque's variance."""
+    """Error of predicting the mean: the torque's variance, over the whole recording if its blocks are held out."""
     zero: Float[np.ndarray, " d"]
     """Error of predicting zero."""
     noise: Float[np.ndarray, " d"] | None = None
@@ -94,6 +94,7 @@ def held_out(
     *,
     noise: Float[np.ndarray, " d"] | None = None,
     file: Float[np.ndarray, "N d"] | None = None,
+    recording: Float[np.ndarray, "M d"] | None = None,
 ) -> HeldOut:
     """Computes the numbers for a verdict.
 
@@ -102,6 +103,8 @@ def held_out(
         measured: torques of motions that the model has not seen.
         noise: standard deviations of the torques' noise, as from `data.encoders.noise_of`; not finite if unknown.
         file: torques of the robot's own file.
+        recording: torques of the recording of which the held-out samples are blocks of time; their own variance may be
+            small by chance.
 
     Raises:
         InputError: there are no samples.
@@ -111,7 +114,7 @@ def held_out(
     variance = None if noise is None else np.where(np.isfinite(noise), noise, 0.0) ** 2
     return HeldOut(
         error=np.mean((predicted - measured) ** 2, axis=0),
-        mean=np.var(measured, axis=0),
+        mean=np.var(measured if recording is None else recording, axis=0),
         zero=np.mean(measured**2, axis=0),
         noise=variance,
         file=None if file is None else np.mean((file - measured) ** 2, axis=0),

@@ -111,3 +111,13 @@ def test_metrics_are_numbers():
 def test_verdict_needs_samples():
     with pytest.raises(InputError, match="no held-out samples"):
         held_out(TRUTH[:0], MEASURED[:0])
+
+
+def test_a_calm_block_of_a_recording_is_judged_in_units_of_the_whole_recording():
+    """In it the torque varies as little as an error that would be small in the rest."""
+    random = np.random.default_rng(5)
+    recording = np.concatenate([random.normal(size=(900, 1)), 0.05 * random.normal(size=(100, 1))])
+    calm, predicted = recording[900:], recording[900:] + 0.05 * random.normal(size=(100, 1))
+    assert judge(held_out(predicted, calm)).level == "refused"
+    assert judge(held_out(predicted, calm, recording=recording)).level == "good"
+    assert judge(held_out(predicted + 2.0, calm, recording=recording)).level == "refused"

@@ -54,6 +54,10 @@ class Recorded(NamedTuple):
     kinematic_prior: KinematicPrior | None
     torque: str = "measured torques"
     """The torques that models are fitted to and uncertainty bands refer to."""
+    torque_noise: np.ndarray | None = None
+    """Standard deviation of the noise of filtered torques, N m or N [d]; `None` if they are not filtered."""
+    blocks: bool = False
+    """Whether recordings were cut into blocks of time to have validation and test data."""
 
 
 def read(options: Options) -> Recorded:
@@ -125,6 +129,8 @@ def read(options: Options) -> Recorded:
         parents=parents,
         kinematic_prior=kinematic_prior_of(options, needs.degrees_of_freedom, parents),
         torque=fitted_torque(filtered),
+        torque_noise=None if filtered is None or not filtered.filtered_torque else filtered.noise_tau,
+        blocks=not whole,
     )
 
 

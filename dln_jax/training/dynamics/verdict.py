@@ -9,6 +9,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import torque_noise
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import merged
 from dln_jax.learning.kinematics import Twin
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
@@ -52,9 +53,12 @@ def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) ->
     if not task.objective.of_torques:
         return TorqueVerdict(None, {}, float("nan"))
     test, validation, robot = task.sets.test, task.sets.validation, task.recorded.robot
-    noise = torque_noise(task.sets.train)
+    noise = torque_noise(task.sets.train) if task.recorded.torque_noise is None else task.recorded.torque_noise
+    recording = merged(task.sets).tau if task.recorded.blocks else None
     tested, validated = (
-        held_out(tau, data.tau, noise=noise, file=None if robot is None else torques_of(robot, data))
+        held_out(
+            tau, data.tau, noise=noise, file=None if robot is None else torques_of(robot, data), recording=recording
+        )
         for tau, data in ((on_test, test), (on_validation, validation))
     )
     names = None if robot is None else robot.tree.names

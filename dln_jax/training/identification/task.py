@@ -70,6 +70,8 @@ class Case(NamedTuple):
     """The torques that the fit and its uncertainty bands refer to."""
     robot_file: str = ""
     data_file: str = ""
+    filtered_noise: np.ndarray | None = None
+    """Standard deviation of the noise of filtered torques [d]; `None` if they are not filtered."""
     motions: MotionSets | None = None
     """Motions to fit and to predict, with --by motions or both."""
     wanted: Wanted = Wanted()
@@ -120,8 +122,10 @@ def prepare(options: Options) -> Case:
     noise = noises(options.noise, robot.tree.degrees_of_freedom)
     torque = fitted_torque(filtered)
     case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque)
-    named = {"robot_file": options.robot.name, "data_file": options.data.name}
-    return with_description(case._replace(motions=motions, wanted=terms, **named))
+    more: dict[str, Any] = {"robot_file": options.robot.name, "data_file": options.data.name}
+    if filtered is not None and filtered.filtered_torque:
+        more["filtered_noise"] = filtered.noise_tau
+    return with_description(case._replace(motions=motions, wanted=terms, **more))
 
 
 def with_description(case: Case, **changes: Any) -> Case:

@@ -44,7 +44,8 @@ def judged(
     test, d = case.sets.test, case.sets.test.degrees_of_freedom
     peaks = spikes(test.tau)
     rows = ~peaks.any(axis=1) if robust else np.ones(len(test.t), bool)
-    noise = torque_noise(case.sets.train) if case.noise is None else case.noise
+    noise = case.filtered_noise if case.noise is None else case.noise
+    noise = torque_noise(case.sets.train) if noise is None else noise
     errors = held_out(torques[kept][rows], test.tau[rows], noise=noise, file=torques["file"][rows])
     verdicts = [judge(errors, case.names), existing(solution, torques, kept, test.tau)]
     mine = parameters_of(solution.theta, case.known)
