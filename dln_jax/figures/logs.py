@@ -96,7 +96,7 @@ def _delays(axis: Axes, torques: Torques, rate: float) -> None:
     axis.set_yscale("symlog", linthresh=10.0)
     axis.axvline(0.0, color="0.7", linewidth=0.8)
     axis.set_xlabel("delay of the torques, ms")
-    axis.set_ylabel("log likelihood ratio, none / delay")
+    axis.set_ylabel("log likelihood ratio,\nnone / delay")
 
 
 def _steps(axis: Axes, data: Trajectories) -> None:

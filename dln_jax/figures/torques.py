@@ -21,6 +21,8 @@ MOST_BANDS, MOST_BAND_SAMPLES = 7, 400
 """Largest numbers of joints and samples shown with bands."""
 MOST_SAMPLES = 4000
 """Largest number of samples drawn per joint."""
+ROUNDING = 1e-9
+"""Parts that vary less than this share of the torque are drawn as zero."""
 HIGH, LOW = 0.8, 0.36
 """Heights of a panel of forces and of a panel of errors, inches."""
 
@@ -57,6 +59,9 @@ def force_decomposition(data: Trajectories, predicted: dict[str, np.ndarray], *,
                     look = {"color": "black", "linewidth": 2.0, "markersize": 4, "label": "truth"}
                     axis.plot(x, truths[key][:, joint], "-" if moving else "o", **look)
                 axis.plot(x, predicted[key][samples, joint], dash, marker=dot, color=shade, linewidth=1.3, label=model)
+                low, high = axis.get_ylim()
+                if high - low < ROUNDING * np.ptp(predicted["tau"][samples, joint]):  # a part that is zero
+                    axis.set_ylim(-1.0, 1.0)
             axis.margins(x=0.01)
             axis.tick_params(axis="x", bottom=line is axes[-1])
             for start in starts[1:]:
@@ -64,13 +69,14 @@ def force_decomposition(data: Trajectories, predicted: dict[str, np.ndarray], *,
         unit = style.unit_of(data, 0)
         line[0].set_ylabel(f"error,\n{prefix}{unit}" if is_error else f"{PARTS[key]},\n{unit}")
     names = [str(data.label[index]) for index in trajectory[starts]]
+    time = "time, s (test motions in turn)" if joints < 3 and len(starts) > 1 else "time, s"
     for joint, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
         unit = style.unit_of(data, joint)
         style.title(top, f"joint {joint + 1}" + (f" ({unit})" if unit != style.unit_of(data, 0) else ""), pad=16)
         for start, end, name in zip(starts, [*starts[1:], len(x)], names, strict=True):
             place, size = ((x[start] + x[end - 1]) / 2, 1.04), style.SMALL if len(name) < 4 else 6.5
             top.annotate(name, place, xycoords=("data", "axes fraction"), ha="center", fontsize=size, color="0.35")
-        bottom.set_xlabel("time, s (test motions in turn)" if moving else "test state")
+        bottom.set_xlabel(time if moving else "test state")
     figure.align_ylabels(axes[:, 0])
     style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
