@@ -4,6 +4,7 @@
 `smooth_locally(data)` does without equal steps, for motions of a few dozen samples.
 """
 
+from dln_jax.data.encoders.clock import Clock, source_clock
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
 from dln_jax.data.encoders.filters import derivatives, low_pass
 from dln_jax.data.encoders.local_polynomials import LocalRates, smooth_locally
@@ -13,6 +14,7 @@ from dln_jax.data.encoders.smoothing import Smoothed, labels_of_parts, smooth
 
 __all__ = [
     "Choice",
+    "Clock",
     "LocalRates",
     "Repeats",
     "Smoothed",
@@ -25,6 +27,7 @@ __all__ = [
     "noise_of",
     "smooth",
     "smooth_locally",
+    "source_clock",
     "step_of",
     "torque_noise",
     "without_repeats",
