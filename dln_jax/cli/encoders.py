@@ -19,7 +19,7 @@ from dln_jax.types import InputError, Needs
 AUTO = "auto"
 FILTERED = (
     "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
-    "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated", "clock",
+    "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated", "arrival",
 )  # fmt: skip
 """Checks for faults that filtering q replaces or repairs."""
 

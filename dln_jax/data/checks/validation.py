@@ -142,7 +142,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
         even = None
     if even is not None and even.clock is not None:
         findings = [finding for finding in findings if finding.check != "jitter"]
-        findings.append(Finding("warning", "clock", clock_line(even.clock), FILTER))
+        findings.append(Finding("warning", "arrival", clock_line(even.clock), FILTER))
     findings += check_channels(recording.data, None if even is None else even.data.qd)
     driven = "tau" not in data.estimated and bool(np.ptp(data.tau, axis=0).any())
     farthest = 0 if even is None else int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))
