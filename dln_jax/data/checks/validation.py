@@ -137,7 +137,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
     data, repeats = without_repeats(data)
     findings += _repeated(repeats)
     try:
-        even = smooth(data, trim=0.0)
+        even = smooth(recording.data, trim=0.0)  # which removes the repeats itself, and knows where they were
     except InputError:  # single states, or motions of a few samples: their rates cannot be checked
         even = None
     if even is not None and even.clock is not None:
