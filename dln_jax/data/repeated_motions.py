@@ -55,8 +55,10 @@ def motion_numbers(q: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"
     return numbers
 
 
-def remark_on_repeats(trained: Sequence[Trajectories], test: Trajectories, *, together: bool = True) -> str:
-    """Returns a line on recordings of one motion: the test repeats trained ones, or they were kept together."""
+def remark_on_repeats(
+    trained: Sequence[Trajectories], test: Trajectories, motion: Int[np.ndarray, " T"] | None = None
+) -> str:
+    """Returns a line on recordings of one motion: the test repeats trained ones, or `motion` kept them together."""
     sets = [*trained, test]
     q, trajectory = (np.concatenate([getattr(part, key) for part in sets]) for key in ("q", "trajectory"))
     seen, held = np.unique(np.concatenate([part.trajectory for part in trained])), np.unique(test.trajectory)
@@ -73,11 +75,10 @@ def remark_on_repeats(trained: Sequence[Trajectories], test: Trajectories, *, to
             f"'{test.label[first]}' and '{test.label[twins[first]]}'; errors on other motions may be larger: hold out "
             "other motions by --test, or record more"
         )
-    recordings, motion = len(seen) + len(held), motion_numbers(q, trajectory)
-    different = len(np.unique(motion[motion >= 0]))
-    if not together or different == recordings:
+    present = np.concatenate([seen, held])
+    if motion is None or (different := len(np.unique(motion[present]))) == len(present):
         return ""
-    return f"{recordings} recordings show {different} motions; recordings of one motion stay together in the split"
+    return f"{len(present)} recordings show {different} motions; recordings of one motion stay together in the split"
 
 
 def _embedded(q: np.ndarray, trajectory: np.ndarray) -> dict[int, np.ndarray]:

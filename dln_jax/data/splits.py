@@ -178,8 +178,9 @@ def split(
         test: labels of the test trajectories.
         validation_share: share of the other trajectories that is for validation.
         seed: seed of the draw.
-        motion: number of the motion that each trajectory shows, as from `repeated_motions.motions`: trajectories of one
-            motion stay together, if there are enough motions. By default every trajectory shows its own.
+        motion: number of the motion that each trajectory shows, as from `repeated_motions.motion_numbers`:
+            trajectories of one motion stay together, if there are enough motions. By default every trajectory shows
+            its own.
 
     Raises:
         InputError: a label is unknown or has no samples, fewer than two trajectories remain for training and
@@ -214,12 +215,17 @@ def by_motion(
     If motions are repeated, a choice of more than half of the trajectories is replaced by the motion with the fewest.
     If there are fewer than `least` motions, every trajectory counts as one.
     """
-    of = present if motion is None or len(np.unique(motion[present])) < least else motion[present]
+    of = _shown(present, motion, least)
     every, counts = np.unique(of, return_counts=True)
     some = every[chosen] if len(every[chosen]) else every[-1:]
     if len(every) < len(present) and 2 * np.isin(of, some).sum() > len(present):
         some = every[counts == counts.min()][-1:]
     return present[np.isin(of, some)]
+
+
+def _shown(present: np.ndarray, motion: np.ndarray | None, least: int) -> np.ndarray:
+    """Returns the motion of each trajectory, or the trajectories themselves if there are fewer than `least` motions."""
+    return present if motion is None or len(np.unique(motion[present])) < least else motion[present]
 
 
 def hold_out(
@@ -232,13 +238,10 @@ def hold_out(
     """
     require_seed(seed)
     present = np.unique(data.trajectory)
-    count = held_out(len(present), share, "trajectories")
-    if motion is not None and (motions := len(np.unique(motion[present]))) > 1:
-        count = held_out(motions, share, "motions")
-        chosen = np.random.default_rng(seed).choice(motions, size=count, replace=False)
-        held = by_motion(present, motion, np.sort(chosen), least=2)
-    else:
-        held = np.random.default_rng(seed).choice(present, size=count, replace=False)
+    motions = len(np.unique(_shown(present, motion, 2)))
+    count = held_out(motions, share, "trajectories")
+    chosen = np.random.default_rng(seed).choice(motions, size=count, replace=False)
+    held = by_motion(present, motion, np.sort(chosen), least=2)
     return select(data, np.setdiff1d(present, held)), select(data, held)
 
 

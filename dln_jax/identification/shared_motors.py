@@ -33,11 +33,11 @@ class SharedMotor(NamedTuple):
     """c."""
     share: float
 
-    def rates(self, d: int) -> str:
-        """Returns the rows of all motors' rates, as `--motors` takes them."""
+    def rates(self, d: int) -> Float[np.ndarray, "d d"]:
+        """Returns S in the motor rates S qd, with one motor for each of d joints."""
         rows = np.eye(d)
         rows[self.joint, self.other] = self.ratio
-        return ";".join(",".join(f"{entry:g}" for entry in row) for row in rows)
+        return rows
 
 
 def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> SharedMotor | None:

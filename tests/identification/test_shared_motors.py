@@ -30,7 +30,7 @@ def test_a_motor_of_two_joints_is_found(joint, other, ratio):
 
 def test_the_rows_of_the_rates_are_those_of_the_option():
     motor = shared_motor(*of_wrist())
-    assert motor is not None and motor.rates(2) == "1,0;1,1"
+    assert motor is not None and motor.rates(2).tolist() == [[1, 0], [1, 1]]
 
 
 def of_wrist():

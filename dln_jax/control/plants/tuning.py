@@ -4,9 +4,9 @@
 2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
    are stronger or weaker than the model says. The weight is wrong by the share `WEIGHT` of that, in the opposite
    direction; stronger motors also act later, by the share `LATE` of a sample.
-3. The best sets are tried again with more errors, and from more starts. The margin of a set is the largest
-   error up to which every trial succeeds. Among the sets that come up from most starts, with the largest margin and not
-   much slower than the fastest, the one whose controls change least at the goal is chosen.
+3. The best sets are tried again with more errors, and from more starts. The margin of a set is the largest error up to
+   which every trial succeeds. Among the sets that come up from most starts, with the largest margin and not much slower
+   than the fastest, the one whose controls change least at the goal is chosen.
 4. Plans with feedback (`planned`) are tried first, and taken if they tolerate every error. Otherwise energy laws are
    tried as well, with correct models in the first round, because few sets work. One with a margin of `LEAST` or more is
    taken: it acts in any state, and a wrong model only costs it time but throws a plan off. Otherwise the larger margin

@@ -28,8 +28,8 @@ LEAST = 100
 """Fewest steps that tell a period."""
 SAME = 0.02
 """Largest relative difference of the total durations by steps and by stamps: beyond, units of qd or t are in doubt."""
-ROUNDS = 5
-"""Largest number of comparisons of all runs with one line."""
+NEAR = 100
+"""Number of rows on either side of a gap between counted steps whose lateness is compared."""
 LATE = 0.1
 """s: largest correction of a stamp."""
 
@@ -62,28 +62,12 @@ def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None
     known = np.arange(len(data.t)) if interpolated is None else np.flatnonzero(~interpolated)
     if "qd" in data.estimated or len(known) <= LEAST:
         return None
-    t, q, qd, trajectory = data.t[known], data.q[known], data.qd[known], data.trajectory[known]
-    size = np.mean(qd**2, axis=0)
-    weights = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
-    v = (qd[1:] + qd[:-1]) / 2
-    speed = v**2 @ weights
-    moving = (np.diff(trajectory) == 0) & (speed > MOVING**2 * np.sum(weights > 0))
-    if moving.sum() < LEAST:
+    t, trajectory = data.t[known], data.trajectory[known]
+    counted = _counted(t, data.q[known], data.qd[known], np.diff(trajectory) == 0)
+    if counted is None:
         return None
-    stamped, steps = np.diff(t), (np.diff(q, axis=0) * v) @ weights / np.where(speed > 0, speed, 1.0)
-    period = float(np.median(steps[moving]))
-    if not period > 0:
-        return None
-    whole = np.round(steps / period)
-    period = float(steps[moving].sum() / max(whole[moving].sum(), 1.0))
-    off, off_stamps = (np.abs(of / period - whole)[moving] for of in (steps, stamped))
-    regular = np.mean((off <= REGULAR) & (whole[moving] >= 1)) >= SHARE
-    same = abs(period * whole[moving].sum() / stamped[moving].sum() - 1) <= SAME
-    jitter = float(np.sqrt(np.mean(off_stamps**2)))
-    if not (regular and same and jitter >= JITTER and np.median(off) <= BETTER * np.median(off_stamps)):
-        return None
-    # Steps that cannot be counted end a run.
-    runs = np.flatnonzero(np.diff(np.r_[0, (moving & (whole >= 1)).astype(int), 0])).reshape(-1, 2)
+    whole, jitter = counted
+    runs = np.flatnonzero(np.diff(np.r_[0, (whole > 0).astype(int), 0])).reshape(-1, 2)
     counts = [np.r_[0.0, np.cumsum(whole[first:last])] for first, last in runs]
     period = _common_slope(counts, [t[first : last + 1] for first, last in runs])
     rows, grids = [], []
@@ -100,6 +84,34 @@ def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None
     return Clock(corrected, period, jitter) if np.abs(corrected - data.t).max() <= LATE else None
 
 
+def _counted(t: np.ndarray, q: np.ndarray, qd: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Returns the periods of each step, 0 where they cannot be counted, and the jitter of the stamps in periods.
+
+    `inside` marks the steps [N - 1] within a trajectory. `None` if the steps are not whole numbers of periods, or not
+    clearly more regular than the stamps.
+    """
+    size = np.mean(qd**2, axis=0)
+    weights = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    v = (qd[1:] + qd[:-1]) / 2
+    speed = v**2 @ weights
+    moving = inside & (speed > MOVING**2 * np.sum(weights > 0))
+    if moving.sum() < LEAST:
+        return None
+    stamped, steps = np.diff(t), (np.diff(q, axis=0) * v) @ weights / np.where(speed > 0, speed, 1.0)
+    period = float(np.median(steps[moving]))
+    if not period > 0:
+        return None
+    whole = np.round(steps / period)
+    period = float(steps[moving].sum() / max(whole[moving].sum(), 1.0))
+    off, off_stamps = (np.abs(of / period - whole)[moving] for of in (steps, stamped))
+    regular = np.mean((off <= REGULAR) & (whole[moving] >= 1)) >= SHARE
+    same = abs(period * whole[moving].sum() / stamped[moving].sum() - 1) <= SAME
+    jitter = float(np.sqrt(np.mean(off_stamps**2)))
+    if not (regular and same and jitter >= JITTER and np.median(off) <= BETTER * np.median(off_stamps)):
+        return None
+    return np.where(moving, np.maximum(whole, 0.0), 0.0), jitter
+
+
 def _common_slope(counts: list[np.ndarray], stamps: list[np.ndarray]) -> float:
     """Returns the period on the clock of the stamps: their common slope over the counts, by least squares."""
     centred = [(count - count.mean(), t - t.mean()) for count, t in zip(counts, stamps, strict=True)]
@@ -109,24 +121,16 @@ def _common_slope(counts: list[np.ndarray], stamps: list[np.ndarray]) -> float:
 def _on_one_grid(stamps: list[np.ndarray], counts: list[np.ndarray], period: float) -> np.ndarray:
     """Returns the counts of all runs of one trajectory from one start, so that they are late as their stamps are.
 
-    Neighbouring runs are compared first, since the period is not yet accurate over many runs; then each with the line
-    through all stamps, so that a short run cannot displace those after it.
+    A run begins so many whole periods after the rows before it that the lateness of neighbouring rows agrees in the
+    mean; over many rows the period is not yet accurate enough.
     """
-    starts = np.array([np.mean(t / period - count) for t, count in zip(stamps, counts, strict=True)])
-    shifts = np.r_[0.0, np.cumsum(np.round(np.diff(starts)))]
-    for _ in range(ROUNDS):
-        grid = np.concatenate([count + shift for count, shift in zip(counts, shifts, strict=True)])
-        slope, start = np.polyfit(grid, np.concatenate(stamps), 1)
-        late = zip(stamps, counts, shifts, strict=True)
-        wrong = np.round([np.mean((t - start) / slope - count - shift) for t, count, shift in late])
-        if not wrong.any():
-            break
-        shifts += wrong
-    placed: list[np.ndarray] = []
-    for shift, count in zip(shifts, counts, strict=True):
-        earliest = placed[-1][-1] + 1 if placed else -np.inf  # short runs are late by another time in the mean
-        placed.append(max(shift, earliest) + count)
-    return np.concatenate(placed)
+    grid, before = counts[0], stamps[0]
+    for count, t in zip(counts[1:], stamps[1:], strict=True):
+        late = np.mean(before[-NEAR:] / period - grid[-NEAR:])
+        shift = np.round(np.mean(t[:NEAR] / period - count[:NEAR]) - late)
+        grid = np.concatenate([grid, max(shift, grid[-1] + 1) + count])
+        before = np.concatenate([before, t])
+    return grid
 
 
 def _between(rows: np.ndarray, known: np.ndarray, times: np.ndarray, stamps: np.ndarray) -> np.ndarray:

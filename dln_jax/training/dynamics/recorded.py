@@ -112,7 +112,7 @@ def read(options: Options) -> Recorded:
     whole = len(np.unique(data.trajectory)) == recordings
     motion = motion_numbers(data.q, data.trajectory) if whole else None  # blocks of one motion may look alike
     sets = split(data, test=labels, seed=options.seed, motion=motion)
-    lines += filter(None, [remark_on_repeats([sets.train, sets.validation], sets.test, together=whole)])
+    lines += filter(None, [remark_on_repeats([sets.train, sets.validation], sets.test, motion)])
     if not whole:
         counts = [f"{len(np.unique(part.trajectory))} for {use}" for part, use in zip(sets, USES, strict=True)]
         which = "one recording" if recordings == 1 else f"{recordings} recordings"

@@ -108,10 +108,10 @@ def prepare(options: Options) -> Case:
         light = lightly_filtered(data, filtered)
     if filtered is not None:
         data = filtered.data
-    motion, motions = motion_numbers(data.q, data.trajectory), None
+    motion, motions = None if is_cut(options.test or None) else motion_numbers(data.q, data.trajectory), None
     sets = held_out(data, options.test or None, motion, in_parts=filtered is not None)
-    together = not (sets.blocks or is_cut(options.test))
-    lines = (*lines, *filter(None, [remark_on_repeats([sets.train], sets.test, together=together)]))
+    remark = remark_on_repeats([sets.train], sets.test, None if sets.blocks else motion)
+    lines = (*lines, *filter(None, [remark]))
     if light is not None:
         motions = MotionSets(*held_out(light, options.test or None, motion, in_parts=filtered is not None)[:2])
     terms = wanted(options, cast(tuple[FrictionLaw, ...], laws), data)

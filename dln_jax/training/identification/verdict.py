@@ -62,9 +62,10 @@ def judged(
         motor = shared_motor(train.tau - predict(mine, train.q, train.qd, train.qdd).torque, train.qd)
         if motor is not None:
             names = [case.names[k] for k in (motor.joint, motor.other)]
+            rows = ";".join(",".join(f"{entry:g}" for entry in row) for row in motor.rates(d))
             remedy = (
                 f"friction of a motor that turns with {names[0]} and {motor.ratio:g} times {names[1]} would explain "
-                f"{motor.share:.0%} of what is left in both: try --motors '{motor.rates(d)}'"
+                f"{motor.share:.0%} of what is left in both: try --motors '{rows}'"
             )
             verdict = Verdict(verdict.level, verdict.reason, f"{remedy}; else {verdict.remedy}")
     share = spikes(case.sets.train.tau).mean(axis=0)

@@ -18,7 +18,15 @@ from dln_jax.types import InputError
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.encoder_data import encoders
 from scripts.reports.excitation import excitation
-from scripts.reports.robots import double_pendulum, identified_by, known_kinematics, lip, log_checks, speed
+from scripts.reports.robots import (
+    arrival_and_repeats,
+    double_pendulum,
+    identified_by,
+    known_kinematics,
+    lip,
+    log_checks,
+    speed,
+)
 from scripts.reports.robots.added_terms import added_terms
 from scripts.reports.robots.recorded_arm import recorded_arm
 
@@ -34,6 +42,8 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
     "logs/sound": partial(log_checks.sound, with_robot=False),
     **{f"logs/{kind}": partial(log_checks.faulty, kind=kind) for kind in log_checks.FAULTS},
     "logs/sound-with-robot": partial(log_checks.sound, with_robot=True),
+    "logs/arrival": arrival_and_repeats.arrival,
+    "logs/repeated-motions": arrival_and_repeats.repeated_motions,
     "terms/two-joints": added_terms,
     "speed/seven-axis": speed.speed,
 }

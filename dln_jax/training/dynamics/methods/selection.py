@@ -25,10 +25,8 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
 from dln_jax.learning.model_selection import Assessment, Candidate, FittedModel, Selection, select_model
 from dln_jax.learning.objectives import SCALED_TORQUE, Objective, require_scales
-from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_to_json
-from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
 from dln_jax.models.serial_tree import tree_of
@@ -36,6 +34,7 @@ from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
 from dln_jax.training.dynamics.options import NETWORK, Options, SelectionOptions, options_of
 from dln_jax.training.dynamics.recorded import Recorded
+from dln_jax.training.dynamics.results import definiteness_of
 from dln_jax.training.dynamics.task import Method, Task, method_of, planned
 from dln_jax.training.identification.additions import with_network
 from dln_jax.training.identification.task import Case, Sets, for_residual, with_description, with_terms
@@ -89,12 +88,11 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
 
 
 def is_definite(fitted: FittedModel, data: Trajectories) -> bool:
-    """Whether a model has positive definite mass matrices at the states of the data, or none at all."""
+    """Whether the mass matrices of a model are positive definite at the states of the data; true without any."""
     with jax.enable_x64(True):
-        mechanics = dynamics(fitted.model.energies(fitted.parameters))
-        if not isinstance(mechanics, Dynamics):
-            return True
-        return definiteness(mechanics, data.q, data.qd).share_not_definite == 0
+        task, mechanics = fitted.outcome[0], dynamics(fitted.model.energies(fitted.parameters))
+        definite = definiteness_of(mechanics, task, data)
+    return definite is None or definite.share_not_definite == 0
 
 
 def report(step: Assessment) -> None:
