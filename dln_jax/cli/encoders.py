@@ -84,7 +84,7 @@ def preparation(data: Trajectories, filtered: Smoothed | None) -> list[str]:
     if count := int((filtered.repeats.q | filtered.repeats.tau).sum()):
         lines.append(f"{count} samples repeat the one before and are resampled over")
     if filtered.clock is not None:
-        lines.append(f"{clock_line(filtered.clock)}: t follows q and qd")
+        lines.append(f"{clock_line(filtered.clock)}; their times replace t")
     if filtered.left_out:
         lines.append(f"{filtered.left_out} segments are too short for the filter and left out")
     return lines

@@ -1,7 +1,7 @@
 """Times on the clock of a log's source, for regular rows that were stamped when they arrived.
 
 A program that reads a robot over a network stamps each row late, by a varying time. Measured positions and velocities
-tell how long the robot moved between two rows:
+give the time for which the robot moved between two rows:
 
     step = sum_j w_j dq_j v_j / sum_j w_j v_j²,    v the mean of both rows' qd,    1 / w_j = mean of qd_j²
 
@@ -45,9 +45,9 @@ class Clock(NamedTuple):
 
 
 def clock_line(clock: Clock) -> str:
-    """Returns a line that says what replaced the stamps, and why."""
+    """Returns a line on the jitter of the stamps and the steps of the source."""
     return (
-        f"t jitters by {clock.jitter:.0%} of a step, while q and qd show that rows are whole multiples of "
+        f"t jitters by {clock.jitter:.0%} of a step, but by q and qd the rows are whole multiples of "
         f"{1e3 * clock.period:.4g} ms apart"
     )
 

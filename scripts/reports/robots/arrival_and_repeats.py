@@ -56,24 +56,24 @@ def arrival(few: bool) -> Findings:
 def repeated_motions(few: bool) -> Findings:
     """Different motions that count as one, and motions whose recordings count as several."""
     kinds = {"Fourier": _fourier, "waypoints": _waypoints, "there and back": _there_and_back, "swings": _swings}
-    joined, told = [], []
+    joined, counts = [], []
     for kind, make in enumerate(kinds.values()):
         for d in (2, 3, 7):
             for number in range(1 if few else SETS):
                 random = np.random.default_rng([SEED, kind, d, number])
                 joined.append(RECORDINGS - _motions([make(random, d) for _ in range(RECORDINGS)]))
-                told.append(
+                counts.append(
                     _motions([_again(random, q) for q in (make(random, d) for _ in range(5)) for _ in range(4)])
                 )
     different = f"of {len(joined) * RECORDINGS} motions ({', '.join(kinds)}; 2, 3 and 7 joints)"
+    share, sets = np.mean(joined) / RECORDINGS, f"of {len(counts)} sets of five motions, recorded four times"
+    name = "log-checks/repeated-motions"
     return Findings(
         [
-            expect("log-checks/repeated-motions", "wrongly_joined", different, sum(joined) / len(joined) / RECORDINGS,
-                   FALSE_ALARMS),
-            expect("log-checks/repeated-motions", "found", f"of {len(told)} sets of five motions, recorded four times",
-                   np.mean(np.array(told) <= 5), FOUND, at_least=True),
+            expect(name, "wrongly_joined", different, share, FALSE_ALARMS),
+            expect(name, "found", sets, np.mean(np.array(counts) <= 5), FOUND, at_least=True),
         ]
-    )  # fmt: skip
+    )
 
 
 def _sines(random: np.random.Generator, d: int):
