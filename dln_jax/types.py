@@ -58,6 +58,12 @@ def require_positive(**numbers: int | float) -> None:
             raise InputError(f"{name} is {value}; expected a positive number")
 
 
+def require_once(what: str, names: Sequence[str]) -> None:
+    """Raises `InputError` for a name that stands twice, since only one of its values would count."""
+    if twice := [name for place, name in enumerate(names) if name in names[:place]]:
+        raise InputError(f"{what} names '{twice[0]:.60}' twice; expected once")
+
+
 def finite_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Converts a value to a float64 array of this shape; `InputError` names a wrong type, shape or number."""
     try:

@@ -14,7 +14,7 @@ from dln_jax.data.encoders.clock import clock_line
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stated_needs import needs_from_text
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, Needs, require_once
 
 AUTO = "auto"
 FILTERED = (
@@ -40,7 +40,9 @@ def _factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
     option = "--torque-factor"
     if "=" in text:
         pairs = [entry.partition("=") for entry in text.split(",")]
-        return {name.strip(): numbers_of(f"{option} {name.strip()}", number, [1])[0] for name, _, number in pairs}
+        names = [name.strip() for name, _, _ in pairs]
+        require_once(option, names)
+        return {name: numbers_of(f"{option} {name}", pair[2], [1])[0] for name, pair in zip(names, pairs, strict=True)}
     numbers = numbers_of(option, text)
     return numbers[0] if len(numbers) == 1 else numbers
 

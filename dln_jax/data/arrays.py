@@ -28,6 +28,8 @@ Reader = Callable[[Path], tuple[dict[str, Any], list[str]]]
 
 MOST_BYTES = 4 * 2**30
 """Limit on all arrays of one file, since a small archive may expand a thousandfold."""
+UNREAD = "unread"
+"""Key of the names, such as titles of columns, that a reader leaves out."""
 FOLDER = "/"
 """Key of the reader of folders."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -46,6 +48,8 @@ def load_file(
 ) -> Data:
     """Reads the arrays with these keys, if present, and passes them to `from_arrays`, which checks them.
 
+    Names of what the file holds beside them are passed under `UNREAD`, so that they can be said.
+
     Args:
         from_arrays: converts arrays by key into the result.
         readers: readers of other formats, by the ending of the name such as ".csv"; that of folders is `FOLDER`.
@@ -63,10 +67,16 @@ def load_file(
     try:
         reader = readers.get(FOLDER if folder else path.suffix.lower())
         arrays, unread = _read(path, keys) if reader is None else reader(path)
-        return from_arrays(arrays)
+        return from_arrays(arrays | ({UNREAD: unread} if unread else {}))
     except InputError as error:
-        names = f" (keys that are not read: {', '.join(unread)[:200]})" if unread else ""
+        names = "".join(f" ({line})" for line in unread_line({UNREAD: unread}))
         raise InputError(f"{path}: {error}{names}") from None
+
+
+def unread_line(arrays: Mapping[str, Any]) -> tuple[str, ...]:
+    """Remark that names what the file of these arrays holds beside them; empty if there is nothing else."""
+    names = ", ".join(arrays.get(UNREAD, ()))
+    return (f"not read: {names if len(names) <= 200 else f'{names[:200]}...'}",) if names else ()
 
 
 def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -126,7 +136,9 @@ def numeric(
             or small that squares overflow or vanish.
     """
     if key not in arrays:
-        raise InputError(f"key '{key}' is missing (found: {', '.join(sorted(arrays)) or 'nothing'}); add it")
+        raise InputError(
+            f"key '{key}' is missing (found: {', '.join(sorted({*arrays} - {UNREAD})) or 'nothing'}); add it"
+        )
     try:
         array = np.asarray(arrays[key])
     except ValueError as error:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_once
 
 SUFFIXES = (".db3", ".mcap", ".bag")
 METADATA = "metadata.yaml"
@@ -185,6 +185,7 @@ def _series(topic: str, rows: Iterator[tuple[int, Any]]) -> Messages:
         received.append(receipt)
         stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
         names = list(message.name)
+        require_once(f"message {number + 1} of {topic}", names)
         for field in FIELDS:
             values = getattr(message, field)
             if len(values) and len(values) != len(names):

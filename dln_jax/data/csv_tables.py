@@ -4,7 +4,7 @@
 
 A title consists of a schema key, the joint (a number or a name; omitted for a single joint) and a unit, which is
 converted to SI. Units are never guessed: a title without one is refused unless the caller states `units`. Columns may
-come in any order, and other columns are ignored.
+come in any order. Other columns are named, but not read.
 """
 
 import csv
@@ -69,14 +69,15 @@ class Column(NamedTuple):
 
 
 def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[str]]:
-    """Reads a CSV file: the arrays by schema key, in SI units, and the titles of ignored columns.
+    """Reads a CSV file: the arrays by schema key, in SI units, and the titles of other columns.
 
     Args:
         units: units of titles without one: "si", or "degrees" for angles in degrees and all else in SI.
 
     Raises:
-        InputError: a missing header, a duplicate title, an unknown or missing unit, joints that differ between q and
-            another key, rows of different lengths, cells that are not numbers, or more than `MOST_BYTES`.
+        InputError: a missing header, a duplicate title, an unknown or missing unit, angles that look like radians
+            where degrees are stated, joints that differ between q and another key, rows of different lengths, cells
+            that are not numbers, or more than `MOST_BYTES`.
     """
     if units is not None and units not in STATED:
         raise InputError(f"units is {units!r:.40}; expected one of {', '.join(STATED)}")
@@ -93,6 +94,7 @@ def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[
         raise InputError("not a text file in UTF-8; export the log as CSV again") from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})") from None
+    _require_degrees(units, table[:, [place for place in places.get("q", ()) if columns[place].unit is None]])
     arrays: dict[str, Any] = {
         key: np.stack([factors[place] * table[:, place] for place in own], axis=1) for key, own in places.items()
     }
@@ -161,7 +163,8 @@ def _column(title: str) -> Column | None:
 
 
 def _spelled(unit: str) -> str:
-    """Normalises a unit to its spelling in `UNITS`."""
+    """Normalises a unit to its spelling in `UNITS`; a prefix mega, which none of them has, is spelled out."""
+    unit = re.sub(r"^\s*M(?=\s*[NnMmSs])", "mega", unit)
     unit = re.sub(r"[\s/]+per[\s/]+", "/", unit.lower())
     unit = re.sub(r"[\s*·.^]", "", unit)
     for spelling, ours in _SPELLINGS.items():
@@ -184,6 +187,15 @@ def _factor(column: Column, stated: str | None) -> float:
     if column.unit not in known:
         raise InputError(f"the unit of '{column.title:.60}' is not known; expected one of {', '.join(known)}")
     return known[column.unit]
+
+
+def _require_degrees(stated: str | None, q: Float[np.ndarray, "N k"]) -> None:
+    """Refuses positions without a unit that are stated to be in degrees, but do not leave one turn in radians."""
+    if stated == "degrees" and q.size and (largest := float(np.abs(q).max())) <= 2 * math.pi:
+        raise InputError(
+            f"--units degrees: q goes to {largest:.3g} at most, as angles in radians do; give --units si, or write "
+            "[deg] into the titles if these are degrees"
+        )
 
 
 def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
@@ -212,7 +224,7 @@ def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
 
 
 def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.ndarray:
-    """All rows below the header [N, columns], with zeros in ignored columns."""
+    """All rows below the header [N, columns], with zeros in columns that are not read."""
     unread = set(range(len(titles))) - read_places
     converters: dict[int | str, Callable] = {**dict.fromkeys(unread, lambda _: 0.0)}
     with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():

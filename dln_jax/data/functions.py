@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.data.arrays import load_file, numeric
+from dln_jax.data.arrays import load_file, numeric, unread_line
 from dln_jax.data.splits import held_out
 from dln_jax.types import InputError, require_positive
 
@@ -52,13 +52,13 @@ class SampleSplit(NamedTuple):
     validation: FunctionSamples
 
 
-def load(path: str | Path) -> FunctionSamples:
-    """Reads and checks a file; never unpickles.
+def load(path: str | Path) -> tuple[FunctionSamples, tuple[str, ...]]:
+    """Reads and checks a file, and names its keys that are not read; never unpickles.
 
     Raises:
         InputError: the file is missing, is not an npz, holds pickled objects, or its arrays break the table above.
     """
-    return load_file(path, from_arrays, KEYS)
+    return load_file(path, lambda arrays: (from_arrays(arrays), unread_line(arrays)), KEYS)
 
 
 def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from dln_jax.data.arrays import load_file
+from dln_jax.data.arrays import UNREAD, load_file, unread_line
 from dln_jax.softbody.mesh.files import SUFFIXES, read_mesh
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.types import InputError, require_positive
@@ -24,7 +24,7 @@ class StoredMesh(NamedTuple):
     held: Int[np.ndarray, " k"] | None
     """Indices of fixed vertices; `None` if the file has none."""
     statements: tuple[str, ...] = ()
-    """Notes on parts that were left out or repaired; an npz file is never repaired."""
+    """Notes on parts that were left out or repaired, and keys that were not read; an npz file is never repaired."""
 
 
 def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
@@ -49,13 +49,13 @@ def from_arrays(arrays: dict[str, Any]) -> StoredMesh:
     """Checks the arrays of a mesh file; errors as for `load`."""
     for name in ("vertices", "elements"):
         if name not in arrays:
-            keys = ", ".join(arrays) or "nothing"
+            keys = ", ".join({*arrays} - {UNREAD}) or "nothing"
             raise InputError(f"'{name}' is missing (found: {keys}); expected `vertices` and `elements`")
     mesh, held = make_mesh(arrays["vertices"], arrays["elements"]), arrays.get("held")
     if held is None:
-        return StoredMesh(mesh, None)
+        return StoredMesh(mesh, None, unread_line(arrays))
     if held.ndim != 1 or held.dtype.kind not in "iu" or held.size == 0:
         raise InputError(
             f"held is {held.dtype} of shape {list(held.shape)}; expected integers [k], k >= 1: indices of vertices"
         )
-    return StoredMesh(mesh, held)
+    return StoredMesh(mesh, held, unread_line(arrays))

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from dln_jax.data import bags, csv_tables, joint_names
-from dln_jax.data.arrays import FOLDER, load_file, numeric
+from dln_jax.data.arrays import FOLDER, load_file, numeric, unread_line
 from dln_jax.data.schema_keys import KEYS, OPTIONAL, RATES
 from dln_jax.data.stated_facts import scaled, with_chosen, with_times
 from dln_jax.data.stated_needs import needs_from_text
@@ -60,7 +60,7 @@ class Trajectories(NamedTuple):
     estimated: tuple[str, ...] = ()
     """Keys that were absent: rates estimated by finite differences, torques set to zero."""
     remarks: tuple[str, ...] = ()
-    """How the file was read: joints matched or left out, repaired stamps, and the clock of a bag."""
+    """How the file was read: columns and joints left out or matched, repaired stamps, and the clock of a bag."""
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -111,7 +111,8 @@ def load_arrays(
     suffix, folder = Path(path).suffix.lower(), is_folder(Path(path))
     if units is not None and suffix != ".csv":
         raise InputError(f"{path!s:.200}: units are for CSV; npz files and bags are in SI units")
-    if topics and not (folder or suffix in bags.SUFFIXES):
+    of_bag = folder or suffix in bags.SUFFIXES
+    if topics and not of_bag:
         raise InputError(f"{path!s:.200}: --topics is for ROS bags; leave it out")
 
     def choose(own: Sequence[str]) -> Sequence[str]:
@@ -126,7 +127,7 @@ def load_arrays(
     readers = {".csv": of_csv, **dict.fromkeys((*bags.SUFFIXES, FOLDER), of_bags)}
 
     def completed(arrays: dict[str, Any]) -> Data:
-        return from_arrays(scaled(with_chosen(with_times(arrays, rate), joints), torque_factor))
+        return from_arrays(scaled(with_chosen(with_times(arrays, rate), joints, of_bag), torque_factor))
 
     return load_file(path, completed, KEYS, readers=readers)
 
@@ -167,7 +168,7 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     names = _joint_names(arrays["joint_names"], q.shape[1]) if "joint_names" in arrays else None
     return Trajectories(
         t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=estimated,
-        remarks=tuple(arrays.get("remarks", ())), **checked,
+        remarks=(*unread_line(arrays), *arrays.get("remarks", ())), **checked,
     )  # fmt: skip
 
 

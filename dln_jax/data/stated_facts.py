@@ -10,8 +10,10 @@ from dln_jax.data.schema_keys import PER_JOINT
 from dln_jax.types import InputError, require_positive
 
 
-def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]:
+def with_chosen(arrays: dict[str, Any], joints: Sequence[str], of_bag: bool) -> dict[str, Any]:
     """Selects, orders and renames the joints as stated (see `data.joint_names.chosen`).
+
+    Of a bag, only the joints of the robot have been read, and the others that are stated do not count.
 
     Raises:
         InputError: joints are stated, but the file names none, or `chosen` refuses them.
@@ -22,8 +24,7 @@ def with_chosen(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]
     if names.ndim != 1 or not names.size or names.dtype.kind not in "US":
         raise InputError("--joints needs the joints' names, which the file lacks; add joint_names, or names in titles")
     own = names.tolist()
-    # Of a bag, only the joints of the robot have been read.
-    stated = [entry for entry in joints if "remarks" not in arrays or entry.partition("=")[0].strip() in own]
+    stated = [entry for entry in joints if not of_bag or entry.partition("=")[0].strip() in own]
     kept = joint_names.chosen(own, stated)
     places = [own.index(name) for name in kept.own]
     if "needs" in arrays and places != list(range(len(own))):

@@ -8,13 +8,15 @@ import numpy as np
 
 from dln_jax.files import matches
 from dln_jax.mechanics.friction import require_laws
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, Needs, require_once
 
 
 def needs_from_text(text: str) -> Needs:
     """`Needs` from JSON text; errors as for `needs_from_json`, also for text that is not JSON."""
     try:
-        stated = json.loads(text)
+        stated = json.loads(text, object_pairs_hook=_fields_once)
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         reason = str(error).splitlines()[0][:80]
         raise InputError(f"needs is not JSON ({reason}); expected the fields {', '.join(Needs._fields)}") from error
@@ -42,6 +44,11 @@ def needs_from_json(stated: Any) -> Needs:
     if joint_map is not None and (len(joint_map[0]) != d or np.linalg.matrix_rank(joint_map) < d):
         raise _wrong("joint_map", joint_map, f"an invertible matrix [{d}, {d}], or null")
     return needs._replace(actuation=actuation, joint_map=joint_map, velocity_scale=float(velocity))
+
+
+def _fields_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    require_once("needs", [key for key, _ in pairs])
+    return dict(pairs)
 
 
 def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] | None:

@@ -12,7 +12,7 @@ from dln_jax.softbody.mesh.surfaces import facet_points, facets_in, inner_surfac
 from dln_jax.softbody.terms.loads import point_force, traction
 from dln_jax.softbody.terms.pressure import pressure
 from dln_jax.softbody.terms.term import Term
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_once
 
 INNER = "inner"
 """Name of the walls of all closed cavities."""
@@ -74,7 +74,9 @@ def _forces(mesh: Mesh, text: str | None) -> dict[str, list[float]]:
 def _numbers(option: str, text: str | None, separator: str, count: int) -> dict[str, list[float]]:
     """Parses `count` numbers for each set."""
     values = {}
-    for item in filter(None, map(str.strip, (text or "").split(separator))):
+    items = [item for part in (text or "").split(separator) if (item := part.strip())]
+    require_once(f"--{option}", [item.rpartition("=")[0].strip() for item in items])
+    for item in items:
         name, _, numbers = item.rpartition("=")
         try:
             values[name.strip()] = [float(number) for number in numbers.split(",")]

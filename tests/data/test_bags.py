@@ -161,6 +161,7 @@ def test_bags_that_cannot_be_used_are_refused_in_one_line(tmp_path):
         tmp_path / "apart", {"/a": rows(t, tau=False), "/b": [state(9 + s, NAMES, tau=[1, 2]) for s in t]}
     )
     uneven = write_bag(tmp_path / "uneven", {"/a": [state(s, NAMES, [1.0, 2.0], [1.0]) for s in t]})
+    double = write_bag(tmp_path / "double", {"/a": [state(s, ["elbow", "elbow"], [1.0, 2.0]) for s in t]})
     half = write_bag(tmp_path / "half", {"/a": [state(s, NAMES, *motion(s)[:2], [1.0, np.nan]) for s in t]})
     for name in ("junk.db3", "junk.mcap", "junk.bag"):
         (tmp_path / name).write_bytes(b"no bag at all" * 20)
@@ -180,6 +181,7 @@ def test_bags_that_cannot_be_used_are_refused_in_one_line(tmp_path):
         (empty, {}, r"no topic has sensor_msgs/msg/JointState; the bag has /rosout \(std_msgs/msg/String\)"),
         (apart, {"topics": ["/a", "/b"]}, "the messages of /a, /b do not overlap in time"),
         (uneven, {}, "message 1 of /a has 2 names, but velocity of length 1"),
+        (double, {}, "message 1 of /a names 'elbow' twice; expected once"),
         (half, {}, "joint 'shoulder' has no efforts, others have; read these alone: --joints elbow"),
         *((tmp_path / f"junk.{kind}", {}, "not a readable ROS bag") for kind in ("db3", "mcap", "bag")),
         (tmp_path / "damaged", {}, "not a readable ROS bag"),

@@ -37,6 +37,17 @@ def test_columns_come_in_any_order_with_others_beside_them(load):
     data, plain = load(text), load(HEADER + ROWS)
     for key in ("t", "q", "qd", "tau", "trajectory"):
         np.testing.assert_array_equal(getattr(data, key), getattr(plain, key))
+    assert data.remarks == ("not read: note",) and plain.remarks == ()
+
+
+def test_every_column_that_is_not_read_is_named(load, tmp_path):
+    data = load("t [s],q1 [rad],torque1,effort1 [N m]\n0,1,2,3\n0.1,5,6,7\n0.2,9,10,11\n")
+    assert "tau" in data.estimated and data.remarks == ("not read: torque1, effort1 [N m]",)
+    assert checks.read(tmp_path / "log.csv").data.remarks == data.remarks
+    titles = ",".join(f"spare{k}" for k in range(100))
+    data = load(f"t [s],q1 [rad],{titles}\n" + "".join(f"{k},1{',0' * 100}\n" for k in range(3)))
+    (remark,) = data.remarks
+    assert remark.endswith("...") and len(remark) < 220
 
 
 @pytest.mark.parametrize(
@@ -63,6 +74,15 @@ def test_units_that_no_title_states_are_asked_for(load):
     data = load(text, units="degrees")
     np.testing.assert_allclose(data.q[:, 0], [np.pi / 2, np.pi, np.pi])
     np.testing.assert_array_equal(data.tau, 1)
+
+
+def test_radians_are_not_read_as_degrees(load):
+    rows = "0,1.5,-3\n1,6.2,1\n2,0.5,0\n"
+    with pytest.raises(InputError, match=r"q goes to 6\.2 at most, as angles in radians do; give --units si, or"):
+        load("t,q1,q2\n" + rows, units="degrees")
+    # A unit in the title is the way out, and one joint that is beyond a turn decides for all.
+    np.testing.assert_allclose(load("t,q1 [deg],q2 [deg]\n" + rows, units="degrees").q[0, 0], np.deg2rad(1.5))
+    np.testing.assert_allclose(load("t,q1,q2\n" + rows + "3,2,7\n", units="degrees").q[0, 0], np.deg2rad(1.5))
 
 
 def test_joints_may_have_names_whose_order_is_that_of_q(load):
@@ -101,7 +121,7 @@ MALFORMED = {
     "digits with a bar": (HEADER + ROWS.replace("7", "7_0"), "'tau1 \\[N m\\]' is '7_0'"),
     "not a number": (HEADER + ROWS.replace("7", "nan"), "tau has 1 NaN or infinite value"),
     "infinite": (HEADER + ROWS.replace("7", "1e999"), "tau has 1 NaN or infinite value"),
-    "no q": ("t [s],x [rad]\n0,1\n", "key 'q' is missing.*keys that are not read: x \\[rad\\]"),
+    "no q": ("t [s],x [rad]\n0,1\n", "key 'q' is missing.*not read: x \\[rad\\]"),
     "no t": ("q1 [rad]\n0\n1\n2\n", "key 't' is missing; add the time of each sample in seconds, or give --rate HZ"),
     "twice": ("t [s],q1 [rad],q1 [rad]\n0,1,2\n", "two columns have the title 'q1 \\[rad\\]'"),
     "twice by other units": (
@@ -112,6 +132,9 @@ MALFORMED = {
     "joint that is missing": ("t [s],q1 [rad],q2 [rad],tau1 [N m]\n0,1,2,3\n", "no column 'tau2'"),
     "joint too many": ("t [s],q1 [rad],tau1 [N m],tau2 [N m]\n0,1,2,3\n", "no column 'q2'"),
     "strange unit": ("t [s],q1 [furlong]\n0,1\n", "the unit of 'q1 \\[furlong\\]' is not known; expected one of rad"),
+    "mega": ("t [s],q1 [rad],tau1 [MN m]\n0,1,2\n", "the unit of 'tau1 \\[MN m\\]' is not known"),
+    "mega without brackets": ("t_s,q1_rad,tau1_MNm\n0,1,2\n", "there is no column 'q1_MNm'|tau1_MNm"),
+    "megaseconds": ("t [Ms],q1 [rad]\n0,1\n", "the unit of 't \\[Ms\\]' is not known"),
     "unit of another quantity": ("t [s],q1 [rad],qd1 [rad]\n0,1,2\n", "the unit of 'qd1 \\[rad\\]' is not known"),
     "not text": (b"\xff\xfe\x00t\x00,", "not a text file in UTF-8"),
     "zero bytes": (HEADER.encode() + b"\x00\x00,1,2,3,4\n", "line"),

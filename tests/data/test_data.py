@@ -57,6 +57,7 @@ REFUSED = [
     (changed(label=np.arange(3)), "one string per trajectory"),
     (changed(needs=np.array("{not json")), "needs is not JSON"),
     (changed(needs=np.array('{"joints": ["ball"]}')), "expected a tuple of revolute, prismatic"),
+    (changed(needs=np.array('{"joints": [], "friction": true, "friction": false}')), "needs names 'friction' twice"),
     (changed(needs=np.array('{"joints": ["revolute"]}')), "states 1 joints, but q has 2"),
     (
         changed(needs=np.array('{"joints": ["revolute", "revolute"], "wind": true}')),

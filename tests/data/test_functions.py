@@ -84,7 +84,9 @@ def test_a_file_is_read_back_with_or_without_derivatives_and_axes_of_length_one(
     path = tmp_path / "mine.npz"
     full = arrays()
     np.savez(path, **full)
-    for ours, theirs in zip(functions.load(path), full.values(), strict=True):
+    data, remarks = functions.load(path)
+    assert remarks == ()
+    for ours, theirs in zip(data, full.values(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert functions.from_arrays(arrays(dy=None, d2y=None)).dy is None
     short = arrays(y=full["y"][:, :1], dy=full["dy"][:, 0], d2y=full["d2y"][:, 0])
@@ -120,6 +122,12 @@ def test_what_does_not_fit_is_named(tmp_path, content, message):
     with pytest.raises(InputError, match=message) as caught:
         functions.load(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_keys_that_are_not_read_are_named(tmp_path):
+    np.savez(tmp_path / "mine.npz", **arrays(dy=None, d2y=None), gradient=np.zeros((12, 2, 3)))
+    data, remarks = functions.load(tmp_path / "mine.npz")
+    assert data.dy is None and remarks == ("not read: gradient",)
 
 
 def test_nothing_is_unpickled(tmp_path):

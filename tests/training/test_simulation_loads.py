@@ -38,6 +38,7 @@ def test_a_pressure_acts_in_the_closed_cavity(path):
         ({"pressure": "bag=2"}, r"--mesh the mesh has no set 'bag'"),
         ({"pressure": "inner"}, r"--pressure is 'inner'; expected SET=PA"),
         ({"load": "tip=1,2,3"}, r"--load is 'tip=1,2,3'; expected SET=FX,FY,"),
+        ({"load": "tip=1,2; tip=3,4"}, r"--load names 'tip' twice; expected once"),
         ({"load": "tip=0,nan"}, r"--load is"),
         ({"load": "tip=0,-5"}, r"the mesh has no set 'tip'"),
     ],

@@ -57,6 +57,7 @@ def announce(task: Task) -> Iterator[str]:
     layers = " x ".join([str(data.inputs), *[width] * network.depth, str(data.outputs)])
     networks = f"{network.members} networks" if network.members > 1 else "network"
     yield f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs"
+    yield from task.remarks
     trained = f"{network.loss}: {', '.join(terms)}; {name_of(task.optimiser)}, {network.precision}"
     yield f"{networks} {layers}, {network.activation}; {trained}"
     if network.activation == "relu" and network.derivative == 2:

@@ -40,11 +40,14 @@ class Task(NamedTuple):
     optimiser: Optimiser
     grown: bool
     """Whether validation selects the width."""
+    remarks: tuple[str, ...] = ()
+    """On what is not read of a file."""
 
 
 def prepare(options: Any) -> Task:
     """Reads and checks everything that the arguments name, before anything is written."""
     require_seed(options.seed)
+    remarks = ()
     network, function, several = network_from(options), options.function, options.ensemble > 1
     if function in NAMED:
         generate, grid = NAMED[function]
@@ -55,7 +58,7 @@ def prepare(options: Any) -> Task:
     else:
         if not function.endswith(".npz"):
             raise InputError(f"function '{function}' is unknown; expected sin, cos_sin or an npz file's path")
-        everything = functions.load(function)
+        everything, remarks = functions.load(function)
         if len(everything.x) < 3:
             raise InputError(f"{function}: {len(everything.x)} samples; training, validation and test need 3")
         data, test = functions.split(everything, seed=options.seed)
@@ -65,7 +68,7 @@ def prepare(options: Any) -> Task:
     optimiser = optimiser_from(options, len(sets.train.x), network.precision)
     targets(to_units(data, units), network)
     grown = options.width is None and isinstance(optimiser, GaussNewton)
-    return Task(function, sets, test, shown, bound, units, network, optimiser, grown)
+    return Task(function, sets, test, shown, bound, units, network, optimiser, grown, remarks)
 
 
 def of_named(options: Any) -> dict[str, Any]:

@@ -16,7 +16,15 @@ from dln_jax.data.bodies import find_bodies
 from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
 from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.schema import Trajectories, column
-from dln_jax.data.splits import by_motion, label_indices, require_no_copies, segments, select, select_samples
+from dln_jax.data.splits import (
+    by_motion,
+    label_indices,
+    require_no_copies,
+    segments,
+    select,
+    select_samples,
+    with_joints,
+)
 from dln_jax.data.stated_tests import stated_test
 from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
@@ -99,7 +107,9 @@ def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[
         other = schema.load(test)
         if other.degrees_of_freedom != data.degrees_of_freedom:
             raise InputError(f"{test} has {other.degrees_of_freedom} coordinates, {file} {data.degrees_of_freedom}")
-        return data, other
+        if data.joint_names is not None and other.joint_names is not None:
+            other = with_joints(other, data.joint_names.tolist())
+        return data._replace(remarks=(*data.remarks, *(f"{test}: {line}" for line in other.remarks))), other
     if test is None and len(present) == 1:
         count = len(data.t) - round(TEST_SHARE * len(data.t))
         if min(count, len(data.t) - count) < WINDOW[name]:

@@ -89,6 +89,7 @@ def test_bags_that_do_not_suit_the_robot_are_one_line(place, capsys):
         (("--joints", "panda_elbow,panda_finger"), "the robot's joint 'fer_shoulder' is not among the data's"),
         (("--joints", "elbow=fer_elbow"), "'elbow' is not among the log's joints (panda_elbow, panda_shoulder, panda_"),
         (("--torque-factor", "fer_elbow=2"), "'fer_elbow' is not among the log's joints (panda_shoulder, panda_elbow)"),
+        (("--torque-factor", "panda_elbow=1,panda_elbow=2"), "--torque-factor names 'panda_elbow' twice"),
         (("--torque-factor", "much"), "--torque-factor is 'much'; expected finite numbers"),
     ):  # fmt: skip
         # The last of an option that is given twice counts.
