@@ -18,6 +18,8 @@ from dln_jax.time_limit import IMPORTED, counting_from
 
 MOST_CHARACTERS = 400
 """Characters shown at either end of a long message; the middle is left out."""
+INTERRUPTED = 130
+"""Exit status after an interrupt, as shells have it."""
 LARGEST_SEED = 2**32 - 1
 """Largest seed of NumPy and JAX."""
 
@@ -68,14 +70,15 @@ def run(
                 print(text)
             sys.stdout.flush()
 
-    if member is None:
-        work(options)
-        return
-    with as_one_line(prog, options):
-        options = scaled.joined(member, options, **({} if joining is None else {"seconds": joining}))
+    if member is not None:
+        with as_one_line(prog, options):
+            options = scaled.joined(member, options, **({} if joining is None else {"seconds": joining}))
     try:
         work(options)
     except SystemExit as stop:
+        # After an interrupt XLA may still run a program, and would abort a process that ends under it.
+        if member is None and not (from_shell and stop.code == INTERRUPTED):
+            raise
         scaled.end_at_once(stop.code if isinstance(stop.code, int) else 1)
 
 
@@ -114,7 +117,7 @@ def as_one_line(prog: str, options: Any) -> Iterator[None]:
         raise _refusal(f"{where}{error.strerror or error}") from None
     except KeyboardInterrupt as stop:
         _say(interrupted(prog, options, *stop.args))
-        raise SystemExit(130) from None
+        raise SystemExit(INTERRUPTED) from None
 
 
 def _refusal(message: str) -> SystemExit:

@@ -92,7 +92,7 @@ def remedy_of(options: Any) -> str:
 
 
 def end_at_once(code: int) -> NoReturn:
-    """Ends this process at once; JAX's own shutdown would wait for the others."""
+    """Ends this process at once, without JAX's own shutdown, which would wait for the other processes."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):
             stream.flush()

@@ -176,6 +176,33 @@ def test_an_interrupt_during_imports_is_one_word(tmp_path, way):
     assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
 
 
+ENDLESS = """
+import dataclasses
+import jax
+from dln_jax.cli import running
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    "Starts a program that never ends."
+
+def main(given):
+    jax.jit(lambda x: jax.lax.while_loop(lambda x: x[0, 0] > 0, lambda x: x @ x / 100, x))(jax.numpy.ones((100, 100)))
+    raise KeyboardInterrupt
+
+running.run(main, Arguments, prog="endless", line=[], from_shell=True)
+"""
+
+
+def test_an_interrupt_ends_a_command_whose_program_still_runs(tmp_path):
+    """XLA would abort the process, or hold it until the program ends."""
+    (tmp_path / "endless.py").write_text(ENDLESS)
+    told = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, tmp_path / "endless.py"], cwd=tmp_path, env=told, capture_output=True, text=True, timeout=100
+    )
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_each_way_of_calling_names_itself(tmp_path, way):
     done = subprocess.run(

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, get_type_hints
 
 from filelock import FileLock
 
+from dln_jax.cli.running import INTERRUPTED
 from dln_jax.files import as_type, is_file, read_json, write_json
 from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK
@@ -21,7 +22,6 @@ OUTPUT = "output.txt"
 """Standard output and errors of the command."""
 METRICS = "metrics.json"
 """File in the run's folder with the numbers to compare."""
-INTERRUPTED = 130
 SECONDS_BETWEEN_LOOKS = 0.1
 SECONDS_TO_END = 10.0
 """Time that an interrupted command has to store its last checkpoint, before it is killed."""

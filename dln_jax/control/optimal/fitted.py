@@ -30,6 +30,7 @@ from dln_jax.control.optimal.flow import Targets, drawn, greedy, targets, widene
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.value_networks import ValueNetwork
 from dln_jax.control.optimal.worst_case import Disturbance
+from dln_jax.interrupts import held_back
 from dln_jax.scale.mesh import local, program, spread
 from dln_jax.types import InputError, require_positive
 
@@ -171,13 +172,14 @@ def fit_values(
             for number in range(len(history), numbers.iterations):
                 grown = number / max(numbers.iterations - 1, 1)
                 memory = jnp.asarray(numbers.first_memory ** (1 - grown) * numbers.memory**grown)
-                current, state, loss = advance(current, state, jax.random.fold_in(key, 2 + number), memory)
-                score = float(judge(current, validated))
-                if score < lowest:
-                    best, lowest = current, score
-                passed = spent + time.perf_counter() - began
-                history.append(ValueProgress(number + 1, float(loss), score, passed))
-                store(seed, IterationState(current, state, best, list(history)))
+                with held_back():  # an interrupt inside of XLA is lost, or ends the process by SIGABRT
+                    current, state, loss = advance(current, state, jax.random.fold_in(key, 2 + number), memory)
+                    score = float(judge(current, validated))
+                    if score < lowest:
+                        best, lowest = current, score
+                    passed = spent + time.perf_counter() - began
+                    history.append(ValueProgress(number + 1, float(loss), score, passed))
+                    store(seed, IterationState(current, state, best, list(history)))
                 report(history[-1])
             if not math.isfinite(lowest):
                 raise InputError(

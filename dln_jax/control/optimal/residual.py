@@ -23,6 +23,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.control.optimal.flow import uniform
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
 from dln_jax.control.optimal.worst_case import Disturbance
+from dln_jax.interrupts import held_back
 from dln_jax.scale.mesh import local, of_first_process, program
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
@@ -134,10 +135,11 @@ def fit_hjb(
 
     def fitted(parameters: Any, discount: float) -> Any:
         x = uniform(problem, jax.random.fold_in(of_draws, len(stages)), samples)
-        parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
-        # This number decides how many rounds there are, so all processes must use the same value.
-        left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
-        stages.append(ResidualStage(discount, int(done), float(loss), float(left)))
+        with held_back():  # as in `fitted.fit_values`
+            parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
+            # This number decides how many rounds there are, so all processes must use the same value.
+            left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
+            stages.append(ResidualStage(discount, int(done), float(loss), float(left)))
         report(stages[-1])
         return parameters
 
