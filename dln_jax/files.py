@@ -136,12 +136,13 @@ def cache_folder() -> Path:
     """Folder for reproducible files, created if missing: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`.
 
     Raises:
-        InputError: the folder cannot be created.
+        InputError: there is no home folder, or the folder cannot be created.
     """
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(base) / "dln_jax"
     try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dln_jax"
         folder.mkdir(parents=True, exist_ok=True)
+    except RuntimeError:  # from `Path.home`
+        raise InputError("this user has no home folder; set XDG_CACHE_HOME to a folder for programs") from None
     except OSError as error:
         raise InputError(f"{folder}: cannot create the folder ({error.strerror}); set XDG_CACHE_HOME") from error
     return folder

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from dln_jax.files import matches, read_json, write_figure, write_json, writing
+from dln_jax.cli import compilation_cache
+from dln_jax.files import cache_folder, matches, read_json, write_figure, write_json, writing
 from dln_jax.types import InputError
 
 
@@ -20,6 +21,22 @@ def here(tmp_path, monkeypatch):
 
 def names(folder="."):
     return sorted(path.name for path in Path(folder).iterdir())
+
+
+def test_a_user_without_a_home_folder_is_told_and_default_data_need_none(monkeypatch):
+    from dln_jax.scenes import scene_named
+    from dln_jax.scenes.datasets import generators
+
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    with pytest.raises(InputError, match="no home folder; set XDG_CACHE_HOME"):
+        cache_folder()
+    assert compilation_cache.keep(True) == "" or "XDG_CACHE_HOME" in compilation_cache.keep(True)
+    assert generators.default_data(scene_named("pendulum")).degrees_of_freedom == 1
+    assert names() == []
 
 
 def test_a_file_is_written_whole_or_not_at_all_and_through_no_link():

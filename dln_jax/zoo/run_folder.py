@@ -66,8 +66,9 @@ def locked(folder: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         raise InputError(f"{folder}: another process is writing there; wait for it, or choose another --out") from None
-    except OSError as error:
-        raise InputError(f"{folder}: cannot write there ({error.strerror}); choose another --out") from error
+    except (OSError, NotImplementedError) as error:  # the second by older filelocks without flock
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{folder}: cannot write there ({reason}); choose another --out") from error
     try:
         for left in folder.glob(f"*.{'[0-9a-f]' * 8}{PARTIAL}"):
             with suppress(OSError):

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from dln_jax.files import write_json
 from dln_jax.types import InputError
@@ -31,6 +32,16 @@ def test_runs_that_start_together_get_folders_of_their_own():
     with ThreadPoolExecutor(8) as pool:
         folders = list(pool.map(start, range(16)))
     assert sorted(folders) == sorted(Path("runs") / f"train-{number}" for number in range(1, 17))
+
+
+def test_a_disk_without_locks_is_named(monkeypatch):
+    def acquire(*_, **__):
+        raise NotImplementedError("FileSystem does not appear to support flock; use SoftFileLock instead")
+
+    monkeypatch.setattr(FileLock, "acquire", acquire)
+    words = r"cannot write there .*does not appear to support flock.*another --out"
+    with pytest.raises(InputError, match=words), run_folder(Path("mine"), "x"):
+        pass
 
 
 def test_a_second_writer_is_refused_until_the_first_has_died():

@@ -29,11 +29,13 @@ _VERSION = 1  # of the generators' output; a new version makes a new file instea
 
 def default_data(scene: Scene) -> Trajectories:
     """Returns letters for the two-link arm, else random states that exercise every term; cached once generated."""
-    kind = "characters" if scene.name == "two-link-arm" else "uniform"
-    path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
+    kind, generate = ("characters", characters) if scene.name == "two-link-arm" else ("uniform", lambda: uniform(scene))
+    try:
+        path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
+    except InputError:  # a user without a home folder
+        return generate()
     if not path.exists():
-        data = characters() if kind == "characters" else uniform(scene)
-        schema.save(path, data, overwrite=True)  # safe if two processes generate at the same time: one rename wins
+        schema.save(path, generate(), overwrite=True)  # two processes may do so at the same time: one rename wins
     return schema.load(path)
 
 
