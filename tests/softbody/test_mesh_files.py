@@ -223,6 +223,12 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
         "b.msh": (whole.replace(b"4.1", b"4.0", 1), "version 4.0 of the MSH format; expected 2.2 or 4.1"),
         "c.msh": (b"$PartitionedEntities\n$EndPartitionedEntities\n" + whole, "partitioned mesh"),
         "d.msh": (whole.replace(b"nan", b"x").replace(b"$Nodes\n2", b"$Nodes\n9"), "fewer numbers than its header"),
+        "i.msh": (
+            gmsh_file(BODIES[2], "4.1", True).replace(b"4.1 1 8", b"4.1 1 3", 1),
+            "numbers have 3 bytes; expected",
+        ),
+        "k.msh": (gmsh_file(BODIES[2], "2.2", False).replace(b"\n1 2 2 ", b"\n1 2 -2 ", 1), "negative number of tags"),
+        "l.msh": (gmsh_file(BODIES[2], "2.2", False).replace(b"\n1 2 2 ", b"\n1 2 nan ", 1), "not a readable .msh"),
         "e.vtu": (b"no xml", "meshio cannot read it"),
         "f.vtk": (b"", "meshio cannot read it"),
         "g.stl": (b"solid", "expected .msh, .vtk, .vtu, .obj"),

@@ -145,10 +145,11 @@ def require_meshio(purpose: str) -> Any:
 
 def _read_gmsh(path: Path) -> FileMesh:
     try:
-        return read_gmsh(path.read_bytes())
+        with np.errstate(invalid="raise"):  # NaN as the number of a node
+            return read_gmsh(path.read_bytes())
     except InputError:
         raise
-    except (ValueError, IndexError, OverflowError) as error:
+    except (ValueError, IndexError, ArithmeticError) as error:
         raise InputError(f"not a readable .msh file ({error}); save it again") from None
 
 

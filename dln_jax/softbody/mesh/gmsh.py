@@ -55,6 +55,8 @@ def read_gmsh(data: bytes) -> FileMesh:
     if missing := [name for name in ("Nodes", "Elements") if name not in sections]:
         raise InputError(f"it has no section ${missing[0]}; mesh the model and save it again")
     binary = form[1] == b"1"
+    if binary and form[2] not in (b"4", b"8"):
+        raise InputError(f"its numbers have {form[2].decode(errors='replace'):.10} bytes; expected 4 or 8")
     order = ">" if binary and form[3][:4] == b"\0\0\0\1" else "<"
     types = {"i": f"{order}i4", "d": f"{order}f8", "n": f"{order}u{int(form[2])}"}
     names = {
@@ -200,6 +202,8 @@ def _elements_2(
     while read < int(count):
         # ASCII states kind and number of tags for every element (number, kind, tags), binary for a block of elements.
         number, block, tags = map(int, take("i", 3)[slice(None) if binary else [1, 0, 2]])
+        if tags < 0:
+            raise ValueError("an element has a negative number of tags")
         columns, block = int(binary) + tags + _kind(number)[1], block if binary else 1
         tables.setdefault((number, tags), []).append(take("i", block * columns).reshape(block, columns))
         read += max(block, 1)
