@@ -14,7 +14,7 @@ from rich.table import Table
 
 from dln_jax.cli.sweeps.job import METRICS, Job, Status, status_of
 from dln_jax.figures.sweeps import Point, error_against_seconds
-from dln_jax.files import finite, is_file, read_json, write_bytes, write_json
+from dln_jax.files import as_type, finite, is_file, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
 VALIDATION = ("validation_error", "validation_loss", "validation")
@@ -125,8 +125,12 @@ def _entry(job: Job) -> Entry:
     path = job.folder / status.run / METRICS
     if status.state != "done" or not is_file(path):
         return Entry(job, status, {})
+    remedy = "remove the job's folder, and --resume"
     try:
-        return Entry(job, status, read_json(path, remedy="remove the job's folder, and --resume"))
+        metrics = as_type(read_json(path, remedy=remedy), dict[str, float | None], name=str(path), remedy=remedy)
+        if strange := [name for name in metrics if not name.isidentifier()]:
+            raise InputError(f"{path}: {strange[0]!r:.40} is no name of a metric; {remedy}")
+        return Entry(job, status, metrics)
     except InputError as error:
         return Entry(job, status._replace(state="failed", line=str(error)), {})
 
@@ -208,7 +212,8 @@ def write_tables(folder: Path, results: Results, **facts: Any) -> None:
     for entry in results.entries:
         name, values, status, best = entry.job.folder.name, entry.job.values, entry.status, entry in results.best
         numbers = [finite(entry.metrics.get(metric)) for metric in results.metrics]
-        rows.writerow([name, *values.values(), status.state, status.line, int(best), status.attempt, *numbers])
+        texts = map(_cell, (*values.values(), status.state, status.line))
+        rows.writerow([name, *texts, int(best), status.attempt, *numbers])
         kinds = {"validation": results.validation, "error": results.error, "train_seconds": results.seconds}
         metrics = {kind: entry.number(metric) for kind, metric in kinds.items()}
         jobs.append({"job": name, "values": values, **status._asdict(), **metrics, "best": best})
@@ -254,6 +259,15 @@ def _unfinished(results: Results) -> str:
     states = [entry.status.state for entry in results.entries if entry.status.state != "done"]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
     return f"{len(results.entries)} jobs: {counts}" if states else ""
+
+
+def _cell(text: str) -> str:
+    """A text as a cell: a spreadsheet would compute one that starts as a formula and is no number."""
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+    return text
 
 
 def _short(text: str) -> str:

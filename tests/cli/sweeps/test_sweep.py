@@ -19,6 +19,7 @@ from dln_jax.cli.commands import sweep
 from dln_jax.cli.sweeps import command as sweep_command
 from dln_jax.cli.sweeps.executors import here
 from dln_jax.cli.sweeps.job import Job, Status, run_job, status_of
+from dln_jax.cli.sweeps.table import compared, write_tables
 from dln_jax.data import schema
 from dln_jax.figures.sweeps import Point, error_against_seconds
 from dln_jax.scenes.datasets import generators
@@ -156,6 +157,21 @@ def test_failed_job_is_repeated_in_another_folder_and_finished_job_is_not(tmp_pa
     (job.folder / "run" / "metrics.json").write_text("{}")
     run_job(job)
     assert not (job.folder / "status.json").exists()
+
+
+def test_a_table_holds_no_formula_and_no_metric_that_is_none(tmp_path):
+    jobs = [Job(tmp_path / name, "train_delan", (), {"width": "=1+1", "shift": "-1"}, True, tmp_path) for name in "abc"]
+    for job, metrics in zip(
+        jobs, ({"torque_mse": 1.0}, {"=cmd|' /C calc'!A0": 1.0}, {"torque_mse": "=1"}), strict=True
+    ):
+        (job.folder / "run").mkdir(parents=True)
+        (job.folder / "run" / "metrics.json").write_text(json.dumps(metrics))
+    results = compared(jobs)
+    assert [entry.status.state for entry in results.entries] == ["done", "failed", "failed"]
+    write_tables(tmp_path, results)
+    rows = list(csv.DictReader((tmp_path / "table.csv").open()))
+    assert all(not text.startswith(("=", "+", "@")) for row in rows for text in (*row, *row.values()))
+    assert [(row["width"], row["shift"]) for row in rows] == [("'=1+1", "-1")] * 3
 
 
 STATUS = {
