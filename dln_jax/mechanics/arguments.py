@@ -82,7 +82,8 @@ def answer(function: Callable[..., Answer], *state: Array) -> Answer:
     """Calls a system's function with vectors of one size.
 
     Raises:
-        InputError: the system has another size; the message quotes the error of its own array operations.
+        InputError: the system has another size, an energy is no scalar, or a function of the system leaves JAX; the
+            message quotes the error of its own array operations. Other errors of the system's functions pass.
     """
     try:
         return function(*state)
@@ -90,7 +91,15 @@ def answer(function: Callable[..., Answer], *state: Array) -> Answer:
         raise
     except (TypeError, ValueError, IndexError) as error:
         reason = str(error).splitlines()[0] if str(error) else ""
-        if not any(word in reason.lower() for word in ("shape", "dimension", "index")):
+        if isinstance(error, jax.errors.JAXTypeError | jax.errors.JAXIndexError):
+            raise InputError(
+                f"a function of the system converts its arguments to NumPy or Python numbers ({reason[:200]}); use "
+                "jax.numpy, and no `float` or `if` of them"
+            ) from error
+        if reason.startswith("Gradient only defined for scalar-output"):
+            raise InputError(f"an energy of the system is no scalar ({reason.partition('. To get')[0]})") from error
+        words = ("shape", "dimension", "index")
+        if "positional argument" in reason or not any(word in reason.lower() for word in words):
             raise
         raise InputError(
             f"the system takes no states of size {state[0].shape[0]} ({reason[:200]}); give vectors [d] of its own size"

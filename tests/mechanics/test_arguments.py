@@ -51,6 +51,23 @@ def test_states_that_fit_are_taken(energy):
     require_size_of(energy, 2)
 
 
+@pytest.mark.parametrize(
+    "energy, message",
+    [
+        (lambda q, qd: 0.5 * qd @ qd - jnp.cos(q[:1]), r"no scalar \(Gradient only .* had shape: \(1,\)\)"),
+        (lambda q, qd: None, "an energy of the system is no scalar"),
+        (lambda q, qd: 0.5 * np.dot(np.asarray(qd), np.asarray(qd)), "NumPy or Python numbers .*; use jax.numpy"),
+        (lambda q, qd: 0.5 * qd @ qd + float(q[0]), "NumPy or Python numbers"),
+        (lambda q, qd: 0.5 * qd @ qd + (q[0] if q[0] > 0 else 0.0), "NumPy or Python numbers"),
+        (lambda q, qd, shape: 0.5 * qd @ qd, "missing 1 required positional argument: 'shape'"),
+    ],
+)
+def test_an_energy_that_is_wrong_in_itself_is_not_blamed_on_the_state(energy, message):
+    with pytest.raises((InputError, TypeError), match=message) as caught:
+        dynamics(LagrangianSystem(energy)).forward_dynamics(*STATE)
+    assert "states of size" not in str(caught.value) and "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("transform", [jax.grad, jax.jit, lambda f: lambda m: jax.vmap(f)(jnp.full(3, m))[1]])
 def test_masses_may_be_traced(transform):
     def torque(mass):
