@@ -29,7 +29,7 @@ MOST_OPTIONS = 256
 """Largest number of options and versions that the processes compare."""
 _TASKS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 """Environment variables of `srun` and `mpirun` that state the number of their processes."""
-_ADDRESS = re.compile(r"(\[[0-9a-fA-F:.%\w]+\]|[^\s:\[\]/]+):(\d{1,5})")
+_ADDRESS = re.compile(r"(\[[0-9a-fA-F:.%\w]+\]|[^\s:\[\]/]+):(\d{1,5})", re.ASCII)
 _OF_PEERS = re.compile(r"gloo|nccl|coordination|unavailable|deadline_exceeded", re.IGNORECASE)
 
 
@@ -82,7 +82,7 @@ def membership(
     if not 0 <= process < processes:
         raise InputError(f"--process-id is {process}; of {processes} processes, expected 0 to {processes - 1}")
     parts = _ADDRESS.fullmatch(coordinator)
-    if not parts or not 0 < int(parts[2]) < 2**16:
+    if not parts or not coordinator.isascii() or not 0 < int(parts[2]) < 2**16:
         raise InputError(f"--coordinator is {coordinator!r:.80}; expected host:port, such as node1:61440")
     return Membership(coordinator, processes, process)
 

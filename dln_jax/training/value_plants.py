@@ -210,6 +210,6 @@ def with_factors(chosen: Chosen, factors: Sequence[float]) -> ControlProblem:
 
 
 def _numbers(actuated: Sequence[str], d: int) -> list[int]:
-    if not all(joint.isdigit() and int(joint) < d for joint in actuated):
+    if not all(joint.isdecimal() and int(joint) < d for joint in actuated):
         raise InputError(f"--actuated is {','.join(actuated)}; the model's joints are the numbers 0 to {d - 1}")
     return sorted({int(joint) for joint in actuated})

@@ -302,6 +302,8 @@ def test_options_are_a_membership_and_go_before_a_cluster():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ((2, "node1:\uff15\uff10\uff10\uff10", 0), "expected host:port, such as node1:61440"),
+        ((2, "n\u00f6de:5000", 0), "expected host:port, such as node1:61440"),
         ((2, None, None), "--coordinator and --process-id missing beside --processes"),
         ((None, "node1:5000", None), "--processes and --process-id missing beside --coordinator"),
         ((2, "node1:5000", None), "--process-id missing beside --processes and --coordinator"),

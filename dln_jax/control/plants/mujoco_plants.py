@@ -163,7 +163,7 @@ def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
     """Returns the numbers of joints from names or numbers."""
     chosen = []
     for joint in actuated:
-        number = int(joint) if isinstance(joint, int) or (str(joint).isdigit() and joint not in names) else None
+        number = int(joint) if isinstance(joint, int) or (str(joint).isdecimal() and joint not in names) else None
         if (number is None and joint not in names) or (number is not None and number >= len(names)):
             known = ", ".join(f"{place} {name}" for place, name in enumerate(names))
             raise InputError(f"there is no joint '{joint}'; the joints are {known}")

@@ -82,6 +82,7 @@ def test_the_verdict_counts_the_starts_that_end_up():
 
 
 MISTAKES = [
+    (("--actuated", "\u00b2"), "there is no joint '\u00b2'"),
     (("--actuated", "elbow"), "there is no joint 'elbow'"),
     (("--control", "-1"), "expected finite positive numbers"),
     (("--control", "1", "--goal", "0.6"), "the limits are"),
