@@ -139,10 +139,12 @@ def cache_folder() -> Path:
         InputError: there is no home folder, or the folder cannot be created.
     """
     try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dln_jax"
-        folder.mkdir(parents=True, exist_ok=True)
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:  # from `Path.home`
         raise InputError("this user has no home folder; set XDG_CACHE_HOME to a folder for programs") from None
+    folder = Path(base) / "dln_jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot create the folder ({error.strerror}); set XDG_CACHE_HOME") from error
     return folder
