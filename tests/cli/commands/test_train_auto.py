@@ -1,5 +1,6 @@
 """--model auto end to end: the model that each arm gets, what is printed and stored, and what is refused."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from calls import refused
 
+from dln_jax import load
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.data.robot_files import mjcf
@@ -72,6 +74,31 @@ def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workpla
     found = dynamics(build(task.description).energies(training.parameters))
     state = (np.array([0.3, -0.5]), np.array([0.7, 0.4]), np.array([1.0, -2.0]))
     np.testing.assert_allclose(found.inverse_dynamics(*state), dynamics(RUBBED).inverse_dynamics(*state), atol=0.05)
+
+
+def test_finished_candidates_are_stored_and_not_fitted_again(workplace, tmp_path, monkeypatch):
+    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
+    options = {"data": Path("rigid.npz"), "robot": Path("arm.xml"), "velocity_scale": 0.01}
+    typed = arguments_of(train_delan.Arguments, model="auto", **options)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(selection, "noise_of", lambda *_: np.full(2, np.nan))  # so that all candidates are tried
+    monkeypatch.setattr(selection, "_by_name", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        selection.fit(prepare(typed), typed, tmp_path, None)
+    kept = load(tmp_path / "candidates" / "rigid-tree")
+
+    monkeypatch.setattr(selection, "_rigid_tree", interrupted)
+    monkeypatch.setattr(selection, "_by_name", lambda *_: "not in this test")
+    monkeypatch.setattr(selection, "_with_network", lambda *_: "not in this test")
+    task, training = selection.fit(prepare(typed), dataclasses.replace(typed, resume=True), tmp_path, None)
+    assert task.kind == "rigid-tree" and task.description == kept.description
+    jax.tree.map(np.testing.assert_array_equal, training.parameters, kept.parameters)
+    assert json.loads((tmp_path / "candidates" / "trigonometric" / "candidate.json").read_text()) == {
+        "reason": "not in this test"
+    }
 
 
 def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monkeypatch):

@@ -18,7 +18,8 @@ from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
-from dln_jax.files import write_json
+from dln_jax.data.stated_needs import needs_from_json
+from dln_jax.files import is_file, read_json, write_json
 from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.engine.problem import Training
@@ -39,12 +40,15 @@ from dln_jax.training.dynamics.task import Method, Task, method_of, planned
 from dln_jax.training.identification.additions import with_network
 from dln_jax.training.identification.task import Case, Sets, for_residual, with_description, with_terms
 from dln_jax.zoo.descriptions import Description, build, describe
+from dln_jax.zoo.run import load, save
 
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
 """Default time limits, s: for the whole selection, and for one search or network in it."""
 MOST_SAMPLES = 4_000
 """Largest number of samples for fitting residual networks."""
 EXPLICIT, KERNEL = "trigonometric", "trigonometric-kernel"
+CANDIDATES, CANDIDATE = "candidates", "candidate"
+"""Folder of the candidates' models in that of the run, and stem of the file that says how a fit ended."""
 BESIDE = "-residual"
 """Suffix of the name of a model with a residual network."""
 
@@ -146,17 +150,22 @@ def as_json(selection: Selection) -> dict[str, Any]:
 
 def _candidates(options: Any, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Candidate]:
     """The candidates, from the strongest prior knowledge to the weakest."""
-    bases: dict[str, FittedModel] = {}
+    bases: dict[str, FittedModel | str] = {}
+
+    def stored(name: str, fit: Callable[[float], FittedModel | str]) -> Candidate:
+        return Candidate(name, lambda left: _stored(folder / CANDIDATES / name, options.resume, recorded, fit, left))
 
     def both(name: str, fit: Callable[[float], FittedModel]) -> list[Candidate]:
-        def base(left: float) -> FittedModel:
-            bases[name] = fit(left)
+        own, beside = (
+            stored(name, fit),
+            stored(name + BESIDE, lambda left: _with_network(recorded, bases.get(name), left)),
+        )
+
+        def base(left: float) -> FittedModel | str:
+            bases[name] = own.fit(left)
             return bases[name]
 
-        return [
-            Candidate(name, base),
-            Candidate(name + BESIDE, lambda left: _with_network(recorded, bases.get(name), left)),
-        ]
+        return [Candidate(name, base), beside]
 
     def by_name(name: str) -> Callable[[float], FittedModel]:
         return lambda left: _by_name(name, options, recorded, folder, mesh, left)
@@ -180,6 +189,34 @@ def _candidates(options: Any, recorded: Recorded, folder: Path, mesh: Mesh | Non
         *(candidate for candidates in order for candidate in candidates[1:]),
         Candidate(NETWORK, by_name(NETWORK)),
     ]
+
+
+def _stored(
+    place: Path, resume: bool, recorded: Recorded, fit: Callable[[float], FittedModel | str], left: float
+) -> FittedModel | str:
+    """Fits a candidate and stores it in a folder of its own, or takes it from there if the run is resumed.
+
+    A learned tree is fitted again: its verdict needs the search.
+    """
+    done = place / f"{CANDIDATE}.json"
+    if resume and is_file(done):
+        facts = read_json(done, remedy=f"remove {place}")
+        if facts.get("reason"):
+            return str(facts["reason"])
+        run = load(place)
+        recorded = recorded._replace(needs=needs_from_json(run.description["needs"]))
+        return _as_training(recorded, run.description, build(run.description), run.parameters, float(facts["seconds"]))
+    began = time.perf_counter()
+    fitted = fit(left)
+    place.mkdir(parents=True, exist_ok=True)
+    if isinstance(fitted, str):
+        write_json(done, {"reason": fitted})
+        return fitted
+    task: Task = fitted.outcome[0]
+    save(place, task.description, fitted.parameters)
+    if task.search is None:
+        write_json(done, {"seconds": time.perf_counter() - began})
+    return fitted
 
 
 def _too_large(size: int | None) -> Callable[[float], str]:
@@ -213,13 +250,13 @@ def _rigid_tree(options: Any, recorded: Recorded, robot: Robot) -> FittedModel:
     return _as_training(recorded, case.description, case.model, kept, time.perf_counter() - began)
 
 
-def _with_network(recorded: Recorded, base: FittedModel | None, left: float) -> FittedModel | str:
+def _with_network(recorded: Recorded, base: FittedModel | str | None, left: float) -> FittedModel | str:
     """Adds a residual network to a model if held-out motions justify it.
 
     Its size is chosen on a part of the training set: chosen on the motions that the candidates are compared by, it
     would fit them.
     """
-    if base is None:
+    if not isinstance(base, FittedModel):
         return "there is no model to add a network to"
     began = time.perf_counter()
     if base.outcome[0].kind == "learned-tree":
