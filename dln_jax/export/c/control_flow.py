@@ -11,7 +11,7 @@ import numpy as np
 
 from dln_jax.export.c import indexing
 from dln_jax.export.c.nodes import Loop, Node, Region, known
-from dln_jax.export.c.primitives import Parameters
+from dln_jax.export.c.primitives import RULES as SIMPLE
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import kind_of
 
@@ -67,43 +67,56 @@ def _steady(
         steady = kept
 
 
-def _while(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
-    split = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
-    of_condition, of_body, start = args[: split[0]], args[split[0] : split[1]], args[split[1] :]
+def _while(
+    program: Program, *args: Node, cond_nconsts: int, cond_jaxpr: Any, body_nconsts: int, body_jaxpr: Any
+) -> list[Node]:
+    """Applies `while`; under `vmap` it turns while any row's condition holds, and other rows keep their carries."""
+    of_condition, of_body = args[:cond_nconsts], args[cond_nconsts : cond_nconsts + body_nconsts]
+    start = args[cond_nconsts + body_nconsts :]
     outer, number, carries = _opened(program, args, start)
-    inside, results, steady = _steady(
-        program, start, carries, lambda inside: program.inline(program, parameters["body_jaxpr"], [*of_body, *inside])
-    )
-    (condition,) = program.inline(program, parameters["cond_jaxpr"], [*of_condition, *inside])
-    program.loops[number] = Loop(carries, [condition], results)
+
+    def condition(inside: Sequence[Node]) -> Node:
+        return program.inline(program, cond_jaxpr, [*of_condition, *inside])[0]
+
+    def turn(inside: list[Node]) -> list[Node]:
+        after, holds = program.inline(program, body_jaxpr, [*of_body, *inside]), condition(inside)
+        if holds.shape == ():
+            return after
+        ranks = [len(new.shape) - len(holds.shape) for new in after]
+        every = [program.reshape(holds, (*holds.shape, *[1] * rank)) for rank in ranks]
+        return [program.select(row, old, new) for row, old, new in zip(every, inside, after, strict=True)]
+
+    inside, results, steady = _steady(program, start, carries, turn)
+    holds = condition(inside)
+    program.loops[number] = Loop(carries, [SIMPLE["reduce_or"](program, holds, axes=range(len(holds.shape)))], results)
     loop = program.make("while", (), "int", start, attribute=number, region=outer)
     projected = projections(program, loop, [(carry.shape, carry.dtype) for carry in start])
     return [_with_known(program, node, *one) for node, one in zip(projected, steady, strict=True)]
 
 
-def _scan(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
-    length, inner = parameters["length"], parameters["jaxpr"].jaxpr
+def _scan(program: Program, *args: Node, length: int, jaxpr: Any, reverse: bool, results: Sequence[Any]) -> list[Node]:
+    inner = jaxpr.jaxpr
 
     def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
         return sum(a.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
 
     # Counted, because JAX releases store these numbers differently; stacked arrays have another shape inside.
-    count = alike(parameters["results"], inner.outvars)
+    count = alike(results, inner.outvars)
     constants = alike(args, inner.invars) - count
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
     if length == 0:
-        left = parameters["results"][count:]
+        left = results[count:]
         return [*start, *(program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in left)]
     outer, number, carries = _opened(program, args, start)
     turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
     slices = [_slice_of(program, array, turn, length) for array in stacked]
-    _, results, steady = _steady(
-        program, start, carries, lambda inside: program.inline(program, parameters["jaxpr"], [*fixed, *inside, *slices])
+    _, after, steady = _steady(
+        program, start, carries, lambda inside: program.inline(program, jaxpr, [*fixed, *inside, *slices])
     )
-    program.loops[number] = Loop(carries, [], results, length, parameters["reverse"])
+    program.loops[number] = Loop(carries, [], after, length, reverse)
     loop = program.make("repeat", (), "int", start, attribute=number, region=outer)
-    projected = projections(program, loop, [(aval.shape, kind_of(aval.dtype)) for aval in parameters["results"]])
-    stacked = [known(result) for result in results[count:]]
+    projected = projections(program, loop, [(aval.shape, kind_of(aval.dtype)) for aval in results])
+    stacked = [known(result) for result in after[count:]]
     steady += [(np.tile(mask & program.finite, length), np.tile(numbers, length)) for mask, numbers in stacked]
     return [_with_known(program, node, *one) for node, one in zip(projected, steady, strict=True)]
 
@@ -123,8 +136,7 @@ def _slice_of(program: Program, array: Node, turn: Node, length: int) -> Node:
     return _with_known(program, taken, same, numbers[0])
 
 
-def _cond(program: Program, parameters: Parameters, which: Node, *operands: Node) -> list[Node]:
-    branches = parameters["branches"]
+def _cond(program: Program, which: Node, *operands: Node, branches: Sequence[Any]) -> list[Node]:
     if len(branches) == 1 or which.op == "const":
         chosen = int(np.clip(which.value, 0, len(branches) - 1)) if which.value is not None else 0
         return program.inline(program, branches[chosen], operands)

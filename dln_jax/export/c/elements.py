@@ -156,6 +156,8 @@ def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
 
     Large gathers are split into boxes, each read from one source by one loop nest.
     """
+    if not node.size:
+        return
     index = np.arange(node.size).reshape(node.shape)
     stored = node in body.plan.arrays and not own
     if node.size <= UNROLL_LIMIT and not stored:

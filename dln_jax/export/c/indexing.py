@@ -5,9 +5,10 @@ from math import prod
 from typing import Any
 
 import numpy as np
+from jax.extend import core
 
 from dln_jax.export.c.nodes import Node, is_constant, values
-from dln_jax.export.c.primitives import Parameters, Rule, convert, rows_of
+from dln_jax.export.c.primitives import Rule, convert, rows_of
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.simplify import VECTOR
 from dln_jax.export.c.text import UNSIGNED, limit
@@ -15,13 +16,15 @@ from dln_jax.export.c.text import UNSIGNED, limit
 _COMBINED = ("add", "sub", "mul", "min", "max")
 
 
-def _gather(program: Program, parameters: Parameters, operand: Node, indices: Node) -> Node:
+def _gather(
+    program: Program, operand: Node, indices: Node, *, dimension_numbers: Any, slice_sizes, mode: Any, fill_value: Any
+) -> Node:
     """Applies `lax.gather`; windows that reach outside the operand are moved inside or filled."""
-    numbers, sizes = parameters["dimension_numbers"], parameters["slice_sizes"]
+    numbers = dimension_numbers
     rank = len(indices.shape) - 1 + len(numbers.offset_dims)
     outer = [axis for axis in range(rank) if axis not in numbers.offset_dims]
     positions, inside = _windows(
-        program, indices, operand.shape, sizes, parameters["mode"], numbers.start_index_map,
+        program, indices, operand.shape, slice_sizes, mode, numbers.start_index_map,
         dropped=(*numbers.collapsed_slice_dims, *numbers.operand_batching_dims),
         batched=(numbers.operand_batching_dims, numbers.start_indices_batching_dims),
         order=np.argsort([*outer, *numbers.offset_dims]),
@@ -29,22 +32,26 @@ def _gather(program: Program, parameters: Parameters, operand: Node, indices: No
     taken = take(program, operand, positions)
     if inside is None:
         return taken
-    fill = parameters["fill_value"]
-    if fill is None:  # JAX's default
-        fill = np.nan if operand.dtype == "real" else limit(operand.dtype, upper=operand.dtype in ("bool", *UNSIGNED))
-    return program.select(inside, program.constant(fill, operand.dtype), taken)
+    if fill_value is None:  # JAX's default
+        fill_value = (
+            np.nan if operand.dtype == "real" else limit(operand.dtype, upper=operand.dtype in ("bool", *UNSIGNED))
+        )
+    return program.select(inside, program.constant(fill_value, operand.dtype), taken)
 
 
 def _scatter(op: str) -> Rule:
     """Returns the rule of `lax.scatter`, or of its variant that combines updates."""
 
-    def rule(program: Program, parameters: Parameters, operand: Node, indices: Node, updates: Node) -> Node:
-        numbers = parameters["dimension_numbers"]
+    def rule(
+        program: Program, operand: Node, indices: Node, updates: Node, *,
+        dimension_numbers: Any, mode: Any, update_jaxpr: Any, update_consts,
+    ) -> Node:  # fmt: skip
+        numbers = dimension_numbers
         dropped = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
         window = iter([updates.shape[axis] for axis in numbers.update_window_dims])
         sizes = [1 if axis in dropped else next(window) for axis in range(len(operand.shape))]
         targets, inside = _windows(
-            program, indices, operand.shape, sizes, parameters["mode"], numbers.scatter_dims_to_operand_dims,
+            program, indices, operand.shape, sizes, mode, numbers.scatter_dims_to_operand_dims,
             dropped=dropped, batched=(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims),
             order=np.arange(len(updates.shape)),
         )  # fmt: skip
@@ -52,7 +59,10 @@ def _scatter(op: str) -> Rule:
             targets = program.select(inside, program.constant(-1, "index"), targets)
         outer = [axis for axis in range(len(updates.shape)) if axis not in numbers.update_window_dims]
         order = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
-        return _put(program, op, operand, targets, program.gather([updates], order))
+        updates = program.gather([updates], order)
+        if op == "set" and update_jaxpr is not None:  # of `x.at[i].apply(f)`
+            return _updated(program, update_jaxpr, update_consts, operand, targets, updates)
+        return _put(program, op, operand, targets, updates)
 
     return rule
 
@@ -144,22 +154,32 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
     return operand
 
 
-def _dynamic_slice(program: Program, parameters: Parameters, operand: Node, *starts: Node) -> Node:
-    sizes = parameters["slice_sizes"]
-    return take(program, operand, _window(program, operand.shape, sizes, starts[: len(sizes)]))
+def _updated(program: Program, jaxpr: Any, constants, operand: Node, targets: Node, updates: Node) -> Node:
+    """Returns the operand after `jaxpr` of an element and an update, at one target after the other."""
+    closed = core.ClosedJaxpr(jaxpr, constants)
+    for place in range(targets.size):
+        target, update = (program.gather([node], np.array([place])) for node in (targets, updates))
+        old = take(program, operand, program.elementwise("max", target, 0))
+        (new,) = program.inline(program, closed, [program.one(old), program.one(update)])
+        operand = _put(program, "set", operand, target, program.reshape(new, (1,)))
+    return operand
 
 
-def _dynamic_update_slice(program: Program, _, operand: Node, update: Node, *starts: Node) -> Node:
+def _dynamic_slice(program: Program, operand: Node, *starts: Node, slice_sizes) -> Node:
+    return take(program, operand, _window(program, operand.shape, slice_sizes, starts[: len(slice_sizes)]))
+
+
+def _dynamic_update_slice(program: Program, operand: Node, update: Node, *starts: Node) -> Node:
     return _put(program, "set", operand, _window(program, operand.shape, update.shape, starts), update)
 
 
-def _sort(program: Program, parameters: Parameters, *nodes: Node) -> list[Node]:
+def _sort(program: Program, *nodes: Node, dimension: int, num_keys: int) -> list[Node]:
     """Applies `lax.sort` along an axis with the first `num_keys` arrays as keys: stable, NaN last."""
-    axis, shape = parameters["dimension"], nodes[0].shape
-    if shape[axis] < 2 or nodes[0].size == 0:
+    axis, shape = dimension, nodes[0].shape
+    if shape[axis] < 2:
         return list(nodes)
     rows = [rows_of(program, node, (axis,)) for node in nodes]
-    order = program.make("order", rows[0].shape, "index", rows[: parameters["num_keys"]])
+    order = program.make("order", rows[0].shape, "index", rows[:num_keys])
     last = np.moveaxis(np.empty(shape), axis, -1).shape
     back = np.moveaxis(np.arange(nodes[0].size).reshape(last), -1, axis)
     return [program.gather([take(program, row, order)], back) for row in rows]

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from dln_jax.export.c.nodes import Node
-from dln_jax.export.c.primitives import Parameters
 from dln_jax.export.c.program import Program
 from dln_jax.types import InputError
 
 
 def _items(program: Program, node: Node, rank: int = 2) -> list[Node]:
     """Returns the matrices of a batch (vectors for rank 1)."""
+    if not node.size:
+        raise InputError(f"factorisations have C of arrays with elements; this one has shape {node.shape}")
     index = np.arange(node.size).reshape(-1, *node.shape[len(node.shape) - rank :])
     return [program.gather([node], positions) for positions in index]
 
@@ -31,18 +32,19 @@ def _applied(
     return [program.gather(nodes, part.reshape(*batch, *shape)) for part, shape in zip(parts, shapes, strict=True)]
 
 
-def _triangular_solve(program: Program, parameters: Parameters, a: Node, b: Node) -> Node:
-    lower, transposed = parameters["lower"], parameters["transpose_a"]
-    if not parameters["left_side"]:  # X A = B is A^T X^T = B^T
-        transposed, b = not transposed, program.transpose(b)
-    if transposed:
+def _triangular_solve(
+    program: Program, a: Node, b: Node, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool
+) -> Node:
+    if not left_side:  # X A = B is A^T X^T = B^T
+        transpose_a, b = not transpose_a, program.transpose(b)
+    if transpose_a:
         a, lower = program.transpose(a), not lower
-    attribute = (bool(lower), bool(parameters["unit_diagonal"]))
+    attribute = (bool(lower), bool(unit_diagonal))
     (x,) = _applied(program, "triangular_solve", a, b, shapes=[b.shape[-2:]], attribute=attribute)
-    return x if parameters["left_side"] else program.transpose(x)
+    return x if left_side else program.transpose(x)
 
 
-def _lu(program: Program, _, a: Node) -> list[Node]:
+def _lu(program: Program, a: Node) -> list[Node]:
     *batch, rows, columns = a.shape
     nodes = [program.make("lu", (), "int", [matrix]) for matrix in _items(program, a)]
     results = []
@@ -52,36 +54,32 @@ def _lu(program: Program, _, a: Node) -> list[Node]:
     return results
 
 
-def _geqrf(program: Program, _, a: Node) -> list[Node]:
+def _geqrf(program: Program, a: Node) -> list[Node]:
     return _applied(program, "geqrf", a, shapes=[a.shape[-2:], (min(a.shape[-2:]),)])
 
 
-def _householder_product(program: Program, _, a: Node, tau: Node) -> list[Node]:
+def _householder_product(program: Program, a: Node, tau: Node) -> list[Node]:
     return _applied(program, "householder_product", a, tau, shapes=[a.shape[-2:]], ranks=(2, 1))
 
 
-def _qr(program: Program, parameters: Parameters, a: Node) -> list[Node]:
+def _qr(program: Program, a: Node, *, full_matrices: bool) -> list[Node]:
     """Applies `qr` by the two rules above, as JAX does."""
-    (*batch, m, n), full = a.shape, parameters["full_matrices"]
-    if parameters["pivoting"]:
-        raise InputError("the primitive 'qr' has C without pivoting; got pivoting=True")
-    if not a.size:
-        raise InputError(f"the primitive 'qr' has C of matrices with elements; this is {a.shape}")
-    packed, tau = _geqrf(program, {}, a)
+    (*batch, m, n), full = a.shape, full_matrices
+    packed, tau = _geqrf(program, a)
     zero, rows, columns = program.constant(0.0, "real"), m if full else min(m, n), m if full or m < n else n
     index = np.arange(a.size).reshape(a.shape)
     wide = np.pad(index, [(0, 0)] * (len(batch) + 1) + [(0, max(columns - n, 0))], constant_values=a.size)
-    (q,) = _householder_product(program, {}, program.gather([packed, zero], wide[..., :columns]), tau)
+    (q,) = _householder_product(program, program.gather([packed, zero], wide[..., :columns]), tau)
     upper = np.where(np.arange(rows)[:, None] <= np.arange(n), index[..., :rows, :], a.size)
     return [q, program.gather([packed, zero], upper)]
 
 
-def _eigh(program: Program, parameters: Parameters, a: Node) -> list[Node]:
+def _eigh(program: Program, a: Node, *, lower: bool, subset_by_index) -> list[Node]:
     """Applies `eigh` to the lower or upper triangle; the signs of eigenvectors may differ from LAPACK's."""
     n = a.shape[-1]
-    if parameters["subset_by_index"] not in (None, (0, n)):
+    if subset_by_index not in (None, (0, n)):
         raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
-    row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if parameters["lower"] else 1]
+    row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if lower else 1]
     symmetric = program.gather([a], np.arange(a.size).reshape(a.shape)[..., row, column])
     return _applied(program, "eigh", symmetric, shapes=[(n, n), (n,)])
 
@@ -91,11 +89,11 @@ RULES = {
     "householder_product": _householder_product,
     "qr": _qr,
     "eigh": _eigh,
-    "cholesky": lambda program, _, a: _applied(program, "cholesky", a, shapes=[a.shape[-2:]]),
+    "cholesky": lambda program, a: _applied(program, "cholesky", a, shapes=[a.shape[-2:]]),
     "triangular_solve": _triangular_solve,
     "lu": _lu,
-    "lu_pivots_to_permutation": lambda program, parameters, pivots: _applied(
-        program, "permutation", pivots, shapes=[(parameters["permutation_size"],)], ranks=(1,), kind="int"
+    "lu_pivots_to_permutation": lambda program, pivots, *, permutation_size: _applied(
+        program, "permutation", pivots, shapes=[(permutation_size,)], ranks=(1,), kind="int"
     ),
 }
 """Rules by name of the primitive."""

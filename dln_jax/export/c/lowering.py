@@ -1,5 +1,6 @@
 """Lowers a jaxpr to a program: inlines calls, keeps control flow, and applies a rule for every primitive."""
 
+import inspect
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,7 +11,6 @@ from jax.dtypes import float0
 from dln_jax.export.c import control_flow, indexing, linear_algebra, primitives
 from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at
 from dln_jax.export.c.nodes import Node, is_constant, values
-from dln_jax.export.c.primitives import Parameters
 from dln_jax.export.c.program import Part, Program
 from dln_jax.export.c.text import PRECISIONS, failure, kind_of
 from dln_jax.types import InputError
@@ -21,6 +21,13 @@ _CALLS = {
     "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr",
     "custom_vmap_call": "call",
 }  # fmt: skip
+_WITHOUT_EFFECT = frozenset((
+    "accuracy", "algorithm", "use_magma", "sharding", "out_sharding", "unroll", "linear",
+    "_split_transpose", "weak_type", "new_dtype", "dtype", "index_dtype", "preferred_element_type",
+    "indices_are_sorted", "unique_indices", "is_stable", "sort_eigenvalues", "conjugate_a", "branches_platforms",
+    "ft_in", "ft_out", "num_consts", "num_carry",
+))  # fmt: skip
+"""Parameters that no value depends on: hints, promises, and types that the results have anyway."""
 _REFUSED = {
     "random": "random numbers; draw them beforehand and pass them as arguments",
     "threefry": "random numbers; draw them beforehand and pass them as arguments",
@@ -97,15 +104,27 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     if is_error_of_equinox(equation):
         return [_failed(program, aval) for aval in results]
     if name in _RULES:
-        parameters = {**parameters, "results": results, "kind": kind_of(results[0].dtype) if results else None}
-        nodes = _RULES[name](program, parameters, *args)
-        return list(nodes) if isinstance(nodes, list | tuple) else [nodes]
+        return _ruled(program, equation, args)
     if why := next((reason for part, reason in _REFUSED.items() if part in name), None):
         raise InputError(f"'{name}' is {why}")
     inner = implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
     if inner is None:
         raise InputError(f"the primitive '{name}' has no C")
     return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
+
+
+def _ruled(program: Program, equation: Any, args: list[Node]) -> list[Node]:
+    """Returns the results by the primitive's rule; refuses parameters that the rule does not read."""
+    name, results = equation.primitive.name, [variable.aval for variable in equation.outvars]
+    read = inspect.signature(_RULES[name]).parameters
+    for key, value in equation.params.items():
+        if key not in read and key not in _WITHOUT_EFFECT and value is not None and value is not False:
+            raise InputError(f"the primitive '{name}' has no C with {key}={value}".partition("\n")[0])
+    if results and all(0 in aval.shape for aval in results):
+        return [program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in results]
+    known = {**equation.params, "results": results, "kind": kind_of(results[0].dtype) if results else None}
+    nodes = _RULES[name](program, *args, **{key: known[key] for key in read if key in known})
+    return list(nodes) if isinstance(nodes, list | tuple) else [nodes]
 
 
 def _failed(program: Program, aval: Any) -> Node:
@@ -135,16 +154,16 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     return control_flow.projections(program, program.make("call", (), "int", passed, attribute=key), shapes)
 
 
-def _custom_linear_solve(program: Program, parameters: Parameters, *args: Node) -> list[Node]:
-    lengths, jaxprs = parameters["const_lengths"], parameters["jaxprs"]
+def _custom_linear_solve(program: Program, *args: Node, const_lengths: Any, jaxprs: Any) -> list[Node]:
+    lengths = const_lengths
     before = lengths.matvec + lengths.vecmat
     constants, right = args[before : before + lengths.solve], args[sum(lengths) :]
     return _inline(program, jaxprs.solve, [*constants, *right])
 
 
-def _platform(program: Program, parameters: Parameters) -> Node:
+def _platform(program: Program, *, platforms) -> Node:
     """Returns the index of the CPU's branch, or of the default branch."""
-    places = [k for k, parameter in enumerate(parameters["platforms"]) if parameter is None or "cpu" in parameter]
+    places = [k for k, parameter in enumerate(platforms) if parameter is None or "cpu" in parameter]
     return program.constant(np.int32(places[0]), "int")
 
 

@@ -1,5 +1,7 @@
 """Random JAX programs: real, whole and truth arrays, moves, reductions, products, control flow and nested functions.
 
+Control flow and indexing are also mapped over the rows of arrays, and arrays may have no elements.
+
 Each is drawn from a seed while it is traced, from the shapes and types of what it has computed so far. Real numbers are
 kept of order one and functions are smooth or compared far from ties, so that round-off stays small.
 """
@@ -17,6 +19,7 @@ REAL, WHOLE = (jnp.float64,), (jnp.int32, jnp.int64, jnp.uint32, jnp.uint64)
 TYPES = (*REAL * 3, *WHOLE[:2] * 2, *WHOLE[2:], jnp.bool_)
 SHAPES = (
     (), (1,), (2,), (3,), (5,), (8,), (9,), (17,), (40,), (65,), (2, 2), (3, 4), (4, 4), (7, 3), (2, 3, 4), (9, 8),
+    (0,), (3, 0),
 )  # fmt: skip
 LARGEST = 300
 """Elements of an array."""
@@ -69,7 +72,12 @@ def _computed(random: np.random.Generator, known: Arrays, *, steps: int, depth: 
     """Returns the known arrays and those that the steps add."""
     for _ in range(steps):
         step = STEPS[random.choice(len(STEPS), p=WEIGHTS)]
-        results = step(random, known, depth)
+        try:
+            results = step(random, known, depth)
+        except (IndexError, TypeError, ValueError, ZeroDivisionError):  # of what has no value without elements
+            if all(array.size for array in known):
+                raise
+            continue
         known = [*known, *(result for result in results if result.size <= LARGEST)]
     return known
 
@@ -78,7 +86,7 @@ def _chosen(random: np.random.Generator, known: Arrays, kinds: str = "fiub", ran
     """One of the arrays of a kind and least rank, late ones more often; a constant where there is none."""
     fitting = [array for array in known if jnp.dtype(array.dtype).kind in kinds and array.ndim >= rank]
     if not fitting or random.random() < 0.05:
-        shapes = [shape for shape in SHAPES if len(shape) >= rank]
+        shapes = [shape for shape in SHAPES if len(shape) >= rank and 0 not in shape]
         dtype = next(dtype for dtype in random.permutation(np.array(TYPES, object)) if jnp.dtype(dtype).kind in kinds)
         return jnp.asarray(_of(random, shapes[random.integers(len(shapes))], dtype))
     return fitting[max(random.integers(len(fitting)), random.integers(len(fitting)))]
@@ -248,6 +256,13 @@ def _moved(random, known, depth):
     return [moves[random.integers(len(moves))]()]
 
 
+def _changed(x):
+    """Another number of the type."""
+    if x.dtype == bool:
+        return ~x
+    return _tame(x * x - 0.5) if jnp.dtype(x.dtype).kind == "f" else 3 * x + 1
+
+
 def _first(x, axis):
     return lax.slice_in_dim(x, 0, 1, axis=axis)
 
@@ -271,6 +286,12 @@ def _indexed(random, known, depth):
         lambda: x.at[near].max(x[0]) if x.dtype != bool else x,
         lambda: x.at[jnp.arange(x.shape[0])].add(x[near.reshape(-1)[0]]) if x.dtype != bool else x,
         lambda: jnp.where(jnp.arange(x.shape[0]) < near.reshape(-1)[0], x.reshape(x.shape[0], -1)[:, 0], 0),
+        lambda: x.at[index].get(mode="fill", fill_value=1),
+        lambda: x.at[near].get(mode="promise_in_bounds"),
+        lambda: x.at[index].add(x[0], mode=("clip", "drop")[random.integers(2)]) if x.dtype != bool else ~x,
+        lambda: x.at[near].min(x[0], mode="promise_in_bounds") if x.dtype != bool else x,
+        lambda: x.at[index].apply(_changed, mode=("clip", "drop")[random.integers(2)]),
+        lambda: x.at[index].apply(jnp.zeros_like),
     ]
     return [ways[random.integers(len(ways))]()]
 
@@ -336,10 +357,35 @@ def _looped(random, known, depth):
         results = _computed(np.random.default_rng(seed), [carry, k], steps=2, depth=depth - 1)
         return _alike(results[-1], carry)
 
-    if random.random() < 0.5:
+    way = random.integers(4)
+    if way == 0:
         return [lax.fori_loop(0, int(random.integers(1, 5)), body, start)]
+    if way == 1:
+        return [lax.fori_loop(0, turns, body, start)]
+    if way == 2:  # until a number of the carry is large, 5 turns at most
+        last = lax.while_loop(
+            lambda s: (s[0] < 5) & ~jnp.any(3 * s[1].astype(float) > 1), lambda s: (s[0] + 1, body(*s)), (0, start)
+        )
+        return [last[1], last[0]]
     last = lax.while_loop(lambda s: s[0] < turns, lambda s: (s[0] + 1, body(s[0], s[1])), (turns * 0, start))
     return [last[1], last[0]]
+
+
+def _mapped(random, known, depth):
+    """Control flow or indexing of each row of some arrays."""
+    if not depth:
+        return []
+    x = _chosen(random, known, rank=1)[:9]
+    rows = [x, *(array[:9] for array in known[-4:] if array.ndim and array[:9].shape[0] == x.shape[0])]
+    order = jnp.argsort(x.reshape(x.shape[0], -1).sum(1)) if x.size else jnp.arange(x.shape[0])
+    steps, seed = (_looped, _looped, _looped, _scanned, _branched, _indexed, _mapped), int(random.integers(1 << 30))
+    step = steps[random.integers(len(steps))]
+    return jax.vmap(lambda *rows: step(np.random.default_rng(seed), [*rows], depth - 1 + (depth < 2)))(*rows, order)
+
+
+def _emptied(random, known, depth):
+    x = _chosen(random, known, rank=1)
+    return [lax.slice_in_dim(x, 0, 0, axis=int(random.integers(x.ndim)))]
 
 
 def _nested(random, known, depth):
@@ -369,6 +415,7 @@ def _differentiated(random, known, depth):
 CHANCES = {
     _one: 5, _two: 6, _doubled: 1, _compared: 2, _selected: 2, _power: 1, _converted: 2, _reduced: 3, _product: 2,
     _moved: 4, _indexed: 3, _scanned: 1, _branched: 1, _looped: 1, _nested: 1, _differentiated: 1,
+    _mapped: 4, _emptied: 1,
 }  # fmt: skip
 STEPS = tuple(CHANCES)
 WEIGHTS = np.array(list(CHANCES.values())) / sum(CHANCES.values())

@@ -326,6 +326,83 @@ CONTROL = {
         lambda s: (jnp.abs(s**3 - 2) > 1e-5) & (s < 10), lambda s: s - (s**3 - 2) / (3 * s**2), 1 + 0.0 * n
     ),
 }
+
+
+def counted(y, n):
+    """A loop whose condition compares a counter and a real number, and the number of its turns."""
+    return lax.while_loop(lambda s: (s[1] < 20) & (s[0] ** 2 < n), lambda s: (1.7 * s[0], s[1] + 1), (y, 0))
+
+
+MAPPED = {
+    "while": lambda x, n: jax.vmap(lambda y: lax.while_loop(lambda s: s**2 < n, lambda s: s * 1.7, y))(x),
+    "while_with_counter": lambda x, n: jax.vmap(lambda y: counted(y, n))(x),
+    "while_twice": lambda x, n: jax.vmap(jax.vmap(lambda y: counted(y, n)))(x[:, None] + x[:3]),
+    "while_of_rows": lambda x, n: jax.vmap(
+        lambda y: lax.while_loop(lambda s: jnp.sum(s[0] ** 2) < n, lambda s: (s[0] * s[1], s[1] + 0.1), (y * x, 1.1))
+    )(x),
+    "while_in_scan": lambda x, n: lax.scan(lambda c, y: (c + 1, jax.vmap(lambda z: counted(z, n))(c * y)[0]), x, x),
+    "fori_loop": lambda x, n: jax.vmap(lambda y, k: lax.fori_loop(0, k, lambda j, z: 1.1 * z + j, y))(
+        x, n + jnp.arange(9) % 4
+    ),
+    "gradient": lambda x, n: jax.vmap(lambda y: jax.jvp(lambda y: counted(y, n)[0], (y,), (2.0,))[1])(x),
+    "newton": lambda x, n: jax.vmap(
+        lambda a: lax.while_loop(lambda s: jnp.abs(s * s - a) > 1e-3, lambda s: (s + a / s) / 2, 1 + a)
+    )(1 + x * x),
+    "bisection": lambda x, n: jax.vmap(
+        lambda a: lax.while_loop(
+            lambda s: s[1] - s[0] > 1e-3 * (1 + a),
+            lambda s: (
+                jnp.where(jnp.tanh((s[0] + s[1]) / 2) < a / (1 + a), (s[0] + s[1]) / 2, s[0]),
+                jnp.where(jnp.tanh((s[0] + s[1]) / 2) < a / (1 + a), s[1], (s[0] + s[1]) / 2),
+            ),
+            (0.0 * a, 5.0 + a),
+        )
+    )(jnp.abs(x)),
+    "cond": lambda x, n: jax.vmap(lambda y: lax.cond(y > 0, jnp.sin, lambda y: counted(1 + y * y, n)[0], y))(x),
+    "exponential_integral": lambda x, n: special.exp1(jnp.abs(x) + 0.1),
+}
+APPLIED = {
+    "changed": lambda x, i: (x.at[i].apply(lambda v: v * v), x.at[1].apply(jnp.sin), x.at[:, i[:2]].apply(jnp.cos)),
+    "changed_by_mode": lambda x, i: [x.at[i, 0].apply(jnp.tanh, mode=mode) for mode in ("clip", "drop")],
+    "changed_at_known": lambda x, i: (x.at[np.array([1, 1, 2])].apply(lambda v: 2 * v), x.at[2:, ::3].apply(jnp.exp)),
+    "changed_in_rows": lambda x, i: jax.vmap(lambda row, k: row.at[k].apply(lambda v: v - 1))(x, i[:5]),
+    "changed_integers": lambda x, i: (i.at[i].apply(lambda v: 3 * v), (i > 0).at[i].apply(jnp.logical_not)),
+}
+EMPTY = {
+    "reductions": lambda z, x: (
+        *(z.sum(), z.sum(0), z.prod(1), jnp.all(z > 0, 0), jnp.any(z > 0), z.max(1), z.max(0, initial=2)),
+    ),
+    "products": lambda z, x: (z.T @ z + x, z @ x, z @ z.T, jnp.einsum("ij,ik->jk", z, z)),
+    "moves": lambda z, x: (
+        *(jnp.pad(z, ((1, 2), (0, 1))), jnp.concatenate([z, x, z]), jnp.tile(z, (2, 2)), z.T.reshape(0, 3)),
+        *(jnp.flip(z, 0), z[:, :1], jnp.stack([z, z], 1).sum((0, 1)), jnp.repeat(z, 3, axis=0)),
+    ),
+    "indices": lambda z, x: (
+        *(x[z[:, 0].astype(int)], x.at[z[:, 0].astype(int)].set(z), x.at[:0].add(1.0), x.at[:0].apply(jnp.sin)),
+        *(z[:, x[0].astype(int)], lax.dynamic_update_slice(x, z, (1, 2)), lax.dynamic_slice(z, (1, 2), (0, 2))),
+    ),
+    "order": lambda z, x: (jnp.sort(z, 0), jnp.sort(z, 1), jnp.cumsum(z, 0), jnp.argmin(z, 1), lax.cummax(z, 1)),
+    "carried": lambda z, x: (
+        lax.fori_loop(0, 3, lambda k, s: (2 * s[0], s[1] + k), (z, x)),
+        lax.while_loop(lambda s: s[1].sum() < 9, lambda s: (2 * s[0], s[1] + 1), (z, x)),
+    ),
+    "scanned": lambda z, x: (
+        lax.scan(lambda c, row: (c + row, c * row), x[0], z),
+        lax.scan(lambda c, row: (c + row, row[:0]), x[0], x),
+        lax.associative_scan(jnp.add, z),
+    ),
+    "branches": lambda z, x: (
+        lax.cond(x[0, 0] > 0, lambda: (z, x), lambda: (2 * z, 2 * x)),
+        lax.switch(jnp.sum(x > 0) % 3, [lambda: z.sum() + x, lambda: 2 * x, lambda: x]),
+    ),
+    "mapped": lambda z, x: jax.vmap(lambda y: counted(y, 3.0))(z[:, 0]),
+    "factors": lambda z, x: (
+        *(jnp.linalg.cholesky(z[:, :0]), jnp.linalg.inv(z[:, :0]), jnp.linalg.det(z[:, :0])),
+        jnp.linalg.solve(x, x[:, :0]),
+    ),
+    "sums": lambda z, x: (jnp.polyval(z[:, 0], x), jnp.interp(z[:, 0], x[0], x[1]), jnp.searchsorted(z[:, 0], x[0])),
+    "integers": lambda z, x: (z.astype(int).sum(), z.astype(int) // 3, ~(z > 0), jnp.nonzero(z > 0, size=2)[0]),
+}  # fmt: skip
 FACTORED = {
     "cholesky": lambda a, b: jnp.linalg.cholesky(definite(a)),
     **{
@@ -520,6 +597,9 @@ CASES = {
     **{name: (function, (normal(5, 7),)) for name, function in MOVES.items()},
     **{name: (function, (normal(5, 7), np.array([3, 0, -1, 9, 3, -8, 1]))) for name, function in INDEXED.items()},
     **{name: (function, (normal(4), np.int64(3))) for name, function in CONTROL.items()},
+    **{f"mapped_{name}": (function, (normal(9), np.int64(3))) for name, function in MAPPED.items()},
+    **{name: (function, (normal(5, 7), np.array([3, 0, -1, 9, 3, -8, 1]))) for name, function in APPLIED.items()},
+    **{f"empty_{name}": (function, (np.zeros((0, 3)), normal(3, 3))) for name, function in EMPTY.items()},
     **PRODUCTS,
     **DIVISIONS,
     **ROUNDED,

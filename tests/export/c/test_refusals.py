@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 from jax.scipy import special
 
-from dln_jax.export.c import source
+from dln_jax.export.c import lowering, source
 from dln_jax.export.c.source import export_c
 from dln_jax.types import InputError
 
@@ -53,7 +53,12 @@ FUNCTIONS = {
     "fft": (lambda x: jnp.fft.rfft(x).real, (X,), r"('fft' has no C|type complex).*test_refusals\.py:\d+"),
     "convolution": (convolved, (X,), r"'conv_general_dilated' has no C \(made at .*test_refusals\.py:\d+\)"),
     "singular values": (lambda x: jnp.linalg.svd(jnp.outer(x, x))[1], (X,), "'svd' has no C"),
-    "pivoted QR": (lambda x: jax.scipy.linalg.qr(jnp.outer(x, x), pivoting=True), (X,), "'qr' has C without pivoting"),
+    "pivoted QR": (lambda x: jax.scipy.linalg.qr(jnp.outer(x, x), pivoting=True), (X,), "no C with pivoting=True"),
+    "rounded product": (lambda x: lax.dot(x, x, precision="BF16_BF16_F32"), (X,), "precision=.*BF16_BF16_F32"),
+    "some eigenvalues": (
+        lambda x: lax.linalg.eigh(jnp.outer(x, x), subset_by_index=(0, 2))[1], (X,), "'eigh' has C for all eigenvalues"
+    ),
+    "factors without elements": (lambda x: jnp.linalg.qr(x[:, None][:, :0], "complete"), (X,), r"shape \(3, 0\)"),
     "stack": (lambda x: jnp.sin(jnp.outer(x, x)).sum(0), (np.zeros(300),), r"KiB of stack; .* 256 KiB"),
     "large array": (lambda x: jnp.sum(jnp.ones(2049)[:, None] * jnp.outer(x, x).ravel()), (np.zeros(64),), "too large"),
     "source": (lambda x: x @ LARGE, (np.zeros(230),), r"source would take 1 MB; .* 1 MB"),
@@ -66,6 +71,13 @@ FUNCTIONS = {
     "bad result": (lambda x: {"while": x}, (X,), "name of a result is 'while'"),
     "result with a space": (lambda x: {"my force": x}, (X,), "name of a result is 'my force'"),
 }  # fmt: skip
+
+
+def test_a_parameter_that_a_rule_does_not_read_is_refused_by_name(tmp_path, monkeypatch):
+    monkeypatch.setitem(lowering._RULES, "cumsum", lambda program, node, *, axis: node)
+    export_c({"run": (lambda x: lax.cumsum(x, reverse=False), (X,))}, tmp_path / "c")
+    with pytest.raises(InputError, match=r"'cumsum' has no C with reverse=True \(made at .*test_refusals\.py:\d+\)"):
+        export_c({"run": (lambda x: lax.cumsum(x, reverse=True), (X,))}, tmp_path / "c", overwrite=True)
 
 
 @pytest.mark.parametrize("case", FUNCTIONS)
