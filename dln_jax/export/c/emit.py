@@ -156,13 +156,16 @@ def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> 
 
 def _carry_over(body: Body, loop: Loop, names: list[str], number: int) -> None:
     """Writes the new carries, through temporaries: they may be the old carries in another order."""
-    moved = loop.results[: len(names)]
-    temporary = [f"n{number}_{index}" for index in range(len(moved))]
-    for name, node in zip(temporary, moved, strict=True):
-        body.declared(name, node.dtype, max(node.size, 1))
-        copied(body, node, name)
-    for name, old, node in zip(names, temporary, moved, strict=True):
-        _from_array(body, old, node.size, name)
+    moved = [
+        (name, f"n{number}_{index}", node)
+        for index, (name, node) in enumerate(zip(names, loop.results, strict=False))
+        if node.size
+    ]
+    for _, temporary, node in moved:
+        body.declared(temporary, node.dtype, node.size)
+        copied(body, node, temporary)
+    for name, temporary, node in moved:
+        _from_array(body, temporary, node.size, name)
 
 
 def _while(body: Body, node: Node) -> None:

@@ -384,7 +384,7 @@ EMPTY = {
     "order": lambda z, x: (jnp.sort(z, 0), jnp.sort(z, 1), jnp.cumsum(z, 0), jnp.argmin(z, 1), lax.cummax(z, 1)),
     "carried": lambda z, x: (
         lax.fori_loop(0, 3, lambda k, s: (2 * s[0], s[1] + k), (z, x)),
-        lax.while_loop(lambda s: s[1].sum() < 9, lambda s: (2 * s[0], s[1] + 1), (z, x)),
+        lax.while_loop(lambda s: jnp.abs(s[1].sum()) < 9, lambda s: (2 * s[0], s[1] + 1), (z, x)),
     ),
     "scanned": lambda z, x: (
         lax.scan(lambda c, row: (c + row, c * row), x[0], z),

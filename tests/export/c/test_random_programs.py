@@ -19,7 +19,7 @@ from dln_jax.types import InputError
 
 needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc on the PATH")
 BATCH, STATES = 20, 3
-FEW, ALL_SUPPORTED, EVERY = 5, 40, 400
+FEW, ALL_SUPPORTED, EVERY = 5, 40, 500
 """Seeds below these are tried by default; have C for every program; are tried by the slow tests."""
 BOUND = 1e-12
 MOST_REFUSED = 1
