@@ -129,6 +129,7 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
     parameters = [f"const {C_TYPES[inputs[k].dtype]} *RESTRICT a{k}_" for k in sorted(inputs)]
     parameters += [f"{C_TYPES[node.dtype]} *RESTRICT {target}" for node, target in zip(results, targets, strict=True)]
     unused = [f"    (void)a{k}_;" for k in sorted(inputs) if not body.uses(inputs[k])]
+    unused += [f"    (void){target};" for result, target in zip(results, targets, strict=True) if not result.size]
     lines = "\n".join([*unused, *body.lines])
     text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
     name = source.names.setdefault(text, f"part_{len(source.names)}")

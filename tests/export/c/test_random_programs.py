@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_programs
@@ -85,6 +86,21 @@ either_contract = pytest.mark.parametrize("finite", [False, True], ids=["any-arg
 @either_contract
 def test_a_few_random_programs_agree_with_jax(finite, tmp_path):
     assert not compared(range(FEW), tmp_path, finite=finite)
+
+
+@needs_compiler
+def test_a_called_function_may_return_an_array_without_elements(tmp_path):
+    @jax.jit
+    def called(x):
+        return x[:0], jnp.cos(jnp.sin(x) * 2 + x) ** 2 - 1
+
+    def function(a):
+        return [*called(a), *called(2 * a)]
+
+    state = (np.array([0.3, -1.2]),)
+    (results,) = in_sanitized_c({"f": (function, state)}, {"f": [state]}, tmp_path)["f"]
+    for ours, theirs in zip(results, function(*state), strict=True):
+        close(ours, np.asarray(theirs), "result")
 
 
 @pytest.mark.slow
