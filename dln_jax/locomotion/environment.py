@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.locomotion.task import FALLEN, LocomotionTask, advance, beginning, change_of, observe
+from dln_jax.types import InputError
 
 
 def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -35,7 +36,13 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
-        """Returns the observation of a start perturbed by the task's variation; without one, at rest."""
+        """Returns the observation of a start perturbed by the task's variation; without one, at rest.
+
+        Raises:
+            InputError: there are options, of which this environment has none.
+        """
+        if options:
+            raise InputError(f"reset got the options {', '.join(options)}; this environment has none")
         super().reset(seed=seed, options=options)
         self._place = self._begin(jax.random.key(int(self.np_random.integers(2**31))))
         return self._observation(), {}

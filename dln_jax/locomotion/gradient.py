@@ -153,7 +153,8 @@ def train(
         policy = policy._replace(init=lambda _: initial)
     learner = make_gradient_learner(task, policy, settings, steps=goal.steps, mesh=mesh)
     facts = {"creature": task.creature.name, "width": width, "episode": task.episode, "steps": goal.steps}
-    facts |= {"upright": task.upright, "speed": task.speed, **task.variation._asdict(), **settings._asdict()}
+    facts |= {"upright": task.upright, "speed": task.speed, "clock_period": task.clock_period}
+    facts |= {**task.variation._asdict(), **settings._asdict()}
     compiled = compile_learner(task, learner, mesh)
     return learn_seeds(compiled, seeds, goal, report, directory=directory, settings=facts, resume=resume)
 

@@ -219,14 +219,16 @@ def learn(
         report: called after every evaluation.
 
     Raises:
-        InputError: the stored run had other settings, or its files are damaged.
+        InputError: the stored run had other settings, its files are damaged, or there is no directory to resume from.
         KeyboardInterrupt: raised only after the current evaluation is stored.
     """
+    if resume and directory is None:
+        raise InputError("resume needs the directory of the run; give it, or start a new run")
     learner, name = compiled.learner, f"{CHECKPOINT}-{seed}"
     identity = {"settings": {**(settings or {}), "seed": seed}}
     state = learner.start(seed)
     best, records = learner.parameters(state), []
-    if resume and directory is not None and has_checkpoint(directory, name):
+    if resume and has_checkpoint(directory, name):
         (state, best), records = _restored(directory, name, identity, (state, best))
     highest = max(map(rank, records), default=rank(None))
     before = records[-1].seconds if records else compiled.seconds

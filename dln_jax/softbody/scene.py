@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.softbody.contact.contact import Contact
 from dln_jax.softbody.contact.crossings import crossings
-from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses
-from dln_jax.softbody.terms.term import Context, Term
+from dln_jax.softbody.mesh.mesh import Mesh, indices_of, lumped_masses
+from dln_jax.softbody.terms.term import Context, Pose, Term
 from dln_jax.solvers.elements.energies import ElementEnergy, value
 from dln_jax.solvers.elements.moving import Lists, MovingEnergy, lists_between, moving_gradient
 from dln_jax.types import InputError
@@ -30,6 +30,12 @@ class Params(NamedTuple):
     """Masses of the vertices in kg."""
     terms: dict[str, Any]
     """Parameters of the terms, by name."""
+
+    @property
+    def poses(self) -> dict[str, Pose]:
+        """Poses of rigid surfaces by the names of their terms."""
+        found = {name: getattr(of, "pose", None) for name, of in self.terms.items()}
+        return {name: pose for name, pose in found.items() if pose is not None}
 
 
 class SoftScene(NamedTuple):
@@ -81,13 +87,16 @@ class State(NamedTuple):
     """Previous state, for two-step methods."""
     growth: Growth | None = None
     """Energy created so far, for `Info.converged` to detect slow divergence; `None` judges single steps only."""
+    poses: tuple[Bool[Array, ""], dict[str, Pose]] | None = None
+    """Whether they are known, and the poses of rigid surfaces: those of the parameters of the previous step, from which
+    friction takes their motion. In a step from unknown poses, such as the first, surfaces are at rest."""
 
 
 def make_scene(
     mesh: Mesh,
     terms: Sequence[Term],
     *,
-    density: float = 1000.0,
+    density: float | None = None,
     masses: Any = None,
     held: Any = (),
     contacts: Sequence[Contact] = (),
@@ -97,14 +106,14 @@ def make_scene(
     Args:
         mesh: its vertices are the rest shape.
         terms: energy terms of the body.
-        density: in kg/m³ (kg/m² in the plane), for the masses of the vertices.
+        density: in kg/m³ (kg/m² in the plane), for the masses of the vertices; by default 1000.
         masses: masses of the vertices in kg, one for all or [n], instead of a density.
-        held: indices of vertices that are not solved for.
+        held: vertices that are not solved for: indices [k], or a boolean mask [n].
         contacts: barrier contacts with obstacles and between bodies, which otherwise pass through each other.
 
     Raises:
-        InputError: a name is used twice, an index or mass is out of range, no vertex is free, or surfaces in contact
-            cross in the rest shape.
+        InputError: a name is used twice, a part was made for another mesh, an index or mass is out of range, both
+            density and masses are given, no vertex is free, or surfaces in contact cross in the rest shape.
     """
     n = len(mesh.vertices)
     terms = tuple(terms)
@@ -115,11 +124,16 @@ def make_scene(
         if len(wrong := np.argwhere((term.indices < 0) | (term.indices >= n))):
             vertex = term.indices[tuple(wrong[0])]
             raise InputError(f"term '{term.name}', element {wrong[0][0]} names vertex {vertex}; expected 0..{n - 1}")
-    held = np.asarray(held, int).reshape(-1)
-    if len(outside := held[(held < 0) | (held >= n)]):
-        raise InputError(f"held names vertex {outside[0]}; expected 0..{n - 1}")
-    if len(np.unique(held)) == n:
+    for part in (*terms, *contacts):
+        of = mesh if part.mesh is None else part.mesh
+        if not (np.array_equal(of.vertices, mesh.vertices) and np.array_equal(of.nodes, mesh.nodes)):
+            raise InputError(f"'{part.name}' was made for another mesh; make it from the mesh of the scene")
+    held = indices_of("held", held, n)
+    if len(held) == n:
         raise InputError(f"held names all {n} vertices; expected at least one that is free to move")
+    if masses is not None and density is not None:
+        raise InputError("masses and density were both given; leave out one of them")
+    density = 1000.0 if density is None else density
     masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
     if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
         raise InputError(f"the mass of vertex {bad[0]} is {masses[bad[0]]} kg; expected a positive number")
@@ -193,13 +207,13 @@ def prepare(
     *,
     dt: Any = jnp.inf,
     control: Any = None,
-    lag: Float[Array, "n dim"] | None = None,
+    **settings: Any,
 ) -> tuple[Any, ...]:
     """Returns the data of all terms' elements for a step of dt in s that starts at x; dt = inf is a static solve.
 
-    Friction takes its normal forces at `lag`, by default at x.
+    The settings are `lag` and `before` of `Context`.
     """
-    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), lag=lag)
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), **settings)
     controls = _by_term(scene, control)
     return tuple(
         term.prepare(params.terms[term.name], context._replace(control=controls(term.name))) for term in scene.terms
@@ -209,13 +223,14 @@ def prepare(
 def _by_term(scene: SoftScene, control: Any) -> Callable[[str], Any]:
     """Returns a function from a term's name to its control: the array of the only actuator, or an entry of a dict."""
     driven = [term.name for term in scene.terms if term.control is not None]
+    if control is None:
+        return lambda _: None
     if not isinstance(control, Mapping):
-        if control is not None and len(driven) > 1:
-            raise InputError(
-                f"the control is one array, but the scene has the actuators {', '.join(driven)}; "
-                "pass a dict of arrays by these names"
-            )
-        return lambda name: control
+        if len(driven) != 1:
+            several = f"the actuators {', '.join(driven)}; pass a dict of arrays by these names"
+            none = "no actuator; leave it out, or give a term no value, so that it reads one"
+            raise InputError(f"the control is one array, but the scene has {several if driven else none}")
+        return {driven[0]: control}.get
     if unknown := [name for name in control if name not in driven]:
         known = f"expected {', '.join(driven)}" if driven else "it has none: give a term no value, so that it reads one"
         raise InputError(f"the control names '{unknown[0]}', which is not an actuator of the scene; {known}")
@@ -228,10 +243,10 @@ def prepare_contacts(
     x: Float[Array, "n dim"],
     *,
     dt: Any = jnp.inf,
-    lag: Float[Array, "n dim"] | None = None,
+    **settings: Any,
 ) -> tuple[Any, ...]:
     """Returns the data of the contacts' energies for a step of dt in s that starts at x, like `prepare`."""
-    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), lag=lag)
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), **settings)
     return tuple(data for contact in scene.contacts for data in contact.prepare(params.terms[contact.name], context))
 
 

@@ -59,7 +59,7 @@ def make_step(
             their number. This compiles the step a second time.
         friction_iterations: number of times to solve the step again with the normal forces and directions of friction
             at the previous solution instead of those at the start (`friction_iterations`). `Info.friction_change`
-            reports how much one more would change.
+            reports how much one more would change. Without them, friction lags by a step.
 
     Raises:
         InputError: a number is not positive, or halvings are used with a two-step method.

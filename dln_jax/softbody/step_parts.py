@@ -24,6 +24,7 @@ from dln_jax.softbody.scene import (
     prepare,
     prepare_contacts,
 )
+from dln_jax.softbody.terms.contact import motion_of
 from dln_jax.softbody.verdict import (
     TOLERANCE,
     Info,
@@ -97,7 +98,7 @@ def step_parts(
             "forces between bodies cannot be averaged along the step, because the pairs that touch change; "
             "use BACKWARD_EULER or BDF2"
         )
-    free = scene.free
+    free, whole = scene.free, dt
     terms = stored = element_energies(scene)
     if integrator.averaged:
         terms = tuple(averaged(element, scene.mesh.dimension) for element in stored)
@@ -105,19 +106,24 @@ def step_parts(
     at = pattern(energies, free.shape[0], free.shape[1], free)
     overlaps = None if scene.contacts else count_overlaps(scene.mesh)
     touching = contact_energies(scene)
+    touched = [contact.name for contact in scene.contacts for _ in contact.energies]
     moving = tuple(map(averaged_moving, touching)) if integrator.averaged else touching
     iterating = friction_iterations > 0 and has_friction(scene)
     rest, masses = scene.params.rest, scene.params.masses
 
-    def along(start: Array, data: tuple[Any, ...]) -> tuple[Any, ...]:
+    def along(start: Callable[[str], Array], data: tuple[Any, ...]) -> tuple[Any, ...]:
         """Returns the data of the terms, averaged along the step if the integrator averages."""
         if not integrator.averaged:
             return data
-        return tuple(averaged_data(element, start, of) for element, of in zip(stored, data, strict=True))
+        starts = [start(term.name) for term in scene.terms]
+        return tuple(map(averaged_data, stored, starts, data))
 
     known = known_data(
         (scene.params, dt),
-        lambda: ((masses / (integrator.span * dt) ** 2, rest), *along(rest, prepare(scene, scene.params, rest, dt=dt))),
+        lambda: (
+            (masses / (integrator.span * dt) ** 2, rest),
+            *along(lambda _: rest, prepare(scene, scene.params, rest, dt=dt)),
+        ),
     )
     chosen = requested_or_chosen(linear_solver, energies, at, rest, known)
     solve = partial(
@@ -138,7 +144,8 @@ def step_parts(
                 raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
         x, v = (jnp.broadcast_to(jnp.asarray(values, float), free.shape) for values in (x, v))
         previous = Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None
-        return State(x, v, previous, Growth(jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)))
+        poses = (jnp.asarray(False), scene.params.poses) if scene.params.poses else None
+        return State(x, v, previous, Growth(jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)), poses)
 
     def balance(params: Params, state: State, control: Any, dt: Any, x_after: Array | None = None) -> Balanced:
         h, target = integrator.target(state, dt)
@@ -146,12 +153,21 @@ def step_parts(
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
         # Averaging along the step halves a linear damping force; half the time makes it that of the mean velocity.
         elapsed = span / 2 if integrator.averaged else span
+        before = {}
+        if state.poses is not None:
+            known, last = state.poses
+            share = jnp.asarray(known * integrator.span * dt / whole, span.dtype)
+            before = jax.tree.map(lambda now, then: now + share * (then - now), params.poses, last)
+
+        def begun(name: str) -> Array:
+            """Returns the start of the way relative to a surface, along which its forces are averaged."""
+            return state.x + motion_of(name, params.terms[name], before, state.x)
 
         def prepared(lag: Array | None) -> tuple[Any, Any, Any]:
-            at_start = prepare(scene, params, state.x, dt=elapsed, control=control, lag=lag)
-            contact = prepare_contacts(scene, params, state.x, dt=elapsed, lag=lag)
-            contact = tuple((state.x, of) for of in contact) if integrator.averaged else contact
-            return at_start, ((weights, target), *along(state.x, at_start)), contact
+            at_start = prepare(scene, params, state.x, dt=elapsed, control=control, lag=lag, before=before)
+            contact = prepare_contacts(scene, params, state.x, dt=elapsed, lag=lag, before=before)
+            contact = tuple(zip(map(begun, touched), contact, strict=True)) if integrator.averaged else contact
+            return at_start, ((weights, target), *along(begun, at_start)), contact
 
         first = prepared(None)
         data = first[1]
@@ -201,7 +217,8 @@ def step_parts(
         info, growth = judged(params, state, x, v, balanced)
         x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
-        return State(x, v, before, growth), info
+        poses = None if state.poses is None else (jnp.asarray(True), params.poses)
+        return State(x, v, before, growth, poses), info
 
     def judged(params: Params, state: State, x: Array, v: Array, solution: Balanced) -> tuple[Info, Growth | None]:
         # The verdict has no derivatives.

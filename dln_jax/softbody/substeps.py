@@ -59,7 +59,9 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
     most = 2**halvings
 
     def part_of(params: Params, state: State, control: Any, length: Array, **start: Array) -> tuple[State, Info]:
-        return advance(params, state, control, jnp.asarray(dt, state.x.dtype) * length / most, **start)
+        after, info = advance(params, state, control, jnp.asarray(dt, state.x.dtype) * length / most, **start)
+        # All parts share the motion of surfaces in the whole step.
+        return after._replace(poses=state.poses), info
 
     @jax.custom_jvp
     def whole(params: Params, state: State, control: Any) -> tuple[State, Info, Parts]:
@@ -97,8 +99,8 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
 
     def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         state, info, parts = whole(*primals)
-        inputs, structure = jax.tree.flatten((primals[0], primals[2]))
-        dots = jax.tree.leaves((tangents[0], tangents[2]), is_leaf=is_constant)
+        inputs, structure = jax.tree.flatten((primals[0], primals[2], state.poses))
+        dots = jax.tree.leaves((tangents[0], tangents[2], tangents[1].poses), is_leaf=is_constant)
         varying = [i for i, dot in enumerate(dots) if not is_constant(dot)]
         varied = [inputs[i] for i in varying]
         start_dot = tuple(
@@ -107,9 +109,9 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
 
         def part(number: Array, varied: list[Array], x: Array, v: Array) -> tuple[Array, Array]:
             replaced = dict(zip(varying, varied, strict=True))
-            params, control = structure.unflatten([replaced.get(i, leaf) for i, leaf in enumerate(inputs)])
+            params, control, poses = structure.unflatten([replaced.get(i, leaf) for i, leaf in enumerate(inputs)])
             known = {"x_after": parts.x_after[number]}
-            after, _ = part_of(params, State(x, v), control, parts.length[number], **known)
+            after, _ = part_of(params, State(x, v, poses=poses), control, parts.length[number], **known)
             return after.x, after.v
 
         def at(number: Array) -> tuple[list[Array], Array, Array]:
@@ -129,7 +131,10 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
     whole.defjvp(derivative, symbolic_zeros=True)
 
     def step(params: Params, state: State, control: Any = None) -> tuple[State, Info]:
-        return whole(params, state, control)[:2]
+        after, info, _ = whole(params, state, control)
+        if state.poses is not None:
+            after = after._replace(poses=(jnp.asarray(True), params.poses))
+        return after, info
 
     return step
 

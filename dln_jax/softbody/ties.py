@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator
-from dln_jax.softbody.mesh.mesh import components
+from dln_jax.softbody.mesh.mesh import components_of_vertices, indices_of
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State
 from dln_jax.softbody.step_parts import Balanced, step_parts
 from dln_jax.softbody.verdict import Info, trusted
@@ -168,7 +168,8 @@ def _moved(pose: tuple[Array, Array], points: Float[Array, "k dim"]) -> Float[Ar
 
 def _checked(scene: SoftScene, ties: Sequence[Tie]) -> tuple[tuple[Tie, ...], list[np.ndarray]]:
     """Returns valid ties, and for each the vertices of the components whose first tie it is."""
-    ties = tuple(tie._replace(vertices=np.asarray(tie.vertices, int).reshape(-1)) for tie in ties)
+    count = len(scene.mesh.vertices)
+    ties = tuple(tie._replace(vertices=indices_of("a tie", tie.vertices, count)) for tie in ties)
     if not ties or not all(len(tie.vertices) for tie in ties):
         raise InputError("ties name no vertex; expected at least one for each frame")
     tied = np.concatenate([tie.vertices for tie in ties])
@@ -176,8 +177,7 @@ def _checked(scene: SoftScene, ties: Sequence[Tie]) -> tuple[tuple[Tie, ...], li
         raise InputError(f"vertex {loose[0]} is tied but not held; pass the tied vertices to make_scene as held")
     if len(np.unique(tied)) < len(tied):
         raise InputError("a vertex is tied twice; expected each vertex in one tie")
-    component = np.full(len(scene.mesh.vertices), -1)
-    component[scene.mesh.nodes] = components(scene.mesh)[:, None]
+    component = components_of_vertices(scene.mesh)
     frame_of, taken = [], np.zeros(len(component), bool)
     for tie in ties:
         vertices = np.isin(component, component[tie.vertices]) & ~taken

@@ -175,6 +175,8 @@ def example_of(options: Any) -> tuple[Example, tuple[str, ...]]:
     modulus = choices.get("youngs_modulus", getattr(known.get("youngs_modulus"), "default", 0.0))
     from_file, statements = own_mesh(options, modulus)
     choices |= {name: value for name, value in from_file.items() if name in known}
+    if "held" in from_file and "held" not in known:
+        statements = (*statements, f"the {options.scene} scene holds no vertices: the file's `held` is not used")
     if options.seed < 0:
         raise InputError(f"--seed is {options.seed}; expected 0 or a positive integer")
     if "seed" in known:

@@ -78,6 +78,8 @@ def _numbers(option: str, text: str | None, separator: str, count: int) -> dict[
     require_once(f"--{option}", [item.rpartition("=")[0].strip() for item in items])
     for item in items:
         name, _, numbers = item.rpartition("=")
+        if name.strip() in values:
+            raise InputError(f"--{option} names '{name.strip()}' twice; name each set once")
         try:
             values[name.strip()] = [float(number) for number in numbers.split(",")]
         except ValueError:

@@ -26,11 +26,11 @@ from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact
 from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
 from dln_jax.softbody.contact.distances import EDGE_EDGE, POINT_TRIANGLE, squared_distance, stencil_of
 from dln_jax.softbody.contact.surface import Surface, areas, surface_of
-from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.contact import Slip, friction_energy
+from dln_jax.softbody.mesh.mesh import Mesh, components_of_vertices
+from dln_jax.softbody.terms.contact import Slip, friction_energy, slip_of
 from dln_jax.softbody.terms.term import Context, Numbers
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
-from dln_jax.types import require_positive
+from dln_jax.types import InputError, require_positive
 
 _AT_ONCE = 256
 """Number of pairs whose distance is measured in one turn of a loop; no list is shorter."""
@@ -81,13 +81,15 @@ def body_contact(
         name: key of its parameters in `Params.terms`.
 
     Raises:
-        InputError: a number that is not positive.
+        InputError: a number that is not positive, or surfaces of one body that are closer than the distance in the rest
+            shape, which would push each other apart.
     """
-    require_positive(distance=distance, threshold_speed=threshold_speed, **({"capacity": capacity} if capacity else {}))
+    require_positive(distance=distance, threshold_speed=threshold_speed, capacity=1 if capacity is None else capacity)
     surface = surface_of(mesh)
     kinds = _kinds(surface, mesh.vertices, distance)
     capacity = max(_AT_ONCE // 2, 2 * len(surface.vertices) if capacity is None else capacity)
     parameters = contact_parameters(distance, stiffness, friction)
+    _require_gaps(mesh, kinds, capacity, parameters)
     barrier = MovingEnergy(
         elements=partial(_near, kinds, capacity),
         describe=partial(_described, surface),
@@ -115,7 +117,7 @@ def body_contact(
         return jnp.sqrt(jnp.minimum(jnp.min(jnp.where(elements.data.used, squares, farthest)), farthest))
 
     energies = (barrier,) if friction is None else (barrier, sliding)
-    return Contact(name, parameters, energies, prepare, least_distance)
+    return Contact(name, parameters, energies, prepare, least_distance, mesh)
 
 
 def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, ...]:
@@ -128,6 +130,19 @@ def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, .
         return (kind(vertices, edges, 0),)
     triangles = group(surface.triangles, rest)
     return kind(vertices, triangles, POINT_TRIANGLE), kind(edges, edges, EDGE_EDGE)
+
+
+def _require_gaps(mesh: Mesh, kinds: tuple[Kind, ...], capacity: int, parameters: ContactParameters) -> None:
+    """Refuses a distance within which a body pushes itself apart in its rest shape; other bodies may be as close."""
+    rest = jnp.asarray(mesh.vertices)
+    corners, near, _ = _near(kinds, capacity, rest, jnp.zeros_like(rest), (parameters, rest))
+    body = components_of_vertices(mesh)
+    own = corners[near.used & (body[corners[:, 0]] == body[corners[:, -1]])]
+    if len(own):
+        raise InputError(
+            f"the vertices {own[0].tolist()} of one body are closer in its rest shape than the distance within which "
+            "contact acts, and would push it open; give a smaller distance"
+        )
 
 
 def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: Any) -> Elements:
@@ -210,12 +225,8 @@ def _lagged(
     elements = jax.lax.stop_gradient(barrier.elements(x, jnp.zeros_like(x), data))
     corners = x[elements.indices]
     force, normal, weights = jax.vmap(normal_force)(corners, barrier.describe(x, elements, data))
-    # A static solve (dt infinite) has no velocities, hence no friction.
-    moving = jnp.isfinite(context.dt)
-    threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
     start = jnp.einsum("mk,mki->mi", weights, context.x[elements.indices])
-    largest = jnp.where(moving, friction * force, 0.0)
-    return elements, (Slip(start, normal, largest, jnp.broadcast_to(threshold, force.shape)), weights)
+    return elements, (slip_of(context, threshold_speed, start, normal, friction * force), weights)
 
 
 def _sliding_energy(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, ""]:

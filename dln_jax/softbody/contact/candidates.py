@@ -67,20 +67,21 @@ def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margi
     return Boxes(low.min(axis=1) - margin, high.max(axis=1) + margin)
 
 
+def meeting(one: Boxes, other: Boxes) -> Int[np.ndarray, "m 2"]:
+    """Returns the pairs of known boxes that meet, by rows of the first."""
+    (low, high), (other_low, other_high) = (map(np.asarray, side) for side in (one, other))
+    rows = [
+        np.flatnonzero((bottom <= other_high).all(axis=1) & (other_low <= top).all(axis=1))
+        for bottom, top in zip(low, high, strict=True)
+    ]
+    return np.stack([np.repeat(np.arange(len(rows)), [len(row) for row in rows]), np.concatenate(rows)], axis=1)
+
+
 def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: float) -> tuple[int, int]:
     """Counts the pairs of clusters and of primitives whose boxes, each enlarged by half the margin, meet at x."""
-    counts = []
-    for clusters in (True, False):
-        sides = []
-        for of in (one, other):
-            box = boxes(of, jnp.asarray(x), jnp.asarray(x), margin / 2)
-            sides.append([np.asarray(side) for side in (_of_clusters(of, box) if clusters else box)])
-        (low, high), (other_low, other_high) = sides
-        rows = (
-            (row <= other_high).all(axis=1) & (other_low <= top).all(axis=1) for row, top in zip(low, high, strict=True)
-        )
-        counts.append(sum(int(row.sum()) for row in rows))
-    return counts[0], counts[1]
+    at = jnp.asarray(x)
+    first, second = (boxes(of, at, at, margin / 2) for of in (one, other))
+    return len(meeting(_of_clusters(one, first), _of_clusters(other, second))), len(meeting(first, second))
 
 
 def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]) -> PairList:

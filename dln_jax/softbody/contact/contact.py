@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms.term import NOT_NEGATIVE, POSITIVE, Context, Numbers, material
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 
@@ -34,6 +35,8 @@ class Contact(NamedTuple):
     """(parameters, context) -> data of the energies in a step."""
     least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
     """(positions, elements and data of the barrier) -> smallest distance in m, capped at h."""
+    mesh: Mesh | None = None
+    """As in `Term`."""
     changing: bool = True
     """Whether the set of elements changes during a motion."""
 

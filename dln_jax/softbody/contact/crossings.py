@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.softbody.contact.candidates import Group, boxes, group
+from dln_jax.softbody.contact.candidates import boxes, group, meeting
 from dln_jax.softbody.contact.surface import surface_of
 from dln_jax.softbody.mesh.mesh import Mesh
 
@@ -28,7 +28,8 @@ def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int
     surface = surface_of(mesh)
     x = np.asarray(x, float)
     others = surface.edges if mesh.dimension == 2 else surface.triangles
-    one, other = _boxes_meet(group(surface.edges, x), group(others, x), x).T
+    at = jnp.asarray(x)
+    one, other = meeting(*(boxes(group(of, x), at, at, 0.0) for of in (surface.edges, others))).T
     if mesh.dimension == 2:
         one, other = one[one < other], other[one < other]
     edges, facets = surface.edges[one], others[other]
@@ -37,17 +38,6 @@ def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int
     meet = _segments_meet if mesh.dimension == 2 else _segments_meet_triangles
     hit = meet(x[edges], x[facets])
     return [(tuple(edge), tuple(facet)) for edge, facet in zip(edges[hit].tolist(), facets[hit].tolist(), strict=True)]
-
-
-def _boxes_meet(one: Group, other: Group, x: np.ndarray) -> Int[np.ndarray, "m 2"]:
-    at = jnp.asarray(x)
-    of_one, of_other = (tuple(np.asarray(side) for side in boxes(of, at, at, 0.0)) for of in (one, other))
-    pairs = []
-    for start in range(0, len(one.primitives), 256):
-        here = slice(start, start + 256)
-        meet = (of_one[0][here, None] <= of_other[1]).all(axis=2) & (of_other[0] <= of_one[1][here, None]).all(axis=2)
-        pairs.append(np.argwhere(meet) + np.array([start, 0]))
-    return np.concatenate(pairs)
 
 
 def _segments_meet(one: Float[np.ndarray, "m 2 2"], other: Float[np.ndarray, "m 2 2"]) -> Bool[np.ndarray, " m"]:

@@ -7,7 +7,8 @@ steps of the minimisation, so that no vertex enters an obstacle, however fast it
 obstacle smaller than the triangles of a body can pass between them. Model it as a held body in a `body_contact`.
 
 A distance function must not overestimate the distance (its slope is at most 1) and must be twice differentiable almost
-everywhere outside the obstacle. To move an obstacle, change its parameters from step to step, by less than the gap.
+everywhere outside the obstacle. To move an obstacle, change its parameters from step to step, by less than the gap;
+friction takes its velocity from the change of its pose.
 """
 
 from collections.abc import Callable
@@ -22,8 +23,8 @@ from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact
 from dln_jax.softbody.contact.continuous_collision import longest_step
 from dln_jax.softbody.contact.surface import areas, surface_of
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.contact import Slip, friction_energy
-from dln_jax.softbody.terms.term import Context, Numbers, vector
+from dln_jax.softbody.terms.contact import Slip, friction_energy, motion_of, plane_pose, slip_of
+from dln_jax.softbody.terms.term import Context, Numbers, Pose, vector
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError, require_positive
 
@@ -36,7 +37,7 @@ class Obstacle(NamedTuple):
 
     distance: Distance
     shape: Any
-    """Parameters: a NamedTuple of arrays, differentiable."""
+    """Parameters: a NamedTuple of arrays, differentiable. With friction it has the property `pose` (`terms.term`)."""
 
 
 class ObstacleParameters(NamedTuple):
@@ -44,6 +45,11 @@ class ObstacleParameters(NamedTuple):
 
     contact: ContactParameters
     shape: Any
+
+    @property
+    def pose(self) -> Pose | None:
+        """Pose of the shape; `None` without friction."""
+        return None if self.contact.friction is None else self.shape.pose
 
 
 class HalfSpace(NamedTuple):
@@ -54,6 +60,11 @@ class HalfSpace(NamedTuple):
     offset: Float[Array, ""]
     """Distance of the plane from the origin along the normal, in m."""
 
+    @property
+    def pose(self) -> Pose:
+        """As in `PlaneContact`."""
+        return plane_pose(self.normal, self.offset)
+
 
 class Capsule(NamedTuple):
     """The points within a radius of a segment; a sphere if both ends coincide."""
@@ -62,6 +73,13 @@ class Capsule(NamedTuple):
     end: Float[Array, " dim"]
     radius: Float[Array, ""]
     """In m."""
+
+    @property
+    def pose(self) -> Pose:
+        """The segment, which does not spin about itself."""
+        along = self.end - self.start
+        squared = jnp.sum(along**2)
+        return self.start, along[None] / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
 
 
 class Box(NamedTuple):
@@ -73,6 +91,11 @@ class Box(NamedTuple):
     rotation: Float[Array, "dim dim"]
     """Orthonormal rows: the directions of the sides."""
 
+    @property
+    def pose(self) -> Pose:
+        """Centre and sides."""
+        return self.centre, self.rotation
+
 
 class Heightfield(NamedTuple):
     """Ground below a smooth surface: the cubic B-spline of heights on a lattice over the horizontal axes."""
@@ -83,6 +106,12 @@ class Heightfield(NamedTuple):
     """Position of the first control point, in m."""
     spacing: Float[Array, ""]
     """Lattice spacing in m."""
+
+    @property
+    def pose(self) -> Pose:
+        """The ground shifts with its lattice; changes of heights do not move it along itself."""
+        origin = jnp.pad(self.origin, (0, 1))
+        return origin, jnp.zeros((0, len(origin)), origin.dtype)
 
 
 def half_space(normal: Numbers, offset: float = 0.0) -> Obstacle:
@@ -164,12 +193,16 @@ def obstacle_contact(
     """Contact of the boundary's vertices with an obstacle; the other arguments are those of `body_contact`.
 
     Raises:
-        InputError: a number is not positive, or a vertex is inside the obstacle in the rest shape.
+        InputError: a number is not positive, a vertex is inside the obstacle in the rest shape, or friction is asked of
+            a shape without a pose.
     """
     require_positive(distance=distance, threshold_speed=threshold_speed)
+    if friction is not None and not hasattr(obstacle.shape, "pose"):
+        raise InputError(f"the shape of '{name}' has no property `pose`, which friction needs (see `Obstacle.shape`)")
     surface = surface_of(mesh)
     parameters = ObstacleParameters(contact_parameters(distance, stiffness, friction), obstacle.shape)
-    inside = jax.vmap(obstacle.distance, (0, None))(jnp.asarray(mesh.vertices[surface.vertices]), obstacle.shape) <= 0
+    distances = jax.vmap(obstacle.distance, (0, None))
+    inside = distances(jnp.asarray(mesh.vertices[surface.vertices]), obstacle.shape) <= 0
     if inside.any():
         vertex = surface.vertices[int(jnp.argmax(inside))]
         raise InputError(
@@ -192,13 +225,10 @@ def obstacle_contact(
         # Inside the obstacle the energy is infinite, so that no step is accepted there.
         return jnp.where(d > 0, strength * barrier(d**2, near)[0], jnp.inf)
 
-    def distances(x: Array, shape: Any) -> Array:
-        return jax.vmap(obstacle.distance, (0, None))(x[surface.vertices], shape)
-
     def longest(x: Array, step: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
         def at(t: Array) -> Array:
             moved = x[surface.vertices] + t[:, None] * step[surface.vertices]
-            return jax.vmap(obstacle.distance, (0, None))(moved, data[0].shape)
+            return distances(moved, data[0].shape)
 
         return longest_step(at, jnp.linalg.norm(step[surface.vertices], axis=1))
 
@@ -220,19 +250,18 @@ def obstacle_contact(
         steep = jnp.linalg.norm(slope, axis=1)
         _, strength, near = describe(context.x, every, data)
         force = -2 * d * strength * barrier(d**2, near)[1] * steep
-        moving = jnp.isfinite(context.dt)
-        threshold = jnp.broadcast_to(jnp.where(moving, threshold_speed * context.dt, 1.0), d.shape)
-        largest = jnp.where(moving, parameters.contact.friction * force, 0.0)
-        return data, Slip(x, slope / steep[:, None], largest, threshold)
+        carried = x + motion_of(name, parameters, context.before, x)
+        largest = parameters.contact.friction * force
+        return data, slip_of(context, threshold_speed, carried, slope / steep[:, None], largest)
 
     energies = [energies_of(energy, describe, longest)]
     if friction is not None:
         energies.append(energies_of(slide, lambda x, _, slip: slip, lambda x, *_: jnp.ones((), x.dtype)))
 
     def least_distance(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
-        return jnp.minimum(jnp.min(distances(x, data[0].shape)), data[0].contact.distance)
+        return jnp.minimum(jnp.min(distances(x[surface.vertices], data[0].shape)), data[0].contact.distance)
 
-    return Contact(name, parameters, tuple(energies), prepare, least_distance, changing=False)
+    return Contact(name, parameters, tuple(energies), prepare, least_distance, mesh, changing=False)
 
 
 def _spline(values: Float[Array, "*outer k"], at: Float[Array, ""]) -> Float[Array, "*outer"]:

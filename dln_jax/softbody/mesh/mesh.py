@@ -7,7 +7,7 @@ Meshes are static NumPy arrays in float64, which become constants of the compile
 import itertools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -110,6 +110,26 @@ def overlaps(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
     return distinct[(counts > 1).any(axis=1)]
 
 
+def indices_of(name: str, values: Any, count: int, what: str = "vertex") -> Int[np.ndarray, " k"]:
+    """Returns distinct indices below a count, given as integers [k] or as a boolean mask [count].
+
+    Raises:
+        InputError: `values` are neither, or an index is out of range or repeated.
+    """
+    chosen = np.atleast_1d(values)
+    if chosen.dtype == bool and chosen.shape == (count,):
+        return np.flatnonzero(chosen)
+    if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu"):
+        raise InputError(
+            f"{name} is {chosen.dtype} of shape {list(chosen.shape)}; expected integers [k], or booleans [{count}]"
+        )
+    if len(outside := chosen[(chosen < 0) | (chosen >= count)]):
+        raise InputError(f"{name} names {what} {outside[0]}; expected 0..{count - 1}")
+    if len(np.unique(chosen)) < len(chosen):
+        raise InputError(f"{name} names a {what} twice; expected each once")
+    return chosen.astype(int)
+
+
 def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
     """Returns the component of every element, counted from 0; shared vertices connect elements."""
     n, m = len(mesh.vertices), len(mesh.elements)
@@ -117,6 +137,13 @@ def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
     first = np.repeat(mesh.elements[:, 0], mesh.elements.shape[1])
     _, of_vertices = connected_components(coo_array((np.ones(len(corners)), (first, corners)), shape=(n, n)))
     return np.unique(of_vertices[mesh.elements[:, 0]], return_inverse=True)[1].reshape(m)
+
+
+def components_of_vertices(mesh: Mesh) -> Int[np.ndarray, " n"]:
+    """Returns the component of every vertex."""
+    result = np.zeros(len(mesh.vertices), int)
+    result[mesh.nodes] = components(mesh)[:, None]
+    return result
 
 
 def boundary_vertices(mesh: Mesh) -> Int[np.ndarray, " b"]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.mesh.mesh import Mesh, NamedSet, make_mesh
+from dln_jax.softbody.mesh.mesh import Mesh, NamedSet, indices_of, make_mesh
 from dln_jax.softbody.mesh.simplices import SIDES
 from dln_jax.types import InputError
 
@@ -62,5 +62,6 @@ def barycentric_split(mesh: Mesh) -> Mesh:
 
 def with_midsides(mesh: Mesh, vertices: ArrayLike) -> Int[np.ndarray, " k"]:
     """Returns corners of a quadratic mesh together with the mid-side nodes between any two of them, for `held`."""
+    vertices = indices_of("held", vertices, len(mesh.vertices))
     chosen = np.isin(mesh.elements, vertices)[:, np.array(SIDES[mesh.dimension])].all(axis=2)
     return np.union1d(vertices, mesh.nodes[:, mesh.dimension + 1 :][chosen]).astype(int)

@@ -24,7 +24,7 @@ A point mass that hits at speed u rebounds at e u, whatever its mass, k and phi 
     c u (1 + e) = ln((1 + c u) / (1 - c e u))
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -39,6 +39,7 @@ from dln_jax.softbody.terms.term import (
     Corners,
     Indices,
     Numbers,
+    Pose,
     Term,
     material,
     require_dimension,
@@ -65,6 +66,11 @@ class PlaneContact(NamedTuple):
     damping: Float[Array, "..."] | None = None
     """c in s/m, or `None`."""
 
+    @property
+    def pose(self) -> Pose:
+        """A plane turns about the origin: other motions along itself cannot be seen from its normal and offset."""
+        return plane_pose(self.normal, self.offset)
+
 
 class DistanceContact(NamedTuple):
     """Parameters of a surface with a signed distance, one for all vertices [] or one per vertex [m]."""
@@ -81,7 +87,7 @@ class Slip(NamedTuple):
     """Friction data of one vertex, or [m, ...] of all."""
 
     start: Float[Array, "*m dim"]
-    """Position x_n at the start of the step, in m."""
+    """Position x_n at the start of the step, moved with the surface, in m."""
     normal: Float[Array, "*m dim"]
     """Unit normal n there."""
     force: Float[Array, "*m"]
@@ -123,11 +129,7 @@ def plane_contact(
     def height(x: Any, plane: tuple[Array, Array]) -> Scalar:
         return jnp.asarray(sum(plane[0][i] * coordinate for i, coordinate in enumerate(x)) - plane[1])
 
-    def touched(x: Array, plane: tuple[Array, Array]) -> tuple[Array, Array, float]:
-        normals, offsets = plane
-        return jnp.sum(x * normals, axis=1) - offsets, normals, 1.0
-
-    return _contact(name, indices, parameters, surface, height, touched, width, threshold_speed)
+    return _contact(name, indices, parameters, surface, height, width, threshold_speed)
 
 
 def distance_contact(
@@ -149,16 +151,10 @@ def distance_contact(
     indices = vertex_list("vertices in contact", vertices)
     parameters = DistanceContact(*_contact_parameters(stiffness, friction, damping, len(indices)))
 
-    def touched(x: Array, _: None) -> tuple[Array, Array, Array]:
-        depth, slope = jax.vmap(jax.value_and_grad(distance))(x)
-        squared = jnp.sum(slope**2, axis=1)
-        steep = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-        return depth, slope / steep[:, None], jnp.where(squared > 0, steep, 0.0)
-
     def depth(x: Any, _: None) -> Scalar:
         return distance(jnp.stack(x))
 
-    return _contact(name, indices, parameters, lambda *_: None, depth, touched, width, threshold_speed)
+    return _contact(name, indices, parameters, lambda *_: None, depth, width, threshold_speed)
 
 
 def _contact_parameters(stiffness: Numbers, friction: Numbers | None, damping: Numbers | None, count: int):
@@ -175,11 +171,10 @@ def _contact(
     parameters: Any,
     surface: Callable[[Any, Array], Any],
     distance: Callable[[Any, Any], Scalar],
-    touched: Callable[[Array, Any], tuple],
     width: float,
     threshold_speed: float,
 ) -> Term:
-    """Builds a surface's term from its data per vertex, the distance, and (distance, normal, steepness) of all."""
+    """Builds a surface's term from its data per vertex and the distance."""
     require_positive(threshold_speed=threshold_speed)
     if width != 0.0:
         require_positive(width=width)
@@ -187,17 +182,17 @@ def _contact(
     def prepare(parameters: Any, context: Context) -> tuple[Any, Array, Slip | None, tuple[Array, Array] | None]:
         x = context.x[indices[:, 0]]
         near, stiffness = surface(parameters, x), jnp.broadcast_to(parameters.stiffness, len(x))
+        carried = x + motion_of(name, parameters, context.before, x)
         braked = slip = None
         if parameters.damping is not None:
-            braked = jax.vmap(distance)(tuple(x.T), near), parameters.damping * stiffness / context.dt
+            braked = jax.vmap(distance)(tuple(carried.T), near), parameters.damping * stiffness / context.dt
         if parameters.friction is not None:
             lagged = x if context.lag is None else context.lag[indices[:, 0]]
-            depth, normal, steepness = touched(lagged, near)
-            force = parameters.friction * (stiffness * penalty_force(depth, width) * steepness)
-            # A static solve (dt infinite) has no velocities, hence no friction.
-            moving = jnp.isfinite(context.dt)
-            threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
-            slip = Slip(x, normal, jnp.where(moving, force, 0.0), jnp.broadcast_to(threshold, len(x)))
+            depth, slope = jax.vmap(jax.value_and_grad(lambda x, near: distance(tuple(x), near)))(lagged, near)
+            squared = jnp.sum(slope**2, axis=1)
+            steep = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+            force = parameters.friction * (stiffness * penalty_force(depth, width) * jnp.where(squared > 0, steep, 0.0))
+            slip = slip_of(context, threshold_speed, carried, slope / steep[:, None], force)
         return near, stiffness, slip, braked
 
     def energy(x: Corners, vertex: tuple[Any, Array, Slip | None, tuple[Array, Array] | None]) -> Scalar:
@@ -211,6 +206,41 @@ def _contact(
         return contact if slip is None else contact + friction_energy(x[0], slip)
 
     return Term(name, indices, energy, parameters, prepare, lagged=parameters.friction is not None)
+
+
+def plane_pose(normal: Float[Array, " dim"], offset: Float[Array, ""]) -> Pose:
+    """Returns the pose of a plane with a normal of any length."""
+    normal = normal / jnp.linalg.norm(normal)
+    return offset * normal, normal[None]
+
+
+def motion_of(
+    name: str, parameters: Any, before: Mapping[str, Pose] | None, x: Float[Array, "m dim"]
+) -> Float[Array, "m dim"]:
+    """Returns the motion in m of the points x of a term's surface from the pose before; exactly 0 at rest."""
+    if not before or name not in before:
+        return jnp.zeros_like(x)
+    (origin, axes), (goal, ends) = before[name], parameters.pose
+    arms, change = x - origin, ends - axes
+    if len(axes) != 1:
+        return goal - origin + arms @ axes.T @ change
+    # The smallest rotation that turns the axis.
+    bend, along = jnp.sum(change**2) / 2, arms @ axes.T
+    across = (arms @ change.T + along * bend) / (2 - bend)
+    return goal - origin + along * change - across * (axes + ends)
+
+
+def slip_of(
+    context: Context,
+    threshold_speed: float,
+    start: Float[Array, "m dim"],
+    normal: Float[Array, "m dim"],
+    force: Float[Array, " m"],
+) -> Slip:
+    """Returns the friction data of a step with forces mu lambda_n; a static solve (dt infinite) has no friction."""
+    moving = jnp.isfinite(context.dt)
+    threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
+    return Slip(start, normal, jnp.where(moving, force, 0.0), jnp.broadcast_to(threshold, force.shape))
 
 
 def friction_energy(x: Any, slip: Slip) -> Scalar:

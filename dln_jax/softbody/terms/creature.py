@@ -113,7 +113,7 @@ def _elements(mesh: Mesh) -> Term:
         strain = change - 0.5 * change**2
         return 0.5 * mu * (squared_norm(F) - len(F)) - mu * strain + 0.5 * lam * strain**2
 
-    return Term("elastic", mesh.elements, energy, parameters, prepare, weights=shape_gradients)
+    return Term("elastic", mesh.elements, energy, parameters, prepare, weights=shape_gradients, mesh=mesh)
 
 
 def _ground(count: int, bumps: Bumps | None) -> Term:

@@ -56,7 +56,7 @@ def mass_damping(mesh: Mesh, *, rate: Numbers, name: str = "mass_damping") -> Te
         weight, start = vertex
         return 0.5 * weight * jnp.asarray(sum((coordinate - start[i]) ** 2 for i, coordinate in enumerate(x[0])))
 
-    return Term(name, np.arange(count)[:, None], energy, parameters, prepare)
+    return Term(name, np.arange(count)[:, None], energy, parameters, prepare, mesh=mesh)
 
 
 def stiffness_damping(
@@ -91,4 +91,4 @@ def stiffness_damping(
         change = [[now - then for now, then in zip(*rows, strict=True)] for rows in zip(after, before, strict=True)]
         return linear_energy(change, mu, lam)
 
-    return Term(name, mesh.elements, energy, parameters, prepare, weights=shape_gradients)
+    return Term(name, mesh.elements, energy, parameters, prepare, weights=shape_gradients, mesh=mesh)

@@ -107,8 +107,8 @@ def elastic(
         return stored + 0.5 * lam * jnp.sum(weights * (determinant(F) - 1.0)) ** 2 / weights.sum()
 
     if mesh.midsides is None:
-        return Term(name, mesh.elements, energy, parameters, prepare, weights=shape_gradients)
-    return Term(name, mesh.nodes, quadratic_energy, parameters, prepare, unrolled=False)
+        return Term(name, mesh.elements, energy, parameters, prepare, weights=shape_gradients, mesh=mesh)
+    return Term(name, mesh.nodes, quadratic_energy, parameters, prepare, unrolled=False, mesh=mesh)
 
 
 def lame_parameters(youngs_modulus: Array, poisson_ratio: Array) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.mesh.mesh import Mesh, indices_of
 from dln_jax.softbody.terms.elasticity import quadratic_geometry, rest_geometry, shape_gradients
 from dln_jax.softbody.terms.springs import length_of
 from dln_jax.softbody.terms.strain_energies import DeformationGradient
@@ -62,11 +62,11 @@ def fibres(
     Raises:
         InputError: a number is out of range, or shapes do not fit.
     """
-    chosen = np.arange(len(mesh.elements)) if elements is None else np.asarray(elements, dtype=int).reshape(-1)
-    wrong = (chosen < 0) | (chosen >= len(mesh.elements))
-    if not len(chosen) or wrong.any():
-        what = f"element {chosen[np.argmax(wrong)]}" if len(chosen) else "no element"
-        raise InputError(f"the fibres are in {what}; expected elements 0..{len(mesh.elements) - 1}")
+    chosen = np.arange(len(mesh.elements))
+    if elements is not None:
+        chosen = indices_of(f"'{name}'", elements, len(chosen), "element")
+    if not len(chosen):
+        raise InputError(f"'{name}' names no element; expected at least one")
     count = len(chosen)
     group = np.zeros(count, dtype=int) if groups is None else np.asarray(groups)
     if group.shape != (count,) or group.dtype.kind not in "iu" or group.min() < 0:
@@ -110,8 +110,8 @@ def fibres(
 
     control = (number,) if activation is None else None
     if mesh.midsides is None:
-        return Term(name, nodes, energy, parameters, prepare, control=control, weights=shape_gradients)
-    return Term(name, nodes, quadratic_energy, parameters, prepare, unrolled=False, control=control)
+        return Term(name, nodes, energy, parameters, prepare, control=control, weights=shape_gradients, mesh=mesh)
+    return Term(name, nodes, quadratic_energy, parameters, prepare, unrolled=False, control=control, mesh=mesh)
 
 
 def _directions(direction: Numbers, count: int, dimension: int) -> Float[Array, "*m dim"]:

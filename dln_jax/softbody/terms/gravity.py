@@ -38,4 +38,5 @@ def gravity(vertices: Mesh | int, acceleration: Numbers | None = None, *, name: 
     def energy(x: Corners, weight: Float[Array, " dim"]) -> Scalar:
         return -jnp.asarray(sum(weight[i] * coordinate for i, coordinate in enumerate(x[0])))
 
-    return Term(name, np.arange(count)[:, None], energy, parameters, prepare)
+    mesh = None if isinstance(vertices, int) else vertices
+    return Term(name, np.arange(count)[:, None], energy, parameters, prepare, mesh=mesh)

@@ -108,7 +108,8 @@ def _load(
     def energy(x: Corners, force: Float[Array, " dim"]) -> Scalar:
         return -jnp.asarray(sum(force[i] * coordinate for i, coordinate in enumerate(x[0])))
 
-    return Term(name, vertices[:, None], energy, Load(force), prepare, control=(dimension,) if force is None else None)
+    control = (dimension,) if force is None else None
+    return Term(name, vertices[:, None], energy, Load(force), prepare, control=control, mesh=mesh)
 
 
 def _summed(count: int, nodes: Int[np.ndarray, "m nodes"], shares: Float[Array, "m nodes"]) -> Float[Array, " count"]:

@@ -80,7 +80,7 @@ def pressure(
         return -value * enclosed_volume(jnp.asarray(x) - centre, np.arange(nodes.shape[1])[None])
 
     linear, control = mesh.midsides is None, () if pressure is None else None
-    return Term(name, nodes, energy if linear else quadratic_energy, parameters, prepare, linear, control)
+    return Term(name, nodes, energy if linear else quadratic_energy, parameters, prepare, linear, control, mesh=mesh)
 
 
 def gas(
@@ -134,4 +134,4 @@ def gas(
         return -amount * jnp.log(now / volume) + ambient * (now - volume)
 
     control = () if pressure is None else None
-    return Term(name, vertices[None], energy, parameters, prepare, unrolled=False, control=control)
+    return Term(name, vertices[None], energy, parameters, prepare, unrolled=False, control=control, mesh=mesh)

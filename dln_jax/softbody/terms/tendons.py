@@ -101,7 +101,8 @@ def _tendon(
     def energy(x: Corners, tendon: Any) -> Scalar:
         return stored(_length(jnp.asarray(weights) @ jnp.asarray(x)), tendon)
 
-    return Term(name, nodes[None], energy, parameters, prepare, unrolled=False, control=() if driven else None)
+    control = () if driven else None
+    return Term(name, nodes[None], energy, parameters, prepare, unrolled=False, control=control, mesh=mesh)
 
 
 def _path(mesh: Mesh, path: ArrayLike) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "p k"]]:

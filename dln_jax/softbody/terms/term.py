@@ -11,7 +11,7 @@ Values passed to the factories of terms are checked when the scene is built. Tra
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,12 +20,18 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.solvers.elements.energies import Corners
 from dln_jax.types import InputError
 
 Numbers = ArrayLike | Sequence[float | int]
 """One number for all elements, or one per element."""
 Indices = ArrayLike | Sequence[int | np.integer] | Sequence[Sequence[int | np.integer]]
+
+
+Pose = tuple[Float[Array, " dim"], Float[Array, "k dim"]]
+"""Origin in m and orthonormal axes of a rigid surface, from which friction and damping take its motion: the property
+`pose` of a term's parameters. One axis turns without spinning about itself, and without axes nothing turns."""
 
 
 class Context(NamedTuple):
@@ -43,6 +49,8 @@ class Context(NamedTuple):
     """Control of the step for this term, if any: an array; for the scene's only actuator the whole control."""
     lag: Float[Array, "n dim"] | None = None
     """Positions in m for friction's normal forces and directions; by default those at the start."""
+    before: Mapping[str, Pose] | None = None
+    """Poses of surfaces a time dt before the end of the step, by the names of their terms; others do not move."""
 
 
 class Term(NamedTuple):
@@ -65,6 +73,8 @@ class Term(NamedTuple):
     """Shape of the control that the preparation reads from its context; `None` for a term without control."""
     lagged: bool = False
     """Whether the preparation reads `Context.lag`."""
+    mesh: Mesh | None = None
+    """Mesh that the term was made for, if any; the scene must have the same."""
     weights: Callable[[Any], Any] | None = None
     """Data of one element -> w[k][j], if the energy takes y[i][j] = sum over vertices k of x[k][i] w[k][j] (rows of a
     deformation gradient, an edge) instead of positions. The Hessian then compiles and runs faster."""
