@@ -41,7 +41,7 @@ def make_step(
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
     halvings: int = 0,
-    friction_iterations: int = 0,
+    friction_iterations: int = 1,
 ) -> Stepper:
     """Returns (init, step) of a scene.
 

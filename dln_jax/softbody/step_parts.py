@@ -81,7 +81,7 @@ def step_parts(
     *,
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
-    friction_iterations: int = 0,
+    friction_iterations: int = 1,
 ) -> StepParts:
     """Returns the parts of the step that `make_step` returns; arguments are explained there."""
     if friction_iterations:
