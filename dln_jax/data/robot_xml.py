@@ -1,7 +1,8 @@
 """Reads the XML of URDF and MJCF files: elements, the inertias of a URDF, and the limits of joints.
 
 Other formats, and files larger than any robot's, are refused. So are malformed limits: MuJoCo treats a range that is
-NaN, empty, swapped or half stated as no range, and a motion designed with it would drive the joint into its stop.
+NaN, empty, swapped or half stated as no range, and a motion designed with it would drive the joint into its stop. The
+text of an MJCF file is read only for ranges of two zeros, which look like no range once compiled.
 """
 
 import xml.etree.ElementTree as ET
@@ -133,9 +134,11 @@ def without_shapes(root: ET.Element, *, inertias: bool) -> ET.Element:
         inertial = ET.SubElement(link, "inertial")
         ET.SubElement(inertial, "mass", value="1")
         ET.SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
-    for settings in root.findall("mujoco"):
-        root.remove(settings)
-    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", fusestatic="false", balanceinertia="false")
+    settings = root.find("mujoco")
+    settings = ET.SubElement(root, "mujoco") if settings is None else settings
+    for part in settings.findall("compiler"):
+        settings.remove(part)
+    ET.SubElement(settings, "compiler", fusestatic="false", balanceinertia="false")
     return root
 
 
@@ -148,9 +151,10 @@ def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
     if root.tag == "mujoco":
         for joint in (joint for part in _with_included(path, root) for joint in part.iter("joint")):
             for attribute, (kind, switch) in RANGES.items():
-                stated = joint.get(attribute)
-                if stated is not None and joint.get(switch) != "false" and joint.get("name") not in locked:
-                    _require_range(joint.get("name") or "of a default class", kind, stated.split())
+                stated = joint.get(attribute, "").split()
+                zero = stated and not any(map(_number, stated))
+                if zero and joint.get(switch) != "false" and joint.get("name") not in locked:
+                    require_range(f"joint '{joint.get('name') or 'of a default class'}'", kind, stated)
         return
     names = [joint.get("name", "") for joint in root.findall("joint")]
     if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
@@ -168,7 +172,7 @@ def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
         limit, dynamics = ({} if part is None else part.attrib for part in map(joint.find, ("limit", "dynamics")))
         sides = [limit.get(side, "") for side in ("lower", "upper")]
         if kind != "continuous" and any(sides):
-            _require_range(name, "position", sides)
+            require_range(f"joint '{name}'", "position", sides)
         for key in ("velocity", "effort"):
             if not _number(limit.get(key, "0")) >= 0:
                 raise InputError(
@@ -196,13 +200,12 @@ def driven_joints(root: ET.Element) -> list[str]:
     return [joint.get("name", "") for motor in root.findall("transmission") for joint in motor.findall("joint")]
 
 
-def _require_range(name: str, kind: str, stated: Sequence[str]) -> None:
+def require_range(name: str, kind: str, stated: Sequence[str]) -> None:
+    """Raises `InputError` unless the limits of a named joint or actuator are two finite numbers, the lower first."""
     numbers = np.array([_number(text) for text in stated])
     if not (numbers.shape == (2,) and np.isfinite(numbers).all() and numbers[0] < numbers[1]):
         shown = ", ".join(f"{text:.40}" if text else "nothing" for text in stated)
-        raise InputError(
-            f"joint '{name}' has limits of {kind} {shown}; expected two finite numbers, the lower first: {REMEDY}"
-        )
+        raise InputError(f"{name} has limits of {kind} {shown}; expected two finite numbers, the lower first: {REMEDY}")
 
 
 def _number(text: str) -> float:
@@ -214,12 +217,12 @@ def _number(text: str) -> float:
 
 
 def _with_included(path: Path, root: ET.Element) -> Iterator[ET.Element]:
-    """The root element and those of included files; unreadable ones are skipped, since MuJoCo reports them."""
+    """The root element and those of included or attached files; unreadable ones are skipped, as MuJoCo reports them."""
     yield root
-    for include in root.iter("include"):
-        file = path.parent / include.get("file", "")
+    for part in (*root.iter("include"), *root.iter("model")):
+        file = path.parent / part.get("file", "")
         if file.is_file() and file.resolve() != path.resolve():
             try:
-                yield ET.parse(file).getroot()
-            except ET.ParseError:
+                yield from _with_included(file, ET.parse(file).getroot())
+            except (ET.ParseError, LookupError, ValueError):
                 continue

@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.robot_xml import MOST_JOINTS, check_joints, link_inertias, parsed, velocity_limits, without_shapes
+from dln_jax.data.robot_xml import (
+    MOST_JOINTS,
+    check_joints,
+    link_inertias,
+    parsed,
+    require_range,
+    velocity_limits,
+    without_shapes,
+)
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -51,16 +59,15 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
 
     Raises:
         InputError: MuJoCo is missing; the file is missing, malformed or cyclic; a joint that is not locked is neither
-            revolute, continuous nor prismatic, mimics another, or has limits that are NaN, equal, swapped or half
-            stated; a joint to lock does not exist; no joint moves; or a moving link has no mass.
+            revolute, continuous nor prismatic, mimics another, has a spring, or has limits that are NaN, equal,
+            swapped or half stated; a joint to lock does not exist; no joint moves; or a moving link has no mass.
     """
     path, root = Path(path), parsed(Path(path))
     try:
         in_urdf = root.tag == "robot"
         inertias, speeds = (link_inertias(root), velocity_limits(root)) if in_urdf else (None, {})
         mujoco, model, locked = opened(path, root, lock)
-        robot = _robot(mujoco, model, locked, inertias)
-        _require_numbers(robot)
+        robot = robot_of(mujoco, model, locked, inertias)
         limits = np.array([speeds.get(name, np.inf) for name in robot.tree.names])
         return robot._replace(velocity_limits=limits) if in_urdf else robot
     except InputError as error:
@@ -79,6 +86,7 @@ def opened(
         mujoco, model = _compiled(path, root, (), inertias)
         locked = _matching(lock, joint_names(model))
         check_joints(path, root, locked)
+        require_ranges(model, locked)
         return mujoco, model, locked
     locked = _matching(lock, [joint.get("name", "") for joint in root.findall("joint")])
     check_joints(path, root, locked)
@@ -88,6 +96,17 @@ def opened(
 def joint_names(model: Any) -> list[str]:
     """Names of MuJoCo's joints."""
     return [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
+
+
+def require_ranges(model: Any, locked: Collection[str] = ()) -> None:
+    """Raises `InputError` for limits of a compiled joint that are NaN, infinite, equal or swapped.
+
+    MuJoCo keeps the numbers of a range that it does not apply; zeros stand for no range.
+    """
+    for k, name in enumerate(joint_names(model)):
+        for kind, limits in (("position", model.jnt_range[k]), ("torque", model.jnt_actfrcrange[k])):
+            if limits.any() and name not in locked:
+                require_range(f"joint '{name}'", kind, [f"{limit:.15g}" for limit in limits])
 
 
 def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
@@ -102,12 +121,16 @@ def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -
     return locked
 
 
-def _compiled(path: Path, root: ET.Element, locked: Collection[str], inertias: bool) -> tuple[Any, Any]:
+def imported_mujoco() -> Any:
+    """MuJoCo; `InputError` if it is missing."""
     try:
-        mujoco: Any = importlib.import_module("mujoco")
+        return importlib.import_module("mujoco")
     except ImportError:
-        raise InputError(f"reading robots needs MuJoCo, which is not installed; {INSTALL}") from None
-    text = None
+        raise InputError(f"MuJoCo, which reads and simulates robots, is not installed; {INSTALL}") from None
+
+
+def _compiled(path: Path, root: ET.Element, locked: Collection[str], inertias: bool) -> tuple[Any, Any]:
+    mujoco, text = imported_mujoco(), None
     if root.tag == "robot":
         for joint in root.iter("joint"):
             for mimic in joint.findall("mimic"):
@@ -147,6 +170,11 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[
                 f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: lock it if it does not move"
             )
     moving = {k for k, name in enumerate(names) if name not in locked}
+    for k in moving & set(np.flatnonzero(model.jnt_stiffness)):
+        raise InputError(
+            f"joint '{names[k]}' has a spring (stiffness {model.jnt_stiffness[k]:.4g}), which no tree of rigid bodies "
+            "has; remove the stiffness, or lock the joint"
+        )
     # Equality constraints and tendons between locked joints have no effect; tendons without a spring are motors.
     joints, over = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtWrap.mjWRAP_JOINT)
     springs = np.repeat((model.tendon_stiffness != 0) | np.asarray(model.tendon_limited, bool), model.tendon_num)
@@ -159,7 +187,13 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[
         raise InputError(f"it has {len(moving)} joints; expected 1 to {MOST_JOINTS} that move")
 
 
-def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping[str, np.ndarray] | None) -> Robot:
+def robot_of(
+    mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping[str, np.ndarray] | None = None
+) -> Robot:
+    """The robot of a compiled model, with the inertias that a URDF states in place of the model's.
+
+    Errors as for `read_robot`.
+    """
     names = joint_names(model)
     _require_tree(mujoco, model, names, locked)
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
@@ -175,8 +209,9 @@ def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping
         for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             # The link's frame is at the joint's anchor, the body's frame behind it.
             anchor, axis, kind = model.jnt_pos[joint], np.array(model.jnt_axis[joint]), int(model.jnt_type[joint])
+            position = locked.get(names[joint], 0.0) - model.qpos0[model.jnt_qposadr[joint]]
+            R, p = _behind_locked(mujoco, kinds.get(kind), anchor, axis, position, R, p)
             if names[joint] in locked:
-                R, p = _behind_locked(mujoco, kinds.get(kind), anchor, axis, locked[names[joint]], R, p)
                 continue
             moving.append(joint)
             links.append((parent, kinds[kind], R, p + R @ anchor, axis))
@@ -208,7 +243,9 @@ def _robot(mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping
     )  # fmt: skip
     ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], infinite)
     forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], infinite)
-    return Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
+    robot = Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
+    _require_numbers(robot)
+    return robot
 
 
 def _armature(model: Any, moving: list[int]) -> np.ndarray:

@@ -53,11 +53,30 @@ def test_mjcf(tmp_path, attribute, kind, stated):
 
 def test_mjcf_default_class_and_included_file(tmp_path):
     default = '<mujoco><default><joint range="1 -1"/></default>'
-    with pytest.raises(InputError, match="joint 'of a default class' has limits of position 1, -1"):
+    with pytest.raises(InputError, match="joint 'elbow' has limits of position 1, -1"):
         read(tmp_path, MJCF.format("").replace("<mujoco>", default))
     (tmp_path / "part.xml").write_text(MJCF.format('range="1 -1"'))
     with pytest.raises(InputError, match="joint 'elbow' has limits of position 1, -1"):
         read(tmp_path, '<mujoco><include file="part.xml"/></mujoco>')
+
+
+@pytest.mark.parametrize("stated", ["nan 1", "1 -1", "0 0"])
+def test_mjcf_in_files_of_files(tmp_path, stated):
+    (tmp_path / "part.xml").write_text(MJCF.format(f'range="{stated}"').replace("<body>", '<body name="arm">'))
+    (tmp_path / "nested.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+    attached = '<asset><model name="m" file="part.xml"/></asset><worldbody><body><attach model="m" body="arm" prefix="'
+    for text in ('<include file="nested.xml"/>', attached + 'the_"/></body></worldbody>'):
+        with pytest.raises(InputError, match=f"elbow' has limits of position {stated.split()[0]}"):
+            read(tmp_path, f"<mujoco>{text}</mujoco>")
+
+
+def test_mjcf_default_class_without_joints_and_switched_off_by_it(tmp_path):
+    default = '<mujoco><default><default class="other"><joint range="1 -1"/></default><joint {}/></default>'
+    unlimited = read(tmp_path, MJCF.format("").replace("<mujoco>", default.format("")))
+    assert np.isinf(unlimited.position_limits).all()
+    off = default.format('limited="false"')
+    free = read(tmp_path, MJCF.format('range="-1 1"').replace("<mujoco>", off))
+    assert np.isinf(free.position_limits).all()
 
 
 def test_switched_off_range_and_held_joint_are_accepted(tmp_path):

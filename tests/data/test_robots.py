@@ -56,7 +56,8 @@ BRANCHED = """
   </body>
 </worldbody></mujoco>"""
 IN_NAMESPACE = ARM.replace("<robot", '<robot xmlns="https://drake.mit.edu"')
-FILES = {"arm.urdf": ARM, "in_namespace.urdf": IN_NAMESPACE, "branched.xml": BRANCHED}
+REFERENCED = BRANCHED.replace('name="x"', 'name="x" ref="25"').replace('name="y"', 'name="y" ref="-.3"')
+FILES = {"arm.urdf": ARM, "in_namespace.urdf": IN_NAMESPACE, "branched.xml": BRANCHED, "referenced.xml": REFERENCED}
 
 
 def written(folder, name, text):
@@ -151,6 +152,12 @@ REFUSED = {
         '<mujoco><worldbody><body><freejoint name="root"/><geom size="1"/></body></worldbody></mujoco>',
         "joint 'root' is free",
     ),
+    "a spring": (
+        "spring.xml",
+        '<mujoco><default><joint stiffness="2"/></default><worldbody><body><joint name="hip"/><geom size="1"/></body>'
+        "</worldbody></mujoco>",
+        r"joint 'hip' has a spring \(stiffness 2\)",
+    ),
     "entities": ("arm.urdf", '<!DOCTYPE x [<!ENTITY a "b">]><robot/>', "entities"),
 }
 
@@ -189,7 +196,11 @@ def test_a_free_base_can_be_locked(tmp_path):
     assert read_robot(path, lock=["root"]).tree.names == ("a",)
 
 
-LOCKED = {"turned": ("branched.xml", {"x": 0.7, "w": -0.4}), "moved": ("arm.urdf", {"slide": 0.2})}
+LOCKED = {
+    "turned": ("branched.xml", {"x": 0.7, "w": -0.4}),
+    "referenced": ("referenced.xml", {"x": 0.7, "y": 0.2}),
+    "moved": ("arm.urdf", {"slide": 0.2}),
+}
 
 
 @pytest.mark.parametrize("name", LOCKED)
