@@ -1,6 +1,5 @@
 """Closed loop with a plant simulated by MuJoCo, which shares no equations with this library (extra `[robot]`)."""
 
-import importlib
 from typing import Any
 
 import jax
@@ -9,10 +8,8 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.closed_loop import ClosedLoopRun, Controller, Hardware, sampled
-from dln_jax.data.robots import quiet
+from dln_jax.data.robots import imported_mujoco, quiet
 from dln_jax.types import InputError, require_positive
-
-INSTALL = "pip install 'dln-jax[robot]'"
 
 
 def simulate_in_mujoco(
@@ -42,16 +39,14 @@ def simulate_in_mujoco(
 
     Raises:
         InputError: MuJoCo is missing or refuses the model; a joint is neither a hinge nor a slide; x has another size;
-            a sample is not a whole number of steps; or as for `simulate`.
+            the time step is not positive and finite; a sample is not a whole number of steps; or as for `simulate`.
     """
     require_positive(seconds=seconds, rate=rate)
     mujoco, model = compiled_model(model)
     data, x = mujoco.MjData(model), np.asarray(x, float)
     if model.nq != model.nv or x.shape != (2 * model.nv,):
         raise InputError(f"x has shape {x.shape} for {model.nv} degrees of freedom; expected hinges, slides and [2 d]")
-    steps = 1 / (rate * model.opt.timestep)
-    if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-        raise InputError(f"a sample has {steps:.4g} steps of {model.opt.timestep:g} s; expected a whole number")
+    _, steps = sampling(model, rate)
     B = np.eye(model.nu) if actuation is None else np.asarray(actuation, float)
     data.qpos[:], data.qvel[:] = np.split(x, 2)
     memory, act = sampled(controller, hardware, controls=B.shape[1], rate=rate, key=key)
@@ -61,7 +56,7 @@ def simulate_in_mujoco(
         memory, u, y = act(memory, jnp.asarray(states[-1]), jnp.asarray(number))
         controls.append(u)
         measurements.append(y)
-        states.append(_advanced(mujoco, model, data, B @ np.asarray(u), round(steps)))
+        states.append(_advanced(mujoco, model, data, B @ np.asarray(u), steps))
     t = jnp.arange(len(states)) / rate
     return ClosedLoopRun(t, jnp.asarray(np.stack(states)), jnp.stack(controls), jnp.stack(measurements))
 
@@ -71,27 +66,45 @@ def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: in
     # MuJoCo replaces values that are not finite, and resets when it diverges: both would hide a failure.
     if np.isfinite(control).all() and np.isfinite(data.qpos).all():
         data.ctrl[:] = control
-        with quiet(mujoco):
-            mujoco.mj_step(model, data, steps)
+        advance(mujoco, model, data, steps)
     else:
-        data.qpos[:] = np.nan
-    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-    if any(data.warning[kind].number for kind in bad):
         data.qpos[:] = np.nan
     x = np.concatenate([data.qpos, data.qvel])
     return x if np.isfinite(x).all() else np.full_like(x, np.nan)
 
 
+def advance(mujoco: Any, model: Any, data: Any, steps: int) -> None:
+    """Advances MuJoCo's data by some time steps; the positions become NaN if it diverges."""
+    with quiet(mujoco):
+        mujoco.mj_step(model, data, steps)
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    if any(data.warning[kind].number for kind in bad):
+        data.qpos[:] = np.nan
+
+
+def sampling(model: Any, rate: float | None = None) -> tuple[float, int]:
+    """Returns the rate of the samples, Hz, by default one per time step, and the number of time steps in a sample.
+
+    Raises:
+        InputError: the time step is not positive and finite, or a sample is not a whole number of steps.
+    """
+    step = float(model.opt.timestep)
+    if not 0 < step < np.inf:
+        raise InputError(f"the time step of the model is {step:g} s; expected a positive, finite one")
+    rate = float(1 / step if rate is None else rate)
+    steps = 1 / rate / step
+    if not 0.5 < steps < np.inf or abs(steps - round(steps)) > 1e-6:
+        raise InputError(f"a sample has {steps:.4g} steps of {step:g} s; expected a whole number")
+    return rate, round(steps)
+
+
 def compiled_model(model: Any) -> tuple[Any, Any]:
     """Returns MuJoCo and the model, compiled if it is MJCF text; `InputError` if either is missing or invalid."""
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError:
-        raise InputError(f"MuJoCo, which simulates the plant, is missing; {INSTALL}") from None
+    mujoco = imported_mujoco()
     if not isinstance(model, str):
         return mujoco, model
     try:
         with quiet(mujoco):
             return mujoco, mujoco.MjModel.from_xml_string(model)
-    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+    except (ValueError, RuntimeError, mujoco.FatalError, mujoco.UnexpectedError) as error:
         raise InputError(f"MuJoCo refuses the model: {str(error).splitlines()[0]}") from None

@@ -1,18 +1,18 @@
 """Plants from MJCF and URDF files, or MuJoCo models: layout, goal and limits are read from the model."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.mujoco_loop import compiled_model
+from dln_jax.control.mujoco_loop import advance, compiled_model, sampling
 from dln_jax.control.plants.plant import Layout, Plant, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.plants.simulated import simulated
 from dln_jax.data.robot_xml import driven_joints, parsed, velocity_limits
-from dln_jax.data.robots import joint_names, opened, quiet
+from dln_jax.data.robots import Robot, joint_names, opened, quiet, require_ranges, robot_of
 from dln_jax.types import InputError
 
 MOST_JOINTS = 4
@@ -32,14 +32,16 @@ def mujoco_plant(
 ) -> Plant:
     """Returns a simulated plant; a learner knows only its layout.
 
-    Motors act as generalised forces of their joints, whatever actuators the file has.
+    Controls are forces of the joints. They act through the motors of the file and within their limits; a joint without
+    an actuator gets them directly. The plant may have friction, drag, contacts and limits of joints. Refused are other
+    actuators than motors, closed loops, springs, gravity compensation, wind and plugins.
 
     Args:
         source: path of an MJCF or URDF file, text of MJCF, or a `mujoco.MjModel`.
         actuated: joints with a motor, by name or number from 0; by default those with an actuator, or in a URDF with a
             transmission.
-        control: largest forces of the motors, N m or N; by default those of the file.
-        goal: posture to hold [d]; by default the highest one.
+        control: largest forces of the motors, N m or N; by default those of the file, and not above them.
+        goal: posture to hold [d]; by default the highest one, with slides in the middle of their ranges.
         hanging: posture of rest [d]; by default the lowest one.
         rate: sampling rate, Hz; by default one sample per time step.
         speed: largest rates, one or [d]; by default those of a URDF, as MJCF cannot state them.
@@ -47,12 +49,30 @@ def mujoco_plant(
         seed: seed of the starts and the noise.
 
     Raises:
-        InputError: MuJoCo is missing or refuses the model; a joint is not a hinge or slide, or not in the file; a motor
-            has no limits; there is no motor or no passive joint, or gravity does not move a passive joint; a sample is
+        InputError: MuJoCo is missing or refuses the model; a joint is not a hinge or slide, or not in the file; the
+            file has what is refused, or numbers that are not finite; a motor has no limits; there is no motor or no
+            passive joint, or gravity does not move a passive joint; bodies touch at the goal or hanging; a sample is
             not a whole number of steps.
     """
-    mujoco, model, data, described, steps = _described(source, actuated, control, goal, hanging, rate, speed, True)
-    return _plant(mujoco, model, data, described, steps, hardware, seed)
+    mujoco, model, data, controls, described, steps = _described(
+        source, actuated, control, goal, hanging, rate, speed, True
+    )
+    B = described.actuation
+    applied = np.where(controls.any(axis=0)[:, None], 0.0, B)
+
+    def begin(q: np.ndarray) -> None:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = q
+
+    def act(u: np.ndarray) -> None:
+        data.ctrl[:] = controls @ B @ u
+        data.qfrc_applied[:] = applied @ u
+        advance(mujoco, model, data, steps)
+
+    def kick(rates: np.ndarray) -> None:
+        data.qvel[:] += rates
+
+    return simulated(described, begin, lambda: data.qpos, act, kick=kick, hardware=hardware, seed=seed)
 
 
 def layout_of_file(
@@ -64,7 +84,7 @@ def layout_of_file(
     rate: float | None = None,
 ) -> Layout:
     """Returns the layout of an MJCF or URDF file, whose joints may all have a motor; arguments as `mujoco_plant`."""
-    return _described(path, actuated, control, goal, None, rate, None, False)[3]
+    return _described(path, actuated, control, goal, None, rate, None, False)[4]
 
 
 def _described(
@@ -76,74 +96,79 @@ def _described(
     rate: float | None,
     speed: Any,
     passive: bool,
-) -> tuple[Any, Any, Any, Layout, int]:
-    """Returns MuJoCo, its model, its data, the layout of the plant, and the number of time steps in a sample."""
+) -> tuple[Any, Any, Any, np.ndarray, Layout, int]:
+    """Returns MuJoCo, its model, its data, controls of the file's actuators per force of a joint [nu, d], the layout of
+    the plant, and the number of time steps in a sample."""
     mujoco, model, speeds, transmissions = _model(source)
     names = joint_names(model)
     speed = [speeds.get(name, np.inf) for name in names] if speed is None else speed
-    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
+    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
         if kind not in kinds:
             raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected a plant with such joints only")
     if not 1 + passive <= len(names) <= MOST_JOINTS:
         which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
         raise InputError(f"the plant has {len(names)} joint(s); expected {which}")
-    joints = [kinds[int(kind)] for kind in model.jnt_type]
+    per_second, steps = sampling(model, rate)
+    robot = robot_of(mujoco, model, {})
+    _require_known_forces(mujoco, model)
+    joints, ranges = robot.tree.joints, robot.position_limits
+    controls, largest = _motors(mujoco, model, robot)
     stated = actuated if len(actuated) else [name for name in transmissions if name in names]
-    driven = _numbers(stated, names) if len(stated) else sorted(_actuators(mujoco, model))
-    per_second = float(1 / model.opt.timestep if rate is None else rate)
-    steps = 1 / (per_second * model.opt.timestep)
-    if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-        raise InputError(f"a sample has {steps:.4g} steps of {model.opt.timestep:g} s; expected a whole number")
+    driven = _numbers(stated, names) if len(stated) else np.flatnonzero(controls.any(axis=0)).tolist()
+    if not driven:
+        raise InputError(
+            "no joint has a motor: the file has no actuator (in a URDF, no transmission); name the joints with one "
+            "(--actuated)"
+        )
     data = mujoco.MjData(model)
-    ranges = np.where(np.asarray(model.jnt_limited, bool)[:, None], model.jnt_range, [-np.inf, np.inf])
     if goal is None or hanging is None:
         lowest, highest = extremes(lambda q: _potential(mujoco, model, data, q), joints, driven, ranges)
         goal = highest if goal is None else goal
         if hanging is None:
             hanging = lowest
-            _require_free_hanging(hanging, ranges, set(range(len(joints))) - set(driven) if passive else set(), names)
-    refused = passive and len(driven) == len(joints)  # by the layout
-    size = _control(mujoco, model, driven, names) if control is None and not refused else control
+            for k in sorted(set(range(len(joints))) - set(driven)) if passive else ():
+                if hanging[k] in ranges[k]:
+                    raise InputError(
+                        f"'{names[k]}' cannot hang within its range of {ranges[k, 0]:.4g} to {ranges[k, 1]:.4g}, where "
+                        "a swing-up starts; widen the range, or remove it"
+                    )
+    if control is None and not (passive and len(driven) == len(joints)):  # the layout refuses these
+        for k in driven:
+            if not 0 < largest[k] < np.inf:
+                raise InputError(
+                    f"the file states no limit of the motor of joint '{names[k]}'; give the largest force (--control), "
+                    "or an actuatorfrcrange"
+                )
+        control = largest[driven]
     described = layout(
-        joints, driven, goal=goal, hanging=hanging, rate=per_second, control=size, position=ranges, speed=speed,
+        joints, driven, goal=goal, hanging=hanging, rate=per_second, control=control, position=ranges, speed=speed,
         names=names, passive=passive,
     )  # fmt: skip
-    return mujoco, model, data, described, round(steps)
-
-
-def _require_free_hanging(
-    hanging: np.ndarray, ranges: np.ndarray, passive: Collection[int], names: Sequence[str]
-) -> None:
-    """Raises `InputError` if a passive joint cannot hang, because its lowest position is a limit of its range."""
-    for k in sorted(passive):
-        if hanging[k] in ranges[k]:
+    for k, asked in zip(driven, described.limits.control[:, 1], strict=True):
+        if asked > largest[k]:
             raise InputError(
-                f"'{names[k]}' cannot hang within its range of {ranges[k, 0]:.4g} to {ranges[k, 1]:.4g}, where a "
-                "swing-up starts; widen the range, or remove it"
+                f"control is {asked:g}; the file limits the motor of joint '{names[k]}' to {largest[k]:g} N m or N"
             )
+    for where, q in (("at the goal", described.goal), ("where the plant hangs", described.hanging)):
+        _potential(mujoco, model, data, q)
+        for pair in data.contact.geom[data.contact.dist < 0][:1]:
+            bodies = " and ".join(f"'{model.body(model.geom_bodyid[geom]).name or geom}'" for geom in pair)
+            raise InputError(f"bodies {bodies} touch {where}; exclude their contact, or move them apart")
+    return mujoco, model, data, controls, described, steps
 
 
-def _plant(mujoco: Any, model: Any, data: Any, described: Layout, steps: int, hardware: Hardware, seed: int) -> Plant:
-    B = described.actuation
-    warnings = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-
-    def begin(q: np.ndarray) -> None:
-        mujoco.mj_resetData(model, data)
-        data.qpos[:] = q
-
-    def advance(u: np.ndarray) -> None:
-        data.qfrc_applied[:] = B @ u
-        with quiet(mujoco):
-            mujoco.mj_step(model, data, steps)
-        # MuJoCo resets when it diverges, which would hide a failure.
-        if any(data.warning[kind].number for kind in warnings):
-            data.qpos[:] = np.nan
-
-    def kick(rates: np.ndarray) -> None:
-        data.qvel[:] += rates
-
-    return simulated(described, begin, lambda: data.qpos, advance, kick=kick, hardware=hardware, seed=seed)
+def _require_known_forces(mujoco: Any, model: Any) -> None:
+    """Raises `InputError` for forces that neither motors nor the potential of a chain explain, or disabled motors."""
+    off = model.opt.disableactuator or model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    for what, present in {
+        "disabled actuators": off and model.nu,
+        "gravity compensation": model.body_gravcomp.any(),
+        "wind": model.opt.wind.any(),
+        "plugins": model.nplugin,
+    }.items():
+        if present:
+            raise InputError(f"the file has {what}; expected a chain that only motors and gravity move")
 
 
 def _model(source: Any) -> tuple[Any, Any, dict[str, float], list[str]]:
@@ -153,10 +178,13 @@ def _model(source: Any) -> tuple[Any, Any, dict[str, float], list[str]]:
         mujoco, model = opened(Path(source), root, (), inertias=True)[:2]
         if root.tag != "robot":
             return mujoco, model, {}, []
-        # A URDF states no integrator, and MuJoCo's default has errors that no rigid body makes.
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        # A URDF by itself states no integrator, and MuJoCo's default has errors that no rigid body makes.
+        if root.find("mujoco/option") is None:
+            model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         return mujoco, model, velocity_limits(root), driven_joints(root)
-    return *compiled_model(source), {}, []
+    mujoco, model = compiled_model(source)
+    require_ranges(model)
+    return mujoco, model, {}, []
 
 
 def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
@@ -171,36 +199,47 @@ def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
     return sorted(set(chosen))
 
 
-def _actuators(mujoco: Any, model: Any) -> dict[int, float]:
-    """Returns the largest forces of joints with actuators, by number of the joint; infinite if the file states none."""
-    of_joint = int(mujoco.mjtTrn.mjTRN_JOINT)
-    forces: dict[int, float] = {}
-    for k in range(model.nu):
-        if int(model.actuator_trntype[k]) == of_joint:
-            size = np.inf
-            if model.actuator_forcelimited[k]:
-                size = float(np.abs(model.actuator_forcerange[k]).min())
-            elif model.actuator_ctrllimited[k]:
-                size = float(np.abs(model.actuator_ctrlrange[k]).min() * abs(model.actuator_gainprm[k, 0]))
-            forces[int(model.actuator_trnid[k, 0])] = size * abs(float(model.actuator_gear[k, 0]))
-    return forces
+def _motors(mujoco: Any, model: Any, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Returns controls of the actuators per force of a joint [nu, d], and the largest forces [d], infinite for none.
 
-
-def _control(mujoco: Any, model: Any, driven: Sequence[int], names: Sequence[str]) -> list[float]:
-    motors, sizes = _actuators(mujoco, model), []
-    for k in driven:
-        limited = float(np.abs(model.jnt_actfrcrange[k]).min()) if model.jnt_actfrclimited[k] else np.inf
-        sizes.append(min(limited, motors.get(k, np.inf)))
-        if not 0 < sizes[-1] < np.inf:
+    Raises:
+        InputError: an actuator is not the only motor of a joint, or its limits are not finite with zero inside.
+    """
+    largest = np.minimum(-robot.force_limits[:, 0], robot.force_limits[:, 1])
+    controls = np.zeros((model.nu, model.njnt))
+    for k in range(len(model.actuator_trntype)):
+        name, gear, gain = model.actuator(k).name or k, model.actuator_gear[k], model.actuator_gainprm[k, 0]
+        joint, force = model.actuator_trnid[k, 0], gear[0] * gain
+        wrong = {  # MuJoCo numbers the kinds of a plain motor 0
+            "its transmission": model.actuator_trntype[k],
+            "its dyntype": model.actuator_dyntype[k],
+            "its gaintype": model.actuator_gaintype[k],
+            "its biastype": model.actuator_biastype[k],
+            f"gear {gear.tolist()} and gain {gain:g}": gear[1:].any() or not 0 < abs(force) < np.inf,
+            "another actuator has its joint": joint in np.flatnonzero(controls.any(axis=0)),
+        }
+        for reason in (what for what, present in wrong.items() if present):
             raise InputError(
-                f"the file states no limit of the motor of joint '{names[k]}'; give the largest force (--control), or "
-                "an actuatorfrcrange"
+                f"actuator '{name}' is not a plain motor of a joint ({reason}); make it a <motor> with a joint and one "
+                "gear, or remove it and name the joint (--actuated, --control)"
             )
-    return sizes
+        controls[k, joint] = 1 / force
+        for limited, (low, high), scale in (
+            (model.actuator_ctrllimited[k], model.actuator_ctrlrange[k], abs(force)),
+            (model.actuator_forcelimited[k], model.actuator_forcerange[k], abs(gear[0])),
+        ):
+            if limited or not (low == high == 0 or low < high):
+                if not -np.inf < low < 0 < high < np.inf:
+                    raise InputError(
+                        f"actuator '{name}' has limits {low:g} to {high:g}; expected finite ones with zero between"
+                    )
+                largest[joint] = min(largest[joint], scale * min(-low, high))
+    return controls, largest
 
 
 def _potential(mujoco: Any, model: Any, data: Any, q: np.ndarray) -> float:
     data.qpos[:] = q
-    mujoco.mj_fwdPosition(model, data)
+    with quiet(mujoco):
+        mujoco.mj_fwdPosition(model, data)
     mujoco.mj_energyPos(model, data)
     return float(data.energy[0])

@@ -22,7 +22,8 @@ def extremes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the postures [d] of least and of greatest potential energy.
 
-    Coordinates that do not matter stay at zero. Without gravity both postures are the one nearest to zero.
+    Slides stay in the middle of their ranges, or at zero without one: the energy is linear in them. Angles that do not
+    matter stay at zero. Without gravity both postures are the one nearest to zero.
 
     Args:
         potential: q [d] -> potential energy, J.
@@ -31,21 +32,27 @@ def extremes(
         ranges: limits of the coordinates, infinite for none.
 
     Raises:
-        InputError: the limits exclude every posture of the search, or gravity does not move a passive joint.
+        InputError: the limits exclude every posture of the search, a passive joint is a slide, or gravity does not move
+            it.
     """
     from scipy.optimize import minimize
 
     turns = 2 * np.pi / TURNS * np.arange(1 - TURNS // 2, TURNS // 2 + 1)
     choices = [
-        [turn for turn in turns if low <= turn <= high] if kind == "revolute" else [float(np.clip(0.0, low, high))]
+        [turn for turn in turns if low <= turn <= high]
+        if kind == "revolute"
+        else [(low + high) / 2 if np.isfinite([low, high]).all() else 0.0]
         for kind, (low, high) in zip(joints, ranges, strict=True)
     ]
+    hinges = np.array([kind == "revolute" for kind in joints])
     grid = sorted(map(np.array, itertools.product(*choices)), key=lambda q: float(np.abs(q).sum()))
     if not grid:
         raise InputError("the limits of the joints exclude every posture of the search; give goal and hanging")
     energies = np.array([potential(q) for q in grid])
     size = float(np.ptp(energies))
     for k in sorted(set(range(len(joints))) - set(driven)):
+        if not hinges[k]:
+            raise InputError(f"nothing holds the passive slide {k}; expected hinges without a motor only")
         moved = [
             abs(potential(q + np.pi / 2 * np.eye(len(joints))[k]) - e) for q, e in zip(grid, energies, strict=True)
         ]
@@ -55,6 +62,7 @@ def extremes(
     for sign in (1.0, -1.0):
         ties = np.flatnonzero(sign * energies <= (sign * energies).min() + 1e-9 * max(size, 1e-12))
         start, options = grid[ties[0]], {"gtol": 1e-7}
-        best = minimize(lambda q: sign * potential(q) / (size or 1.0), start, method="BFGS", options=options)  # noqa: B023
+        energy = lambda q: sign * potential(np.where(hinges, q, start)) / (size or 1.0)  # noqa: B023, E731
+        best = minimize(energy, start, method="BFGS", options=options)
         postures.append(np.clip(np.where(np.abs(best.x) < 1e-9, 0.0, best.x), ranges[:, 0], ranges[:, 1]))
     return postures[0], postures[1]

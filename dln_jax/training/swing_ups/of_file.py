@@ -15,6 +15,7 @@ from dln_jax.control.plants.ways import require_recovery
 from dln_jax.data import schema
 from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
+from dln_jax.sizes import require_memory
 from dln_jax.training.swing_ups.any_plant import learn_to_swing_up, push_at_half, run_seconds, try_plant
 from dln_jax.training.swing_ups.run import LEAST_SECONDS
 from dln_jax.types import InputError, require_positive, require_seed
@@ -62,6 +63,7 @@ def asked(
         return mujoco_plant(file, actuated, control=control, hardware=hardware, seed=number)
 
     layout = make(0).layout
+    require_memory(f"{seconds_of_data:.3g} s of motion at {layout.rate:.3g} Hz", 1000.0 * layout.rate * seconds_of_data)
     slides = np.array([kind == "prismatic" for kind in layout.joints])
     hardware = hardware._replace(encoder_step=np.where(slides, 1e-4, ENCODER_STEP))
     pushed = push_at_half(layout, push)

@@ -77,6 +77,13 @@ def test_mistakes_with_a_file_are_one_line_and_leave_nothing(capsys, tmp_path, a
     assert not (tmp_path / "run").exists()
 
 
+def test_a_time_step_that_would_fill_the_memory_is_one_line(capsys, tmp_path):
+    file = two_links(tmp_path)
+    file.write_text(file.read_text().replace("<mujoco>", '<mujoco><option timestep="1e-9"/>'))
+    line = refused(capsys, swing_up, "--plant", file, *MOTOR, "--out", tmp_path / "run")
+    assert "30 s of motion at 1e+09 Hz would take about" in line and not (tmp_path / "run").exists()
+
+
 def test_a_recording_that_a_later_step_refuses_is_kept(capsys, tmp_path, monkeypatch):
     def learn(plant, *_, keep, **__):
         keep(Explored(recording(plant.layout), ()))

@@ -132,3 +132,110 @@ def test_a_urdf_plant_with_a_link_of_no_mass_is_one_line(tmp_path):
 def test_a_sample_is_a_whole_number_of_steps():
     with pytest.raises(InputError, match=r"a sample has 1.667 steps"):
         mujoco_plant(CART_POLE, rate=300.0)
+
+
+MOTOR = '<motor joint="rail" gear="2" ctrllimited="true" ctrlrange="-5 5"/>'
+SITED = CART_POLE.replace("<geom type", '<site name="crank" pos=".1 0 0"/><site name="slider"/><geom type', 1)
+TENDON = '<tendon><fixed name="t"><joint joint="rail" coef="1"/><joint joint="hinge" coef=".2"/></fixed></tendon>'
+
+
+@pytest.mark.parametrize(
+    ("actuator", "reason"),
+    [
+        ('<position name="it" joint="rail" kp="100" ctrlrange="-1 1"/>', "biastype"),
+        ('<velocity name="it" joint="rail" kv="10"/>', "biastype"),
+        ('<intvelocity name="it" joint="rail" kp="10" actrange="-1 1"/>', "dyntype"),
+        ('<damper name="it" joint="rail" kv="1" ctrlrange="0 1"/>', "gaintype"),
+        ('<cylinder name="it" joint="rail" timeconst="1" area="1"/>', "dyntype"),
+        ('<muscle name="it" joint="rail" lengthrange="0 1"/>', "dyntype"),
+        ('<general name="it" joint="rail" dyntype="filter" dynprm=".1"/>', "dyntype"),
+        ('<general name="it" joint="rail" dyntype="integrator"/>', "dyntype"),
+        ('<general name="it" joint="rail" gaintype="affine"/>', "gaintype"),
+        ('<motor name="it" tendon="t"/>', "transmission"),
+        ('<motor name="it" site="slider" gear="1 0 0"/>', "transmission"),
+        ('<motor name="it" slidersite="slider" cranksite="crank" cranklength=".3"/>', "transmission"),
+        ('<adhesion name="it" body="cart" ctrlrange="0 1"/>', "transmission"),
+        ('<motor name="it" joint="rail" gear="1 2"/>', "gear"),
+        ('<motor name="it" joint="rail" gear="0"/>', "gear"),
+        (MOTOR + '<motor name="it" joint="rail"/>', "another actuator"),
+    ],
+)
+@pytest.mark.parametrize("control", [None, 3.0])
+def test_an_actuator_that_is_not_a_plain_motor_is_refused_by_name(actuator, reason, control):
+    file = SITED.replace(MOTOR, actuator).replace("<worldbody><body>", '<worldbody><body name="cart">')
+    file = file.replace("<actuator>", f"{TENDON}<actuator>")
+    with pytest.raises(InputError, match=f"actuator 'it' is not a plain motor of a joint .*{reason}"):
+        mujoco_plant(file, [] if control is None else ["rail"], control=control)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("</actuator>", '</actuator><equality><joint joint1="rail" joint2="hinge"/></equality>', "close loops"),
+        ('name="hinge"', 'name="hinge" stiffness="1"', "joint 'hinge' has a spring"),
+        ("<body><joint name", '<body gravcomp="1"><joint name', "the file has gravity compensation"),
+        ("<mujoco>", '<mujoco><option wind="1 0 0" density="1"/>', "the file has wind"),
+        ("<mujoco>", '<mujoco><option><flag actuation="disable"/></option>', "the file has disabled actuators"),
+        ("<mujoco>", '<mujoco><option actuatorgroupdisable="0"/>', "the file has disabled actuators"),
+        ("<worldbody>", '<worldbody><geom size=".04"/>', "bodies 'world' and 'cart' touch at the goal"),
+        ("<mujoco>", '<mujoco><option timestep="0"/>', "the time step of the model is 0 s"),
+        ("<mujoco>", '<mujoco><option timestep="nan"/>', "the time step of the model is nan s"),
+        ("<mujoco>", '<mujoco><option timestep="inf"/>', "the time step of the model is inf s"),
+        ("<mujoco>", '<mujoco><option gravity="0 0 nan"/>', "gravity has nan"),
+        ('name="hinge"', 'name="hinge" damping="nan"', "the damping of joint 'hinge' is nan"),
+        ("-.5 .5", "nan .5", "joint 'rail' has limits of position nan, 0.5"),
+        (" limited", ' class="it" limited', "joint 'rail' has limits of torque nan, 1"),
+        ('"-5 5"', '"nan 5"', "actuator '0' has limits nan to 5"),
+        ('"-5 5"', '"0 5"', "actuator '0' has limits 0 to 5"),
+        ('"-5 5"', '"-5 5" forcerange="5 -5"', "actuator '0' has limits 5 to -5"),
+        (MOTOR, "", "no joint has a motor: the file has no actuator"),
+    ],
+)
+def test_a_plant_that_motors_and_gravity_do_not_explain_is_refused(before, after, message):
+    default = '<default><default class="it"><joint actuatorfrcrange="nan 1"/></default></default><worldbody><body name='
+    file = CART_POLE.replace("<worldbody><body>", f'{default}"cart">').replace("<body><joint", "<body><joint", 1)
+    assert before in file
+    with pytest.raises(InputError, match=message):
+        mujoco_plant(file.replace(before, after, 1))
+
+
+@pytest.mark.parametrize(
+    ("motor", "joint", "force"),
+    [
+        ('<motor joint="rail" gear="-2" ctrlrange="-5 6"/>', "", 10.0),
+        ('<general joint="rail" gear="2" gainprm="3" ctrlrange="-5 5"/>', "", 30.0),
+        ('<general joint="rail" gear="2" gainprm="3" ctrlrange="-5 5" forcerange="-8 4"/>', "", 8.0),
+        ('<motor joint="rail" gear="2" ctrlrange="-5 5" forcerange="-80 80"/>', "", 10.0),
+        ('<motor joint="rail" gear="2" ctrlrange="-5 5"/>', 'actuatorfrcrange="-7 9"', 7.0),
+    ],
+)
+def test_a_motor_gives_the_force_that_is_asked_for_within_all_limits_of_its_file(motor, joint, force):
+    file = CART_POLE.replace(MOTOR, motor).replace('name="rail"', f'name="rail" {joint}')
+    plant, bare = mujoco_plant(file, seed=2), mujoco_plant(CART_POLE.replace(MOTOR, ""), ["rail"], control=99, seed=2)
+    np.testing.assert_allclose(plant.layout.limits.control, [[-force, force]])
+    for one in (plant, bare):
+        one.reset()
+        for share in (1.0, -1.0, 0.5):
+            one.act([share * force])
+    np.testing.assert_allclose(plant.read(), bare.read(), rtol=1e-12)
+    with pytest.raises(InputError, match=f"the file limits the motor of joint 'rail' to {force:g}"):
+        mujoco_plant(file, control=force + 1)
+
+
+@pytest.mark.parametrize(("gravity", "rail", "middle"), [("1e-5", "-.5 .5", 0.0), ("0.1", "0 1", 0.5)])
+def test_a_slide_stays_in_the_middle_of_its_range_on_a_tilted_rail(gravity, rail, middle):
+    file = CART_POLE.replace("-.5 .5", rail).replace("<mujoco>", f'<mujoco><option gravity="{gravity} 0 -9.81"/>')
+    layout = mujoco_plant(file).layout
+    tilt = np.arctan2(float(gravity), 9.81)
+    np.testing.assert_allclose(layout.hanging, [middle, -tilt], atol=1e-5)
+    np.testing.assert_allclose([layout.goal[0], abs(layout.goal[1])], [middle, np.pi - tilt], atol=1e-5)
+    with pytest.raises(InputError, match="nothing holds the passive slide 0"):
+        mujoco_plant(file.replace(MOTOR, ""), ["hinge"], control=1.0)
+
+
+def test_the_settings_of_mujoco_in_a_urdf_are_those_of_the_plant(tmp_path):
+    file = tmp_path / "moon.urdf"
+    settings = '<mujoco><option gravity="0 0 -1.6" timestep="0.004" integrator="Euler"/></mujoco>'
+    file.write_text(URDF.replace("</robot>", f"{settings}</robot>"))
+    assert mujoco_plant(file, ["elbow"]).layout.rate == 250.0
+    np.testing.assert_array_equal(read_robot(file).tree.gravity, [0.0, 0.0, -1.6])
