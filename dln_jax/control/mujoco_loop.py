@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.closed_loop import ClosedLoopRun, Controller, Hardware, sampled
-from dln_jax.data.robots import imported_mujoco, quiet
+from dln_jax.data.robots import compiled_model, quiet
 from dln_jax.types import InputError, require_positive
 
 
@@ -96,15 +96,3 @@ def sampling(model: Any, rate: float | None = None) -> tuple[float, int]:
     if not 0.5 < steps < np.inf or abs(steps - round(steps)) > 1e-6:
         raise InputError(f"a sample has {steps:.4g} steps of {step:g} s; expected a whole number")
     return rate, round(steps)
-
-
-def compiled_model(model: Any) -> tuple[Any, Any]:
-    """Returns MuJoCo and the model, compiled if it is MJCF text; `InputError` if either is missing or invalid."""
-    mujoco = imported_mujoco()
-    if not isinstance(model, str):
-        return mujoco, model
-    try:
-        with quiet(mujoco):
-            return mujoco, mujoco.MjModel.from_xml_string(model)
-    except (ValueError, RuntimeError, mujoco.FatalError, mujoco.UnexpectedError) as error:
-        raise InputError(f"MuJoCo refuses the model: {str(error).splitlines()[0]}") from None

@@ -121,16 +121,28 @@ def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -
     return locked
 
 
-def imported_mujoco() -> Any:
-    """MuJoCo; `InputError` if it is missing."""
+def compiled_model(source: Any, refusal: str = "MuJoCo refuses the model") -> tuple[Any, Any]:
+    """MuJoCo and its model of a file or of MJCF text; a `mujoco.MjModel` stays as it is.
+
+    Raises:
+        InputError: MuJoCo is missing, or cannot compile the source; the message begins with the refusal.
+    """
     try:
-        return importlib.import_module("mujoco")
+        mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
         raise InputError(f"MuJoCo, which reads and simulates robots, is not installed; {INSTALL}") from None
+    if not isinstance(source, (str, Path)):
+        return mujoco, source
+    make = mujoco.MjModel.from_xml_string if isinstance(source, str) else mujoco.MjModel.from_xml_path
+    try:
+        with quiet(mujoco):
+            return mujoco, make(str(source))
+    except (ValueError, RuntimeError, mujoco.FatalError, mujoco.UnexpectedError) as error:
+        raise InputError(f"{refusal}: {' '.join(str(error).split()):.300}") from None
 
 
 def _compiled(path: Path, root: ET.Element, locked: Collection[str], inertias: bool) -> tuple[Any, Any]:
-    mujoco, text = imported_mujoco(), None
+    source = path
     if root.tag == "robot":
         for joint in root.iter("joint"):
             for mimic in joint.findall("mimic"):
@@ -140,14 +152,8 @@ def _compiled(path: Path, root: ET.Element, locked: Collection[str], inertias: b
                         "freely: lock it, and the joint that it follows"
                     )
                 joint.remove(mimic)
-        text = ET.tostring(without_shapes(root, inertias=inertias), encoding="unicode")
-    try:
-        with quiet(mujoco):
-            model = mujoco.MjModel
-            return mujoco, model.from_xml_path(str(path)) if text is None else model.from_xml_string(text)
-    except (ValueError, RuntimeError, RecursionError, mujoco.FatalError, mujoco.UnexpectedError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: MuJoCo cannot compile it: {reason:.300}") from None
+        source = ET.tostring(without_shapes(root, inertias=inertias), encoding="unicode")
+    return compiled_model(source, f"{path}: MuJoCo cannot compile it")
 
 
 @contextlib.contextmanager

@@ -23,6 +23,12 @@ UNSURE = 1.0
 """Standard deviation of the first estimate: of coordinates in rad or m, and of rates in 1/s or m/s."""
 
 
+def require_estimator(name: str) -> None:
+    """Raises `InputError` for a name that is not one of `ESTIMATORS`."""
+    if name not in ESTIMATORS:
+        raise InputError(f"estimator is {name!r:.40}; choose from {', '.join(ESTIMATORS)}")
+
+
 def by_differences(layout: Layout) -> Estimator:
     """Returns an estimator of the rates by differences of the measurements and a low-pass."""
     cutoff = min(FASTEST_FILTER, layout.rate / 4)
@@ -59,8 +65,7 @@ def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: i
     Raises:
         InputError: the name is unknown, or a filter has no process.
     """
-    if name not in ESTIMATORS:
-        raise InputError(f"estimator is {name!r:.40}; choose from {', '.join(ESTIMATORS)}")
+    require_estimator(name)
     if name == "differences":
         return by_differences(layout)
     if process is None:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.mujoco_loop import advance, compiled_model, sampling
+from dln_jax.control.mujoco_loop import advance, sampling
 from dln_jax.control.plants.plant import Layout, Plant, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.plants.simulated import simulated
 from dln_jax.data.robot_xml import driven_joints, parsed, velocity_limits
-from dln_jax.data.robots import Robot, joint_names, opened, quiet, require_ranges, robot_of
+from dln_jax.data.robots import Robot, compiled_model, joint_names, opened, quiet, require_ranges, robot_of
 from dln_jax.types import InputError
 
 MOST_JOINTS = 4
@@ -55,7 +55,7 @@ def mujoco_plant(
             not a whole number of steps.
     """
     mujoco, model, data, controls, described, steps = _described(
-        source, actuated, control, goal, hanging, rate, speed, True
+        source, actuated, control, goal, rate, hanging, speed, passive=True
     )
     B = described.actuation
     applied = np.where(controls.any(axis=0)[:, None], 0.0, B)
@@ -84,7 +84,7 @@ def layout_of_file(
     rate: float | None = None,
 ) -> Layout:
     """Returns the layout of an MJCF or URDF file, whose joints may all have a motor; arguments as `mujoco_plant`."""
-    return _described(path, actuated, control, goal, None, rate, None, False)[4]
+    return _described(path, actuated, control, goal, rate)[4]
 
 
 def _described(
@@ -92,19 +92,18 @@ def _described(
     actuated: Sequence[int | str],
     control: Any,
     goal: Any,
-    hanging: Any,
     rate: float | None,
-    speed: Any,
-    passive: bool,
+    hanging: Any = None,
+    speed: Any = None,
+    passive: bool = False,
 ) -> tuple[Any, Any, Any, np.ndarray, Layout, int]:
     """Returns MuJoCo, its model, its data, controls of the file's actuators per force of a joint [nu, d], the layout of
     the plant, and the number of time steps in a sample."""
     mujoco, model, speeds, transmissions = _model(source)
     names = joint_names(model)
     speed = [speeds.get(name, np.inf) for name in names] if speed is None else speed
-    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
-    for name, kind in zip(names, map(int, model.jnt_type), strict=True):
-        if kind not in kinds:
+    for name, kind in zip(names, model.jnt_type, strict=True):
+        if kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
             raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected a plant with such joints only")
     if not 1 + passive <= len(names) <= MOST_JOINTS:
         which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
@@ -153,8 +152,10 @@ def _described(
     for where, q in (("at the goal", described.goal), ("where the plant hangs", described.hanging)):
         _potential(mujoco, model, data, q)
         for pair in data.contact.geom[data.contact.dist < 0][:1]:
-            bodies = " and ".join(f"'{model.body(model.geom_bodyid[geom]).name or geom}'" for geom in pair)
-            raise InputError(f"bodies {bodies} touch {where}; exclude their contact, or move them apart")
+            first, second = (model.body(body).name or body for body in model.geom_bodyid[pair])
+            raise InputError(
+                f"bodies '{first}' and '{second}' touch {where}; exclude their contact, or move them apart"
+            )
     return mujoco, model, data, controls, described, steps
 
 
@@ -218,10 +219,10 @@ def _motors(mujoco: Any, model: Any, robot: Robot) -> tuple[np.ndarray, np.ndarr
             f"gear {gear.tolist()} and gain {gain:g}": gear[1:].any() or not 0 < abs(force) < np.inf,
             "another actuator has its joint": joint in np.flatnonzero(controls.any(axis=0)),
         }
-        for reason in (what for what, present in wrong.items() if present):
+        if reasons := [what for what, present in wrong.items() if present]:
             raise InputError(
-                f"actuator '{name}' is not a plain motor of a joint ({reason}); make it a <motor> with a joint and one "
-                "gear, or remove it and name the joint (--actuated, --control)"
+                f"actuator '{name}' is not a plain motor of a joint ({reasons[0]}); make it a <motor> with a joint and "
+                "one gear, or remove it and name the joint (--actuated, --control)"
             )
         controls[k, joint] = 1 / force
         for limited, (low, high), scale in (

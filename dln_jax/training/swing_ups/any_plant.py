@@ -8,7 +8,7 @@ import numpy as np
 
 from dln_jax.control.closed_loop import Hardware, Push
 from dln_jax.control.estimate import from_log
-from dln_jax.control.plants.estimators import ESTIMATORS, estimator_of
+from dln_jax.control.plants.estimators import estimator_of, require_estimator
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import HELD, PlantRun, Trials, compiled, judged_runs, run, start_of
@@ -63,8 +63,7 @@ def learn_to_swing_up(
     Raises:
         InputError: as for `explore`, `prepare`, `identified_chain`, `from_log` and `tune`, or an unknown estimator.
     """
-    if estimator not in ESTIMATORS:
-        raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
+    require_estimator(estimator)
     began = time.perf_counter()
     explored = explore(plant, model_of, exploration, seed=seed)
     recording = explored.recording

@@ -11,14 +11,12 @@ from dln_jax.control.plants.exploring import Exploration, Explored
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Plant
 from dln_jax.control.plants.runs import PlantRun
-from dln_jax.control.plants.ways import require_recovery
 from dln_jax.data import schema
 from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
-from dln_jax.sizes import require_memory
 from dln_jax.training.swing_ups.any_plant import learn_to_swing_up, push_at_half, run_seconds, try_plant
-from dln_jax.training.swing_ups.run import LEAST_SECONDS
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.training.swing_ups.run import require_settings
+from dln_jax.types import InputError
 from dln_jax.zoo.run import save
 
 LEAST_SHARE = 0.5
@@ -52,18 +50,13 @@ def asked(
     push: float = 0.0,
 ) -> FileTask:
     """Checks the arguments of a command before anything is written; errors as for `mujoco_plant`."""
-    require_recovery(recover)
-    require_positive(starts=starts)
-    require_seed(seed)
-    if not LEAST_SECONDS <= seconds_of_data < np.inf:
-        raise InputError(f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: six episodes")
     hardware = Hardware(encoder_step=ENCODER_STEP, delay=1)
 
     def make(number: int) -> Plant:
         return mujoco_plant(file, actuated, control=control, hardware=hardware, seed=number)
 
     layout = make(0).layout
-    require_memory(f"{seconds_of_data:.3g} s of motion at {layout.rate:.3g} Hz", 1000.0 * layout.rate * seconds_of_data)
+    require_settings(layout.rate, seconds_of_data, starts, seed, estimator, recover)
     slides = np.array([kind == "prismatic" for kind in layout.joints])
     hardware = hardware._replace(encoder_step=np.where(slides, 1e-4, ENCODER_STEP))
     pushed = push_at_half(layout, push)

@@ -22,7 +22,7 @@ from dln_jax.control.desktop_plants import (
     upright_for,
 )
 from dln_jax.control.estimate import from_log
-from dln_jax.control.plants.estimators import ESTIMATORS, Estimator, estimator_of
+from dln_jax.control.plants.estimators import Estimator, estimator_of, require_estimator
 from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.scales import scales_of
 from dln_jax.control.plants.ways import require_recovery
@@ -77,16 +77,20 @@ def asked(
     chosen = desktop_plant(plant)
     if model not in MODELS:
         raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
-    if estimator not in ESTIMATORS:
-        raise InputError(f"estimator is {estimator!r:.40}; choose from {', '.join(ESTIMATORS)}")
+    require_settings(chosen.layout.rate, seconds_of_data, starts, seed, estimator, recover)
+    pushed = push_at_half(chosen.layout, push)
+    return SwingUpTask(chosen, NAMES[plant], model, seconds_of_data, estimator, starts, seed, recover, pushed)
+
+
+def require_settings(rate: float, seconds_of_data: float, starts: int, seed: int, estimator: str, recover: str) -> None:
+    """Raises `InputError` for a setting that no swing-up has, or more data than the memory holds at a rate in Hz."""
+    require_estimator(estimator)
     require_recovery(recover)
     require_positive(starts=starts)
     require_seed(seed)
     if not LEAST_SECONDS <= seconds_of_data < np.inf:
         raise InputError(f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: six episodes")
-    require_memory(f"{seconds_of_data:.3g} s of motion at 500 Hz", 1000.0 * 500 * seconds_of_data)
-    pushed = push_at_half(chosen.layout, push)
-    return SwingUpTask(chosen, NAMES[plant], model, seconds_of_data, estimator, starts, seed, recover, pushed)
+    require_memory(f"{seconds_of_data:.3g} s of motion at {rate:.3g} Hz", 1000.0 * rate * seconds_of_data)
 
 
 def swing_up(task: SwingUpTask, folder: Path, *, figures: bool) -> dict[str, float]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from dln_jax.control import Plan, TrajectoryProblem, first_plan, time_varying_lqr
 from dln_jax.control.closed_loop import outcomes
-from dln_jax.control.mujoco_loop import compiled_model
+from dln_jax.data.robots import compiled_model
 from scripts.reports.case import Findings
 from scripts.reports.control.plans import in_jax
 from scripts.reports.control.real_time import (
