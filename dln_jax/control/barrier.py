@@ -23,6 +23,8 @@ class Inequalities(NamedTuple):
     present: Array
     elastic: Array
     """Soft inequalities."""
+    strict: Array
+    """Limits of controls and durations, which no iterate may leave."""
     linear: Any
     square: Any
 
@@ -128,9 +130,10 @@ def to_boundary(of: Inequalities, at: Iterate, step: Iterate, share: Array) -> t
 
 
 def inside(of: Inequalities, values: Values, x: Array, u: Array, margin: float) -> Iterate:
-    """Returns the first iterate: slacks of at least a margin, z = 1, y >= 1, and other multipliers zero."""
+    """Returns the first iterate: slacks of at least a margin unless strict, z = 1, y >= 1, other multipliers zero."""
     t = jnp.where(of.elastic, jnp.maximum(values.c, 0.0) + margin, 0.0)
-    s, z = jnp.where(of.present, jnp.maximum(t - values.c, margin), 1.0), jnp.where(of.present, 1.0, 0.0)
+    slack = jnp.where(of.strict & (values.c < 0), -values.c, jnp.maximum(t - values.c, margin))
+    s, z = jnp.where(of.present, slack, 1.0), jnp.where(of.present, 1.0, 0.0)
     y = jnp.where(of.elastic, jnp.maximum(of.linear + of.square * t - z, 1.0), 0.0)
     return Iterate(x, u, jnp.zeros_like(values.defects), jnp.zeros_like(values.h), s, z, t, y)
 

@@ -51,8 +51,8 @@ class Kinds(NamedTuple):
     present: Bool[Array, " M"]
     """Finite limits and all constraints, except those on the first state."""
     soft: Bool[Array, " M"]
-    controls: Bool[Array, " M"]
-    """Limits of the controls."""
+    unknowns: Bool[Array, " M"]
+    """Limits of the controls and of the free components of the states, such as a duration."""
 
 
 def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
@@ -98,6 +98,9 @@ def constraints(problem: TrajectoryProblem, n: int, m: int) -> tuple[Rows, Rows,
 
     def kinds(steps: int) -> Kinds:
         limits_u, limits_x = finite_u(m), finite_x(n)
+        free = jnp.zeros(n) if problem.free is None else jnp.asarray(problem.free, float)
+        # Rows that change with the free components.
+        free = jax.jvp(of_x, (jnp.zeros(n),), (free,))[1] != 0
         path, states, end = size(problem.path, n, m), size(problem.states, n), size(problem.end_below, n)
         yes, no = (lambda number: jnp.ones(number, bool)), (lambda number: jnp.zeros(number, bool))
         u, x = len(limits_u), len(limits_x)
@@ -109,7 +112,7 @@ def constraints(problem: TrajectoryProblem, n: int, m: int) -> tuple[Rows, Rows,
         return Kinds(
             every([limits_u, yes(path), limits_x, yes(states)], [limits_x, yes(states + end)]),
             every([no(u), yes(path), no(x), yes(states)], [no(x), yes(states + end)]),
-            every([yes(u), no(path + x + states)], [no(x + states + end)]),
+            every([yes(u), no(path), free, no(states)], [free, no(states + end)]),
         )
 
     return step_rows, end_rows, kinds

@@ -5,10 +5,10 @@ McCormick 1968). As in IPOPT (Wächter and Biegler 2006, with its constants), a 
 accepts steps; if the longest step raises the violation, a second-order correction is tried. The Hessian is damped until
 the recursion's pivots are positive. The damping is remembered, and rises if no step is accepted.
 
-If inequalities cut several steps in a row short, or no step is accepted, slacks are widened: the inequalities may then
-be violated on the way, like the other constraints. A stationary point counts as a minimum if its undamped pivots are
-positive. At a saddle, the last step follows a direction of negative curvature of the Lagrangian (by an inverse
-iteration from noise).
+If inequalities cut several steps in a row short, or no step is accepted, slacks are widened, except those of limits of
+controls and durations: the inequalities may then be violated on the way, like the other constraints. A stationary point
+counts as a minimum if its undamped pivots are positive. At a saddle, the last step follows a direction of negative
+curvature of the Lagrangian (by an inverse iteration from noise).
 """
 
 from collections.abc import Callable
@@ -220,14 +220,14 @@ def search(
             entries + keep, search.largest, short, releases, search.iterations + ~done, plain, ending,
         )  # fmt: skip
         # How far below zero the whole step would take the slacks.
-        wanted = jnp.max(jnp.where(present, -(search.at.s + step.s), 0.0), initial=0.0)
+        wanted = jnp.max(jnp.where(present & ~rows.strict, -(search.at.s + step.s), 0.0), initial=0.0)
         return jax.lax.cond(release, released, lambda after, _: after, after, wanted)
 
     def released(search: Search, width: Array) -> Search:
-        """Widens the slacks, so that inequalities may be violated on the way, and starts again."""
+        """Widens the slacks, so that inequalities may be violated on the way unless strict, and starts again."""
         at = search.at
-        s = jnp.where(present, jnp.maximum(at.s, jnp.clip(width, 1e-1, 1e2)), at.s)
-        z = jnp.where(present, FIRST_BARRIER / s, 0.0)
+        s = jnp.where(present & ~rows.strict, jnp.maximum(at.s, jnp.clip(width, 1e-1, 1e2)), at.s)
+        z = jnp.where(present, jnp.minimum(FIRST_BARRIER / s, 1.0), 0.0)
         y = jnp.where(rows.elastic, FIRST_BARRIER / at.t, 0.0)
         at = at._replace(prices=0 * at.prices, nu=0 * at.nu, s=s, z=z, y=y)
         return _begun(rows, search._replace(at=at))

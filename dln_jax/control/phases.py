@@ -2,9 +2,9 @@
 
 If a search ends at a saddle, the next one starts beside it, along a direction of negative curvature of the Lagrangian.
 If a search gives up where hard constraints are violated, the next one minimises the sum of violations of all hard
-constraints except the steps and the limits of the controls (the restoration phase of Wächter and Biegler 2006, section
-3.3). If it reaches a point where they hold, the search for a minimum continues from there; if it converges elsewhere,
-the violation is stationary and the problem is locally infeasible.
+constraints except the steps and the limits of controls and durations (the restoration phase of Wächter and Biegler
+2006, section 3.3). If it reaches a point where they hold, the search for a minimum continues from there; if it
+converges elsewhere, the violation is stationary and the problem is locally infeasible.
 """
 
 from collections.abc import Callable
@@ -62,9 +62,10 @@ def phases(
     def prepared(restoring: Array) -> tuple[Array, Conditions, Inequalities]:
         weight = jnp.where(restoring, RESTORING, 1.0)
         present = kinds.present & (restoring | ~ends)
-        elastic = present & jnp.where(restoring, ~kinds.controls, limited)
+        elastic = present & jnp.where(restoring, ~kinds.unknowns, limited)
         weights = (jnp.where(limited, weight * w, price) for w, price in zip(soft or (0.0, 0.0), prices, strict=True))
-        return weight, of(weight, jnp.where(restoring, 0.0, 1.0)), Inequalities(present, elastic, *weights)
+        rows = Inequalities(present, elastic, kinds.unknowns, *weights)
+        return weight, of(weight, jnp.where(restoring, 0.0, 1.0)), rows
 
     def following(phase: Phase) -> Phase:
         restoring = phase.restoring

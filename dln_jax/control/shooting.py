@@ -29,6 +29,8 @@ from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem,
 from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, require_positive
 
+HELD = 100.0
+"""A constraint holds if its excess is at most this many tolerances: 1e-6 by default."""
 LARGEST_GRADIENT = 100.0
 """The cost is scaled so that its derivatives at the guess do not exceed this."""
 
@@ -48,6 +50,8 @@ class Shooting(NamedTuple):
     """Largest |f(x_k, u_k) - x_{k+1}|, in the states' units."""
     violation: Float[Array, ""]
     """Largest excess of an inequality, soft ones included, or of an equation of the end."""
+    objective: Float[Array, ""]
+    """Cost plus the price of the excess of soft constraints; infinite if a hard constraint is violated."""
     stationarity: Float[Array, ""]
     """Largest derivative of the Lagrangian, for the cost divided by `scale`."""
     feasibility: Float[Array, ""]
@@ -62,7 +66,10 @@ class Shooting(NamedTuple):
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether all conditions of an optimum hold within the tolerance; `solvers.ending.reason` says why not."""
+        """Whether all conditions of an optimum hold within the tolerance, and all constraints within 100 times it.
+
+        `solvers.ending.reason` says why not.
+        """
         return self.ending == Ending.CONVERGED
 
 
@@ -96,7 +103,7 @@ def shoot(
         exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton, which
             does not recognise saddles.
         starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: that of
-            least cost within the constraints, or else of least violation.
+            least objective within the hard constraints, or else of least violation.
 
     Raises:
         InputError: shapes do not agree, a setting is not positive, limits are crossed, the start violates the limits of
@@ -107,7 +114,7 @@ def shoot(
         def one(states: Array, u: Array) -> Shooting:
             return shoot(problem, x, states, u, iterations=iterations, tolerance=tolerance, exact=exact)
 
-        return _best(jax.vmap(one)(*_with_first((states, u), starts)), tolerance)
+        return _best(jax.vmap(one)(*_with_first((states, u), starts)))
     start = x
     x, states, u = (jnp.asarray(array, float) for array in (x, states, u))
     if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
@@ -149,8 +156,7 @@ def optimise(
         InputError: as for `shoot`.
     """
     plan = _single(problem, x, u, iterations, tolerance, exact) if starts is None else _best(
-        jax.vmap(lambda u: _single(problem, x, u, iterations, tolerance, exact))(*_with_first((u,), (starts,))),
-        tolerance,
+        jax.vmap(lambda u: _single(problem, x, u, iterations, tolerance, exact))(*_with_first((u,), (starts,)))
     )  # fmt: skip
     return plan.plan._replace(u=jnp.clip(plan.plan.u, problem.lower, problem.upper))
 
@@ -189,22 +195,30 @@ def _solved(
 
     soft = None if problem.soft is None else (problem.soft[0] / scale, problem.soft[1] / scale)
     last, weight = phases(of, trial, x, u, soft=soft, free=problem.free, iterations=iterations, tolerance=tolerance)
-    return _result(of(jnp.ones(()), jnp.ones(())), last, scale / weight, tolerance)
+    return _result(of(jnp.ones(()), jnp.ones(())), last, scale / weight, tolerance, problem.soft, weight == 1)
 
 
-def _result(of: Conditions, last: Search, scale: Array, tolerance: float) -> Shooting:
+def _result(
+    of: Conditions, last: Search, scale: Array, tolerance: float, soft: Any, not_restored: Array
+) -> Shooting:  # fmt: skip
     at, values, residuals = last.at, last.values, last.residuals
     present = of.kinds.present
     rows, (above, below) = len(present), jnp.split(at.z[len(present) :], 2)
-    excess = jnp.max(jnp.where(present, values.c[:rows], -jnp.inf), initial=0.0)
-    violation = jnp.maximum(excess, jnp.max(values.c[rows:], initial=0.0))
-    outside = jnp.maximum(violation, residuals.feasibility) > jnp.sqrt(tolerance)
-    ending = jnp.where(gave_up(last.ending) & outside, Ending.VIOLATED, last.ending)
+    excess = jnp.where(present, jnp.maximum(values.c[:rows], 0.0), 0.0)
+    violation = jnp.maximum(jnp.max(excess, initial=0.0), jnp.max(values.c[rows:], initial=0.0))
+    outside = gave_up(last.ending) & (residuals.feasibility > jnp.sqrt(tolerance))
+    exceeded = (last.ending == Ending.CONVERGED) & (violation > HELD * tolerance)
+    ending = jnp.select([outside, exceeded], [Ending.VIOLATED, Ending.EXCEEDED], last.ending)
     damping, cost = jnp.asarray(FIRST_DAMPING, at.u.dtype), scale * values.cost
+    w_1, w_2 = soft or (0.0, 0.0)
+    objective = cost + jnp.sum(jnp.where(of.kinds.soft, w_1 * excess + w_2 / 2 * excess**2, 0.0))
+    # After a search that minimised violations, feasibility does not count them.
+    held = not_restored & (residuals.feasibility <= HELD * tolerance)
     plan = Plan(at.u, at.x, last.change.K, cost, damping, jnp.asarray(True), ending)
     return Shooting(
         plan, scale * at.prices, scale * (at.nu + above - below), scale * at.z[:rows],
-        jnp.max(jnp.abs(values.defects)), violation, *residuals, scale, last.iterations, ending,
+        jnp.max(jnp.abs(values.defects)), violation, jnp.where(held, objective, jnp.inf), *residuals,
+        scale, last.iterations, ending,
     )  # fmt: skip
 
 
@@ -217,13 +231,11 @@ def _with_first(first: tuple[Any, ...], more: tuple[Any, ...]) -> list[Array]:
     return [jnp.concatenate([one[None], others]) for one, others in pairs]
 
 
-def _best(solutions: Shooting, tolerance: float) -> Shooting:
-    """Returns the solution of least cost within the constraints, or that of least violation if there is none."""
-    off = jnp.maximum(solutions.violation, solutions.feasibility)
-    # Soft constraints may be violated even if all conditions hold.
-    inside = (solutions.ending == Ending.CONVERGED) | (off <= jnp.sqrt(tolerance))
-    best = jnp.where(inside.any(), *(jnp.argmin(jnp.where(jnp.isfinite(key), key, jnp.inf)) for key in (
-        jnp.where(inside, solutions.plan.cost, jnp.inf), off)))  # fmt: skip
+def _best(solutions: Shooting) -> Shooting:
+    """Returns the solution of least objective, or that of least violation if all violate hard constraints."""
+    keys = solutions.objective, jnp.maximum(solutions.violation, solutions.feasibility)
+    objective, off = (jnp.where(jnp.isfinite(key), key, jnp.inf) for key in keys)
+    best = jnp.where(jnp.isfinite(objective).any(), jnp.argmin(objective), jnp.argmin(off))
     return jax.tree.map(lambda leaf: leaf[best], solutions)
 
 

@@ -41,10 +41,11 @@ class TrajectoryProblem(NamedTuple):
     """x_N -> [e], at most zero."""
     end: Callable[..., Array] | None = None
     """x_N -> [q], zero; always hard."""
-    soft: tuple[float, float] | None = (1e3, 1e3)
+    soft: tuple[float, float] | None = None
     """Weights (w_1, w_2) of w_1 t + w_2 t² / 2 for the excess t of `path`, `states` and `end_below`; None: hard.
 
-    The excess is zero where constraints can be met at a price per unit below w_1.
+    The excess is zero where constraints can be met at a price per unit below w_1. Elsewhere the plan violates them and
+    ends with `Ending.EXCEEDED`.
     """
     free: Any = None
     """Mask [n] of the unknown components of the first state, such as a duration; by default none."""

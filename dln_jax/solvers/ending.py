@@ -17,6 +17,7 @@ class Ending(IntEnum):
     VIOLATED = 5
     INFEASIBLE = 6
     SADDLE = 7
+    EXCEEDED = 8
 
 
 REASONS = {
@@ -29,6 +30,8 @@ REASONS = {
     Ending.INFEASIBLE: "is locally infeasible: no small change lowers the violation (`control.worst_violation` names "
     "the worst); change the limits, the horizon or the start",
     Ending.SADDLE: "ended at a saddle: all slopes vanish, but the cost curves down; start beside it",
+    Ending.EXCEEDED: "is optimal at its prices, but violates soft constraints (`control.worst_violation` names the "
+    "worst); raise the prices, or make the constraints hard (soft=None)",
     Ending.UNDECIDED: "has not ended: a single iteration cannot tell",
 }
 
