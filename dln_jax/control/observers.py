@@ -23,6 +23,8 @@ def with_differences(law: Law | Controller, d: int, *, rate: float, cutoff: floa
         cutoff: cut-off frequency of the low-pass, Hz.
         order: order of the differences; 1 is late by half a sample, 2 is not but amplifies encoder noise more.
 
+    A measurement that is not finite reaches the law, and the rates continue without it.
+
     Raises:
         InputError: the rate or the cut-off is not positive, or the order is neither 1 nor 2.
     """
@@ -34,11 +36,12 @@ def with_differences(law: Law | Controller, d: int, *, rate: float, cutoff: floa
 
     def act(memory: tuple, t: Array, y: Array) -> tuple[tuple, Array]:
         (before, slope, qd, seen), inner = memory
+        measured, y = y, jnp.where(jnp.isfinite(y), y, before + qd / rate)
         newest = y - before
         # The first sample has no difference, and the second no earlier difference.
         rates = rate * (1.5 * newest - 0.5 * jnp.where(seen > 1, slope, newest) if order == 2 else newest)
         qd = jnp.where(seen > 0, qd + share * (rates - qd), 0.0)
-        inner, u = controller.act(inner, t, jnp.concatenate([y, qd]))
+        inner, u = controller.act(inner, t, jnp.concatenate([measured, qd]))
         return ((y, newest, qd, jnp.minimum(seen + 1, 2)), inner), u
 
     return Controller(((jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(0)), controller.start), act)

@@ -8,9 +8,12 @@ solves a smooth problem, with barriers for the limits of the controls and prices
     -μ log(-c)   and   min_t  w_1 t - μ log t - μ log(t - c)  +  w_2 max(c, 0)² / 2
 
 Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick
-1968): as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. It has a
-closed form: with δ = 2 μ / w_1 and r = √(c² + δ²), t = (r + c + δ) / 2, and the multiplier is μ / (t - c). So every
-sample has a plan, which needs no memory of multipliers and states whether it violates a constraint.
+1968): as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. With
+h = μ / w_1 and the smoothed distance d = (√(c² + 4 h²) - c) / 2 its slope is μ / (d + h); a barrier has h = 0 and
+d = -c. These slopes act at any distance, and a far obstacle would move the plan away from its goal. So they are
+multiplied by (1 - d / D)², and are zero beyond a distance D: a tenth of the range of a limit, or 0.1 in the units of
+any other constraint. So every sample has a plan, which needs no memory of multipliers and states whether it violates a
+constraint.
 
 An iteration is that of a Gauss-Newton regulator (Li and Todorov 2004) by Riccati's recursion. It takes the best of
 several step lengths, each giving a motion, and raises the damping of the controls' Hessian if none lowers the cost.
@@ -37,9 +40,9 @@ BARRIER = 1e-3
 PRICES = 1e3, 1e3
 """Prices (w_1, w_2) of the constraints of problems without `soft`."""
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e9
-TO_BOUNDARY, CLOSEST = 0.99, 1e-5
-"""Share of the distance to a limit that a control may go in an iteration, and its least distance from finite limits
-relative to their range."""
+TO_BOUNDARY, CLOSEST, REACH = 0.99, 1e-5, 0.1
+"""Share of the distance to a limit that a control may go in an iteration, its least distance from finite limits
+relative to their range, and D relative to the range, or to one where there is none."""
 ROUNDING = 1e-12
 """Relative difference of costs that counts as rounding."""
 VIOLATED = 5.0
@@ -60,7 +63,8 @@ def prepare(
     Args:
         problem: over the horizon; its knots, if any, have N+2 rows, from this sample to the end of the next horizon.
         plan: the plan that gave the control.
-        x: measured state.
+        x: measured state. Components that are not finite are replaced by those that the plan expects, and the plan's
+            `ending` is `NOT_FINITE`.
         barrier, step_lengths: as for `improve`.
         iterations: number of iterations; it may be traced.
 
@@ -69,7 +73,8 @@ def prepare(
     """
     if not isinstance(iterations, Tracer):
         require_positive(iterations=iterations)
-    x = jnp.asarray(x, float)
+    seen = jnp.isfinite(jnp.asarray(x, float))
+    x = jnp.where(seen, x, plan.x[0])
     now, later = (
         problem._replace(knots=jax.tree.map(lambda rows, part=part: rows[part], problem.knots))
         for part in (slice(None, -1), slice(1, None))
@@ -83,7 +88,7 @@ def prepare(
     lost = ~jnp.isfinite(states).all()
     bare = lambda: under(jnp.zeros_like(plan.x[:-1]), jnp.zeros_like(plan.K))  # noqa: E731
     states, u = jax.lax.cond(lost, bare, lambda: (states, u))
-    u = jnp.where(jnp.isfinite(u), u, plan.u)  # x was not finite
+    u = jnp.where(jnp.isfinite(u), u, plan.u)  # of states that are not finite
     knot = jax.tree.map(lambda rows: rows[-1], knots_of(later)[0])
     last = problem.step(states[-1], u[-1], *knot)
     moved = plan._replace(
@@ -93,7 +98,8 @@ def prepare(
     again = lambda _, plan: improve(later, plan, barrier=barrier, step_lengths=step_lengths)  # noqa: E731
     # A loop with a single turn would only add code.
     single = not isinstance(iterations, Tracer) and iterations == 1
-    return again(0, moved) if single else jax.lax.fori_loop(0, iterations, again, moved)
+    after = again(0, moved) if single else jax.lax.fori_loop(0, iterations, again, moved)
+    return after._replace(ending=jnp.where(seen.all(), after.ending, Ending.NOT_FINITE))
 
 
 def mpc(
@@ -191,40 +197,43 @@ class _Smooth(NamedTuple):
 
 def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_Smooth, _Smooth]:
     """Returns the cost of a step and the cost of the end."""
-    w_1, w_2 = PRICES if problem.soft is None else problem.soft
-    width = _width(problem, barrier)
+    w_2, h_price = (PRICES if problem.soft is None else problem.soft)[1], _width(problem, barrier) / 2
 
-    def wall(c: Array) -> tuple[Array, Array, Array]:
-        return -barrier * jnp.log(-c), -barrier / c, barrier / c**2
+    def law(c: Array, h: Any, D: Any) -> tuple[Array, Array, Array]:
+        """Returns value, slope and curvature of prices, or of barriers for h = 0."""
+        r, beyond = jnp.sqrt(c**2 + 4 * h**2), jnp.maximum(c, 0.0)
+        # Without cancellation: (r + c) (r - c) = 4 h².
+        d = jnp.where(c >= 0, 2 * h**2 / (r + jnp.abs(c)), (r + jnp.abs(c)) / 2)
 
-    def price(c: Array) -> tuple[Array, Array, Array]:
-        beyond, r = jnp.maximum(c, 0.0), jnp.sqrt(c**2 + width**2)
-        # r - c without cancellation: (r + c) (r - c) = δ².
-        s = (width + jnp.where(c > 0, width**2 / (r + jnp.abs(c)), r + jnp.abs(c))) / 2
-        value = w_1 * (s + c) - barrier * jnp.log(s * (s + c)) + w_2 / 2 * beyond**2
-        return value, barrier / s + w_2 * beyond, barrier / s**2 * (1 - c / r) / 2 + jnp.where(c > 0, w_2, 0.0)
+        def integral(d: Any) -> Array:
+            logs = 2 * (1 + h / D) ** 2 * jnp.log(d + h) - (1 + 2 * h / D) * jnp.log(d)
+            return logs - h / d - 2 * d / D + (d / 2 - h) * d / D**2
+
+        fade, steep = jnp.maximum(1 - d / D, 0.0), barrier / (d + h)
+        value = barrier * (integral(D) - integral(jnp.minimum(d, D))) + w_2 / 2 * beyond**2
+        curvature = d / r * steep * fade * (fade / (d + h) + 2 / D) + jnp.where(c > 0, w_2, 0.0)
+        return value, steep * fade**2 + w_2 * beyond, curvature
 
     def priced(cost: Callable[..., Any], rows: list[Callable[..., Array]], limits: list[tuple[Any, ...]]) -> _Smooth:
         # The derivative of a limit is constant and has one non-zero element.
-        boxes = [(law, signs, bounds) for law, signs, bounds in limits if len(bounds)]
+        boxes = [limit for limit in limits if len(limit[1])]
 
         def every(y: Array, *knot: Any) -> Array:
             return jnp.concatenate([row(y, *knot) for row in rows])
 
         def whole(y: Array, *knot: Any) -> tuple[Array, Array]:
-            terms = [(law, signs @ y - bounds) for law, signs, bounds in boxes]
-            terms += [(price, every(y, *knot))] if rows else []
-            worst = [jnp.max(c) for law, c in terms if law is price]
-            value = cost(y, *knot) + sum(jnp.sum(law(c)[0]) for law, c in terms)
-            return value, jnp.max(jnp.stack(worst)) if worst else jnp.full((), -jnp.inf, y.dtype)
+            terms = [(signs @ y - bounds, *shape) for signs, bounds, *shape in boxes]
+            terms += [(every(y, *knot), h_price, REACH)] if rows else []
+            value = cost(y, *knot) + sum(jnp.sum(law(*term)[0]) for term in terms)
+            return value, jnp.max(jnp.concatenate([jnp.full(1, -jnp.inf), *(c for c, *_ in terms)]))
 
         def expansion(y: Array, *knot: Any) -> tuple[Array, Array]:
             gradient, hessian = jax.grad(cost)(y, *knot), jax.hessian(cost)(y, *knot)
-            for law, signs, bounds in boxes:
-                _, slope, curvature = law(signs @ y - bounds)
+            for signs, bounds, *shape in boxes:
+                _, slope, curvature = law(signs @ y - bounds, *shape)
                 gradient, hessian = gradient + signs.T @ slope, hessian + jnp.diag(jnp.abs(signs).T @ curvature)
             if rows:
-                _, slope, curvature = price(every(y, *knot))
+                _, slope, curvature = law(every(y, *knot), h_price, REACH)
                 J = jax.jacfwd(every)(y, *knot)
                 gradient, hessian = gradient + J.T @ slope, hessian + J.T @ (curvature[:, None] * J)
             return gradient, hessian
@@ -242,31 +251,39 @@ def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_
     on_end = [problem.end_below] if problem.end_below else []
     if end := problem.end:
         on_end += [end, lambda x, *knot: -end(x, *knot)]
-    signs, bounds = _limits(problem.lower_x, problem.upper_x, n)
-    signs_u, bounds_u = _limits(problem.lower, problem.upper, m)
+    signs, bounds, reach = _limits(problem.lower_x, problem.upper_x, n)
+    signs_u, *barriers = _limits(problem.lower, problem.upper, m)
     on_step = [
-        (price, np.pad(signs, ((0, 0), (0, m))), bounds), (wall, np.pad(signs_u, ((0, 0), (n, 0))), bounds_u)
-    ]  # fmt: skip
+        (np.pad(signs, ((0, 0), (0, m))), bounds, h_price, reach),
+        (np.pad(signs_u, ((0, 0), (n, 0))), barriers[0], 0.0, barriers[1]),
+    ]
     return (
         priced(of_both(problem.cost), path + states, on_step),
-        priced(problem.final_cost, states + on_end, [(price, signs, bounds)]),
+        priced(problem.final_cost, states + on_end, [(signs, bounds, h_price, reach)]),
     )
 
 
-def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array]:
-    """Returns signs [r, size] and bounds [r] of finite limits, signs y <= bounds; traced limits count as finite."""
-    signs, bounds = [], []
+def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array, Array]:
+    """Returns signs [r, size], bounds [r] and D [r] of finite limits, signs y <= bounds; traced limits are finite."""
+    sides = []
     for sign, limit in ((-1.0, lower), (1.0, upper)):
         known = np.ones(size, bool) if isinstance(limit, Tracer) else np.isfinite(np.broadcast_to(limit, size))
-        signs.append(sign * np.eye(size)[known])
-        bounds.append(sign * jnp.broadcast_to(jnp.asarray(limit, float), size)[np.flatnonzero(known)])
-    return np.concatenate(signs), jnp.concatenate(bounds)
+        bounds, ranges = (jnp.broadcast_to(y, size)[np.flatnonzero(known)] for y in (limit, _range(lower, upper)))
+        sides.append((sign * np.eye(size)[known], sign * bounds, REACH * ranges))
+    signs, bounds, reach = zip(*sides, strict=True)
+    return np.concatenate(signs), jnp.concatenate(bounds), jnp.concatenate(reach)
+
+
+def _range(lower: Any, upper: Any) -> Array:
+    """Returns the range between limits, one where it is not finite."""
+    size = jnp.asarray(upper, float) - jnp.asarray(lower, float)
+    return jnp.where(jnp.isfinite(size), size, 1.0)
 
 
 def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
     """Returns (control, previous control) -> control within its limits and at most `TO_BOUNDARY` of the way to them."""
     lower, upper = (jnp.asarray(limit, float) for limit in (problem.lower, problem.upper))
-    closest = CLOSEST * jnp.where(jnp.isfinite(upper - lower), upper - lower, 1.0)
+    closest = CLOSEST * _range(lower, upper)
 
     def limited(u: Array, before: Array) -> Array:
         low = jnp.maximum(lower + closest, before - TO_BOUNDARY * (before - lower))

@@ -88,13 +88,16 @@ def recovery_by_plans(
     def act(memory: Recovery, t: Array, x: Array) -> tuple[Recovery, Array]:
         last = () if memory.parameters is None else (memory.parameters,)
         now = problem if memory.parameters is None else problem(memory.parameters)
-        within = cost(x, *last) <= level
+        seen = jnp.isfinite(x).all()
+        within = jnp.where(seen, cost(x, *last) <= level, memory.near)
+        # Plans go on from the state that they expect.
+        known = jnp.where(seen, x, memory.acting[3])
         # Counted by time, which all lanes of a `vmap` share: with a counter in memory they would plan at every sample.
         number = jnp.round(t * rate).astype(int) % every
         # The regulator takes over at any sample, a plan only at the start of a step.
         kept = lambda memory, x, within: memory  # noqa: E731
         if_away = lambda *args: jax.lax.cond(within, kept, planned, *args)  # noqa: E731
-        memory = jax.lax.cond(number == 0, if_away, kept, memory, x, within)
+        memory = jax.lax.cond(number == 0, if_away, kept, memory, known, within)
         memory = memory._replace(near=memory.near | within)
         u, K, begin, end = memory.acting
         along = u + K @ (x - begin - number / every * (end - begin))

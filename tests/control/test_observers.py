@@ -38,3 +38,12 @@ def test_differences_of_second_order_are_exact_for_parabolas():
     np.testing.assert_allclose(falling.u[2:, 0], falling.x[2:-1, 1], rtol=1e-9)
     with pytest.raises(InputError, match="order is 3"):
         with_differences(lambda x: x, 1, rate=50.0, cutoff=1.0, order=3)
+
+
+def test_differences_continue_after_a_measurement_that_is_not_finite():
+    controller = with_differences(stateless(lambda x: x[1:]), 1, rate=50.0, cutoff=1e6)
+    memory, rates = controller.start, []
+    for number, y in enumerate([0.0, 0.02, 0.04, np.nan, 0.08, 0.1]):
+        memory, u = controller.act(memory, jnp.asarray(number / 50), jnp.array([y]))
+        rates.append(float(u[0]))
+    np.testing.assert_allclose(rates[1:], 1.0)

@@ -9,6 +9,8 @@ import pytest
 
 from dln_jax.control import TrajectoryProblem, feedback, first_plan, improve, mpc, prepare, shoot, worst_violation
 from dln_jax.control.real_time import BARRIER, _smooth
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
 from dln_jax.solvers.ending import Ending, reason
 from dln_jax.types import InputError
 
@@ -51,17 +53,23 @@ def test_iterations_approach_the_optimum_as_the_barrier_falls():
 
 
 def test_prices_have_their_closed_forms():
-    """The price minimises w t - μ log t - μ log(t - c) over t; slope and curvature are its derivatives."""
+    """Slopes of the minimum of w t - μ log t - μ log(t - c) over t, times (1 - d / D)²; no price beyond D = 0.1."""
     step, _ = _smooth(
         BLOCK._replace(cost=lambda x, u: 0 * x[0], soft=(2.0, 0.0), lower=-np.inf, upper=np.inf), 2, 1, 0.1
     )
     slope = jax.jit(jax.grad(lambda y: step.cost(y)[0]))
     for speed in (-3.0, 0.55, 0.6, 2.0):
         c, y = speed - 0.6, jnp.array([0.0, speed, 0.0])
-        t = max(c, 0.0) + np.geomspace(1e-6, 10.0, 400_000)
-        lowest = np.min(2.0 * t - 0.1 * np.log(t) - 0.1 * np.log(t - c))
-        assert float(step.cost(y)[0]) == pytest.approx(lowest, abs=1e-6)
+        ahead, behind = (
+            np.min(2.0 * t - 0.1 * np.log(t) - 0.1 * np.log(t - at))
+            for at in (c + 1e-4, c - 1e-4)
+            for t in [max(at, 0.0) + np.geomspace(1e-6, 10.0, 400_000)]
+        )
+        d = (np.sqrt(c**2 + 0.1**2) - c) / 2
         gradient, hessian = step.expansion(y)
+        fade = max(1 - d / 0.1, 0.0) ** 2
+        assert float(gradient[1]) == pytest.approx(fade * (ahead - behind) / 2e-4, rel=1e-4, abs=1e-12)
+        assert (float(step.cost(y)[0]) > 0.0) == (fade > 0.0)
         np.testing.assert_allclose(gradient, slope(y), rtol=1e-9, atol=1e-12)
         numeric = (slope(y.at[1].add(1e-5)) - slope(y.at[1].add(-1e-5)))[1] / 2e-5
         assert float(hessian[1, 1]) == pytest.approx(float(numeric), rel=1e-5, abs=1e-8)
@@ -96,7 +104,8 @@ def test_a_sample_without_feasible_plan_says_so():
 def test_a_control_is_nan_where_the_state_is():
     plan = improving(BARRIER)(START)
     assert np.isnan(feedback(BLOCK, plan, START * np.nan)).all()
-    assert int(prepare(BLOCK, plan, jnp.asarray(START) * np.nan).ending) == Ending.NOT_FINITE
+    after = prepare(BLOCK, plan, jnp.asarray(START) * np.nan)
+    assert int(after.ending) == Ending.NOT_FINITE and all(np.isfinite(leaf).all() for leaf in after)
 
 
 STEEP = BLOCK._replace(
@@ -115,10 +124,48 @@ def test_a_plan_without_a_value_is_no_end(cause):
         if hit and cause == "gains":
             plan = plan._replace(K=plan.K + 1e200)
         u, after = act(x * np.nan if hit and cause == "reading" else x, plan)
-        lost = cause == "reading" and sample in (10, 11)
+        lost = cause == "reading" and sample == 10
         assert np.isnan(u).all() == lost
         plan, x = after, STEEP.step(x, jnp.zeros(1) if lost else u)
     assert int(plan.ending) == Ending.UNDECIDED and np.abs(x).max() < 0.05
+
+
+def test_a_far_obstacle_and_unequal_limits_leave_the_mass_at_its_goal():
+    """Before, an obstacle 1.5 m away moved the mass by millimetres."""
+    obstacle = BLOCK._replace(upper_x=np.inf, lower=-2.0, states=lambda x: x[:1] - 1.5)
+    act, plan, x = jax.jit(mpc(obstacle)), first_plan(obstacle, START, np.zeros((N, 1))), jnp.asarray(START)
+    for _ in range(120):
+        u, plan = act(x, plan)
+        x = obstacle.step(x, u)
+    assert np.abs(x).max() < 1e-6 and int(plan.ending) == Ending.UNDECIDED
+
+
+def test_one_reading_that_is_not_finite_costs_one_command_in_c_too(tmp_path):
+    problem = STEEP._replace(upper_x=np.array([np.inf, 0.6]))
+    first = first_plan(problem, START / 2, np.zeros((4, 1)))
+
+    def renew(x, u, states, gains, damping):
+        plan = first._replace(u=u, x=states, K=gains, damping=damping)
+        after = prepare(problem, plan, x)
+        return {
+            "force": feedback(problem, plan, x), "controls": after.u, "next": after.x, "feedback": after.K,
+            "size": after.damping, "ending": after.ending,
+        }  # fmt: skip
+
+    examples = tuple(np.asarray(leaf) for leaf in (first.x[0], first.u, first.x, first.K, first.damping))
+    export_c({"renew": (renew, examples)}, tmp_path / "plan", stack=2**20)
+    in_c, in_jax = load_c(tmp_path / "plan"), jax.jit(renew)
+    memory = {"c": examples[1:], "jax": examples[1:]}
+    for reading in (START / 2, START * np.nan, START / 2.2):
+        answers = {"c": in_c.renew(reading, *memory["c"])._asdict(), "jax": in_jax(reading, *memory["jax"])}
+        assert np.isnan(answers["c"]["force"]).all() == np.isnan(reading).all()
+        for name, value in answers["c"].items():
+            np.testing.assert_allclose(value, answers["jax"][name], rtol=1e-9, atol=1e-12)
+            assert np.isfinite(value).all() or name == "force"
+        memory = {
+            way: tuple(answer[name] for name in ("controls", "next", "feedback", "size"))
+            for way, answer in answers.items()
+        }
 
 
 def test_knots_move_a_reference_and_constraints_that_depend_on_time():

@@ -88,6 +88,19 @@ def test_a_state_that_is_not_finite_has_no_torque(pushed):
     assert np.isnan(pushed([np.nan, 0.0])[1]).all()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("start", "near"), [((0.0, 3.0), False), ((0.05, 0.0), True)])
+def test_a_reading_that_is_not_finite_costs_one_torque(start, near):
+    law = controller()
+    act, step, memory, x = jax.jit(law.act), jax.jit(integrated(rates, 1 / RATE)), law.start, jnp.asarray(start)
+    memory = memory._replace(parameters=jnp.asarray(1.0))
+    for number in range(21):
+        lost = number in (5, 12)
+        memory, u = act(memory, jnp.asarray(number / RATE), x * np.nan if lost else x)
+        assert np.isnan(u).all() == lost and memory.near == near
+        x = step(x, jnp.zeros(1) if lost else u)
+
+
 def test_a_step_without_samples_is_refused():
     plans = first_plan(TrajectoryProblem(rates, lambda x, u: x @ x, lambda x: x @ x), UPRIGHT, np.zeros((1, 1)))
     with pytest.raises(InputError, match="every"):
