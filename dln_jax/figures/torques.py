@@ -27,12 +27,15 @@ HIGH, LOW = 0.8, 0.36
 """Heights of a panel of forces and of a panel of errors, inches."""
 
 
-def force_decomposition(data: Trajectories, predicted: dict[str, np.ndarray], *, model: str = "model") -> Figure:
+def force_decomposition(
+    data: Trajectories, predicted: dict[str, np.ndarray], *, model: str = "model", note: str = ""
+) -> Figure:
     """Torque and its parts over the first test motions, one column per joint: truth and model, with the error below.
 
     All errors share one scale. Motions are joined in time; isolated states are compared point by point.
 
-    `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour.
+    `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour, and
+    the legend adds a note to it.
     """
     shown = np.unique(data.trajectory)[:MOST_MOTIONS]
     samples = np.flatnonzero(np.isin(data.trajectory, shown))
@@ -58,7 +61,9 @@ def force_decomposition(data: Trajectories, predicted: dict[str, np.ndarray], *,
                 if key in truths:
                     look = {"color": "black", "linewidth": 2.0, "markersize": 4, "label": "truth"}
                     axis.plot(x, truths[key][:, joint], "-" if moving else "o", **look)
-                axis.plot(x, predicted[key][samples, joint], dash, marker=dot, color=shade, linewidth=1.3, label=model)
+                axis.plot(
+                    x, predicted[key][samples, joint], dash, marker=dot, color=shade, linewidth=1.3, label=model + note
+                )
                 low, high = axis.get_ylim()
                 if high - low < ROUNDING * np.ptp(predicted["tau"][samples, joint]):  # a part that is zero
                     axis.set_ylim(-1.0, 1.0)

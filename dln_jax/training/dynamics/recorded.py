@@ -138,11 +138,13 @@ def stated_needs(options: Options, scene: Scene | None, data: Trajectories, robo
     """`Needs` of the plant and their origin: the command line, the scene, the file, the robot, or an assumption."""
     needs, origin = _needs_and_origin(options, scene, data, robot)
     require_positive_if_given(options, ["velocity_scale"])
+    if needs.friction and (options.model == AUTO or entry_of(str(options.model)).properties.searched):
+        # All candidates of a selection get the same friction, so that none wins by friction alone.
+        needs = needs._replace(friction=False, joint_friction=needs.joint_friction or USUAL)
     scale = options.velocity_scale
     if scale is None:
         return needs, origin
-    trees = options.model == AUTO or entry_of(str(options.model)).properties.searched
-    if not (needs.joint_friction or (trees and needs.friction)):
+    if not needs.joint_friction:
         raise InputError(
             "--velocity-scale is for dry friction of joints, which the needs do not state; "
             'add --needs with "joint_friction", or leave it out'

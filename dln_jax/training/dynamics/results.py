@@ -52,6 +52,7 @@ MEANINGS = {
     "inertial_mse": "inertial force, mean square error",
     "coriolis_mse": "Coriolis force, mean square error",
     "gravity_mse": "gravity force, mean square error",
+    "gravity_determined": "gravity told from friction: 1 yes, 0 known only in sum",
     "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
     "share_not_definite": "states where the mass matrix is not definite",
     "largest_condition_number": "largest condition number of the mass matrix",
@@ -106,6 +107,7 @@ def evaluate(
     of_bands, bands = uncertainty_metrics(folder, programs.double, test, predicted["tau"], task.kind)
     metrics = {
         **errors(predicted, test),
+        "gravity_determined": int(not task.summed),
         **judged.metrics,
         **({} if task.refinement is None else task.refinement.metrics),
         **spread,
@@ -192,7 +194,8 @@ def figures_of(
 ) -> dict[str, Callable[[Path], None]]:
     """The applicable figures; `motions` are the model's rollouts of the test, possibly none."""
     test = task.sets.test
-    figures = {"decomposition.png": png(drawing.force_decomposition, test, predicted, model=task.kind)}
+    note = " (gravity in sum with friction)" if task.summed else ""
+    figures = {"decomposition.png": png(drawing.force_decomposition, test, predicted, model=task.kind, note=note)}
     if training.history and task.solver is not None:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}

@@ -133,7 +133,9 @@ def store_bands(folder: Path, task: Task, model: Model, parameters: Parameters) 
 
 
 def warnings(task: Task, training: Training, folder: Path) -> Iterator[str]:
-    """Lines on indefinite mass matrices and on a training that ended early."""
+    """Lines on forces known only in sum, on indefinite mass matrices and on a training that ended early."""
+    if task.summed:
+        yield f"gravity and friction of joints {task.summed} are known only in sum; the potential takes any constant"
     definite = definiteness_of(load(folder).dynamics, task, merged(task.sets))
     if definite is not None and definite.share_not_definite > 0:
         properties = CATALOGUE[task.kind].properties

@@ -9,12 +9,13 @@ from jax.sharding import Mesh
 from dln_jax.data.splits import Split
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem, Training
+from dln_jax.learning.gauges import summed_with_friction, without_offset
 from dln_jax.learning.kinematics import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
 from dln_jax.models.model import Parameters
 from dln_jax.scenes.scene import Scene
 from dln_jax.time_limit import seconds_left
-from dln_jax.training.dynamics.options import AUTO, FITS
+from dln_jax.training.dynamics.options import AUTO, FITS, NetworkOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build
@@ -103,6 +104,11 @@ class Task(NamedTuple):
         return self.recorded.needs
 
     @property
+    def summed(self) -> list[int]:
+        """Joints, counted from 1, whose gravity and friction are known only in sum."""
+        return summed_with_friction(self.needs, self.sets.train, network=self.solver is not None)
+
+    @property
     def precision(self) -> str:
         """f32 or f64, for the model and its training."""
         return self.description["precision"]
@@ -126,9 +132,15 @@ def method_of(kind: str) -> Method:
 def planned(options: Any, kind: str, recorded: Recorded, until: float) -> Task:
     """Plans the task of a model, which ends when `time.perf_counter` reads `until`; nothing is written yet.
 
+    A network's friction has no offset if its potential represents one.
+
     Raises:
         InputError: data that the model cannot be fitted to.
     """
+    needs = recorded.needs
+    if NetworkOptions in FITS[kind].options and summed_with_friction(needs, recorded.sets.train, network=True):
+        lines = (*recorded.lines, "friction has no offset: the potential takes any constant")
+        recorded = recorded._replace(needs=without_offset(needs), lines=lines)
     asked = getattr(options, "objective", None)
     objective = SCALED_TORQUE if kind == AUTO else objective_of(kind, recorded.sets.train, asked)
     if objective is TORQUE and getattr(options, "target", None) is None:

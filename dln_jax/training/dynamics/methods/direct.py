@@ -1,4 +1,7 @@
-"""For fits without an optimiser: their one-step history, and refinement by Gauss-Newton for other objectives."""
+"""For fits without an optimiser: friction, one-step history, and refinement by Gauss-Newton for other objectives."""
+
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +11,8 @@ from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Progress, Stop, Training, one_after_the_other
+from dln_jax.learning.gauges import without_offset
+from dln_jax.learning.model_selection import Candidate, FittedModel, select_model
 from dln_jax.models.model import Parameters
 from dln_jax.precision import data_type
 from dln_jax.training.dynamics.task import Task
@@ -16,6 +21,26 @@ from dln_jax.zoo.descriptions import build
 
 REFINEMENTS = 50
 """Upper bound on the Gauss-Newton steps from a direct fit, which is near the minimum."""
+
+
+def with_needed_offset(task: Task, fitted: Any, refit: Callable[[Task], Any]) -> tuple[Task, Any]:
+    """Keeps the offset of friction beside a potential if validation motions need it; returns the task and its fit.
+
+    Args:
+        fitted: fit of the task, with `parameters`.
+        refit: fits the task without the offset.
+    """
+    needs = without_offset(task.needs)
+    if needs == task.needs:
+        return task, fitted
+    description = {**task.description, "needs": needs._asdict()}
+    lean = task._replace(recorded=task.recorded._replace(needs=needs), description=description)
+    outcomes = [(lean, refit(lean)), (task, fitted)]
+    models = [FittedModel(build(tried.description), result.parameters, (tried, result)) for tried, result in outcomes]
+    candidates = [Candidate(task.kind, lambda left, model=model: model) for model in models]
+    chosen = select_model(candidates, task.sets.train, task.sets.validation).fitted.outcome
+    print(f"friction kept by validation: {', '.join(chosen[0].needs.joint_friction) or 'none'}")
+    return chosen
 
 
 def training_of(task: Task, parameters: Parameters, loss: float, seconds: float) -> Training:

@@ -8,9 +8,9 @@ from jax.sharding import Mesh
 
 from dln_jax.cli.arguments import require_positive_if_given, resolved
 from dln_jax.learning.engine.problem import Training
-from dln_jax.learning.kernel import choose_kernel
+from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.objectives import Objective
-from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
+from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of, with_needed_offset
 from dln_jax.training.dynamics.options import KernelOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task
@@ -33,7 +33,11 @@ def fit(task: Task, options: KernelOptions, folder: Path, mesh: Mesh | None) -> 
     began = time.perf_counter()
     upper, available = task.description["samples"], len(task.sets.train.tau)
     chosen, trials = choose_kernel(task.needs, task.sets.train, task.sets.validation, samples=upper)
-    solution = chosen.outcome
+    sizes = {"samples": chosen.outcome.samples, "serial": chosen.candidate}
+    task = task._replace(description={**task.description, **sizes})
+    task, solution = with_needed_offset(
+        task, chosen.outcome, lambda lean: fit_kernel(lean.needs, lean.sets.train, **sizes)
+    )
     if solution.samples < available:
         print(f"kernel: {solution.samples} of {available} samples, evenly spaced; --samples takes more")
     tried = ", ".join(f"{_order(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
@@ -41,8 +45,6 @@ def fit(task: Task, options: KernelOptions, folder: Path, mesh: Mesh | None) -> 
     noise = ", ".join(f"{sd:.2g}" for sd in solution.noise)
     size = f"{solution.parameter_count} equations, log likelihood {solution.likelihood:.2f} by the torque"
     print(f"kernel: {_order(chosen.candidate)}, {size}, noise of the joints {noise}")
-    description = {**task.description, "samples": solution.samples, "serial": chosen.candidate}
-    task = task._replace(description=description)
     training = training_of(task, solution.parameters, solution.torque_mse, time.perf_counter() - began)
     return task, refined_if_asked(task, training)
 

@@ -36,7 +36,7 @@ def needs_of_tree(needs: Needs) -> Needs:
     """
     if others := [law for law in needs.joint_friction if law not in USUAL]:
         raise InputError(f"a learned tree has no {others[0]} friction; leave it out of joint_friction")
-    return needs._replace(friction=needs.friction or bool(needs.joint_friction), joint_friction=())
+    return needs._replace(friction=bool(needs.joint_friction), joint_friction=())
 
 
 def plan(options: TreeOptions, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:

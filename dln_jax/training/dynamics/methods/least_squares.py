@@ -9,7 +9,7 @@ from jax.sharding import Mesh
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import Objective
-from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
+from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of, with_needed_offset
 from dln_jax.training.dynamics.options import TrigonometricOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task
@@ -35,6 +35,7 @@ def fit(task: Task, options: TrigonometricOptions, folder: Path, mesh: Mesh | No
         print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
         task = task._replace(description={**task.description, "degree": list(chosen.candidate)})
     fitted = chosen.outcome if chosen is not None else fit_linear(build(task.description), task.sets.train)
+    task, fitted = with_needed_offset(task, fitted, lambda lean: fit_linear(build(lean.description), lean.sets.train))
     size = f"{fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
     print(f"least squares: {size}")
     training = training_of(task, fitted.parameters, fitted.torque_mse, time.perf_counter() - began)

@@ -70,12 +70,6 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
     """
     recorded = task.recorded
     train_set, validation, _ = recorded.sets
-    needs = recorded.needs
-    if needs.friction:
-        # All models get the same friction, so that none wins by friction alone.
-        laws = needs.joint_friction or USUAL
-        recorded = recorded._replace(needs=needs._replace(friction=False, joint_friction=laws))
-        print(f"friction of every model: {', '.join(laws)} in each joint")
     noise = noise_of(train_set.tau, train_set.trajectory)
     selection = select_model(
         _candidates(options, recorded, folder, mesh),
