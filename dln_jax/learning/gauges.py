@@ -28,8 +28,8 @@ def summed_with_friction(needs: Needs, data: Trajectories, *, network: bool) -> 
     laws = set(needs.joint_friction)
     rates = data.qd if needs.joint_map is None else data.qd @ np.transpose(needs.joint_map)
     one_way = np.ptp(np.sign(rates), axis=0) == 0
-    constant = ("offset" in laws) | (one_way & bool(laws - {"viscous", "load"}))
-    takes = (np.array(needs.joints) == "prismatic") | (network & (np.ptp(data.q, axis=0) < CIRCLE))
+    constant = ("offset" in laws) | one_way & bool(laws - {"viscous", "load"})
+    takes = (np.array(needs.joints) == "prismatic") | network & (np.ptp(data.q, axis=0) < CIRCLE)
     return (np.flatnonzero(needs.gravity & takes & constant) + 1).tolist()
 
 

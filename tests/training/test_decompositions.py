@@ -107,7 +107,7 @@ def test_joints_whose_potential_takes_a_constant():
 def test_terms_of_a_lagrangian_linear_in_the_rates_take_no_power():
     """Viscous friction therefore cannot hide in the energy of a black-box model."""
     with jax.enable_x64(True):
-        q, qd, qdd = np.random.default_rng(0).normal(size=(3, 3))
+        q, qd, qdd = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3)))
         W = np.random.default_rng(1).normal(size=(3, 3))
         force = lagrangian.inverse_dynamics(lambda q, qd: jnp.sin(W @ q) @ (q * qd), q, qd, qdd)
         assert np.linalg.norm(force) > 0.1
