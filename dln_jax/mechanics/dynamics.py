@@ -36,11 +36,12 @@ class Dynamics(NamedTuple):
     forward_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
     """(q, qd, tau) -> qdd [d]."""
     energy: Callable[[VectorLike, VectorLike], Array]
-    """(q, qd) -> T + V, scalar."""
+    """(q, qd) -> T + V, scalar. Data leave the constant of a learned energy open and, without torques, its factor."""
     mass_matrix: Callable[..., Array]
     """(q, qd=None) -> M [d, d], by default at qd = 0; M of a natural system depends on q alone, others also on qd."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
-    """(q, qd, qdd) -> inertial, Coriolis and gravity forces, without friction."""
+    """(q, qd, qdd) -> inertial, Coriolis and gravity forces, without friction. Data may determine gravity and friction
+    only in sum (`learning.gauges`)."""
     friction: Callable[[VectorLike, VectorLike], Array]
     """(q, qd) -> friction force dD/dqd [d]; zero without friction."""
 
