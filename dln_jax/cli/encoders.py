@@ -1,6 +1,6 @@
 """Options of commands that read logs, and the lines printed about a log before training."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from dln_jax.cli.arguments import names_listed, numbers_of, refuse_given
 from dln_jax.cli.options import Checked, Filtered, Logged
-from dln_jax.data.checks import quick
+from dln_jax.data.checks import Finding, quick
 from dln_jax.data.encoders import Smoothed, smooth
 from dln_jax.data.encoders.clock import clock_line
 from dln_jax.data.robots import Robot
@@ -17,9 +17,11 @@ from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.types import InputError, Needs, require_once
 
 AUTO = "auto"
+NOISY = "raw-differences"
+"""Check for rates whose differences are dominated by the noise of q."""
 FILTERED = (
     "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
-    "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated", "arrival",
+    "qdd-exchanged", NOISY, "quantisation", "jitter", "gaps", "rates", "repeated", "arrival",
 )  # fmt: skip
 """Checks for faults that filtering q replaces or repairs."""
 
@@ -47,36 +49,63 @@ def _factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def smoothed(options: Filtered, data: Trajectories) -> Smoothed | None:
-    """Filters a log as the options ask; `None` without --cutoff.
+def prepare_log(
+    options: Filtered,
+    data: Trajectories,
+    path: Path | None,
+    *,
+    robot: Robot | None = None,
+    without: Collection[str] = (),
+) -> tuple[Smoothed | None, list[str], tuple[str, ...]]:
+    """Checks a log and filters it: as --cutoff states, else if its rates are missing and the noise of q matters.
+
+    Returns the filtered log or `None`, lines for the user, and the faults that no filter repairs.
+
+    Args:
+        options: options of the command.
+        data: unfiltered data.
+        path: file of the data; `None` for data that need no check.
+        robot: robot that the log is compared with, if any.
+        without: names of checks that do not matter for this command.
 
     Raises:
-        InputError: an invalid cut-off, --decimate without --cutoff, or data that `data.encoders.smooth` refuses.
+        InputError: an invalid cut-off, --decimate without --cutoff, data that `data.encoders.smooth` refuses, or the
+            log has an error, and --accept-log is not set.
     """
-    if options.cutoff is None:
+    findings = [] if path is None else quick(data, robot)
+    noisy = [finding.observation for finding in findings if finding.check == NOISY and "qd" in data.estimated]
+    filtered, lines, cutoff = None, [], options.cutoff
+    if cutoff is None:
         refuse_given(options, ["decimate"], "for filtered data: add --cutoff auto")
-        return None
-    cutoff = None if options.cutoff == AUTO else _hertz(options.cutoff)
-    decimate = 1 if options.decimate is None else options.decimate
-    try:
-        return smooth(data, cutoff, decimate=decimate)
-    except InputError as error:
-        raise InputError(f"--cutoff {options.cutoff}: {error}") from None
+    if cutoff is not None or noisy:
+        hertz = None if cutoff in (None, AUTO) else _hertz(cutoff)
+        decimate = 1 if options.decimate is None else options.decimate
+        try:
+            filtered = smooth(data, hertz, decimate=decimate)
+        except InputError as error:
+            if cutoff is not None:  # otherwise the finding remains: the log is too short for a filter
+                raise InputError(f"--cutoff {cutoff}: {error}") from None
+    if cutoff is None and filtered is not None:
+        lines = [f"q is filtered before it is differentiated: {noisy[0]} (--cutoff inf leaves q as it is)"]
+    settled = set(without) if filtered is None else {*without, *FILTERED}
+    if filtered is not None and np.isinf(filtered.cutoff):  # splines through q keep its noise
+        settled.discard(NOISY)
+    findings = [finding for finding in findings if finding.check not in settled]
+    lines = [*lines, *preparation(data, filtered), *_lines(options, path, findings)]
+    return filtered, lines, tuple(finding.observation for finding in findings if finding.severity != "note")
 
 
 def preparation(data: Trajectories, filtered: Smoothed | None) -> list[str]:
     """Lines that state how the file was read, where rates and torques come from, and how noisy they are."""
     lines = list(data.remarks)
     if filtered is None:
-        estimated = [key for key in data.estimated if key != "tau"]
-        lines += [f"not in the data: {', '.join(data.estimated)}"] if data.estimated else []
-        if estimated:
-            lines[-1] += "; rates are raw finite differences, which amplify noise: --cutoff auto filters q first"
+        if data.estimated:
+            lines.append(f"not in the data: {', '.join(data.estimated)}; rates are raw finite differences")
         return lines
     kept = f"{filtered.rate / filtered.decimate:.4g} Hz in {filtered.parts} parts"
     how = "given" if filtered.choice is None else "chosen from the spectra of q"
     lines.append(
-        f"rates: q is not filtered, as its noise is too small; derivatives of splines, {kept}"
+        f"rates: q is not filtered{', as its noise is too small' * (filtered.choice is not None)}; splines, {kept}"
         if np.isinf(filtered.cutoff)
         else f"rates: q filtered without delay at {filtered.cutoff:.3g} Hz ({how}), {kept}"
     )
@@ -99,28 +128,22 @@ def fitted_torque(filtered: Smoothed | None) -> str:
     return f"torques low-passed at {filtered.cutoff:.3g} Hz (measured ones scatter more)"
 
 
-def checked(
-    options: Checked,
-    data: Trajectories,
-    path: Path,
-    *,
-    robot: Robot | None = None,
-    without: Collection[str] = (),
-) -> list[str]:
+def checked(options: Checked, data: Trajectories, path: Path, *, without: Collection[str] = ()) -> list[str]:
     """Findings of the quick checks of `check_data`, one line per finding.
 
     Args:
-        options: options of the command; with a cut-off, checks of the file's own rates (`FILTERED`) are skipped.
-        data: unfiltered data of the file.
-        robot: robot that the log is compared with, if any.
+        options: options of the command.
+        data: data of the file.
+        path: file of the data.
         without: names of checks that do not matter for this command.
 
     Raises:
         InputError: the log has an error, and --accept-log is not set.
     """
-    has_cutoff = isinstance(options, Filtered) and options.cutoff is not None
-    settled = {*without, *(FILTERED if has_cutoff else ())}
-    findings = [finding for finding in quick(data, robot) if finding.check not in settled]
+    return _lines(options, path, [finding for finding in quick(data) if finding.check not in without])
+
+
+def _lines(options: Checked, path: Path | None, findings: Sequence[Finding]) -> list[str]:
     if not findings:
         return []
     more = f"python -m scripts.check_data --data {path}"
@@ -139,8 +162,8 @@ def _hertz(text: str) -> float:
         value: Any = float(text)
     except ValueError:
         value = -1.0
-    if not (np.isfinite(value) and value > 0):
-        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, or auto")
+    if not value > 0:
+        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, auto or inf")
     return value
 
 

@@ -105,7 +105,8 @@ class Filtered(Checked):
     """How to derive rates where a log has no reliable ones."""
 
     cutoff: Unstated[str] = None
-    """Low-pass q at this frequency, Hz, or auto, and derive the rates (default: the file's)."""
+    """Low-pass q at this frequency, Hz, auto, or inf for none, and derive the rates (default: the file's; auto where
+    it has none and the noise of q matters)."""
     decimate: Unstated[int] = None
     """With --cutoff: keep every n-th sample (default: 1)."""
 

@@ -5,15 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.cli.arguments import names_listed, refuse_given, require_positive_if_given
-from dln_jax.cli.encoders import (
-    checked,
-    facts,
-    fitted_torque,
-    needs_from_option,
-    preparation,
-    smoothed,
-    without_torque,
-)
+from dln_jax.cli.encoders import facts, fitted_torque, needs_from_option, prepare_log, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
@@ -58,6 +50,8 @@ class Recorded(NamedTuple):
     """Standard deviation of the noise of filtered torques, N m or N [d]; `None` if they are not filtered."""
     blocks: bool = False
     """Whether recordings were cut into blocks of time to have validation and test data."""
+    causes: tuple[str, ...] = ()
+    """Faults that the check found in the log and that no filter repairs."""
 
 
 def read(options: Options) -> Recorded:
@@ -97,9 +91,7 @@ def read(options: Options) -> Recorded:
     rubbing = bool(needs.friction or needs.joint_friction)
     cut = labels is None and (parts or len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES)
     settled = ("repeated-motions", *["split"] * bool(cut), *["friction"] * rubbing)
-    findings = [] if options.data is None else checked(options, data, options.data, robot=robot, without=settled)
-    filtered = smoothed(options, data)
-    lines = [*preparation(data, filtered), *findings]
+    filtered, lines, causes = prepare_log(options, data, options.data, robot=robot, without=settled)
     if filtered is not None:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)
@@ -131,6 +123,7 @@ def read(options: Options) -> Recorded:
         torque=fitted_torque(filtered),
         torque_noise=None if filtered is None or not filtered.filtered_torque else filtered.noise_tau,
         blocks=not whole,
+        causes=causes,
     )
 
 

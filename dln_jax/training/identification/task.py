@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.cli.arguments import names_in, names_listed, numbers_of, refuse_given, require_positive_if_given
-from dln_jax.cli.encoders import checked, facts, fitted_torque, preparation, smoothed, without_torque
+from dln_jax.cli.encoders import facts, fitted_torque, prepare_log, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
@@ -76,6 +76,8 @@ class Case(NamedTuple):
     """Motions to fit and to predict, with --by motions or both."""
     wanted: Wanted = Wanted()
     """Terms that cross-validation may add."""
+    causes: tuple[str, ...] = ()
+    """Faults that the check found in the log and that no filter repairs."""
 
     @property
     def laws(self) -> tuple[FrictionLaw, ...]:
@@ -98,8 +100,7 @@ def prepare(options: Options) -> Case:
         raise InputError(
             f"{options.data}: the data have no tau; identification takes measured torques{without_torque(data)}"
         )
-    filtered = smoothed(options, data)
-    lines = (*preparation(data, filtered), *checked(options, data, options.data, robot=robot, without=SETTLED))
+    filtered, lines, causes = prepare_log(options, data, options.data, robot=robot, without=SETTLED)
     require_positive_if_given(options, ["window"])
     light = None
     if options.by == "torques":
@@ -122,7 +123,7 @@ def prepare(options: Options) -> Case:
     noise = noises(options.noise, robot.tree.degrees_of_freedom)
     torque = fitted_torque(filtered)
     case = Case(robot, robot.tree.names, sets, description, None, None, noise, locked, lines, torque)
-    more: dict[str, Any] = {"robot_file": options.robot.name, "data_file": options.data.name}
+    more: dict[str, Any] = {"causes": causes, "robot_file": options.robot.name, "data_file": options.data.name}
     if filtered is not None and filtered.filtered_torque:
         more["filtered_noise"] = filtered.noise_tau
     return with_description(case._replace(motions=motions, wanted=terms, **more))

@@ -5,7 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import check_data, train_delan
+from dln_jax.cli.encoders import prepare_log
+from dln_jax.data import schema
 from tests.calls import command, refused
 
 RATE = 100.0
@@ -60,19 +63,46 @@ def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log, tmp_path, 
 
 
 @pytest.mark.slow
-def test_training_filters_when_it_is_asked_to_and_says_so_when_it_does_not(log, tmp_path, capsys):
+def test_missing_rates_of_a_noisy_log_come_from_filtered_q_unless_the_user_declines(log, tmp_path, capsys):
     errors = {}
-    for name, options in (("raw", []), ("filtered", ["--cutoff", "auto"])):
+    for name, options in (("default", []), ("auto", ["--cutoff", "auto"]), ("raw", ["--cutoff", "inf"])):
         out = ["--out", tmp_path / name, "--no-figures", "--no-low-latency", "--no-uncertainty"]
         command(train_delan, "--data", log, "--model", "trigonometric", "--degree", "1", "--test", "d", *options, *out)
         said = capsys.readouterr().out
-        assert ("raw finite differences, which amplify noise: --cutoff auto" in said) == (name == "raw")
-        assert ("q filtered without delay at" in said) == (name == "filtered")
-        assert ("warning: accelerations by differences of this q" in said) == (name == "raw")
+        reason = "q is filtered before it is differentiated: accelerations by differences of this q have noise of"
+        assert (reason in said) == (name == "default")
+        assert ("q filtered without delay at" in said) == (name != "raw")
         errors[name] = json.loads((tmp_path / name / "metrics.json").read_text())["torque_mse"]
-    assert errors["filtered"] < 0.1 * errors["raw"]
-    config = json.loads((tmp_path / "filtered" / "config.json").read_text())
-    assert config["cutoff"] == "auto" and 3 < config["chosen"]["cutoff_hz"] < 30
+    assert errors["default"] == errors["auto"] < 0.1 * errors["raw"]
+    config = json.loads((tmp_path / "default" / "config.json").read_text())
+    assert 3 < config["chosen"]["cutoff_hz"] < 30
+
+
+def prepared(path, **options):
+    return prepare_log(arguments_of(train_delan.Arguments, data=path, **options), schema.load(path), path)
+
+
+def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_missing(log, tmp_path):
+    filtered, lines, causes = prepared(log)
+    assert filtered is not None and 3 < filtered.cutoff < 30 and causes == () and "q is filtered" in lines[0]
+    arrays = dict(np.load(log))
+    np.savez(tmp_path / "rates.npz", **arrays, qd=np.gradient(arrays["q"], axis=0), qdd=arrays["tau"])
+    assert prepared(tmp_path / "rates.npz", accept_log=True)[0] is None, "measured rates stay"
+    t = arrays["t"]
+    exact = {**arrays, "q": np.sin(5 * t + arrays["trajectory"])[:, None]}
+    np.savez(tmp_path / "exact.npz", **exact)
+    filtered, lines, causes = prepared(tmp_path / "exact.npz")
+    assert filtered is None and not any("filtered" in line for line in lines), "exact data are used as they are"
+    short = {key: value if key == "label" else value[arrays["t"] < 0.05] for key, value in arrays.items()}
+    np.savez(tmp_path / "short.npz", **short)
+    assert prepared(tmp_path / "short.npz", accept_log=True)[0] is None
+
+
+def test_faults_of_a_log_that_no_filter_repairs_are_causes_of_a_verdict(log, tmp_path):
+    arrays = dict(np.load(log))
+    np.savez(tmp_path / "degrees.npz", **{**arrays, "q": np.degrees(arrays["q"])})
+    _, _, causes = prepared(tmp_path / "degrees.npz", accept_log=True)
+    assert any("q of joint 1 goes to" in cause for cause in causes)
 
 
 def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, tmp_path, capsys):
