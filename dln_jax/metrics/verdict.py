@@ -6,7 +6,8 @@ the error of the robot's own file. A joint is
 
     explained     e <= UNEXPLAINED v + NOISE n
     unexplained   e >= v: a constant would have done as well
-    doubtful      in between; if the mean of e / v over all joints exceeds FAILED, the fit is refused
+    doubtful      in between; if the mean of e / v over all joints exceeds FAILED, the fit is refused. Also if e exceeds
+                  both FAR_FROM_NOISE n and COUNTS v: the model lacks something, or its parameters are not determined
     unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: no conclusion
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
@@ -36,6 +37,9 @@ UNEXPLAINED, FAILED = 0.05, 0.25
 share over all joints at which the fit is refused (50 %)."""
 NOISE = 2.0
 """Errors up to this multiple of the noise variance count as noise, because that variance is itself an estimate."""
+FAR_FROM_NOISE, COUNTS = 4.0, 0.005
+"""A fit is doubtful if a joint's error exceeds this multiple of its noise variance, and this share of the torque's
+variance (an rms error of 7 %)."""
 WORSE, MUCH_WORSE = 0.01, 2.0
 """A fit is worse than the robot's file if its mean nMSE is larger by the first number; it is also refused if it is
 larger by the second as a factor."""
@@ -121,27 +125,28 @@ def held_out(
     )
 
 
-def judge(errors: HeldOut, names: Sequence[str] | None = None) -> Verdict:
-    """Returns the verdict on held-out torques.
+def judge(errors: HeldOut, names: Sequence[str] | None = None, *, quantity: str = "torque") -> Verdict:
+    """Returns the verdict on held-out torques, or on another quantity of the same joints.
 
     Args:
         errors: mean squares of the joints.
         names: names of the joints; by default joint 1, joint 2, ...
+        quantity: name of the quantity, for the reason.
     """
     names = [f"joint {k + 1}" for k in range(len(errors.error))] if names is None else names
     if not errors.zero.any():
-        return Verdict("refused", "every held-out torque is zero", "record driven motions with measured torques")
+        return Verdict("refused", f"every held-out {quantity} is zero", "record driven motions with measured torques")
     share = errors.error / errors.unit
     if not np.isfinite(share).all():
         which = _listed(names, ~np.isfinite(share))
-        return Verdict("refused", f"the torque of {which} is not finite on held-out motions", "check the data")
+        return Verdict("refused", f"the {quantity} of {which} is not finite on held-out motions", "check the data")
     noise = np.zeros_like(share) if errors.noise is None else errors.noise / errors.unit
     unseen = (noise >= 0.5) & (share > UNEXPLAINED) & (share <= NOISE * noise)
     numbers = _numbers(errors, share, noise, names)
     unexplained = (share >= 1) & ~unseen
     if share.mean() >= 1 or unexplained.any() or np.where(unseen, 0.0, share - NOISE * noise).mean() >= FAILED:
-        beyond = f"more than {FAILED:.0%} of all torques is unexplained"
-        constant = f"the torque of {_listed(names, unexplained)} is predicted no better than by a constant"
+        beyond = f"more than {FAILED:.0%} of the {quantity} is unexplained in the mean of all joints"
+        constant = f"the {quantity} of {_listed(names, unexplained)} is predicted no better than by a constant"
         remedy = "check the sign, order and unit of tau, and the times of the log (check_data), or record more motions"
         return Verdict("refused", f"{constant if unexplained.any() else beyond}: {numbers}", remedy)
     worse = 0.0 if errors.file is None else share.mean() - np.mean(errors.file / errors.unit)
@@ -150,16 +155,20 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None) -> Verdict:
         remedy = "keep the file's values, or record more and different motions"
         return Verdict(level, f"the robot's file predicts held-out torques better: {numbers}", remedy)
     doubtful = (share > UNEXPLAINED + NOISE * noise) & ~unseen
-    if doubtful.any():
-        which = _listed(names, doubtful)
-        reason = f"more than {UNEXPLAINED:.0%} of the torque of {which} is unexplained: {numbers}"
+    far = (noise > 0) & (share > np.maximum(FAR_FROM_NOISE * noise, COUNTS)) & ~unseen
+    if doubtful.any() or far.any():
+        reason = f"more than {UNEXPLAINED:.0%} of the {quantity} of {_listed(names, doubtful)} is unexplained"
+        if not doubtful.any():
+            ratio = np.max(share[far] / noise[far])
+            reason = f"errors of {_listed(names, far)} are up to {ratio:.2g} times the noise of the {quantity}"
+        reason += f": {numbers}"
         remedy = "add what the model lacks (friction, a load), remove outliers, or record more motions; see check_data"
         return Verdict("doubtful", reason, remedy)
     if unseen.all():
-        reason = f"no torque rises above its noise: {numbers}"
+        reason = f"no {quantity} rises above its noise: {numbers}"
         return Verdict("doubtful", reason, "record faster motions, or sample them more often")
     if unseen.any():
-        numbers += f"; the torque of {_listed(names, unseen)} does not rise above its noise"
+        numbers += f"; the {quantity} of {_listed(names, unseen)} does not rise above its noise"
     return Verdict("good", numbers)
 
 
@@ -207,15 +216,20 @@ def judge_motions(
     )
 
 
-def worst(first: Verdict, *others: Verdict) -> Verdict:
-    """Returns the most severe of several verdicts; of equal ones that are not good, all reasons and remedies."""
+def worst(first: Verdict, *others: Verdict, causes: Sequence[str] = ()) -> Verdict:
+    """Returns the most severe of several verdicts; of equal ones that are not good, all reasons and remedies.
+
+    Args:
+        causes: faults of the log, which belong to the reasons of a verdict that is not good.
+    """
     every = [first, *others]
     level = LEVELS[max(verdict.number for verdict in every)]
     if level == "good":
         return first
     severe = [verdict for verdict in every if verdict.level == level]
+    reasons = [*(verdict.reason for verdict in severe), *(f"in the log, {cause}" for cause in causes)]
     remedies = dict.fromkeys(verdict.remedy for verdict in severe if verdict.remedy)
-    return Verdict(level, "; ".join(verdict.reason for verdict in severe), "; ".join(remedies))
+    return Verdict(level, "; ".join(reasons), "; ".join(remedies))
 
 
 def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]:

@@ -10,24 +10,22 @@ import numpy as np
 
 from dln_jax import figures as drawing
 from dln_jax.compilation import in_background
-from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
 from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import as_arrays, errors, mean_square, samples_of
 from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import Motion, by_trajectory, metrics_of_motions, records_of
+from dln_jax.metrics.verdict import Verdict
 from dln_jax.precision import data_type
 from dln_jax.training.dynamics.programs import Programs, judged_data
 from dln_jax.training.dynamics.task import Task
-from dln_jax.training.dynamics.verdict import TorqueVerdict, judge_torques
+from dln_jax.training.dynamics.verdict import judge_fit
 from dln_jax.training.low_latency_calls import low_latency_metrics
 from dln_jax.training.pipeline import png
 from dln_jax.training.results import cost_metrics, number, unit_of
 from dln_jax.training.uncertainty import uncertainty_metrics
 from dln_jax.types import InputError
-from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.run import load
 
 SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
@@ -79,7 +77,7 @@ class Evaluation(NamedTuple):
     """Results of a stored model of dynamics on the test."""
 
     metrics: dict[str, float | int]
-    judged: TorqueVerdict
+    verdict: Verdict
     figures: dict[str, Callable[[Path], None]]
     measured: Callable[[], dict[str, float]]
     """Waits for the time of single calls in low-latency mode, which another process measures."""
@@ -97,8 +95,8 @@ def evaluate(
     samples = samples_of(judged_data(task), data_type(task.precision))
     answers = as_arrays(programs.predict(run.parameters, samples))
     predicted = {name: array[: len(test.t)] for name, array in answers.items()}
-    judged = judge_torques(task, predicted["tau"], answers["tau"][len(test.t) :])
     motions, of_rollouts = rollouts(run.parameters, task, programs)
+    verdict, of_verdict = judge_fit(task, functions, answers, motions)
     spread = {}
     if seeds > 1:
         answers = [programs.predict(parameters_of(training, index), samples) for index in range(seeds)]
@@ -108,10 +106,9 @@ def evaluate(
     metrics = {
         **errors(predicted, test),
         "gravity_determined": int(not task.summed),
-        **judged.metrics,
+        **of_verdict,
         **({} if task.refinement is None else task.refinement.metrics),
         **spread,
-        **definiteness_metrics(functions, task),
         **of_bands,
         **of_rollouts,
         **validation_metrics(training, seeds, task.best),
@@ -122,7 +119,7 @@ def evaluate(
             best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
         ),
     }
-    return Evaluation(metrics, judged, {**figures_of(task, training, motions, predicted), **bands}, timed)
+    return Evaluation(metrics, verdict, {**figures_of(task, training, motions, predicted), **bands}, timed)
 
 
 def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
@@ -155,21 +152,6 @@ def latency_states(task: Task) -> tuple[np.ndarray, ...]:
     """Up to 512 test states q, qd and qdd, in the precision of the model."""
     test, dtype = task.sets.test, data_type(task.precision)
     return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
-
-
-def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Trajectories) -> Definiteness | None:
-    """Definiteness of the mass matrices along the data; `None` for a model without energy or definite by structure."""
-    properties = CATALOGUE[task.kind].properties
-    if properties.definite or not properties.energy:
-        return None
-    return definiteness(functions, data.q, data.qd)
-
-
-def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
-    """Metrics on the mass matrices of an unstructured model over the test states."""
-    definite = definiteness_of(functions, task, task.sets.test)
-    names = {"smallest_eigenvalue": "smallest_mass_eigenvalue"}
-    return {} if definite is None else {names.get(key, key): value for key, value in definite._asdict().items()}
 
 
 def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:

@@ -9,7 +9,6 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.cli.optimisers import name_of
-from dln_jax.data.splits import merged
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
@@ -19,14 +18,13 @@ from dln_jax.time_limit import deadline
 from dln_jax.training.dynamics.options import NETWORK, model_of, network_option
 from dln_jax.training.dynamics.programs import Programs, programs_ahead, programs_of
 from dln_jax.training.dynamics.recorded import read
-from dln_jax.training.dynamics.results import best_seed, columns, definiteness_of, evaluate, rows
+from dln_jax.training.dynamics.results import best_seed, columns, evaluate, rows
 from dln_jax.training.dynamics.task import Task, method_of, planned
 from dln_jax.training.pipeline import Fitted, Judged, Kind, train
 from dln_jax.training.results import settings_of
 from dln_jax.training.uncertainty import store_uncertainty
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.run import load
 
 
 class Outcome(NamedTuple):
@@ -108,10 +106,10 @@ def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
         title=f"test on {task.name}, {task.precision}",
         columns=columns(evaluation.metrics),
         measured=evaluation.measured,
-        verdict=evaluation.judged.verdict,
+        verdict=evaluation.verdict,
         figures=evaluation.figures,
         chosen=chosen,
-        lines=(*lines, *warnings(task, training, folder), *evaluation.judged.warnings),
+        lines=(*lines, *warnings(task, training)),
         ended_by_user=task.solver is not None and limits != [None, None],
         error=failure(task, training, folder),
     )
@@ -132,19 +130,10 @@ def store_bands(folder: Path, task: Task, model: Model, parameters: Parameters) 
     store_uncertainty(folder, model, parameters, sets.train, sets.validation, task.recorded.torque, **options)
 
 
-def warnings(task: Task, training: Training, folder: Path) -> Iterator[str]:
-    """Lines on forces known only in sum, on indefinite mass matrices and on a training that ended early."""
+def warnings(task: Task, training: Training) -> Iterator[str]:
+    """Lines on forces known only in sum, and on a training that ended early."""
     if task.summed:
         yield f"gravity and friction of joints {task.summed} are known only in sum; the potential takes any constant"
-    definite = definiteness_of(load(folder).dynamics, task, merged(task.sets))
-    if definite is not None and definite.share_not_definite > 0:
-        properties = CATALOGUE[task.kind].properties
-        structured = f"--model {'structured-hnn' if properties.canonical else 'structured-delan'}"
-        remedy = f"another --degree, {structured}" if "degree" in task.description else structured
-        yield (
-            f"the mass matrix is not positive definite at {definite.share_not_definite:.1%} of the states of the data: "
-            f"accelerations and rollouts are wrong or infinite there; try {remedy}, or more varied motions"
-        )
     if training.stop.reason == "no improvement":
         yield f"stopped early, at step {training.stop.step}: no better validation error for --patience steps"
     if training.stop.reason == "time":

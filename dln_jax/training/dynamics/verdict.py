@@ -1,6 +1,4 @@
-"""Judges a trained model of dynamics by its torques on held-out motions and by its search for joint frames."""
-
-from typing import NamedTuple
+"""Judges a trained model of dynamics: held-out torques and accelerations, mass matrices, rollouts, and its search."""
 
 import jax
 import numpy as np
@@ -11,65 +9,104 @@ from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
 from dln_jax.learning.kinematics import Twin
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.metrics.verdict import HeldOut, Verdict, held_out, judge, verdict_metrics, worst
+from dln_jax.metrics.definiteness import Definiteness, definiteness
+from dln_jax.metrics.rollouts import Motion
+from dln_jax.metrics.verdict import (
+    FAR_FROM_NOISE,
+    HeldOut,
+    Verdict,
+    held_out,
+    judge,
+    verdict_metrics,
+    worst,
+)
 from dln_jax.training.dynamics.task import Task
+from dln_jax.zoo.catalogue import CATALOGUE
 
-AT_NOISE, FAR_FROM_NOISE = 2.0, 4.0
-"""Held-out errors of a tree with unknown frames, in units of the noise variance: up to the first its frames are right,
-above the second they may be wrong."""
-
-
-class TorqueVerdict(NamedTuple):
-    """A verdict and the numbers behind it."""
-
-    verdict: Verdict | None
-    """`None` for a model that is not fitted to torques alone."""
-    metrics: dict[str, float | int]
-    """Entries of metrics.json."""
-    validation_nmse: float
-    """Mean over joints of the squared error, relative to the torque's variance."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A line if a constant torque would be closer than the model."""
-        if self.verdict is None or self.validation_nmse <= 1:
-            return ()
-        return (
-            f"warning: on validation motions the torque's mean square error is {self.validation_nmse:.3g} times its "
-            "variance: a constant torque would be closer than this model",
-        )
+AT_NOISE = 2.0
+"""Held-out errors of a tree with unknown frames, in units of the noise variance, up to which its frames are right;
+above `FAR_FROM_NOISE` they may be wrong."""
 
 
-def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) -> TorqueVerdict:
-    """The most severe verdict from test motions, validation motions and the search for joint frames.
+def judge_fit(
+    task: Task,
+    functions: Dynamics | PlainDynamics,
+    answers: dict[str, np.ndarray],
+    motions: list[Motion],
+) -> tuple[Verdict, dict[str, float | int]]:
+    """The most severe verdict from held-out motions, mass matrices, rollouts and the search, and its metrics.
+
+    Accelerations are judged if the model is fitted to them.
 
     Args:
-        on_test: the model's torques on the test motions [N, d].
-        on_validation: the model's torques on the validation motions.
+        functions: the model.
+        answers: the model's `tau` and `qdd` [N, d] on the test motions, followed by the validation motions.
+        motions: rollouts of the test motions, possibly none.
     """
-    if not task.objective.of_torques:
-        return TorqueVerdict(None, {}, float("nan"))
-    test, validation, robot = task.sets.test, task.sets.validation, task.recorded.robot
-    noise = torque_noise(task.sets.train) if task.recorded.torque_noise is None else task.recorded.torque_noise
-    recording = merged(task.sets).tau if task.recorded.blocks else None
+    recorded, sets, robot, numbers = task.recorded, task.sets, task.recorded.robot, {}
+    noise = torque_noise(sets.train) if recorded.torque_noise is None else recorded.torque_noise
+    whole, names = merged(sets), None if robot is None else robot.tree.names
+    held = len(sets.test.t)
+    parts = ((slice(held), sets.test), (slice(held, None), sets.validation))
     tested, validated = (
         held_out(
-            tau, data.tau, noise=noise, file=None if robot is None else torques_of(robot, data), recording=recording
+            answers["tau"][part],
+            data.tau,
+            noise=noise,
+            file=None if robot is None else torques_of(robot, data),
+            recording=whole.tau if recorded.blocks else None,
         )
-        for tau, data in ((on_test, test), (on_validation, validation))
+        for part, data in parts
     )
-    names = None if robot is None else robot.tree.names
-    verdict, numbers = worst(judge(tested, names), judge(validated, names)), {}
+    verdicts = [judge(tested, names), judge(validated, names)]
+    if not task.objective.of_torques:
+        recording = whole.qdd if recorded.blocks else None
+        accelerations = [held_out(answers["qdd"][part], data.qdd, recording=recording) for part, data in parts]
+        verdicts += [judge(errors, names, quantity="acceleration") for errors in accelerations]
+    definite = definiteness_of(functions, task, whole)
+    verdicts += judge_mechanics(task, definite, motions)
     if task.search is not None:
         of_search, numbers = searched(
             task.search.losses, task.search.agreeing, task.search.agreement, tested, task.search.twin
         )
-        verdict = verdict if of_search is None else worst(verdict, of_search)
+        verdicts += [] if of_search is None else [of_search]
+    if definite is not None:
+        numbers |= {"smallest_mass_eigenvalue": definite.smallest_eigenvalue, **definite._asdict()}
+        del numbers["smallest_eigenvalue"]
+    verdict = worst(*verdicts, causes=recorded.causes)
     nmse = {"test_nmse": _nmse(tested), "validation_nmse": _nmse(validated)}
-    return TorqueVerdict(verdict, {**nmse, **verdict_metrics(tested, verdict), **numbers}, nmse["validation_nmse"])
+    return verdict, {**nmse, **verdict_metrics(tested, verdict), **numbers}
+
+
+def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Trajectories) -> Definiteness | None:
+    """Definiteness of the mass matrices along the data; `None` for a model without energy or definite by structure."""
+    properties = CATALOGUE[task.kind].properties
+    if properties.definite or not properties.energy:
+        return None
+    return definiteness(functions, data.q, data.qd)
+
+
+def judge_mechanics(task: Task, definite: Definiteness | None, motions: list[Motion]) -> list[Verdict]:
+    """Verdicts on mass matrices that are not positive definite and on rollouts that are not finite."""
+    structured = "structured-hnn" if CATALOGUE[task.kind].properties.canonical else "structured-delan"
+    remedy = f"try another --degree, --model {structured}, or more varied motions"
+    infinite = sum(not np.isfinite([motion.q, motion.qd]).all() for motion in motions)
+    verdicts = []
+    if infinite:
+        reason = f"{infinite} of {len(motions)} rollouts of test motions are not finite"
+        verdicts.append(Verdict("doubtful", reason, remedy))
+    if definite is not None and definite.share_not_definite > 0:
+        share = definite.share_not_definite
+        reason = (
+            f"the mass matrix is not positive definite at {share:.1%} of the states of the data: accelerations and "
+            "rollouts are wrong or infinite there"
+        )
+        verdicts.append(Verdict("refused" if share == 1 else "doubtful", reason, remedy))
+    return verdicts
 
 
 def _nmse(errors: HeldOut) -> float:

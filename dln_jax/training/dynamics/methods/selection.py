@@ -35,8 +35,8 @@ from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
 from dln_jax.training.dynamics.options import NETWORK, Options, SelectionOptions, options_of
 from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.results import definiteness_of
 from dln_jax.training.dynamics.task import Method, Task, method_of, planned
+from dln_jax.training.dynamics.verdict import definiteness_of
 from dln_jax.training.identification.additions import with_network
 from dln_jax.training.identification.task import Case, Sets, for_residual, with_description, with_terms
 from dln_jax.zoo.descriptions import Description, build, describe
@@ -109,13 +109,11 @@ def print_selection(selection: Selection) -> None:
     title = "candidates, by errors on validation motions"
     table = Table("model", "nMSE, mean", "nMSE, worst joint", "s", "", title=title)
     for step in selection.steps:
-        numbers = (
-            ["", "", ""] if step.nmse is None else [f"{number:.2e}" for number in (step.nmse.mean(), step.nmse.max())]
-        )
+        numbers = ["", "", ""]
         if step.nmse is not None:
-            numbers.append(f"{step.seconds:.1f}")
+            numbers = [f"{step.nmse.mean():.2e}", f"{step.nmse.max():.2e}", f"{step.seconds:.1f}"]
         state = "none" if step.nmse is None else "" if step.definite else "indefinite masses"
-        state = "kept" if step is selection.chosen else state if step.tried else "not tried"
+        state = f"kept {state}".strip() if step is selection.chosen else state if step.tried else "not tried"
         table.add_row(step.name, *numbers, state)
     Console(highlight=False, soft_wrap=True).print(table)
     if selection.ended:
@@ -124,21 +122,18 @@ def print_selection(selection: Selection) -> None:
 
 def as_json(selection: Selection) -> dict[str, Any]:
     """Contents of `model_selection.json`."""
-    candidates = []
-    for step in selection.steps:
-        mean = None if step.nmse is None else float(step.nmse.mean())
-        joints = None if step.nmse is None else step.nmse.tolist()
-        errors = {"validation_nmse": mean, "validation_nmse_joints": joints}
-        candidates.append(
-            {
-                "name": step.name,
-                "tried": step.tried,
-                **errors,
-                "definite": step.definite,
-                "seconds": step.seconds,
-                "reason": step.reason,
-            }
-        )
+    candidates = [
+        {
+            "name": step.name,
+            "tried": step.tried,
+            "validation_nmse": None if step.nmse is None else float(step.nmse.mean()),
+            "validation_nmse_joints": None if step.nmse is None else step.nmse.tolist(),
+            "definite": step.definite,
+            "seconds": step.seconds,
+            "reason": step.reason,
+        }
+        for step in selection.steps
+    ]
     return {"kept": selection.chosen.name, "ended": selection.ended, "candidates": candidates}
 
 
