@@ -6,9 +6,9 @@ samples (the one-standard-error rule of Breiman et al. 1984, paired). `grow` tra
 
 `select_model` fits models of one recording, most structured and cheapest first. They are compared on the validation
 motions by squared torque errors in units of the joints' variances, so that a wrist counts as much as a shoulder, and
-the differences are taken over time segments. Models that explain the torques of every joint, and whose mass matrices
-are positive definite, come before others: without such a matrix, accelerations are wrong. The selection ends early if
-the errors equal the noise of the torques, or rounding, and when time is up.
+the differences are taken over time segments. Models whose mass matrices are positive definite come before others,
+unless they explain much less: without such a matrix, accelerations are wrong. The selection ends early if the errors
+equal the noise of the torques, or rounding, and when time is up.
 """
 
 import time
@@ -32,9 +32,9 @@ LEAST_NOISE, MOST_NOISE = 0.5, 1.2
 error shows that the estimate of the noise is wrong."""
 
 
-EXPLAINED, PRICE = 0.05, 10.0
-"""Largest normalised error of a joint whose torque counts as explained, as in `metrics.verdict`, and the largest factor
-on the least mean error that a positive definite mass matrix may cost."""
+USEFUL, PRICE = 0.25, 10.0
+"""Largest mean normalised error of a model that a verdict does not refuse, as in `metrics.verdict`, and the largest
+factor on the least mean error that a positive definite mass matrix may cost."""
 
 
 class Trial(NamedTuple):
@@ -143,11 +143,6 @@ class Assessment(NamedTuple):
     definite: bool = True
     """Whether the mass matrix is positive definite; true for models without one."""
 
-    @property
-    def sound(self) -> bool:
-        """Whether the model explains the torque of every joint with a positive definite mass matrix."""
-        return self.definite and self.nmse is not None and bool(np.all(self.nmse <= EXPLAINED))
-
 
 class Selection(NamedTuple):
     """Result of a model selection: all candidates in order, tried or not."""
@@ -170,7 +165,7 @@ def select_model(
     definite: Callable[[FittedModel], bool] = lambda fitted: True,
     report: Callable[[Assessment], None] = lambda step: None,
 ) -> Selection:
-    """Fits candidates in order and chooses the first that no other betters significantly, among sound ones if any is.
+    """Fits candidates in order and chooses the first that no other betters significantly, definite ones before others.
 
     Args:
         candidates: candidates, most structured first; of two equally good ones the first is chosen.
@@ -204,8 +199,8 @@ def select_model(
     ]
     if not trials or not np.isfinite(min(trial.validation for trial in trials)):
         raise InputError("no model could be fitted: " + "; ".join(f"{step.name}: {step.reason}" for step in steps))
-    affordable = PRICE * min(trial.validation for trial in trials)
-    sound = [trial for trial in trials if trial.candidate.sound and trial.validation <= affordable]
+    affordable = min(USEFUL, PRICE * min(trial.validation for trial in trials))
+    sound = [trial for trial in trials if trial.candidate.definite and trial.validation <= affordable]
     best = smallest_enough(sound or trials)
     return Selection(best.candidate, best.outcome, tuple(steps), ended)
 

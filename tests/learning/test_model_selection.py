@@ -140,3 +140,13 @@ def test_models_with_indefinite_masses_come_last_among_those_that_explain_the_to
 
     assert chosen([]) == "true" and chosen([1.0]) == "near"
     assert chosen([1.0, 1.1]) == "true", "the rough one explains too little to come first"
+
+
+def test_a_definite_model_that_explains_less_comes_before_an_indefinite_one():
+    """No candidate explains every joint to 5 %, and only the second has definite mass matrices."""
+    candidates = [candidate("indefinite", 1.3, 1.3), candidate("definite", 1.4, 1.4)]
+    selection = select_model(
+        candidates, TRAIN, VALIDATION, definite=lambda fitted: fitted.parameters[0] != UNIT[0] * 1.3
+    )
+    assert min(step.nmse.min() for step in selection.steps) > 0.05
+    assert selection.chosen.name == "definite"
