@@ -40,6 +40,20 @@ def test_bodies_are_compared_with_the_file(factor, level):
     assert weight_verdict(factor * torques, torques).level == level
 
 
+@pytest.mark.parametrize(("wrong", "factor"), [(0, 1e3), (1, 1e-3), (2, 1e3), (2, 1e-3), (3, 1e3)])
+def test_a_unit_error_in_one_joint_of_a_scara_is_doubtful_and_names_the_joint(wrong, factor):
+    torques = np.random.default_rng(0).normal(size=(100, 4)) * [8, 4, 20, 0.1]
+    changed = torques * np.where(np.arange(4) == wrong, factor, 1)
+    verdict = weight_verdict(changed, torques)
+    assert weight_verdict(torques, torques).level == "good" and verdict.level == "doubtful"
+    assert f"in joint {wrong + 1}" in verdict.reason
+
+
+def test_a_payload_or_a_flange_without_mass_in_the_file_is_no_unit_error():
+    torques = np.random.default_rng(0).normal(size=(100, 3)) * [50, 5, 0]
+    assert weight_verdict(torques * [1.3, 4, 1] + [0, 0, 0.5], torques).level == "good"
+
+
 def test_friction_that_drives_is_refused_and_a_fast_scale_doubted():
     qd = np.random.default_rng(0).uniform(-1, 1, (500, 2))
     tau = 3 * np.where(np.arange(500) % 2, 1, -1)[:, None] + qd

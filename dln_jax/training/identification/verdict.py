@@ -17,9 +17,12 @@ from dln_jax.training.identification.task import Case
 
 HEAVIER, MUCH_HEAVIER = 5.0, 50.0
 """Factors by which the bodies' torques may differ from those of the robot's file: beyond the first the fit is doubtful,
-beyond the second refused. Payloads and rough files stay below; wrong units (N mm, mN m) do not."""
+beyond the second refused. Payloads and rough files stay below; wrong units (N mm, mN m) do not. A single joint, where a
+payload counts for more, is doubtful beyond the second."""
 IMPOSSIBLE = 0.1
 """A physically consistent robot is ruled out if its mean nMSE exceeds that of least squares by this."""
+SLIGHT = 1e-3
+"""Torques of bodies below this fraction of those in the strongest joint are not compared."""
 COUNTS = 0.02
 """Friction is judged if its standard deviation exceeds this fraction of the torque's."""
 FAST = 0.9
@@ -56,7 +59,7 @@ def judged(
     verdicts += [friction_verdict(case.names, test.qd, test.tau, friction, fitted)]
     bodies = [predict(without_joints(theta), test.q, test.qd, test.qdd).torque for theta in (mine, case.known)]
     verdicts += [weight_verdict(*bodies)]
-    verdict = worst(*verdicts)
+    verdict = worst(*verdicts, causes=case.causes)
     if verdict.level != "good" and case.description["motors"] is None:
         train = every(case.sets.train, -(-len(case.sets.train.t) // MOST))
         motor = shared_motor(train.tau - predict(mine, train.q, train.qd, train.qdd).torque, train.qd)
@@ -128,12 +131,21 @@ def without_joints(parameters: RigidTreeParameters) -> RigidTreeParameters:
 
 
 def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"]) -> Verdict:
-    """Whether the torques of the bodies are of the same magnitude as those of the robot's file."""
+    """Whether the torques of the bodies are of the same magnitude as those of the robot's file, in every joint."""
     sizes = np.sqrt(np.mean(np.square([mine, file]), axis=1))
-    there = sizes[1] > 1e-3 * sizes[1].max()
-    factor = float(np.median(sizes[0][there] / sizes[1][there])) if there.any() else 1.0
-    if 1 / HEAVIER <= factor <= HEAVIER:
+    slight = SLIGHT * sizes[1].max()
+    there = sizes[1] > slight
+    if not there.any():
         return Verdict("good", "")
-    reason = f"the bodies take {factor:.3g} times the torques of those in the robot's file"
+    # The file may state nothing of a joint that hardly counts, such as the mass of a flange.
+    factors = np.divide(*(sizes + slight))
+    off, factor = np.maximum(factors, 1 / factors), np.median(np.divide(*sizes[:, there]))
+    joint, typical = int(np.argmax(off)), max(factor, 1 / max(factor, SLIGHT))
+    if typical <= HEAVIER and off[joint] <= MUCH_HEAVIER:
+        return Verdict("good", "")
+    reason = (
+        f"the bodies take {factor:.3g} times the torques of those in the robot's file, in joint {joint + 1} "
+        f"{factors[joint]:.3g} times"
+    )
     remedy = "check the unit of tau (N m) and its side of the gears, or correct the masses in the file"
-    return Verdict("doubtful" if 1 / MUCH_HEAVIER <= factor <= MUCH_HEAVIER else "refused", reason, remedy)
+    return Verdict("refused" if typical > MUCH_HEAVIER else "doubtful", reason, remedy)
