@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.cli.optimisers import name_of
 from dln_jax.cli.progress import progress
-from dln_jax.data.functions import SampleSplit
+from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
@@ -21,8 +21,10 @@ from dln_jax.learning.functions import WIDTHS, Network, grow_width
 from dln_jax.learning.functions import train as train_network
 from dln_jax.learning.model_selection import Trial
 from dln_jax.learning.standardisation import layers_in_own_units, to_units
-from dln_jax.metrics.functions import Prediction, errors, predictions, typical_spread
+from dln_jax.metrics.functions import QUANTITIES, Prediction, errors, predictions, typical_spread
 from dln_jax.metrics.latency import one_step
+from dln_jax.metrics.verdict import Verdict, held_out, worst
+from dln_jax.metrics.verdict import judge as judge_columns
 from dln_jax.nn.activations import activation
 from dln_jax.scale.devices import device_lines
 from dln_jax.training.functions.options import Options
@@ -46,6 +48,8 @@ RELU = (
     "a ReLU network is piecewise linear: its Hessian is zero almost everywhere, so its hessian_mse is that of "
     "predicting zero and a Hessian in the loss teaches it nothing; use softplus, tanh, cos or another smooth activation"
 )
+
+REMEDY = "train a wider network or longer, or add samples where the function changes quickly"
 
 
 def announce(task: Task) -> Iterator[str]:
@@ -107,7 +111,8 @@ def judge(task: Task, fitted: Fitted, options: Options, folder: Path) -> Judged:
     tested = predictions(loaded.parameters, task.test.x, activation=function)
     # Without a bound, the figures show the test samples.
     shown = tested if task.bound is None else predictions(loaded.parameters, task.shown.x, activation=function)
-    metrics = errors(tested.mean, task.test)
+    verdict = verdict_of(network, tested.mean, task.test)
+    metrics = {**errors(tested.mean, task.test), "verdict": verdict.number}
     if task.bound is not None and shown.spread is not None:
         inside = np.all(abs(task.shown.x) <= task.bound, axis=1)
         metrics["spread_inside"] = typical_spread(shown.spread, inside)
@@ -122,13 +127,28 @@ def judge(task: Task, fitted: Fitted, options: Options, folder: Path) -> Judged:
     return Judged(
         metrics=metrics,
         rows=lambda metrics: [
-            (key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()
+            (key.replace("_", " "), number(key, value), unit_of(key, UNITS))
+            for key, value in metrics.items()
+            if key != "verdict"
         ],
         title=f"test on {task.name}, {network.precision}",
+        verdict=verdict,
+        ended_by_user=bool(getattr(options, "steps", None) or getattr(options, "epochs", None)),
         figures=drawings(task, shown, training, trials),
         chosen={**network._asdict(), **settings_of(task.optimiser), **of_named(options)},
         lines=lines,
     )
+
+
+def verdict_of(network: Network, *samples: FunctionSamples) -> Verdict:
+    """Verdict on every component of the value and of the derivatives that were fitted; predicted and true samples."""
+    verdicts = []
+    for key in ("y", *["dy"] * (network.loss == "type1"), *["d2y"] * (network.derivative == 2)):
+        off = held_out(*(getattr(part, key).reshape(len(part.x), -1) for part in samples))
+        names = [f"component {k + 1}" for k in range(len(off.error))]
+        verdicts.append(judge_columns(off, names, quantity=QUANTITIES[key]))
+    verdict = worst(*verdicts)
+    return verdict if verdict.level == "good" else verdict._replace(remedy=REMEDY)
 
 
 def drawings(task: Task, shown: Prediction, training: Training, trials: list[Trial]) -> dict[str, Any]:

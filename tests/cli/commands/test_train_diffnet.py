@@ -13,8 +13,11 @@ from dln_jax.cli.commands import train_diffnet
 from dln_jax.data import functions
 from dln_jax.learning.engine import checkpoint
 from dln_jax.learning.engine import fit as engine_fit
+from dln_jax.learning.functions import Network
+from dln_jax.metrics.verdict import LEVELS
 from dln_jax.training.functions import run as function_runs
 from dln_jax.training.functions import task as function_task
+from dln_jax.training.functions.run import verdict_of
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import load, save
@@ -80,7 +83,20 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
     np.testing.assert_allclose(np.mean((answers.hessian - grid.d2y) ** 2), metrics["hessian_mse"], rtol=1e-6)
     out = capsys.readouterr().out
     assert "value, gradient; gauss-newton, f64" in out and "almost everywhere" not in out
+    assert "verdict: " in out and metrics["verdict"] == LEVELS.index(config["chosen"]["verdict"]["level"])
     assert "already contains a run" in refused(capsys, train_diffnet, *TINY, "--out", folder)
+
+
+def test_verdict_counts_every_component_of_what_was_fitted():
+    x = np.random.default_rng(0).normal(size=(200, 2))
+    true = functions.FunctionSamples(x, x**2, np.einsum("ni,ij->nij", 2 * x, np.eye(2)))
+    network = Network(width=4, depth=1, loss="type1")
+    dead = true._replace(dy=true.dy * np.array([[1, 1], [1, 0]]))
+    assert verdict_of(network, true, true).level == "good"
+    assert verdict_of(network._replace(loss="type2"), dead, true).level == "good"
+    verdict = verdict_of(network, dead, true)
+    assert verdict.level == "refused" and "the gradient of component 4 is predicted no better" in verdict.reason
+    assert "wider network" in verdict.remedy
 
 
 @pytest.mark.slow
