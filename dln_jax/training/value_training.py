@@ -36,8 +36,8 @@ from dln_jax.training.values import (
 )
 from dln_jax.types import InputError, require_positive, require_seed
 
-FAILED = 0.9
-"""Share of the hanging starts that must end upright; a law below it is refused."""
+FAILED, WRONG = 0.9, 0.1
+"""Share of the hanging starts that must end upright; a law below it is refused. Largest median error of a good V."""
 OF_OWN = ("actuated", "control", "positions", "effort", "weights", "box")
 """Options of a user's own plant."""
 
@@ -176,7 +176,7 @@ def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
     """Returns of the law in the evaluation, whether its starts end upright, and figures."""
     run, numbers = fitted.outcome
     run = ValueRun(run.name, run.plant, run.network, with_float64(run.parameters), run.own)
-    measures = measured(case.chosen, run.law, count=options.starts, share=case.robust)
+    measures = measured(case.chosen, run, count=options.starts, share=case.robust)
     verdict, numbers = verdict_of(measures, options.starts), numbers | measures
     own = None if case.chosen.own is None else case.chosen.own.problem
     return Judged(
@@ -198,16 +198,20 @@ def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
 
 
 def verdict_of(numbers: dict[str, float], count: int) -> Verdict:
-    """Verdict on a law by the share of starts that end upright."""
+    """Verdict on a value function by the share of starts that its law brings upright, and the error of V."""
     down, anywhere = numbers["down_up_share"], numbers["uniform_up_share"]
     reason = f"{down:.0%} of {count} hanging starts end up, and {anywhere:.0%} of those anywhere at rest"
     if (altered := [numbers.get(f"{name}_up_share") for name in ("heavy_weak", "light_strong")])[0] is not None:
         reason += f"; {min(altered):.0%} of the hanging ones with the worst masses and motors"  # type: ignore[type-var]
+    error = numbers.get("value_error", 0.0)
+    reason += f"; V differs from the cost of its law by {error:.1%} in the median"
     remedy = "train longer (--iterations) or with other --seeds, narrow the --box, or give a stronger motor"
     if not down >= FAILED:
         return Verdict("refused", reason, remedy)
     shares = [down, anywhere, *(share for share in altered if share is not None)]
-    return Verdict("good", reason) if min(shares) == 1 else Verdict("doubtful", reason, remedy)
+    # A robust V is that of the worst case, and exceeds the cost on the model.
+    sound = min(shares) == 1 and (error <= WRONG or altered[0] is not None)
+    return Verdict("good", reason) if sound else Verdict("doubtful", reason, remedy)
 
 
 def save(folder: Path, fitted: Fitted, case: Case) -> None:

@@ -195,22 +195,37 @@ def by_equation(
     return trained
 
 
-def measured(chosen: Chosen, law: Law, *, count: int = 100, seed: int = 0, share: float = 0.0) -> dict[str, float]:
-    """Returns of a law from both kinds of starts; a failed start counts as NaN.
+def measured(chosen: Chosen, run: ValueRun, *, count: int = 100, seed: int = 0, share: float = 0.0) -> dict[str, float]:
+    """Returns of a value function's law from both kinds of starts, and the error of V; a failed start counts as NaN.
 
     With a share, also on plants with masses larger and motors weaker by that share, and vice versa.
     """
     numbers: dict[str, float] = {}
+    law = run.law
     where: Where
     for where in ("down", "uniform"):
         evaluation = evaluate(chosen.plant, law, starts(chosen.plant, where, count, seed))
         numbers |= {f"{where}_{key}": value for key, value in summary(evaluation).items()}
+        numbers["value_error"] = value_error(run, evaluation)
     for name, sign in (("heavy_weak", 1), ("light_strong", -1)) if share else ():
         factors = [1 + sign * share * (-1 if of.startswith("strength") else 1) for of in chosen.uncertain]
         plant = chosen.plant._replace(problem=with_factors(chosen, factors))
         evaluation = evaluate(plant, law, starts(chosen.plant, "down", count, seed))
         numbers |= {f"{name}_{key}": value for key, value in summary(evaluation).items()}
     return numbers
+
+
+def value_error(run: ValueRun, runs: Returns) -> float:
+    """Median error of V, relative to the discounted cost of following its law; NaN unless a start ends up.
+
+    Starts that are not up at the end of the evaluation are left out: their cost is not known.
+    """
+    problem, dt = run.problem, run.plant.evaluation.held / run.plant.evaluation.rate
+    costs = jax.vmap(jax.vmap(lambda x, u: problem.state_cost(x) + problem.action_cost.cost(u)))
+    weights = dt * np.exp(-problem.discount * dt * np.arange(runs.u.shape[1]))
+    V = jax.vmap(run.value_and_gradient)(runs.x[:, 0])[0]
+    off = np.abs(V / (costs(runs.x[:, :-1], runs.u) @ weights) - 1)[np.isfinite(runs.settled)]
+    return float(np.median(off)) if len(off) else float("nan")
 
 
 def summary(evaluation: Returns) -> dict[str, float]:

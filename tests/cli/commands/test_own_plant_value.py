@@ -9,12 +9,15 @@ import pytest
 from calls import command, refused
 
 from dln_jax.cli.commands import train_value
+from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration
-from dln_jax.control.optimal.problem import rates
+from dln_jax.control.optimal.plants import Evaluation, Starts, ValuePlant, evaluate
+from dln_jax.control.optimal.problem import ControlProblem, rates
+from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.training.value_checkpoints import Kept
 from dln_jax.training.value_plants import Wishes, of_file, of_run, with_factors
 from dln_jax.training.value_training import verdict_of
-from dln_jax.training.values import load_value
+from dln_jax.training.values import ValueRun, load_value, value_error
 from dln_jax.types import InputError
 from dln_jax.zoo.run import save
 
@@ -79,6 +82,35 @@ def test_the_verdict_counts_the_starts_that_end_up():
     assert verdict_of(numbers | {"heavy_weak_up_share": 0.9, "light_strong_up_share": 1.0}, 100).level == "doubtful"
     assert verdict_of(numbers | {"down_up_share": 0.89}, 100).level == "refused"
     assert verdict_of(numbers | {"down_up_share": np.nan}, 100).level == "refused"
+    wrong = verdict_of(numbers | {"value_error": 0.3}, 100)
+    assert wrong.level == "doubtful" and "V differs from the cost of its law by 30.0%" in wrong.reason
+    assert verdict_of(numbers | {"value_error": 0.01}, 100).level == "good"
+    robust = {"value_error": 0.3, "heavy_weak_up_share": 1.0, "light_strong_up_share": 1.0}
+    assert verdict_of(numbers | robust, 100).level == "good", "the value of the worst case exceeds the cost"
+
+
+def test_error_of_a_known_value_is_that_of_the_quadrature():
+    """dx/dt = u with cost (x² + u²)/2, discount 1.5: V = p x² / 2 with p² + 1.5 p = 1, so p = 1/2 and u = -x/2."""
+    problem = ControlProblem(
+        lambda x: jnp.zeros(1),
+        lambda x: jnp.ones((1, 1)),
+        lambda x: x[0] ** 2 / 2,
+        quadratic(1.0),
+        1.5,
+        [-1.0],
+        [1.0],
+        ("prismatic",),
+        [0.0],
+    )
+    plant = ValuePlant(problem, 1.0, Starts([0.0], [0.0], [1.0]), (0,), evaluation=Evaluation(1000.0, 10.0, 1))
+    network = value_network(problem)._replace(
+        value_and_gradient=lambda scale, x: (scale * x[0] ** 2 / 4, scale * x / 2)
+    )
+    runs = evaluate(plant, lambda x: -x / 2, np.linspace(0.3, 0.9, 4)[:, None])
+    for scale in (1.0, 1.2):
+        run = ValueRun("integrator", plant, network, scale)
+        assert value_error(run, runs) == pytest.approx(scale - 1, abs=2e-3)
+    assert np.isnan(value_error(run, runs._replace(settled=np.full(4, np.inf))))
 
 
 MISTAKES = [
