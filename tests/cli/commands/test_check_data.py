@@ -1,5 +1,6 @@
 """`check_data` as the shell calls it, and `--cutoff` where commands train on logs."""
 
+import contextlib
 import json
 
 import numpy as np
@@ -67,11 +68,15 @@ def test_missing_rates_of_a_noisy_log_come_from_filtered_q_unless_the_user_decli
     errors = {}
     for name, options in (("default", []), ("auto", ["--cutoff", "auto"]), ("raw", ["--cutoff", "inf"])):
         out = ["--out", tmp_path / name, "--no-figures", "--no-low-latency", "--no-uncertainty"]
-        command(train_delan, "--data", log, "--model", "trigonometric", "--degree", "1", "--test", "d", *options, *out)
+        given = ("--data", log, "--model", "trigonometric", "--degree", "1", "--test", "d", *options, *out)
+        with pytest.raises(SystemExit) if name == "raw" else contextlib.nullcontext():
+            command(train_delan, *given)
         said = capsys.readouterr().out
         reason = "q is filtered before it is differentiated: accelerations by differences of this q have noise of"
         assert (reason in said) == (name == "default")
         assert ("q filtered without delay at" in said) == (name != "raw")
+        cause = "; in the log, accelerations by differences of this q have noise of"
+        assert ("verdict: good" in said, cause in said) == (name != "raw", name == "raw")
         errors[name] = json.loads((tmp_path / name / "metrics.json").read_text())["torque_mse"]
     assert errors["default"] == errors["auto"] < 0.1 * errors["raw"]
     config = json.loads((tmp_path / "default" / "config.json").read_text())
