@@ -223,7 +223,7 @@ def value_error(run: ValueRun, runs: Returns) -> float:
     problem, dt = run.problem, run.plant.evaluation.held / run.plant.evaluation.rate
     costs = jax.vmap(jax.vmap(lambda x, u: problem.state_cost(x) + problem.action_cost.cost(u)))
     weights = dt * np.exp(-problem.discount * dt * np.arange(runs.u.shape[1]))
-    V = jax.vmap(run.value_and_gradient)(runs.x[:, 0])[0]
+    V = jax.vmap(run.value_and_gradient)(jnp.asarray(runs.x[:, 0]))[0]
     off = np.abs(V / (costs(runs.x[:, :-1], runs.u) @ weights) - 1)[np.isfinite(runs.settled)]
     return float(np.median(off)) if len(off) else float("nan")
 
