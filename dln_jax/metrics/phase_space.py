@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dln_jax.data.schema import momenta
 from dln_jax.mechanics.equations import flow
@@ -123,6 +123,42 @@ def motion_errors(
     if published_energy is not None and published_energy is not H:
         errors |= over_all("published_energy_mse", functools.partial(energy_errors, published_energy))
     return errors | over_all("rollout_mse", state_errors)
+
+
+def quarter_period(states: Float[np.ndarray, "K T n"], bounded: Bool[np.ndarray, " n"]) -> int:
+    """Returns the system's own time in samples: the first lag at which motions no longer correlate with themselves.
+
+    It is a quarter of the period of an oscillation. Every column counts alike; angles, which may turn over, enter by
+    their cosine and sine. Noise that is independent between samples does not matter.
+    """
+    covariance = np.zeros(states.shape[1])
+    for column, stays in zip(np.moveaxis(states, 2, 0), bounded, strict=True):
+        parts = [column] if stays else [np.cos(column), np.sin(column)]
+        about = np.stack([part - part.mean(axis=1, keepdims=True) for part in parts])
+        size = np.mean(np.sum(about**2, axis=0))
+        spectrum = np.abs(np.fft.rfft(about, n=2 * states.shape[1], axis=2)) ** 2
+        covariance += np.fft.irfft(spectrum.sum(axis=(0, 1)))[: states.shape[1]] / (size if size > 0 else 1.0)
+    return max(int(np.argmax(covariance <= 0)), 1)
+
+
+def free_motions(
+    states: Float[np.ndarray, "K T n"], joints: int, *, fitted: int, quarter: int
+) -> tuple[Float[np.ndarray, "K T n"], Float[np.ndarray, "K T n"]]:
+    """Returns two guesses without a model from the last of the `fitted` samples on: rest, and motion without forces.
+
+    Args:
+        states: measured states; the first `joints` columns are coordinates, the others momenta.
+        quarter: a quarter period in samples; lines through half of it give the velocities.
+    """
+    count = min(max(quarter // 2, 2), states.shape[1])
+    first = max(fitted - count, 0)
+    near = np.arange(count) - (count - 1) / 2
+    window = states[:, first : first + count]
+    slope = np.einsum("t,ktn->kn", near, window)[:, None] / np.sum(near**2)
+    line = window.mean(axis=1, keepdims=True) + slope * (np.arange(states.shape[1]) - first - near[-1])[:, None]
+    momenta = np.arange(states.shape[2]) >= joints
+    still = np.broadcast_to(states[:, fitted - 1 : fitted], states.shape)
+    return np.where(momenta, 0.0, still), np.where(momenta, still, line)
 
 
 # Compiled once per model, for all parameters.

@@ -12,12 +12,19 @@ the error of the robot's own file. A joint is
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
 
+Two refusals need more: errors that vanish in means over a quarter of the torque's period are too fast to be a wrong
+model, sign or unit, and leave the fit doubtful.
+
 A predicted motion escapes if a state is not finite, or if a momentum or a position is further from zero than `RANGE`
 times the farthest measured one; angles may grow, since a pendulum can turn over. The error of a motion is the mean
-square of its first `EARLY` samples over the variance of the data, because chaotic motions later diverge from any model.
+square over one period of the system, after the samples that its start was fitted to, and over measured columns alone;
+chaotic motions later diverge from any model. Its unit is the smallest error of a guess without a model: rest, no force,
+the mean of the test motions, or the variance of the data.
 
-    refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the spread)
-    doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the share of noise in the variance is added to both limits
+    refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the unit)
+    doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the variance of the noise is added to both limits, but a
+               refused model is at least as bad as a guess, and a good one has at most HALF of its error
+    rates      measured rates at the test states must be explained by the same two limits
 """
 
 from collections.abc import Sequence
@@ -26,7 +33,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dln_jax.metrics.phase_space import Motions
+from dln_jax.metrics.phase_space import Motions, free_motions, quarter_period
 from dln_jax.types import InputError
 
 Level = Literal["good", "doubtful", "refused"]
@@ -46,10 +53,10 @@ larger by the second as a factor."""
 CONSTANT = 1e-12
 """A torque is constant if its variance is below this share of the mean square of all torques."""
 
-EARLY, RANGE, MOTION_NOISE = 30, 10.0, 4.0
-"""Number of samples that count for a motion's error, distance relative to the data beyond which a motion has escaped,
-and factor on the noise: noise in the measured initial state moves a motion as far as the noise in the measurements that
-it is compared with, and this may grow."""
+RANGE, MOTION_NOISE, HALF = 10.0, 4.0, 0.5
+"""Distance relative to the data beyond which a motion has escaped; factor on the noise: noise in the measured initial
+state moves a motion as far as the noise in the measurements that it is compared with, and this may grow; and largest
+error of a good model relative to a guess, whatever the noise."""
 
 
 class Verdict(NamedTuple):
@@ -179,6 +186,9 @@ def judge_motions(
     size: Float[np.ndarray, " two_d"],
     bounded: Bool[np.ndarray, " two_d"],
     noise: Float[np.ndarray, " two_d"] | None = None,
+    measured: Bool[np.ndarray, " two_d"] | None = None,
+    fitted: int = 1,
+    rates: Float[np.ndarray, " r"] | None = None,
 ) -> Verdict:
     """Returns the verdict on predicted test motions.
 
@@ -188,32 +198,50 @@ def judge_motions(
         size: standard deviation of q and p in the data.
         bounded: mask of q and p that cannot grow without limit: all but angles.
         noise: standard deviation of the measurements of q and p, if known.
+        measured: mask of q and p that were measured; others do not count (default: all).
+        fitted: number of first samples that the start of a prediction saw; they do not count.
+        rates: shares of the variance of measured rates that the model leaves unexplained at test states, without noise.
     """
     remedy = "state the plant's --needs, try another --model, or record more motions"
-    errors, escaped = [], 0
-    for exact, model in zip(truth, predicted, strict=True):
-        true, states = (np.concatenate([motions.q, motions.p], axis=2) for motions in (exact, model))
-        farthest = RANGE * np.maximum(np.abs(true).max(axis=(0, 1)), size)
-        # A state that is not finite compares as false.
-        stays = np.where(bounded, np.abs(states) <= farthest, np.isfinite(states)).all(axis=(1, 2))
-        with np.errstate(over="ignore", invalid="ignore"):
-            squares = ((states - true)[:, :EARLY] / size) ** 2
-        errors += np.where(stays, squares.mean(axis=(1, 2)), np.inf).tolist()
-        escaped += int((~stays).sum())
-    if escaped:
-        reason = f"{escaped} of {len(errors)} predicted test motions grow beyond {RANGE:g} times the range of the data"
-        return Verdict("refused", reason, remedy)
-    share = 0.0 if noise is None else float(np.mean(np.minimum(noise / size, 1.0) ** 2))
-    median = float(np.median(errors))
-    numbers = f"squared error of predicted test motions over the variance {median:.2g}, worst {max(errors):.2g}"
-    numbers += f" (median of {len(errors)}; first {EARLY} samples)" + (f", noise {share:.2g}" if share else "")
-    if not median <= FAILED + MOTION_NOISE * share:
-        return Verdict("refused", numbers, remedy)
-    return (
-        Verdict("doubtful", numbers, remedy)
-        if median > UNEXPLAINED + MOTION_NOISE * share
-        else Verdict("good", numbers)
+    counts = np.ones(len(size), bool) if measured is None else measured
+    joints = int(counts[: len(size) // 2].sum())
+    size, bounded = size[counts], bounded[counts]
+    true, states = (
+        [np.concatenate([m.q, m.p], axis=2)[..., counts] for m in motions] for motions in (truth, predicted)
     )
+    mean = np.mean(np.concatenate([each.reshape(-1, len(size)) for each in true]), axis=0)
+    errors, seconds, escaped = [], [], 0
+    for at, exact, model in zip(truth, true, states, strict=True):
+        farthest = RANGE * np.maximum(np.abs(exact).max(axis=(0, 1)), size)
+        # A state that is not finite compares as false.
+        stays = np.where(bounded, np.abs(model) <= farthest, np.isfinite(model)).all(axis=(1, 2))
+        escaped += int((~stays).sum())
+        quarter = quarter_period(exact, bounded)
+        judged = slice(fitted, fitted + 4 * quarter)
+        seconds.append(np.ptp(at.t[fitted - 1 : judged.stop]))
+        guesses = [np.broadcast_to(mean, exact.shape), *free_motions(exact, joints, fitted=fitted, quarter=quarter)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            off = [((each - exact)[:, judged] / size) ** 2 for each in (model, *guesses)]
+        errors.append([each.mean(axis=(1, 2)) for each in off])
+    if escaped:
+        count = sum(len(exact) for exact in true)
+        reason = f"{escaped} of {count} predicted test motions grow beyond {RANGE:g} times the range of the data"
+        return Verdict("refused", reason, remedy)
+    every = np.concatenate(errors, axis=1)
+    median, *guessed = np.median(every, axis=1)
+    unit = min(1.0, *guessed)
+    share = 0.0 if noise is None else float(np.mean(np.minimum(noise[counts] / size, 1.0) ** 2))
+    rates = np.zeros(1) if rates is None else rates
+    numbers = f"squared error of predicted test motions over the variance {median:.2g}, worst {every[0].max():.2g}"
+    numbers += f" (median of {every.shape[1]}; one period of {np.median(seconds):.3g} s), best guess {unit:.2g}"
+    numbers += f", noise {share:.2g}" if share else ""
+    numbers += f", rates unexplained {rates.mean():.2g}" if rates.any() else ""
+    allowed = MOTION_NOISE * share
+    if not (median <= FAILED * unit + allowed and median < unit and rates.mean() < FAILED + allowed):
+        return Verdict("refused", numbers, remedy)
+    if median > min(UNEXPLAINED * unit + allowed, HALF * unit) or rates.max() > UNEXPLAINED + allowed:
+        return Verdict("doubtful", numbers, remedy)
+    return Verdict("good", numbers)
 
 
 def worst(first: Verdict, *others: Verdict, causes: Sequence[str] = ()) -> Verdict:

@@ -12,7 +12,7 @@ noise was a quarter too small if steps varied by 30 %.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
@@ -34,6 +34,8 @@ class LocalRates(NamedTuple):
     data: Trajectories
     noise: Float[np.ndarray, " d"]
     """Standard deviation of the noise of q, rad or m."""
+    resolved: Bool[np.ndarray, " d"]
+    """Whether more than the fewest neighbours were best; if not, the noise may be the curvature of a coarse motion."""
     rows: np.ndarray
     """Rows of the samples kept."""
 
@@ -68,7 +70,7 @@ def smooth_locally(data: Trajectories) -> LocalRates:
     q, qd, qdd, _, variance = (np.stack(arrays, axis=1) for arrays in zip(*columns, strict=True))
     rows = np.concatenate(parts)
     kept = select_samples(data, rows)._replace(q=q, qd=qd, qdd=qdd)
-    return LocalRates(kept, np.sqrt(np.mean(variance, axis=0)), rows)
+    return LocalRates(kept, np.sqrt(np.mean(variance, axis=0)), best > 0, rows)
 
 
 def _sizes(most: int) -> list[int]:

@@ -71,6 +71,10 @@ class Trust(NamedTuple):
     weights: Weights
     free_of_noise: bool
     """Whether rates are measured and states have so little noise that fitting the rates is sufficient."""
+    noise: np.ndarray
+    """Standard deviations of the noise of q and p that was stated or measured [2 d]; 0 where it is unknown."""
+    rate_noise: np.ndarray
+    """The same of qd and pd."""
 
 
 NOTHING = Stated()
@@ -173,13 +177,19 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
     sizes = {key: spread(key, column(data, key)) for key in ("q", "p", "qd", "pd")}
     sizes = {key: np.where(size > 0, size, 1.0) for key, size in sizes.items()}
 
-    def of(key: str, least: float) -> np.ndarray:
-        noise = smooth_locally(surveyed._replace(q=column(surveyed, key))).noise
-        return np.maximum(noise, least * sizes[key])
+    known = {key: np.zeros(d) for key in sizes}
 
-    of_q = of("q", FREE_OF_NOISE) if noise is None else np.broadcast_to(noise[:d], d)
+    def of(key: str, least: float) -> np.ndarray:
+        smooth = smooth_locally(surveyed._replace(q=column(surveyed, key)))
+        known[key] = np.where(smooth.resolved, smooth.noise, 0.0)
+        return np.maximum(smooth.noise, least * sizes[key])
+
+    if noise is None:
+        of_q = of("q", FREE_OF_NOISE)
+    else:
+        of_q = known["q"] = np.broadcast_to(noise[:d], d)
     if noise is not None and len(noise) == 2 * d:
-        of_p = np.asarray(noise[d:])
+        of_p = known["p"] = np.asarray(noise[d:])
     else:
         of_p = ANCHOR * sizes["p"] if "p" in data.estimated else of("p", FREE_OF_NOISE)
     rates = [sizes[key] * np.inf if key in data.estimated else of(key, LEAST_RATE_NOISE) for key in ("qd", "pd")]
@@ -188,7 +198,8 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
         tuple(np.concatenate([of_q, of_p]).tolist()), tuple(rate.tolist()) if np.isfinite(rate).any() else None
     )
     quiet = np.all(of_q <= FREE_OF_NOISE * sizes["q"]) and np.all(of_p <= FREE_OF_NOISE * sizes["p"])
-    return Trust(weights, bool(quiet and np.isfinite(rate).all()))
+    own = (np.concatenate([known[key] for key in keys]) for keys in (("q", "p"), ("qd", "pd")))
+    return Trust(weights, bool(quiet and np.isfinite(rate).all()), *own)
 
 
 def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:

@@ -13,7 +13,15 @@ from dln_jax.figures.style import TRUTH
 from dln_jax.learning.measured_motions import MeasuredWindows
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import on_grid, padded, predict_measured, prediction_metrics
-from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
+from dln_jax.metrics.phase_space import (
+    Motions,
+    energies,
+    field_errors,
+    field_rates,
+    motion_errors,
+    predict,
+    quarter_period,
+)
 from dln_jax.models.model import Model, Parameters
 from dln_jax.training.hamiltonian.stages import in_velocities
 from dln_jax.training.hamiltonian.tasks import MEASURED, WINDOW, Problem
@@ -56,7 +64,7 @@ def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
     model, parameters = build(trained.description), trained.result.parameters
     if in_velocities(problem, trained.description):
         windows = padded([on_grid(true.t, true.q[0], true.p[0]) for true in problem.truth])
-        fitted = min(WINDOW[MEASURED], *(len(true.t) - 1 for true in problem.truth))
+        fitted = samples_fitted(problem, trained)
         moved = predict_measured(model, parameters, windows, fitted=fitted, substeps=SUBSTEPS)
         kept = [np.flatnonzero(weight) for weight in windows.weight]
         pairs = zip(problem.truth, moved.q, moved.qd, kept, strict=True)
@@ -68,6 +76,18 @@ def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
         first_samples(predict(model, parameters, true.q[:, 0], true.p[:, 0], t), len(true.t))
         for true, t in zip(problem.truth, times, strict=True)
     ]
+
+
+def samples_fitted(problem: Problem, trained: Trained) -> int:
+    """Number of samples that the start of a predicted motion is fitted to; 1 if it is the first state.
+
+    It is a window or, where samples are dense, a quarter of the period, but at most half of the shortest motion.
+    """
+    if not in_velocities(problem, trained.description):
+        return 1
+    angles = np.array([joint == "revolute" for joint in problem.needs.joints])
+    quarters = [quarter_period(true.q, ~angles) for true in problem.truth]
+    return max(2, min(max(WINDOW[MEASURED], *quarters), *(len(true.t) // 2 for true in problem.truth)))
 
 
 def first_samples(motions: Motions, count: int) -> Motions:

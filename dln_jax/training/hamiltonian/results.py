@@ -9,11 +9,13 @@ import numpy as np
 from dln_jax.data.arrays import spread
 from dln_jax.data.schema import column
 from dln_jax.figures import animations
+from dln_jax.figures.phase_space import Field
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.metrics.latency import one_step
-from dln_jax.metrics.verdict import Verdict, judge_motions
-from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, units_of
+from dln_jax.metrics.verdict import NOISE, Verdict, held_out, judge_motions
+from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, samples_fitted, units_of
+from dln_jax.training.hamiltonian.stages import in_velocities
 from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.training.hamiltonian.training import MOTIONS, RATES, Trained
 from dln_jax.training.pipeline import png
@@ -32,7 +34,9 @@ def evaluate(folder: Path, problem: Problem, trained: Trained) -> tuple[dict[str
     """Entries of metrics.json, what figures show, and the verdict on the predicted test motions."""
     truth = problem.truth[0]
     metrics, seen, predicted = measured_once(problem, trained)
-    verdict = judge_motions(predicted, problem.truth, **units_of_judgement(problem))
+    rates = rates_unexplained(problem, trained, seen.rates)
+    known = {**units_of_judgement(problem), "fitted": samples_fitted(problem, trained), "rates": rates}
+    verdict = judge_motions(predicted, problem.truth, **known)
     states = list(zip(truth.q[0, :256], truth.p[0, :256], strict=True))
     metrics = {**metrics, **one_step_metrics(one_step(load(folder).flow.rates, states, calls=2000))}
     if problem.noise is not None:
@@ -43,12 +47,35 @@ def evaluate(folder: Path, problem: Problem, trained: Trained) -> tuple[dict[str
 
 
 def units_of_judgement(problem: Problem) -> dict[str, Any]:
-    """Spread of q and p, which of them are bounded, and their noise if known."""
+    """Spread of q and p, which of them are bounded and were measured, and their noise if known."""
     data, d = problem.fitted, problem.needs.degrees_of_freedom
     size = np.concatenate([spread("q", data.q), spread("p", column(data, "p"))])
     angles = [joint == "revolute" for joint in problem.needs.joints]
-    noise = None if problem.trust is None else np.broadcast_to(problem.trust.weights.state, 2 * d)
-    return {"size": np.where(size > 0, size, 1.0), "bounded": ~np.array(angles + [False] * d), "noise": noise}
+    return {
+        "size": np.where(size > 0, size, 1.0),
+        "bounded": ~np.array(angles + [False] * d),
+        "noise": None if problem.trust is None else problem.trust.noise,
+        "measured": np.repeat([True, "p" not in data.estimated], d),
+    }
+
+
+def rates_unexplained(problem: Problem, trained: Trained, rates: Field) -> np.ndarray | None:
+    """Shares of the variance of measured rates that the model leaves unexplained at test states, above their noise.
+
+    `None` if no rate was measured, because the noise of estimated rates is unknown.
+    """
+    data, d = problem.held_out, problem.needs.degrees_of_freedom
+    # Velocities are states of such models, so that only accelerations tell something.
+    told = ("pd",) if in_velocities(problem, trained.description) else ("qd", "pd")
+    keys = [] if data is None else [key for key in told if key not in data.estimated]
+    if data is None or not keys:
+        return None
+    known = dict(zip(("qd", "pd"), rates(data.q, column(data, "p")), strict=True))
+    model, true = (np.concatenate([values[key] for key in keys], axis=1) for values in (known, data._asdict()))
+    noise = np.zeros(2 * d) if problem.trust is None else problem.trust.rate_noise
+    noise = np.concatenate([noise[:d] if key == "qd" else noise[d:] for key in keys])
+    errors = held_out(model, true, noise=noise)
+    return np.maximum(errors.error - NOISE * noise**2, 0.0) / errors.unit
 
 
 def figures_of(problem: Problem, name: str, seen: Seen, trained: Trained) -> dict[str, Callable[[Path], None]]:

@@ -66,8 +66,8 @@ def prepare(options: Any) -> Case:
     known = Stated(needs, stated("test"), noise, file)
     problem = problem_of(options.task, trajectories=stated("trajectories"), data=stated("data"), stated=known)
     findings = []
-    if stated("data") is not None:
-        findings = checked(options, problem.fitted, options.data, without=FILTERED_HERE)
+    if problem.recorded is not None:
+        findings = checked(options, problem.recorded, options.data, without=FILTERED_HERE)
     size = {name: stated(name) for name in KEYWORDS}
     if options.model == "auto" and options.task == MEASURED:
         networks = options.optimizer == "adam" or any(size[name] is not None for name in KEYWORDS[:3])

@@ -75,6 +75,10 @@ class Problem(NamedTuple):
     assumed: bool = False
     """Whether the needs are not stated, so that the data decide between candidates."""
     gaps: int = 0
+    recorded: Trajectories | None = None
+    """The file as it was read; `None` for generated data."""
+    held_out: Trajectories | None = None
+    """Test states q, p with their rates qd, pd, measured or of the exact field."""
 
 
 def problem_of(
@@ -115,7 +119,9 @@ def generated(name: str, trajectories: int | None) -> Problem:
     start = clean.q[first], schema.column(clean, "p")[first]
     q, p = reference_motion(task.hamiltonian, *start, t, dissipation=task.scene.dissipation)
     energies = task.hamiltonian, task.published_energy
-    return Problem(name, task.scene.needs, task.train.data, task.train, task.test, (Motions(t, q, p),), *energies)
+    sides, truth = (task.train.data, task.train, task.test), (Motions(t, q, p),)
+    held_out = task.test.data._replace(**task.test.field._asdict())
+    return Problem(name, task.scene.needs, *sides, truth, *energies, held_out=held_out)
 
 
 def real_energy(q: Array, p: Array) -> Array:
@@ -141,6 +147,5 @@ def measured(name: str, data: Trajectories, file: str, stated: Stated = NOTHING)
             raise InputError(f"no test motion has {WINDOW[MEASURED] + 1} samples without a gap; record longer ones")
     present = np.unique(test.trajectory)[:STARTS]
     truth = tuple(motion_of(select(test, np.array([index]))) for index in present)
-    return Problem(
-        name, needs, fitted, None, None, truth, energy, energy, noise, tests, trust, assumed, gap_count(test)
-    )
+    known = noise, tests, trust, assumed, gap_count(test), data, test
+    return Problem(name, needs, fitted, None, None, truth, energy, energy, *known)
