@@ -12,8 +12,8 @@ the error of the robot's own file. A joint is
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
 
-Two refusals need more: errors that vanish in means over a quarter of the torque's period are too fast to be a wrong
-model, sign or unit, and leave the fit doubtful.
+A refusal becomes a doubt if means over a quarter of the torque's period are explained, with less than HALF of the share
+of single samples: such errors come from noise of accelerations or torques, and from no wrong sign, order or unit.
 
 A predicted motion escapes if a state is not finite, or if a momentum or a position is further from zero than `RANGE`
 times the farthest measured one; angles may grow, since a pendulum can turn over. The error of a motion is the mean
@@ -31,7 +31,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from dln_jax.metrics.phase_space import Motions, free_motions, quarter_period
 from dln_jax.types import InputError
@@ -92,6 +92,8 @@ class HeldOut(NamedTuple):
     """Variance of the measured torque's noise, if it was estimated."""
     file: Float[np.ndarray, " d"] | None = None
     """Error of the torques of the robot's own file, if there is one."""
+    slow: Float[np.ndarray, " d"] | None = None
+    """Error of means over a quarter period of each torque, over their variance; `None` if the order is unknown."""
 
     @property
     def unit(self) -> Float[np.ndarray, " d"]:
@@ -106,6 +108,7 @@ def held_out(
     noise: Float[np.ndarray, " d"] | None = None,
     file: Float[np.ndarray, "N d"] | None = None,
     recording: Float[np.ndarray, "M d"] | None = None,
+    trajectory: Int[np.ndarray, " N"] | None = None,
 ) -> HeldOut:
     """Computes the numbers for a verdict.
 
@@ -116,6 +119,7 @@ def held_out(
         file: torques of the robot's own file.
         recording: torques of the recording of which the held-out samples are blocks of time; their own variance may be
             small by chance.
+        trajectory: index of the trajectory of every sample, in the order of time.
 
     Raises:
         InputError: there are no samples.
@@ -129,6 +133,7 @@ def held_out(
         zero=np.mean(measured**2, axis=0),
         noise=variance,
         file=None if file is None else np.mean((file - measured) ** 2, axis=0),
+        slow=None if trajectory is None else _slow_errors(predicted, measured, trajectory),
     )
 
 
@@ -152,6 +157,12 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None, *, quantity: str 
     numbers = _numbers(errors, share, noise, names)
     unexplained = (share >= 1) & ~unseen
     if share.mean() >= 1 or unexplained.any() or np.where(unseen, 0.0, share - NOISE * noise).mean() >= FAILED:
+        slow = share if errors.slow is None else np.where(unseen, 0.0, errors.slow)
+        if (slow < 1).all() and slow.mean() < min(FAILED, HALF * share.mean()):
+            reason = f"errors are too fast for the motion, {slow.mean():.3g} in means over a quarter period: {numbers}"
+            return Verdict(
+                "doubtful", reason, "accelerations or torques are noisy: try --cutoff with a lower frequency"
+            )
         beyond = f"more than {FAILED:.0%} of the {quantity} is unexplained in the mean of all joints"
         constant = f"the {quantity} of {_listed(names, unexplained)} is predicted no better than by a constant"
         remedy = "check the sign, order and unit of tau, and the times of the log (check_data), or record more motions"
@@ -265,6 +276,19 @@ def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]
     compared = {"zero": errors.zero, "noise": errors.noise, "file": errors.file}
     means = {f"{name}_nmse": float(np.mean(e / errors.unit)) for name, e in compared.items() if e is not None}
     return {"verdict": verdict.number, **means}
+
+
+def _slow_errors(predicted: np.ndarray, measured: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
+    errors, torques = [], []
+    for index in np.unique(trajectory):
+        own = measured[trajectory == index]
+        window = np.ones(quarter_period(own[None], np.ones(own.shape[1], bool)))
+        both = [own, predicted[trajectory == index] - own]
+        means = [np.stack([np.convolve(x, window / len(window), "valid") for x in part.T], axis=1) for part in both]
+        torques.append(means[0])
+        errors.append(means[1] ** 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num(np.concatenate(errors).mean(axis=0) / np.concatenate(torques).var(axis=0), nan=0.0)
 
 
 def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:

@@ -33,9 +33,11 @@ from dln_jax.metrics.frames import (
     frame_errors,
     inject_energy,
     late_energy_errors,
+    physical_states,
     recoded,
 )
-from dln_jax.metrics.phase_space import summary
+from dln_jax.metrics.phase_space import Motions, summary
+from dln_jax.metrics.verdict import Verdict, judge_motions
 from dln_jax.models.latent_phase import (
     Components,
     Field,
@@ -45,7 +47,15 @@ from dln_jax.models.latent_phase import (
     through_components,
 )
 from dln_jax.models.model import Parameters
-from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, FRAMES, TRAJECTORIES, FrameSplit, split, swinging_rod
+from dln_jax.scenes.datasets.pendulum_frames import (
+    FRAME_TIME,
+    FRAMES,
+    TRAJECTORIES,
+    FrameSplit,
+    RodFrames,
+    split,
+    swinging_rod,
+)
 from dln_jax.training.hamiltonian.options import ImageOptions
 from dln_jax.training.pipeline import Fitted, Judged, Kind, png
 from dln_jax.training.results import OF_LOSSES, losses
@@ -125,6 +135,17 @@ def measure_pixels(
     return numbers, SeenFrames(model, parameters, motions, components, training.history)
 
 
+def judge_frames(motions: FrameMotions, test: RodFrames) -> Verdict:
+    """The verdict on predicted films by the rod's motions (q, qd) in them; a start is a pair of frames."""
+    times = motions.pairs.shape[1]
+    truth = Motions(test.t[:times], test.q[:, :times, None], test.qd[:, :times, None])
+    q, qd = physical_states(motions.pairs)
+    turns = 2 * np.pi * np.round((truth.q[..., 0] - q) / (2 * np.pi))
+    size = np.array([np.std(test.q), np.std(test.qd)])
+    predicted = Motions(truth.t, (q + turns)[..., None], qd[..., None])
+    return judge_motions([predicted], [truth], size=size, bounded=np.array([False, True]), fitted=2)
+
+
 def figures_of(seen: dict[str, SeenFrames], data: FrameSplit) -> dict[str, Callable[[Path], None]]:
     """`pixels.gif` (truth and every model's frames) and, for an energy, `pixels-injection.png`."""
     times = data.test.frames.shape[1] - 1
@@ -188,12 +209,16 @@ def judge(case: Case, fitted: Fitted, options: ImageOptions, folder: Path) -> Ju
         best = min(seen.history, key=lambda at: at.validation).step
         curve = png(training_curve, seen.history, best_step=best, unit="loss", **OF_LOSSES)
         figures = {**figures_of({case.kind: seen}, case.data), "training.png": curve}
+    verdict = judge_frames(seen.motions, case.data.test)
+    metrics = {key: value for key, value in numbers.items() if np.isfinite(value)}
     return Judged(
-        metrics={key: value for key, value in numbers.items() if np.isfinite(value)},
+        metrics=metrics | {"verdict": verdict.number},
         rows=lambda _: [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
         title=f"test films, {case.kind}",
         columns=("quantity", "value"),
+        verdict=verdict,
         figures=figures,
+        ended_by_user=options.steps is not None,
     )
 
 
