@@ -135,3 +135,15 @@ def test_a_calm_block_of_a_recording_is_judged_in_units_of_the_whole_recording()
     assert judge(held_out(predicted, calm)).level == "refused"
     assert judge(held_out(predicted, calm, recording=recording)).level == "good"
     assert judge(held_out(predicted + 2.0, calm, recording=recording)).level == "refused"
+
+
+def test_errors_that_are_too_fast_for_the_motion_are_a_doubt():
+    """Noise of differentiated accelerations at 20 Hz beside torques at 0.5 Hz; a wrong sign is slow, and refused."""
+    t = np.arange(0, 10, 0.005)
+    torque = np.stack([np.sin(np.pi * t), np.cos(np.pi * t)], axis=1)
+    fast = 0.9 * np.sin(40 * np.pi * t + np.array([[0.0], [1.0]])).T
+    known = {"trajectory": np.zeros(len(t), int)}
+    verdict = judge(held_out(torque + fast, torque, **known))
+    assert verdict.level == "doubtful" and "--cutoff" in verdict.remedy and "sign" not in verdict.line
+    wrong = judge(held_out(torque * [1, -1] + fast, torque, **known))
+    assert wrong.level == "refused" and "sign" in wrong.remedy

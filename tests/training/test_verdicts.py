@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 
+from dln_jax.data import schema
+from dln_jax.data.splits import Split
+from dln_jax.learning.objectives import CANONICAL
 from dln_jax.metrics.verdict import HeldOut
-from dln_jax.training.dynamics.verdict import searched
+from dln_jax.training.dynamics.recorded import Recorded
+from dln_jax.training.dynamics.task import Task
+from dln_jax.training.dynamics.verdict import judge_torques, searched
 from dln_jax.training.identification.verdict import friction_verdict, spikes, weight_verdict
+from dln_jax.types import Needs
 
 
 def held_out(error, noise=1e-4):
@@ -75,3 +81,15 @@ def test_spikes_are_single_samples_and_dry_friction_has_none():
     assert not spikes(torque).any()
     torque[[300, 700], [0, 1]] += 60
     assert np.argwhere(spikes(torque)).tolist() == [[300, 0], [700, 1]]
+
+
+def test_hamiltonian_of_momenta_is_judged_by_torques():
+    t = np.arange(0, 10, 0.01)
+    q = np.stack([np.sin(t), np.cos(2 * t)], axis=1)
+    data = schema.from_arrays({"t": t, "q": q, "tau": -q, "p": q, "trajectory": np.zeros(len(t), int)})
+    needs = Needs(joints=("revolute", "revolute"))
+    recorded = Recorded("", Split(data, data, data), None, needs, "", (), None, None, None, None, "", np.zeros(2))
+    task = Task(recorded, "structured-hnn", {}, CANONICAL, None, 0, 0.0)
+    for tau, level in ((-q, "good"), (q, "refused")):
+        verdict = judge_torques(task, tau, tau).verdict
+        assert verdict is not None and verdict.level == level

@@ -81,13 +81,13 @@ def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
 def samples_fitted(problem: Problem, trained: Trained) -> int:
     """Number of samples that the start of a predicted motion is fitted to; 1 if it is the first state.
 
-    It is a window or, where samples are dense, a quarter of the period, but at most half of the shortest motion.
+    It is a window or, where samples are dense, an eighth of the period, but at most half of the shortest motion.
     """
     if not in_velocities(problem, trained.description):
         return 1
     angles = np.array([joint == "revolute" for joint in problem.needs.joints])
-    quarters = [quarter_period(true.q, ~angles) for true in problem.truth]
-    return max(2, min(max(WINDOW[MEASURED], *quarters), *(len(true.t) // 2 for true in problem.truth)))
+    dense = min(quarter_period(true.q, ~angles) for true in problem.truth) // 2
+    return max(2, min(max(WINDOW[MEASURED], dense), *(len(true.t) // 2 for true in problem.truth)))
 
 
 def first_samples(motions: Motions, count: int) -> Motions:

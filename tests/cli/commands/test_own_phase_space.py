@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from dln_jax import load
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_hnn, train_hnn_task
 from dln_jax.mechanics.equations import flow
 from dln_jax.training import pipeline
 from dln_jax.training.hamiltonian import recipes, training
 from dln_jax.training.hamiltonian import run as phase_space
 from dln_jax.training.hamiltonian.model_selection import description_of
+from dln_jax.training.hamiltonian.results import units_of_judgement
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
 from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import InputError, Needs
@@ -45,6 +47,30 @@ def test_noise_of_states_and_rates_weighs_motions(files):
     assert named is not None and named.rate == 0.01
     assert problem.trust.weights.rate is not None
     assert np.all(np.abs(np.log2(np.divide(problem.trust.weights.rate, named.rate))) < 1)
+
+
+def test_noise_that_nobody_measured_is_none(files):
+    """An exact, coarse file of q alone has noise neither of q nor of p."""
+    t = np.arange(0, 20, 0.25)
+    q = np.cos(4 * t + np.arange(6)[:, None]).reshape(-1, 1)
+    np.savez("coarse.npz", t=np.tile(t, 6), q=q, trajectory=np.repeat(np.arange(6), len(t)))
+    problem = problem_of(MEASURED, data=files / "coarse.npz", stated=Stated(SLIDING))
+    assert problem.trust is not None and not problem.trust.noise.any()
+    known = units_of_judgement(problem)
+    assert known["measured"].tolist() == [True, False] and not known["noise"].any()
+    noisy = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    np.testing.assert_allclose(units_of_judgement(noisy)["noise"], 0.1, rtol=0.15)
+
+
+def test_recordings_are_counted_and_no_windows(files):
+    """Four motions, each recorded twice, of ten windows each."""
+    t = np.arange(0, 12, 0.02)
+    motions = [np.stack([np.sin((2 + k) * t), np.cos(3 * t + k)], axis=1) for k in (0, 0, 1, 1, 2, 2, 3, 3)]
+    every = {"t": np.tile(t, 8), "q": np.concatenate(motions), "trajectory": np.repeat(np.arange(8), len(t))}
+    np.savez("repeated.npz", **every)
+    stated = {"task": "measured", "data": files / "repeated.npz", "model": "structured-hnn", "width": 2, "depth": 1}
+    case = phase_space.prepare(arguments_of(train_hnn_task.Arguments, **stated))
+    assert any("8 recordings show 4 motions" in line for line in case.findings)
 
 
 def test_stated_noise_is_used_or_refused(files, capsys):

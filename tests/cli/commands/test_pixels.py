@@ -20,6 +20,7 @@ from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics import frames as frame_metrics
 from dln_jax.metrics.phase_space import Motions
+from dln_jax.metrics.verdict import Verdict
 from dln_jax.models.latent_phase import (
     LatentModel,
     LatentPhase,
@@ -306,6 +307,14 @@ def test_end_to_end_with_a_tiny_budget(tmp_path, monkeypatch):
     assert shapes[0]["decoder"] == shapes[1]["decoder"] and shapes[0]["encoder"] == shapes[1]["encoder"]
 
 
+def test_films_are_judged_by_the_motion_in_them(data):
+    """The true film is good; one that stands still is refused."""
+    pairs, latent = data.pairs, Motions(data.t, data.q[..., None], data.qd[..., None])
+    still = np.broadcast_to(pairs[:, :1], pairs.shape)
+    for film, level in ((pairs, "good"), (still, "refused")):
+        assert pixel_task.judge_frames(frame_metrics.FrameMotions(latent, film), data).level == level
+
+
 @pytest.mark.slow
 def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     for name in ("FRAMES", "TRAJECTORIES"):
@@ -317,8 +326,10 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pixel_task, "energy_floor", lambda *given: 0.0)
     for name in ("late_energy_errors", "energy_errors"):
         monkeypatch.setattr(pixel_task, name, lambda *given: np.ones(2))
+    monkeypatch.setattr(pixel_task, "judge_frames", lambda *given: Verdict("good", "told"))
     options = ("--model", "phase-network", "--steps", "1", "--no-figures", "--out", str(tmp_path / "run"))
     command(train_hnn_pixels, *options)
+    assert "verdict: good: told" in capsys.readouterr().out
     stored = (tmp_path / "run" / "model.safetensors").read_bytes()
     (tmp_path / "run" / "model.safetensors").unlink()
     command(train_hnn_pixels, "--out", str(tmp_path / "run"), "--resume", "--no-figures")
