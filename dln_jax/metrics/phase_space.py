@@ -131,34 +131,28 @@ def quarter_period(states: Float[np.ndarray, "K T n"], bounded: Bool[np.ndarray,
     It is a quarter of the period of an oscillation. Every column counts alike; angles, which may turn over, enter by
     their cosine and sine. Noise that is independent between samples does not matter.
     """
-    covariance = np.zeros(states.shape[1])
-    for column, stays in zip(np.moveaxis(states, 2, 0), bounded, strict=True):
-        parts = [column] if stays else [np.cos(column), np.sin(column)]
-        about = np.stack([part - part.mean(axis=1, keepdims=True) for part in parts])
-        size = np.mean(np.sum(about**2, axis=0))
-        spectrum = np.abs(np.fft.rfft(about, n=2 * states.shape[1], axis=2)) ** 2
-        covariance += np.fft.irfft(spectrum.sum(axis=(0, 1)))[: states.shape[1]] / (size if size > 0 else 1.0)
-    return max(int(np.argmax(covariance <= 0)), 1)
+    parts = np.stack([np.where(bounded, states, np.cos(states)), np.where(bounded, 0.0, np.sin(states))])
+    about = parts - parts.mean(axis=2, keepdims=True)
+    size = np.sqrt(np.sum(about**2, axis=(0, 1, 2)))
+    spectrum = np.abs(np.fft.rfft(about / np.where(size > 0, size, 1.0), 2 * states.shape[1], axis=2)) ** 2
+    return max(int(np.argmax(np.fft.irfft(spectrum.sum(axis=(0, 1, 3)))[: states.shape[1]] <= 0)), 1)
 
 
 def free_motions(
     states: Float[np.ndarray, "K T n"], joints: int, *, fitted: int, quarter: int
-) -> tuple[Float[np.ndarray, "K T n"], Float[np.ndarray, "K T n"]]:
+) -> tuple[Float[np.ndarray, "K 1 n"], Float[np.ndarray, "K T n"]]:
     """Returns two guesses without a model from the last of the `fitted` samples on: rest, and motion without forces.
 
     Args:
         states: measured states; the first `joints` columns are coordinates, the others momenta.
-        quarter: a quarter period in samples; lines through half of it give the velocities.
+        quarter: a quarter period in samples; velocities are differences over a quarter of it.
     """
-    count = min(max(quarter // 2, 2), states.shape[1])
-    first = max(fitted - count, 0)
-    near = np.arange(count) - (count - 1) / 2
-    window = states[:, first : first + count]
-    slope = np.einsum("t,ktn->kn", near, window)[:, None] / np.sum(near**2)
-    line = window.mean(axis=1, keepdims=True) + slope * (np.arange(states.shape[1]) - first - near[-1])[:, None]
-    momenta = np.arange(states.shape[2]) >= joints
-    still = np.broadcast_to(states[:, fitted - 1 : fitted], states.shape)
-    return np.where(momenta, 0.0, still), np.where(momenta, still, line)
+    near = max(quarter // 4, 1)
+    first = max(fitted - 1 - near, 0)
+    slope = (states[:, [first + near]] - states[:, [first]]) / near
+    momenta, start = np.arange(states.shape[2]) >= joints, states[:, [fitted - 1]]
+    line = start + slope * (np.arange(states.shape[1]) - fitted + 1)[:, None]
+    return np.where(momenta, 0.0, start), np.where(momenta, start, line)
 
 
 # Compiled once per model, for all parameters.

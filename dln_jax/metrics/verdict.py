@@ -31,7 +31,8 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
+from scipy.ndimage import uniform_filter1d
 
 from dln_jax.metrics.phase_space import Motions, free_motions, quarter_period
 from dln_jax.types import InputError
@@ -93,7 +94,7 @@ class HeldOut(NamedTuple):
     file: Float[np.ndarray, " d"] | None = None
     """Error of the torques of the robot's own file, if there is one."""
     slow: Float[np.ndarray, " d"] | None = None
-    """Error of means over a quarter period of each torque, over their variance; `None` if the order is unknown."""
+    """Error of means over a quarter of the torques' period, over their variance; `None` if unknown."""
 
     @property
     def unit(self) -> Float[np.ndarray, " d"]:
@@ -108,7 +109,6 @@ def held_out(
     noise: Float[np.ndarray, " d"] | None = None,
     file: Float[np.ndarray, "N d"] | None = None,
     recording: Float[np.ndarray, "M d"] | None = None,
-    trajectory: Int[np.ndarray, " N"] | None = None,
 ) -> HeldOut:
     """Computes the numbers for a verdict.
 
@@ -119,13 +119,14 @@ def held_out(
         file: torques of the robot's own file.
         recording: torques of the recording of which the held-out samples are blocks of time; their own variance may be
             small by chance.
-        trajectory: index of the trajectory of every sample, in the order of time.
 
     Raises:
         InputError: there are no samples.
     """
     if not len(measured):
         raise InputError("there are no held-out samples to judge a fit by; hold out some motions")
+    quarter = quarter_period(measured[None], np.ones(measured.shape[1], bool))
+    error, torque = (uniform_filter1d(x, quarter, axis=0) for x in (predicted - measured, measured))
     variance = None if noise is None else np.where(np.isfinite(noise), noise, 0.0) ** 2
     return HeldOut(
         error=np.mean((predicted - measured) ** 2, axis=0),
@@ -133,7 +134,7 @@ def held_out(
         zero=np.mean(measured**2, axis=0),
         noise=variance,
         file=None if file is None else np.mean((file - measured) ** 2, axis=0),
-        slow=None if trajectory is None else _slow_errors(predicted, measured, trajectory),
+        slow=np.mean(error**2, axis=0) / np.maximum(np.var(torque, axis=0), CONSTANT * np.mean(measured**2) or 1.0),
     )
 
 
@@ -157,7 +158,7 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None, *, quantity: str 
     numbers = _numbers(errors, share, noise, names)
     unexplained = (share >= 1) & ~unseen
     if share.mean() >= 1 or unexplained.any() or np.where(unseen, 0.0, share - NOISE * noise).mean() >= FAILED:
-        slow = share if errors.slow is None else np.where(unseen, 0.0, errors.slow)
+        slow = share if errors.slow is None else errors.slow
         if (slow < 1).all() and slow.mean() < min(FAILED, HALF * share.mean()):
             reason = f"errors are too fast for the motion, {slow.mean():.3g} in means over a quarter period: {numbers}"
             return Verdict(
@@ -199,7 +200,7 @@ def judge_motions(
     noise: Float[np.ndarray, " two_d"] | None = None,
     measured: Bool[np.ndarray, " two_d"] | None = None,
     fitted: int = 1,
-    rates: Float[np.ndarray, " r"] | None = None,
+    rates: Float[np.ndarray, " r"] | tuple[float, ...] = (0.0,),
 ) -> Verdict:
     """Returns the verdict on predicted test motions.
 
@@ -211,7 +212,7 @@ def judge_motions(
         noise: standard deviation of the measurements of q and p, if known.
         measured: mask of q and p that were measured; others do not count (default: all).
         fitted: number of first samples that the start of a prediction saw; they do not count.
-        rates: shares of the variance of measured rates that the model leaves unexplained at test states, without noise.
+        rates: shares of the variance of measured rates that the model leaves unexplained at test states.
     """
     remedy = "state the plant's --needs, try another --model, or record more motions"
     counts = np.ones(len(size), bool) if measured is None else measured
@@ -221,36 +222,31 @@ def judge_motions(
         [np.concatenate([m.q, m.p], axis=2)[..., counts] for m in motions] for motions in (truth, predicted)
     )
     mean = np.mean(np.concatenate([each.reshape(-1, len(size)) for each in true]), axis=0)
-    errors, seconds, escaped = [], [], 0
-    for at, exact, model in zip(truth, true, states, strict=True):
+    errors, escaped = [], []
+    for exact, model in zip(true, states, strict=True):
         farthest = RANGE * np.maximum(np.abs(exact).max(axis=(0, 1)), size)
         # A state that is not finite compares as false.
-        stays = np.where(bounded, np.abs(model) <= farthest, np.isfinite(model)).all(axis=(1, 2))
-        escaped += int((~stays).sum())
+        escaped += (~np.where(bounded, np.abs(model) <= farthest, np.isfinite(model)).all(axis=(1, 2))).tolist()
         quarter = quarter_period(exact, bounded)
-        judged = slice(fitted, fitted + 4 * quarter)
-        seconds.append(np.ptp(at.t[fitted - 1 : judged.stop]))
-        guesses = [np.broadcast_to(mean, exact.shape), *free_motions(exact, joints, fitted=fitted, quarter=quarter)]
+        guesses = model, mean, *free_motions(exact, joints, fitted=fitted, quarter=quarter)
         with np.errstate(over="ignore", invalid="ignore"):
-            off = [((each - exact)[:, judged] / size) ** 2 for each in (model, *guesses)]
-        errors.append([each.mean(axis=(1, 2)) for each in off])
-    if escaped:
-        count = sum(len(exact) for exact in true)
-        reason = f"{escaped} of {count} predicted test motions grow beyond {RANGE:g} times the range of the data"
-        return Verdict("refused", reason, remedy)
+            off = [((each - exact) / size)[:, fitted : fitted + 4 * quarter] for each in guesses]
+            errors.append([np.mean(each**2, axis=(1, 2)) for each in off])
+    if any(escaped):
+        many = f"{sum(escaped)} of {len(escaped)} predicted test motions"
+        return Verdict("refused", f"{many} grow beyond {RANGE:g} times the range of the data", remedy)
     every = np.concatenate(errors, axis=1)
     median, *guessed = np.median(every, axis=1)
-    unit = min(1.0, *guessed)
-    share = 0.0 if noise is None else float(np.mean(np.minimum(noise[counts] / size, 1.0) ** 2))
-    rates = np.zeros(1) if rates is None else rates
+    unit, share = min(1.0, *guessed), 0.0
+    if noise is not None:
+        share = float(np.mean(np.minimum(noise[counts] / size, 1.0) ** 2))
     numbers = f"squared error of predicted test motions over the variance {median:.2g}, worst {every[0].max():.2g}"
-    numbers += f" (median of {every.shape[1]}; one period of {np.median(seconds):.3g} s), best guess {unit:.2g}"
-    numbers += f", noise {share:.2g}" if share else ""
-    numbers += f", rates unexplained {rates.mean():.2g}" if rates.any() else ""
+    numbers += f" (median of {len(escaped)}; over one period), best guess {unit:.2g}"
+    numbers += (f", noise {share:.2g}" if share else "") + f", rates unexplained {np.max(rates):.2g}"
     allowed = MOTION_NOISE * share
-    if not (median <= FAILED * unit + allowed and median < unit and rates.mean() < FAILED + allowed):
+    if not (median <= FAILED * unit + allowed and median < unit and np.mean(rates) < FAILED + allowed):
         return Verdict("refused", numbers, remedy)
-    if median > min(UNEXPLAINED * unit + allowed, HALF * unit) or rates.max() > UNEXPLAINED + allowed:
+    if median > min(UNEXPLAINED * unit + allowed, HALF * unit) or np.max(rates) > UNEXPLAINED + allowed:
         return Verdict("doubtful", numbers, remedy)
     return Verdict("good", numbers)
 
@@ -276,19 +272,6 @@ def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]
     compared = {"zero": errors.zero, "noise": errors.noise, "file": errors.file}
     means = {f"{name}_nmse": float(np.mean(e / errors.unit)) for name, e in compared.items() if e is not None}
     return {"verdict": verdict.number, **means}
-
-
-def _slow_errors(predicted: np.ndarray, measured: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
-    errors, torques = [], []
-    for index in np.unique(trajectory):
-        own = measured[trajectory == index]
-        window = np.ones(quarter_period(own[None], np.ones(own.shape[1], bool)))
-        both = [own, predicted[trajectory == index] - own]
-        means = [np.stack([np.convolve(x, window / len(window), "valid") for x in part.T], axis=1) for part in both]
-        torques.append(means[0])
-        errors.append(means[1] ** 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.nan_to_num(np.concatenate(errors).mean(axis=0) / np.concatenate(torques).var(axis=0), nan=0.0)
 
 
 def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:

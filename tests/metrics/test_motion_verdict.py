@@ -57,10 +57,10 @@ def test_straight_lines_are_no_model_at_any_rate(step):
     true = Motions(t, np.cos(t + PHASES)[..., None], -np.sin(t + PHASES)[..., None])
     q = true.q[:, 29:30] + true.p[:, 29:30] * (t - t[29])[:, None]
     lines = Motions(t, q, np.broadcast_to(true.p[:, 29:30], q.shape))
+    bounded = np.array([False, True])
     for fitted in (1, 30):
-        known = {"size": SIZE, "bounded": np.array([False, True]), "fitted": fitted}
-        assert judge_motions([lines], [true], **known).level == "refused"
-        assert judge_motions([true], [true], **known).level == "good"
+        assert judge_motions([lines], [true], size=SIZE, bounded=bounded, fitted=fitted).level == "refused"
+        assert judge_motions([true], [true], size=SIZE, bounded=bounded, fitted=fitted).level == "good"
 
 
 def test_samples_that_the_start_saw_do_not_count():

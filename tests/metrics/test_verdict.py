@@ -142,8 +142,7 @@ def test_errors_that_are_too_fast_for_the_motion_are_a_doubt():
     t = np.arange(0, 10, 0.005)
     torque = np.stack([np.sin(np.pi * t), np.cos(np.pi * t)], axis=1)
     fast = 0.9 * np.sin(40 * np.pi * t + np.array([[0.0], [1.0]])).T
-    known = {"trajectory": np.zeros(len(t), int)}
-    verdict = judge(held_out(torque + fast, torque, **known))
+    verdict = judge(held_out(torque + fast, torque))
     assert verdict.level == "doubtful" and "--cutoff" in verdict.remedy and "sign" not in verdict.line
-    wrong = judge(held_out(torque * [1, -1] + fast, torque, **known))
+    wrong = judge(held_out(torque * [1, -1] + fast, torque))
     assert wrong.level == "refused" and "sign" in wrong.remedy

@@ -59,7 +59,6 @@ def judge_fit(
             noise=noise,
             file=None if robot is None else torques_of(robot, data),
             recording=whole.tau if recorded.blocks else None,
-            trajectory=data.trajectory,
         )
         for part, data in parts
     )

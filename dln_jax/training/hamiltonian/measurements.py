@@ -73,8 +73,6 @@ class Trust(NamedTuple):
     """Whether rates are measured and states have so little noise that fitting the rates is sufficient."""
     noise: np.ndarray
     """Standard deviations of the noise of q and p that was stated or measured [2 d]; 0 where it is unknown."""
-    rate_noise: np.ndarray
-    """The same of qd and pd."""
 
 
 NOTHING = Stated()
@@ -198,8 +196,7 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
         tuple(np.concatenate([of_q, of_p]).tolist()), tuple(rate.tolist()) if np.isfinite(rate).any() else None
     )
     quiet = np.all(of_q <= FREE_OF_NOISE * sizes["q"]) and np.all(of_p <= FREE_OF_NOISE * sizes["p"])
-    own = (np.concatenate([known[key] for key in keys]) for keys in (("q", "p"), ("qd", "pd")))
-    return Trust(weights, bool(quiet and np.isfinite(rate).all()), *own)
+    return Trust(weights, bool(quiet and np.isfinite(rate).all()), np.concatenate([known["q"], known["p"]]))
 
 
 def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:

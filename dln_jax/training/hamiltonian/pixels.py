@@ -137,13 +137,13 @@ def measure_pixels(
 
 def judge_frames(motions: FrameMotions, test: RodFrames) -> Verdict:
     """The verdict on predicted films by the rod's motions (q, qd) in them; a start is a pair of frames."""
-    times = motions.pairs.shape[1]
-    truth = Motions(test.t[:times], test.q[:, :times, None], test.qd[:, :times, None])
-    q, qd = physical_states(motions.pairs)
-    turns = 2 * np.pi * np.round((truth.q[..., 0] - q) / (2 * np.pi))
-    size = np.array([np.std(test.q), np.std(test.qd)])
-    predicted = Motions(truth.t, (q + turns)[..., None], qd[..., None])
-    return judge_motions([predicted], [truth], size=size, bounded=np.array([False, True]), fitted=2)
+    # Angles in images are known up to turns.
+    predicted, truth = (
+        Motions(test.t[:-1], np.sin(q)[..., None], qd[..., None])
+        for q, qd in (physical_states(motions.pairs), (test.q[:, :-1], test.qd[:, :-1]))
+    )
+    size = np.array([truth.q.std(), truth.p.std()])
+    return judge_motions([predicted], [truth], size=size, bounded=np.ones(2, bool), fitted=2)
 
 
 def figures_of(seen: dict[str, SeenFrames], data: FrameSplit) -> dict[str, Callable[[Path], None]]:

@@ -13,7 +13,7 @@ from dln_jax.figures.phase_space import Field
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.metrics.latency import one_step
-from dln_jax.metrics.verdict import NOISE, Verdict, held_out, judge_motions
+from dln_jax.metrics.verdict import Verdict, judge_motions
 from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, samples_fitted, units_of
 from dln_jax.training.hamiltonian.stages import in_velocities
 from dln_jax.training.hamiltonian.tasks import Problem
@@ -59,23 +59,20 @@ def units_of_judgement(problem: Problem) -> dict[str, Any]:
     }
 
 
-def rates_unexplained(problem: Problem, trained: Trained, rates: Field) -> np.ndarray | None:
-    """Shares of the variance of measured rates that the model leaves unexplained at test states, above their noise.
+def rates_unexplained(problem: Problem, trained: Trained, rates: Field) -> np.ndarray:
+    """Shares of the variance of measured rates that the model leaves unexplained at test states.
 
-    `None` if no rate was measured, because the noise of estimated rates is unknown.
+    The noise of estimated rates is unknown, and velocities are states of models in velocities: these do not count.
     """
-    data, d = problem.held_out, problem.needs.degrees_of_freedom
-    # Velocities are states of such models, so that only accelerations tell something.
-    told = ("pd",) if in_velocities(problem, trained.description) else ("qd", "pd")
-    keys = [] if data is None else [key for key in told if key not in data.estimated]
-    if data is None or not keys:
-        return None
-    known = dict(zip(("qd", "pd"), rates(data.q, column(data, "p")), strict=True))
-    model, true = (np.concatenate([values[key] for key in keys], axis=1) for values in (known, data._asdict()))
-    noise = np.zeros(2 * d) if problem.trust is None else problem.trust.rate_noise
-    noise = np.concatenate([noise[:d] if key == "qd" else noise[d:] for key in keys])
-    errors = held_out(model, true, noise=noise)
-    return np.maximum(errors.error - NOISE * noise**2, 0.0) / errors.unit
+    data = problem.held_out
+    if data is None:
+        return np.zeros(1)
+    told = [key not in data.estimated for key in ("qd", "pd")]
+    told[0] &= not in_velocities(problem, trained.description)
+    known = np.repeat(told, problem.needs.degrees_of_freedom)
+    sides = rates(data.q, column(data, "p")), (data.qd, column(data, "pd"))
+    model, true = (np.concatenate(side, axis=1)[:, known] for side in sides)
+    return np.mean((model - true) ** 2, axis=0) / np.var(true, axis=0) if known.any() else np.zeros(1)
 
 
 def figures_of(problem: Problem, name: str, seen: Seen, trained: Trained) -> dict[str, Callable[[Path], None]]:

@@ -49,8 +49,7 @@ def judged(
     rows = ~peaks.any(axis=1) if robust else np.ones(len(test.t), bool)
     noise = case.filtered_noise if case.noise is None else case.noise
     noise = torque_noise(case.sets.train) if noise is None else noise
-    known = {"noise": noise, "file": torques["file"][rows], "trajectory": test.trajectory[rows]}
-    errors = held_out(torques[kept][rows], test.tau[rows], **known)
+    errors = held_out(torques[kept][rows], test.tau[rows], noise=noise, file=torques["file"][rows])
     verdicts = [judge(errors, case.names), existing(solution, torques, kept, test.tau)]
     mine = parameters_of(solution.theta, case.known)
     still = np.zeros_like(test.q)

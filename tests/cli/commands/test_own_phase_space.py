@@ -57,7 +57,7 @@ def test_noise_that_nobody_measured_is_none(files):
     problem = problem_of(MEASURED, data=files / "coarse.npz", stated=Stated(SLIDING))
     assert problem.trust is not None and not problem.trust.noise.any()
     known = units_of_judgement(problem)
-    assert known["measured"].tolist() == [True, False] and not known["noise"].any()
+    assert known["measured"].tolist() == [True, False] and not np.any(known["noise"])
     noisy = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
     np.testing.assert_allclose(units_of_judgement(noisy)["noise"], 0.1, rtol=0.15)
 
