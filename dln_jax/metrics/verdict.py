@@ -221,7 +221,7 @@ def judge_motions(
     true, states = (
         [np.concatenate([m.q, m.p], axis=2)[..., counts] for m in motions] for motions in (truth, predicted)
     )
-    mean = np.mean(np.concatenate([each.reshape(-1, len(size)) for each in true]), axis=0)
+    mean = np.mean(np.concatenate([exact.reshape(-1, len(size)) for exact in true]), axis=0)
     errors, escaped = [], []
     for exact, model in zip(true, states, strict=True):
         farthest = RANGE * np.maximum(np.abs(exact).max(axis=(0, 1)), size)
@@ -230,8 +230,8 @@ def judge_motions(
         quarter = quarter_period(exact, bounded)
         guesses = model, mean, *free_motions(exact, joints, fitted=fitted, quarter=quarter)
         with np.errstate(over="ignore", invalid="ignore"):
-            off = [((each - exact) / size)[:, fitted : fitted + 4 * quarter] for each in guesses]
-            errors.append([np.mean(each**2, axis=(1, 2)) for each in off])
+            off = [((guess - exact) / size)[:, fitted : fitted + 4 * quarter] for guess in guesses]
+            errors.append([np.mean(error**2, axis=(1, 2)) for error in off])
     if any(escaped):
         many = f"{sum(escaped)} of {len(escaped)} predicted test motions"
         return Verdict("refused", f"{many} grow beyond {RANGE:g} times the range of the data", remedy)
