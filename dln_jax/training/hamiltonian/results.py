@@ -67,9 +67,9 @@ def rates_unexplained(problem: Problem, trained: Trained, rates: Field) -> np.nd
     data = problem.held_out
     if data is None:
         return np.zeros(1)
-    told = [key not in data.estimated for key in ("qd", "pd")]
-    told[0] &= not in_velocities(problem, trained.description)
-    known = np.repeat(told, problem.needs.degrees_of_freedom)
+    informative = [key not in data.estimated for key in ("qd", "pd")]
+    informative[0] &= not in_velocities(problem, trained.description)
+    known = np.repeat(informative, problem.needs.degrees_of_freedom)
     sides = rates(data.q, column(data, "p")), (data.qd, column(data, "pd"))
     model, true = (np.concatenate(side, axis=1)[:, known] for side in sides)
     return np.mean((model - true) ** 2, axis=0) / np.var(true, axis=0) if known.any() else np.zeros(1)
