@@ -29,7 +29,7 @@ from dln_jax.data.arrays import FOLDER, load_file, numeric, unread_line
 from dln_jax.data.schema_keys import KEYS, OPTIONAL, RATES
 from dln_jax.data.stated_facts import scaled, with_chosen, with_times
 from dln_jax.data.stated_needs import needs_from_text
-from dln_jax.data.trajectory_times import require_increasing_time, time_derivative, trajectory_names
+from dln_jax.data.trajectory_times import require_increasing_time, time_derivative, trajectory_names, unwrapped
 from dln_jax.files import is_file, is_folder, writing
 from dln_jax.types import InputError, Needs
 
@@ -152,6 +152,13 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     trajectory, label = trajectory_names(arrays, samples)
     require_increasing_time(t, trajectory, label)
 
+    needs = needs_from_text(str(arrays["needs"])) if "needs" in arrays else None
+    if needs is not None and needs.degrees_of_freedom != q.shape[1]:
+        raise InputError(
+            f"needs states {needs.degrees_of_freedom} joints, but q has {q.shape[1]} columns; make them agree"
+        )
+    turning = ["revolute"] * q.shape[1] if needs is None else needs.joints
+    q, wraps = unwrapped(q, trajectory, np.array(turning) == "revolute")
     checked = {"q": q} | {key: numeric(arrays, key, q.shape) for key in (*RATES, *OPTIONAL) if key in arrays}
     estimated = tuple(key for key in (*RATES, "tau") if key not in arrays)
     for key, source in zip(RATES, ("q", "qd"), strict=True):
@@ -160,15 +167,10 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     checked.setdefault("tau", np.zeros_like(q))
     if arrays.get("temperature") is not None:
         checked["temperature"] = _temperature(arrays, q.shape)
-    needs = needs_from_text(str(arrays["needs"])) if "needs" in arrays else None
-    if needs is not None and needs.degrees_of_freedom != q.shape[1]:
-        raise InputError(
-            f"needs states {needs.degrees_of_freedom} joints, but q has {q.shape[1]} columns; make them agree"
-        )
     names = _joint_names(arrays["joint_names"], q.shape[1]) if "joint_names" in arrays else None
     return Trajectories(
         t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=estimated,
-        remarks=(*unread_line(arrays), *arrays.get("remarks", ())), **checked,
+        remarks=(*unread_line(arrays), *arrays.get("remarks", ()), *wraps), **checked,
     )  # fmt: skip
 
 

@@ -9,6 +9,8 @@ from dln_jax.types import InputError
 
 LARGEST_INDEX = 2**53
 """float64 is exact for integers up to this one."""
+LONG = np.pi / 4
+"""rad: usual steps of angles are shorter."""
 
 
 def trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -45,6 +47,27 @@ def require_increasing_time(t: np.ndarray, trajectory: np.ndarray, label: np.nda
             f"t does not increase at sample {sample} of trajectory '{label[trajectory[sample]]}'; sort the samples by "
             "time, and number recordings that follow one another in a column 'trajectory'"
         )
+
+
+def unwrapped(q: np.ndarray, trajectory: np.ndarray, revolute: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Angles without the jumps by 2 pi of sensors that wrap, and remarks on them.
+
+    A joint is left alone if a step beside its jumps, or more than one in a hundred, is long: turns could be motions.
+
+    Args:
+        q: [N, d].
+        trajectory: index of every sample's trajectory [N].
+        revolute: joints that turn [d].
+    """
+    ends = np.flatnonzero(np.diff(trajectory)) + 1
+    straight = np.concatenate([np.unwrap(part, axis=0) for part in np.split(q, ends)])
+    turned, step = (np.abs(np.delete(np.diff(x, axis=0), ends - 1, axis=0)) for x in (straight - q, straight))
+    jumps, far = turned > 1, step > LONG
+    wraps = revolute & jumps.any(axis=0) & ~(jumps & far).any(axis=0) & (far.sum(axis=0) < len(far) / 100)
+    if not wraps.any():
+        return q, []
+    columns = ", ".join(str(joint + 1) for joint in np.flatnonzero(wraps))
+    return np.where(wraps, straight, q), [f"angles in column {columns} of q wrap by 2 pi and are unwrapped"]
 
 
 def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *, name: str) -> np.ndarray:
