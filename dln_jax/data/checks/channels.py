@@ -155,12 +155,14 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
     moves = np.abs(np.diff(channel))
     moving = moves[same & (moves > 1e-9 * size)]
     typical = np.median(moving) if len(moving) else np.inf
+    # A smooth extreme in steps is entered and left by one step, however slow the motion is.
+    abrupt = max(ABRUPT * typical, 1.5 * float(step_of(channel[:, None])[0]))
     count = 0
     for extreme in (channel.max(), channel.min()):
         at = np.abs(channel - extreme) <= 1e-9 * size
         edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0]))
         for first, last in edges.reshape(-1, 2):
             beside = [place for place in (first - 1, last - 1) if 0 <= place < len(moves) and same[place]]
-            if last - first >= RUN and any(moves[place] > ABRUPT * typical for place in beside):
+            if last - first >= RUN and any(moves[place] > abrupt for place in beside):
                 count += last - first
     return count / len(channel)
