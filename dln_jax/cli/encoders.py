@@ -17,6 +17,8 @@ from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.types import InputError, Needs, require_once
 
 AUTO = "auto"
+NO_GRAVITY = "no-gravity"
+"""Check for torques from which a robot's controller has subtracted gravity."""
 NOISY = "raw-differences"
 """Check for rates whose differences are dominated by the noise of q."""
 FILTERED = (
@@ -56,10 +58,11 @@ def prepare_log(
     *,
     robot: Robot | None = None,
     without: Collection[str] = (),
-) -> tuple[Smoothed | None, list[str], tuple[str, ...]]:
+) -> tuple[Smoothed | None, list[str], tuple[str, ...], Robot | None]:
     """Checks a log and filters it: as --cutoff states, else if its rates are missing and the noise of q matters.
 
-    Returns the filtered log or `None`, lines for the user, and the faults that no filter repairs.
+    Returns the filtered log or `None`, lines for the user, the faults that no filter repairs, and the robot, without
+    gravity if tau holds none.
 
     Args:
         options: options of the command.
@@ -92,7 +95,10 @@ def prepare_log(
         settled.discard(NOISY)
     findings = [finding for finding in findings if finding.check not in settled]
     lines = [*lines, *preparation(data, filtered), *_lines(options, path, findings)]
-    return filtered, lines, tuple(finding.observation for finding in findings if finding.severity != "note")
+    if robot is not None and any(finding.check == NO_GRAVITY for finding in findings):
+        robot = robot._replace(tree=robot.tree._replace(gravity=np.zeros(3)))
+    faults = [finding for finding in findings if finding.severity != "note" and finding.check != NO_GRAVITY]
+    return filtered, lines, tuple(finding.observation for finding in faults), robot
 
 
 def preparation(data: Trajectories, filtered: Smoothed | None) -> list[str]:
@@ -154,7 +160,8 @@ def _lines(options: Checked, path: Path | None, findings: Sequence[Finding]) -> 
     if errors and not options.accept_log:
         raise InputError(f"{path}: {'; also '.join(errors)}; or go on with --accept-log ({more} says more)")
     lines = [f"warning: {finding.observation}; {finding.remedy}" for finding in findings if finding.severity == "error"]
-    return [*lines, *(finding.line for finding in findings if finding.severity != "error"), f"{more} says more"]
+    lines += [finding.line for finding in findings if finding.severity != "error"]
+    return [*lines, f"{more} says more"]
 
 
 def _hertz(text: str) -> float:

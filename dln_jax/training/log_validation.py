@@ -40,10 +40,11 @@ def validate(options: Any) -> None:
 
 def for_robot(recording: Recording, names: Sequence[str]) -> Recording:
     """The recording with the robot's joints, if their names match; else unchanged, which the checks then report."""
-    if not names or set(names) == set(recording.names) or recording.data.joint_names is None:
+    own = recording.data.joint_names
+    if not names or own is None or set(names) == set(own):
         return recording
     with contextlib.suppress(InputError):
-        return recording._replace(data=with_joints(recording.data, names), names=tuple(names))
+        return recording._replace(data=with_joints(recording.data, names))
     return recording
 
 

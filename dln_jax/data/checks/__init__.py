@@ -1,7 +1,7 @@
 """Log validation: findings about a log before it is used for learning, one line each with a remedy.
 
-`quick(data, robot)` looks at few torques and is run by commands that train; `examine(recording, robot)` is the full
-examination that `check_data` prints.
+`quick(data, robot)` is run by commands that train; `examine(recording, robot)` is the same with the results behind it,
+which `check_data` prints.
 """
 
 from dln_jax.data.checks.findings import Finding, by_severity

@@ -8,8 +8,9 @@ and kernels that are products over the coordinates, the torques d/dt dT/dqd - dT
 closed-form covariance (the construction of Giacomuzzo et al., arXiv 2310.06585). The prior contains every tree of rigid
 bodies with revolute joints. Most arms are chains with columns ordered from base to tip: the energy of a body then
 depends on the joints below it only, and its kinetic energy not on the first joint. Such energies have weights of their
-own, so few samples suffice for chains, and the general energies remain for all other robots. Each joint adds its own
-friction: viscous, dry on two scales, and an offset.
+own, so few samples suffice for chains, and the general energies remain for all other robots. Forces A(q) qd with an
+antisymmetric A, as of magnetic fields and flywheels, belong to no T - V and have a covariance of their own. Each joint
+adds its own friction: viscous, dry on two scales, and an offset.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,14 +58,40 @@ class _Kernel(NamedTuple):
 
 
 def any_energy(joints: tuple[str, ...]) -> Build:
-    """Prior without a robot: torques of an arbitrary kinetic and potential energy, and friction."""
+    """Prior without a robot: torques of an arbitrary kinetic and potential energy, gyroscopic forces and friction."""
 
     def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
         del gravity  # any
-        parts = [part for pair in covariances(states, states, joints, sizes_of(states[2], tau)) for part in pair]
-        return Prior(np.zeros(tau.size), parts, friction(states[1]))
+        sizes = sizes_of(states[2], tau)
+        pairs = covariances(states, states, joints, sizes)
+        parts = [pair.kinetic for pair in pairs] + [pair.potential for pair in pairs]
+
+        def inertias(pushed: States, rows: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]:
+            shared = [rows @ pair.kinetic for pair in covariances(pushed, states, joints, sizes)]
+            own = [rows @ pair.kinetic @ rows.T for pair in covariances(pushed, pushed, joints, sizes)]
+            return np.zeros(len(rows)), shared, own, 0
+
+        parts += gyroscopic(states, joints, sizes)
+        return Prior(np.zeros(tau.size), parts, friction(states[1]), inertias)
 
     return build
+
+
+def gyroscopic(states: States, joints: Sequence[str], sizes: np.ndarray) -> list[Float[np.ndarray, "a a"]]:
+    """Covariance of A(q) qd for an antisymmetric A with A_ij ~ GP(0, sizes_i sizes_j k(q, q')); none for one joint.
+
+    cov(tau_i, tau_j') = k sizes_i ([i = j] sum over l of sizes_l qd_l qd_l' - sizes_j qd_j qd_i').
+    """
+    q, qd, _ = states
+    n, d = q.shape
+    if d == 1:
+        return []
+    strength, ranges = np.full(d, STRONGEST), np.maximum(np.ptp(q, axis=0), 1e-9)
+    kernel = _kernel(q, q, joints, strength, ranges, 1).value
+    along = kernel * ((qd * sizes) @ qd.T)
+    across = kernel[..., None, None] * qd[:, None, None, :] * qd[None, :, :, None] * np.outer(sizes, sizes)
+    both = along[..., None, None] * np.diag(sizes) - across
+    return [both.transpose(0, 2, 1, 3).reshape(n * d, n * d)]
 
 
 def sizes_of(qdd: np.ndarray, tau: np.ndarray) -> np.ndarray:

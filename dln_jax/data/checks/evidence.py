@@ -5,7 +5,7 @@ maximise the likelihood (minorisation-maximisation: Zhou et al., arXiv 1509.0742
 probability of every block of time conditional on all others, so a fault counts only if it shows in most of the log.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,10 @@ class Prior(NamedTuple):
     parts: list[Float[np.ndarray, "a a"]]
     """Covariances, to be weighted."""
     columns: list[Float[np.ndarray, "a k"]]
-    """Factors C of further covariances C Cᵀ, to be weighted."""
+    """Factors C of further covariances C Cᵀ, to be weighted; the last d are friction, joint by joint."""
+    inertias: Callable[..., tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]]
+    """(states q, qd and qdd [m, d], R [d, m d]) -> R times the inertial torques at these states: mean [d], and lists of
+    covariances with the torques [d, n d] and with themselves [d, d], for the weights from a place on."""
 
 
 class Explanation(NamedTuple):
@@ -49,7 +52,11 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
     sizes = np.maximum(tau.var(axis=0), 1e-12 * tau.var(axis=0).max())
     y, noise = tau.ravel() - prior.mean, np.tile(sizes, n)
     square = np.ix_(few, few)
-    some = Prior(prior.mean[few], [part[square] for part in prior.parts], [columns[few] for columns in prior.columns])
+    some = prior._replace(
+        mean=prior.mean[few],
+        parts=[part[square] for part in prior.parts],
+        columns=[columns[few] for columns in prior.columns],
+    )
     weights = _likeliest(some, y[few], noise[few], d, iterations)
     inverse = _inverse(_covariance(prior, weights, noise, d))
     pull = inverse @ y

@@ -3,6 +3,9 @@
 A hypothesis is accepted if it predicts left-out blocks of time much better than the log as recorded, in nearly all
 blocks. Without a robot, the torques have the prior of an arbitrary energy with friction (`energies`), valid for arms
 of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the next.
+
+Priors are Gaussian, so they also hold impossible robots. A repair that needs negative inertia or friction that drives
+is none, and joints whose inertia is negative beyond doubt have torques of the wrong sign.
 """
 
 import functools
@@ -15,7 +18,7 @@ from jaxtyping import Float
 
 from dln_jax.data.checks import evidence
 from dln_jax.data.checks.derivatives import away_from_ends, vertex
-from dln_jax.data.checks.energies import SCALES, Build, Parts, States, covariances, sizes_of
+from dln_jax.data.checks.energies import SCALES, Build, States
 from dln_jax.data.checks.evidence import Explanation, Prior
 from dln_jax.data.schema import Trajectories
 
@@ -28,6 +31,8 @@ BETTER = 0.8
 all joints, since its parameters couple them; without one it is that of the joints whose torques change."""
 LESS_LATE = 0.95
 """The same for a delay."""
+EXPLAINED = 0.02
+"""Signs and order of torques are right if less than this fraction of each one's variance is unexplained as recorded."""
 LATE = 0.2
 """Smallest delay reported, in samples."""
 MOST_FAULTS = 3
@@ -36,7 +41,8 @@ SCANNED, ROUGHLY, CANDIDATES = 250, 3, 2
 INERTIAS = 8
 """Number of configurations for testing the sign of the inertias."""
 NEGATIVE = -5.0
-"""Inertias are negative if their sum over joints is below this many standard deviations."""
+"""An inertia, the sum of them over joints, or the power lost to friction is negative if it is below this many standard
+deviations."""
 
 
 class Log(NamedTuple):
@@ -120,7 +126,7 @@ def examine_torques(
     *,
     farthest: int,
     equations: int,
-    ambiguous: bool,
+    alone: bool = False,
     faults: bool = True,
     others: Callable[[Log], list[Log]] = lambda _: [],
 ) -> Torques | None:
@@ -131,8 +137,7 @@ def examine_torques(
         build: makes the prior.
         farthest: largest delay tried, in samples.
         equations: number n d of equations used.
-        ambiguous: whether the prior fits any robot. It then allows negative inertias, so the common sign of all torques
-            is tested too, and couples joints so weakly that a fault is judged by the joints it concerns.
+        alone: whether the prior couples joints so weakly that a fault is judged by the joints it concerns.
         others: proposes further faults, as repaired logs.
     """
     d = data.degrees_of_freedom
@@ -145,13 +150,15 @@ def examine_torques(
     first = now = _explained(log, build)
     loss, likely = _late(log, build, now, farthest)
     for _ in range(MOST_FAULTS if faults else 0):
-        better = _better(log, build, now, farthest, others, alone=ambiguous)
+        better = _better(log, build, now, farthest, others, alone=alone)
         if better is None:
             break
         log, now = better
-    if ambiguous and _inertias(log, now) < NEGATIVE:
-        log = log._replace(signs=-log.signs)
-    return Torques(first, log, now, np.arange(-farthest, farthest + 1.0), loss, likely, *_friction(log, build, now))
+    if faults:
+        log, now = _with_positive_inertias(log, build, now)
+    return Torques(
+        first, log, now, np.arange(-farthest, farthest + 1.0), loss, likely, *_friction(log, build, now)[:-1]
+    )
 
 
 def _explained(log: Log, build: Build) -> Explanation:
@@ -187,12 +194,20 @@ def _better(
     better: list[tuple[Log, Explanation]] = []
     for trial in trials:
         explained = _explained(trial, build)
+        if not np.array_equal(trial.signs, log.signs):
+            # Turning one torque or all those coupled to it explains a log alike.
+            trial, explained = _with_positive_inertias(trial, build, explained)
         limit = LESS_LATE if trial.delay != log.delay else BETTER
         concerned = (trial.signs != log.signs) | (np.array(trial.order) != np.array(log.order))
+        if concerned.any() and now.unexplained.mean(axis=0)[concerned].max() < EXPLAINED:
+            continue
         if not alone or not concerned.any():  # a delay, the clock and the base concern all joints
             concerned = np.ones(d, bool)
         if decisive(now, explained, limit, concerned):
             better.append((trial, explained))
+    if better:
+        credible = ~_impossible(log, build, now)
+        better = [(trial, then) for trial, then in better if not np.any(_impossible(trial, build, then) & credible)]
     return max(better, key=lambda pair: pair[1].densities.sum(), default=None)
 
 
@@ -226,33 +241,40 @@ def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndar
     )
 
 
-def _inertias(log: Log, now: Explanation) -> float:
-    """Sum over joints of the mean inertia divided by its standard deviation, over the square root of their number."""
-    tau, (q, qd, qdd) = log.torques(), log.states()
-    n, d = q.shape
-    chosen = q[np.linspace(0, n - 1, INERTIAS).astype(int)]
-    total, sizes = 0.0, sizes_of(qdd, tau)
-    joints = ("revolute",) * d if log.data.needs is None else log.data.needs.joints
-    for joint in range(d):
-        push = np.zeros_like(chosen)
-        push[:, joint] = 1.0
-        pushed = (chosen, np.zeros_like(chosen), push)
-        with_log = _kinetic(now, covariances(pushed, (q, qd, qdd), joints, sizes))
-        alone = _kinetic(now, covariances(pushed, pushed, joints, sizes))
-        mean_with = with_log.reshape(INERTIAS, d, -1)[:, joint].mean(axis=0)
-        variance = alone.reshape(INERTIAS, d, INERTIAS, d)[:, joint, :, joint].mean()
-        variance = max(float(variance - mean_with @ now.inverse @ mean_with), 1e-12 * float(variance))
-        total += float(mean_with @ now.pull) / np.sqrt(variance)
-    return total / np.sqrt(d)
+def _with_positive_inertias(log: Log, build: Build, now: Explanation) -> tuple[Log, Explanation]:
+    """The log with the signs of torques changed where inertias are negative beyond doubt, if that fits as well."""
+    inertias = _inertias(log, build, now)
+    if min(*inertias, inertias.sum() / np.sqrt(len(inertias))) >= NEGATIVE:
+        return log, now
+    # Friction shows the sign of joints with little inertia.
+    wrong = inertias + _friction(log, build, now)[-1] < 0
+    trial = log._replace(signs=np.where(wrong, -log.signs, log.signs))
+    explained = _explained(trial, build)
+    return (trial, explained) if explained.densities.sum() > now.densities.sum() - DECISIVE else (log, now)
 
 
-def _kinetic(now: Explanation, parts: list[Parts]) -> np.ndarray:
-    """Covariance of the torques of all kinetic energies, by their weights."""
-    return np.add.reduce([weight * part.kinetic for weight, part in zip(now.weights[::2], parts, strict=False)])
+def _impossible(log: Log, build: Build, now: Explanation) -> np.ndarray:
+    """Joints [d] with a negative inertia or friction that drives them."""
+    return np.minimum(_inertias(log, build, now), _friction(log, build, now)[-1]) < NEGATIVE
+
+
+def _inertias(log: Log, build: Build, now: Explanation) -> Float[np.ndarray, " d"]:
+    """Mean inertia of every joint divided by its standard deviation."""
+    states = log.states()
+    d = len(log.order)
+    q = np.repeat(states[0][np.linspace(0, len(states[0]) - 1, INERTIAS).astype(int)], d, axis=0)
+    pushed = q, np.zeros_like(q), np.tile(np.eye(d), (INERTIAS, 1))
+    diagonal = np.tile(np.eye(d * d)[:: d + 1], INERTIAS) / INERTIAS
+    mean, shared, own, first = build(states, log.torques(), log.gravity).inertias(pushed, diagonal)
+    weights = now.weights[first : first + len(own)]
+    with_log, alone = (np.tensordot(weights, np.array(parts), 1) for parts in (shared, own))
+    known = alone - with_log @ now.inverse @ with_log.T
+    return (mean + with_log @ now.pull) / np.sqrt(np.maximum(np.diag(known), 1e-12 * np.diag(alone) + 1e-300))
 
 
 def _friction(log: Log, build: Build, now: Explanation) -> tuple[np.ndarray, ...]:
-    """Viscous and dry friction, the error of the latter, its velocity scale, and torques of friction and noise only."""
+    """Viscous and dry friction, the error of the latter, its velocity scale, torques of friction and noise only, and
+    the power lost in standard deviations."""
     tau, (_, qd, _) = log.torques(), log.states()
     n, d = tau.shape
     prior = build(log.states(), tau, log.gravity)
@@ -266,6 +288,8 @@ def _friction(log: Log, build: Build, now: Explanation) -> tuple[np.ndarray, ...
         rest[:, joint] += (columns @ own).reshape(n, d)[:, joint]
         spread = weight * np.eye(len(own)) - weight**2 * columns.T @ now.inverse @ columns
         dry = np.r_[0.0, np.ones(len(SCALES)), 0.0]
-        numbers.append([own[0] / typical[joint], own @ dry, np.sqrt(max(dry @ spread @ dry, 0.0))])
-    viscous, coulomb, error = np.array(numbers).T
-    return viscous, coulomb, error, SCALES[0] * typical, rest
+        lost = qd[:, joint] @ columns[joint::d]
+        numbers.append([own[0] / typical[joint], own @ dry, *(np.sqrt(max(x @ spread @ x, 0.0)) for x in (dry, lost))])
+        numbers[-1][-1] = own @ lost / max(numbers[-1][-1], 1e-300)
+    viscous, coulomb, error, power = np.array(numbers).T
+    return viscous, coulomb, error, SCALES[0] * typical, rest, power

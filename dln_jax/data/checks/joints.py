@@ -80,7 +80,7 @@ def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) 
 
 
 def _unexplained(data: Trajectories, joints: tuple[str, ...]) -> float | None:
-    torques = examine_torques(data, any_energy(joints), farthest=0, equations=FEWER, ambiguous=False, faults=False)
+    torques = examine_torques(data, any_energy(joints), farthest=0, equations=FEWER, faults=False)
     return None if torques is None else float(torques.explanation.unexplained.mean())
 
 
@@ -115,7 +115,7 @@ def better_order(
 ) -> list[Finding]:
     """Searches for a joint order that explains the torques much better: two joints exchanged, all reversed or rotated.
 
-    `samples` are q, qd, qdd and tau [n, d], `friction` the friction columns [d, n, 3].
+    `samples` are q, qd, qdd and tau [n, d], `friction` the columns of friction and rotors [d, n, k].
     """
     q, qd, qdd, tau = samples
     d = q.shape[1]
@@ -125,7 +125,8 @@ def better_order(
         shares = []
         for place, joint in enumerate(order):
             columns, torque = np.column_stack([there[:, place], friction[joint]]), tau[:, joint]
-            left = torque - columns @ np.linalg.lstsq(columns, torque, rcond=1e-10)[0]
+            factors = np.linalg.lstsq(columns, torque, rcond=1e-10)[0]
+            left = torque - columns @ factors * (factors[0] > 0)  # torques of the other sign are impossible
             shares.append(left.var() / max(torque.var(), np.finfo(float).tiny))
         return float(np.mean(shares))
 

@@ -31,6 +31,8 @@ GEAR = 5.0
 measured on the other side of the gear."""
 TILTED = 4.0
 """Larger angles between the data's gravity and the description's, in degrees, are tested as a tilt."""
+HELD = 0.3
+"""Torques with a smaller fraction of the tree's gravity, and inertial forces of a credible size, may hold none."""
 PACE = 0.03
 """A wrong clock is tested if the log ratio of the speeds that the robot and t imply is larger."""
 LENGTH = 0.1
@@ -39,6 +41,8 @@ ILL = 1000.0
 """Noise dominates the parameters if the condition of the scaled regressor is larger."""
 RANK = 1e-7
 """Singular values below this fraction of the largest count as undetermined."""
+LEFT = 1e-5
+"""A joint whose friction and rotor leave less than this fraction of its torque says nothing of units."""
 FRICTION_SCALE = 0.05
 """Smoothing velocity of dry friction, relative to the typical velocity of the joint."""
 
@@ -97,18 +101,23 @@ def against_tree(
     still = np.zeros_like(q)
     weight = [phi(q, still, still, axis) @ theta for axis in np.eye(3)]
     forces = np.stack([phi(q, qd, qdd, np.zeros(3)) @ theta, *weight, tau], axis=2) / sizes[:, None]
-    rows = _without_friction(forces, friction)
+    # Files of robots rarely hold the rotors' inertia, so it is no evidence for wrong units, clocks or orders.
+    rubbing = np.concatenate([friction, qdd.T[..., None]], axis=2)
+    rows = _without(forces, rubbing)
     scale, correlation = _by_joint(rows, down)
-    estimate = _gravity(rows[varies], down)
+    inertial, *estimate = _gravity(rows[varies], down)
+    estimate = np.array(estimate)
     torques = examine_torques(
-        data, near_tree(phi, theta, down), farthest=farthest, equations=equations, ambiguous=False,
-        others=lambda log: _mounted(log, estimate, down) + (_paced(log, rows, down) if varies.all() else []),
+        data, near_tree(phi, theta, down, tree.joints), farthest=farthest, equations=equations,
+        others=lambda log: [
+            *_mounted(log, inertial, estimate, down), *(_paced(log, inertial, estimate, down) if varies.all() else [])
+        ],
     )  # fmt: skip
     if torques is not None:
         findings += check_torques(data, torques, friction_stated=True, with_robot=True) + _base_and_clock(torques, down)
-    if not any(finding.check in ("order", "tree-sign", "gravity", "clock") for finding in findings):
+    if not any(finding.check in ("order", "tree-sign", "gravity", "no-gravity", "clock") for finding in findings):
         # A column order that differs from the robot's changes the size of torques too, so it is tested before gears.
-        findings += better_order(phi, theta, down, samples, friction) or _gears(scale, correlation)
+        findings += better_order(phi, theta, down, samples, rubbing) or _gears(scale, correlation)
     return OnTree(findings, scale, correlation, estimate, rank, parameters, condition, torques)
 
 
@@ -140,37 +149,52 @@ def _program(parents: tuple[int, ...], joints: tuple[JointKind, ...], axes: tupl
     return jax.jit(batch, compiler_options=quick_compilation())
 
 
-def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray) -> Build:
-    """Prior of the torques of a tree with parameters near those of its file, and friction."""
+def near_tree(
+    phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray, joints: tuple[JointKind, ...]
+) -> Build:
+    """Prior of the torques of a tree with bodies near those of its file, any rotors, gyroscopic forces and friction."""
     d = len(theta) // 11
     bodies = np.abs(theta[: 10 * d]).reshape(d, 10)
     mass = np.maximum(bodies[:, :1], 1e-3 * bodies[:, :1].max())
     # If the file is wrong by a body's own mass, its centre of mass and inertia are off by these amounts.
     spread = np.hstack([mass, mass * LENGTH * np.ones((1, 3)), mass * LENGTH**2 * np.ones((1, 6))])
-    sizes = np.concatenate([np.maximum(bodies, spread).ravel(), np.full(d, float(spread[:, 4].max()))])
+    sizes = np.maximum(bodies, spread).ravel()
 
     def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
+        scales = energies.sizes_of(states[2], tau)
+
+        def weighted(columns: np.ndarray) -> list[np.ndarray]:
+            return [columns[:, : 10 * d] * sizes, columns[:, 10 * d :] * scales]
+
+        def inertias(pushed: States, rows: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]:
+            columns = rows @ phi(*pushed, np.zeros(3)).reshape(rows.shape[1], -1)
+            parts = weighted(columns)
+            shared = [part @ of_log.T for part, of_log in zip(parts, own, strict=True)]
+            return columns @ theta, shared, [part @ part.T for part in parts], len(turning)
+
         columns = phi(*states, down if gravity is None else gravity).reshape(tau.size, -1)
-        return Prior(columns @ theta, [], [columns * sizes, *energies.friction(states[1])])
+        own = weighted(columns)
+        turning = energies.gyroscopic(states, joints, scales)
+        return Prior(columns @ theta, turning, [*own, *energies.friction(states[1])], inertias)
 
     return build
 
 
-def _mounted(log: Log, estimate: np.ndarray, down: np.ndarray) -> list[Log]:
-    """The log of a robot with its base turned as the data suggest."""
-    length = float(np.linalg.norm(estimate))
-    if log.gravity is not None or not length > 0 or _angle(estimate, down) < TILTED:
+def _mounted(log: Log, inertial: float, estimate: np.ndarray, down: np.ndarray) -> list[Log]:
+    """The log without gravity, or of a robot with its base turned, as the data suggest."""
+    length, stated = float(np.linalg.norm(estimate)), float(np.linalg.norm(down))
+    if log.gravity is not None:
         return []
-    return [log._replace(gravity=estimate * np.linalg.norm(down) / length)]
+    if length < HELD * stated and 1 / GEAR < inertial < GEAR:
+        return [log._replace(gravity=np.zeros(3))]
+    tilted = length > 0 and _angle(estimate, down) >= TILTED
+    return [log._replace(gravity=estimate * stated / length)] if tilted else []
 
 
-def _paced(log: Log, rows: np.ndarray, down: np.ndarray) -> list[Log]:
+def _paced(log: Log, inertial: float, estimate: np.ndarray, down: np.ndarray) -> list[Log]:
     """The log at the speed that the inertial forces imply; they scale with the square of the speed."""
-    if log.speed != 1.0:
-        return []
-    columns = np.stack([rows[..., 0], rows[..., 1:4] @ down], axis=-1).reshape(-1, 2)
-    inertial, weight = np.linalg.lstsq(columns, rows[..., 4].ravel(), rcond=1e-10)[0]
-    if not (inertial > 0 and weight > 0):
+    weight = estimate @ down / max(down @ down, 1e-300)
+    if log.speed != 1.0 or log.gravity is not None or not (inertial > 0 and weight > HELD):
         return []
     speed = float(np.sqrt(inertial / weight))
     return [] if abs(np.log(speed)) < PACE else [log._replace(speed=speed)]
@@ -178,6 +202,9 @@ def _paced(log: Log, rows: np.ndarray, down: np.ndarray) -> list[Log]:
 
 def _base_and_clock(torques: Torques, down: np.ndarray) -> list[Finding]:
     gravity, speed = torques.log.gravity, torques.log.speed
+    if gravity is not None and not gravity.any():
+        observation = f"tau holds no gravity ({torques.gain}): the robot's driver removes it"
+        return [Finding("warning", "no-gravity", observation, "models are fitted without gravity; add it to commands")]
     if gravity is not None:
         estimate = "(" + ", ".join(f"{number:.1f}" for number in np.round(gravity, 1) + 0.0) + ")"
         observation = f"gravity is tilted by {_angle(gravity, down):.0f} degrees"
@@ -219,13 +246,13 @@ def _determined(
     return solution.rank, weighted.shape[1], solution.condition
 
 
-def _without_friction(forces: np.ndarray, friction: np.ndarray) -> np.ndarray:
-    """Part of the forces [n, d, 5] that friction does not explain, joint by joint [d, n, 5].
+def _without(forces: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Part of the forces [n, d, 5] that these columns [d, n, k] do not explain, joint by joint [d, n, 5].
 
     The forces are inertial with Coriolis, gravity of 1 m/s² along each axis, and measured, all divided by the standard
     deviation of the joint's torque.
     """
-    basis = np.linalg.qr(friction)[0]
+    basis = np.linalg.qr(columns)[0]
     forces = forces.swapaxes(0, 1)
     return forces - basis @ (basis.swapaxes(1, 2) @ forces)
 
@@ -241,18 +268,18 @@ def _gears(scale: np.ndarray, correlation: np.ndarray) -> list[Finding]:
 
 
 def _by_joint(rows: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scale and correlation of measured torques relative to the tree's, without friction."""
+    """Scale and correlation of measured torques relative to the tree's, without friction and rotors."""
     tree, measured = rows[..., 0] + rows[..., 1:4] @ down, rows[..., 4]
     product, *sizes = (np.sum(x * y, axis=1) for x, y in ((tree, measured), (tree, tree), (measured, measured)))
-    known = np.minimum(*sizes) > 0
+    known = np.minimum(*sizes) > LEFT**2 * rows.shape[1]
     scale = np.divide(product, sizes[0], out=np.full(len(rows), np.nan), where=known)
     correlation = np.divide(product, np.sqrt(sizes[0] * sizes[1]), out=np.zeros(len(rows)), where=known)
     return scale, correlation
 
 
 def _gravity(rows: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """The gravity that explains the torques of all joints best, with inertial forces scaled freely."""
+    """The scale of inertial forces and the gravity [3] that explain the torques of all joints best."""
     if not len(rows) or not np.any(down):
-        return np.full(3, np.nan)
+        return np.full(4, np.nan)
     rows = rows.reshape(-1, 5)
-    return least_squares.solve(rows[:, :4], rows[:, 4], rank_tolerance=1e-6, negligible=1e-9).x[1:]
+    return least_squares.solve(rows[:, :4], rows[:, 4], rank_tolerance=1e-6, negligible=1e-9).x

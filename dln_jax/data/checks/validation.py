@@ -22,13 +22,11 @@ from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
 
-FARTHEST = 0.1
+FARTHEST = 0.25
 """s: largest delay between q and tau tested; at most `MOST_SHIFTS` samples."""
 MOST_SHIFTS = 20
-EQUATIONS = 1000
-"""Number of torques, over all joints, used to search for faults."""
-FEWER, FEWER_EACH = 300, 100
-"""Smaller numbers for `quick`: the minimum over all joints, and the number per joint."""
+EQUATIONS, EACH = 300, 100
+"""Number of torques used to search for faults: the minimum over all joints, and the number per joint."""
 BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
 """Without a robot, torques are not examined if one of these findings is present."""
 WIDTH = 10
@@ -37,11 +35,9 @@ ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates ar
 
 
 class Recording(NamedTuple):
-    """Trajectories in order of time, with joint names and findings on repairs."""
+    """Trajectories in order of time, with findings on repairs."""
 
     data: Trajectories
-    names: tuple[str, ...] = ()
-    """Joint names, if the file has `joint_names`."""
     repaired: tuple[Finding, ...] = ()
 
 
@@ -77,11 +73,8 @@ def read(path: str | Path, **stated: Any) -> Recording:
 
 
 def _from_arrays(arrays: dict[str, Any]) -> Recording:
-    names = np.ravel(arrays.get("joint_names", np.array([], str)))
-    kept, repaired = _in_order({key: array for key, array in arrays.items() if key != "joint_names"})
-    if names.dtype.kind in "US" and np.shape(kept.get("q"))[1:] == (len(set(names.tolist())),) == names.shape:
-        kept["joint_names"] = names
-    return Recording(schema.from_arrays(kept), tuple(map(str, names)), repaired)
+    kept, repaired = _in_order(arrays)
+    return Recording(schema.from_arrays(kept), repaired)
 
 
 def _in_order(arrays: dict[str, Any]) -> tuple[dict[str, Any], tuple[Finding, ...]]:
@@ -102,29 +95,30 @@ def _in_order(arrays: dict[str, Any]) -> tuple[dict[str, Any], tuple[Finding, ..
         return arrays, ()
     kept = order[~same]
     return {
-        key: np.asarray(array)[kept] if np.shape(array)[:1] == (len(t),) and key != "label" else array
+        key: np.asarray(array)[kept]
+        if np.shape(array)[:1] == (len(t),) and key not in ("label", "joint_names")
+        else array
         for key, array in arrays.items()
     }, repaired
 
 
 def quick(data: Trajectories, robot: Robot | None = None) -> list[Finding]:
-    """Runs all checks on fewer torques, in a few seconds; arguments as for `examine`."""
-    equations = max(FEWER, FEWER_EACH * data.degrees_of_freedom)
-    return examine(as_recording(data), robot, equations=equations).findings
+    """Findings of all checks, most severe first; arguments as for `examine`."""
+    return examine(as_recording(data), robot).findings
 
 
-def examine(recording: Recording, robot: Robot | None = None, *, equations: int = EQUATIONS) -> Examination:
+def examine(recording: Recording, robot: Robot | None = None) -> Examination:
     """Runs all checks.
 
     Args:
         robot: description of the robot, with the joints of the data.
-        equations: number of torques, over all joints, used to search for faults of sign, order and delay.
 
     Raises:
         InputError: the robot and the data have different numbers of joints.
     """
     data = recording.data
     d, needs = data.degrees_of_freedom, data.needs
+    equations = max(EQUATIONS, EACH * d)
     joints = needs.joints if needs is not None else ("revolute",) * d
     if robot is not None:
         joints = robot.tree.joints
@@ -155,14 +149,15 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
         sound = not any(finding.severity == "error" or finding.check in BLINDING for finding in findings)
         if driven and sound and robot is None and _one_motor_per_joint(data):
             regression = examine_torques(
-                even.data, any_energy(tuple(joints)), farthest=farthest, equations=equations, ambiguous=True
+                even.data, any_energy(tuple(joints)), farthest=farthest, equations=equations, alone=True
             )
         if regression is not None:
             stated = needs is not None and bool(needs.friction or needs.joint_friction)
             findings += check_torques(even.data, regression, friction_stated=stated, with_robot=False)
     if robot is not None:
         samples = data if even is None else even.data
-        on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest, equations=equations)
+        names = () if data.joint_names is None else tuple(map(str, data.joint_names))
+        on_tree = against_tree(samples, robot, names, driven=driven, farthest=farthest, equations=equations)
         findings += on_tree.findings
     return Examination(by_severity(findings), recording, even, regression, on_tree, step_of(recording.data.q))
 

@@ -91,7 +91,7 @@ def read(options: Options) -> Recorded:
     rubbing = bool(needs.friction or needs.joint_friction)
     cut = labels is None and (parts or len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES)
     settled = ("repeated-motions", *["split"] * bool(cut), *["friction"] * rubbing)
-    filtered, lines, causes = prepare_log(options, data, options.data, robot=robot, without=settled)
+    filtered, lines, causes, robot = prepare_log(options, data, options.data, robot=robot, without=settled)
     if filtered is not None:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)

@@ -100,7 +100,8 @@ def prepare(options: Options) -> Case:
         raise InputError(
             f"{options.data}: the data have no tau; identification takes measured torques{without_torque(data)}"
         )
-    filtered, lines, causes = prepare_log(options, data, options.data, robot=robot, without=SETTLED)
+    filtered, lines, causes, measured = prepare_log(options, data, options.data, robot=robot, without=SETTLED)
+    robot = measured or robot
     require_positive_if_given(options, ["window"])
     light = None
     if options.by == "torques":

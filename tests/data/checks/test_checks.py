@@ -240,7 +240,7 @@ def test_a_clean_log_suits_its_robot(clean):
 @pytest.mark.parametrize("name", TREE_FAULTS)
 def test_a_fault_against_the_robot_is_found(clean, name):
     plant, robot, check, joints = TREE_FAULTS[name]
-    examined = examine(as_recording(schema.from_arrays(plant(dict(clean)))), robot, equations=300)
+    examined = examine(as_recording(schema.from_arrays(plant(dict(clean)))), robot)
     findings = examined.findings
     found = [finding for finding in findings if finding.check == check]
     assert found, f"{check} is not among {[finding.line for finding in findings]}"
@@ -270,7 +270,7 @@ def test_times_out_of_order_or_double_are_repaired_and_said(clean, tmp_path):
     assert np.array_equal(recording.data.q, clean["q"]) and recording.data.needs == Needs(
         ("revolute",) * 3, friction=True
     )
-    findings = examine(recording, arm(), equations=300).findings
+    findings = examine(recording, arm()).findings
     assert {"time-order", "time-double", "order"} <= {finding.check for finding in findings}
 
 
@@ -302,7 +302,7 @@ def test_exact_logs_of_planar_arms_have_no_false_sign_or_delay(seed):
     states = [x[0] for x in (q, qd, qdd)]
     tau = np.asarray(jax.jit(jax.vmap(lambda *state: trees.newton_euler(tree, *state)))(*states)) + 0.2 * states[1]
     data = schema.from_arrays({"t": t, "q": states[0], "tau": tau, "trajectory": np.zeros(SAMPLES, int)})
-    examined = examine(as_recording(data), equations=300)
+    examined = examine(as_recording(data))
     assert [finding.check for finding in examined.findings if finding.severity != "note"] == ["split"]
     assert abs(examined.regression.likely_delay) < 0.05
     assert examined.regression.viscous == pytest.approx(np.full(3, 0.2), abs=0.02)
@@ -310,11 +310,11 @@ def test_exact_logs_of_planar_arms_have_no_false_sign_or_delay(seed):
 
 def test_a_tilt_and_a_wrong_clock_are_found_with_the_robot(clean):
     tilted = arm(gravity=(9.81 * np.sin(0.3), 0.0, -9.81 * np.cos(0.3)))
-    on_tree = examine(as_recording(schema.from_arrays(clean)), tilted, equations=300).on_tree
+    on_tree = examine(as_recording(schema.from_arrays(clean)), tilted).on_tree
     assert [finding.check for finding in on_tree.findings] == ["gravity"]
     assert "17 degrees" in on_tree.findings[0].observation
     slow = without(["qd"], {**clean, "t": 1.25 * clean["t"]})
-    on_tree = examine(as_recording(schema.from_arrays(slow)), arm(), equations=300).on_tree
+    on_tree = examine(as_recording(schema.from_arrays(slow)), arm()).on_tree
     assert [finding.check for finding in on_tree.findings] == ["clock"]
     assert on_tree.torques.log.speed == pytest.approx(1.25, rel=0.03)
 
