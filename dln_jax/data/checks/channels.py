@@ -155,8 +155,8 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
     moves = np.abs(np.diff(channel))
     moving = moves[same & (moves > 1e-9 * size)]
     typical = np.median(moving) if len(moving) else np.inf
-    # A smooth extreme in steps is entered and left by one step, however slow the motion is.
-    abrupt = max(ABRUPT * typical, 1.5 * float(step_of(channel[:, None])[0]))
+    # A smooth extreme of at least RUN samples in steps is entered and left by fewer than three steps.
+    abrupt = max(ABRUPT * typical, 3 * float(step_of(channel[:, None])[0]))
     count = 0
     for extreme in (channel.max(), channel.min()):
         at = np.abs(channel - extreme) <= 1e-9 * size

@@ -124,6 +124,7 @@ def test_steps_of_a_smooth_extreme_are_not_cut_off():
     step = 2 * np.pi / 4096
     assert flat_share(np.round(angle / step) * step, same) == 0
     assert flat_share(np.round(torque / 0.5) * 0.5, same) == 0
+    assert flat_share(np.round(4 * np.sin(12 * t + 0.03) / 0.05) * 0.05, same) == 0
     clipped = np.clip(torque, -3.0, 3.0)
     assert flat_share(clipped, same) > 0.1
-    assert flat_share(np.round(clipped / 0.05) * 0.05, same) > 0.1
+    assert flat_share(np.round(clipped / 0.01) * 0.01, same) > 0.1
