@@ -230,8 +230,8 @@ def _wraps(log: Recorded) -> bool:
     data = schema.from_arrays(log.arrays)
     jumps = np.abs(np.diff(log.arrays["q"], axis=0))[np.diff(data.trajectory) == 0].max() > np.pi
     smooth = np.abs(np.diff(data.q, axis=0))[np.diff(data.trajectory) == 0].max() < np.pi
-    said = any("wrap by 2 pi" in remark for remark in data.remarks)
-    return smooth and said == jumps and not any(finding.severity == "error" for finding in checked(log, log.arrays))
+    remarked = any("wrap by 2 pi" in remark for remark in data.remarks)
+    return smooth and remarked == jumps and not any(finding.severity == "error" for finding in checked(log, log.arrays))
 
 
 FAULTS: Mapping[str, tuple[tuple[str, ...], str, Callable[[Recorded], bool]]] = {
@@ -246,9 +246,9 @@ FAULTS: Mapping[str, tuple[tuple[str, ...], str, Callable[[Recorded], bool]]] = 
 
 def faulty(few: bool, *, kind: str) -> Findings:
     """The share of faulty logs whose fault is detected and named."""
-    robots, recording, found = FAULTS[kind]
+    robots, recording, detect = FAULTS[kind]
     count = QUICK if few else FAULTY
     logs = [record(robots[number % len(robots)], recording, 7 + 100 * number) for number in range(count)]
-    hits = [found(log) for log in logs]
+    hits = [detect(log) for log in logs]
     words = f"{sum(hits)} of {count} logs of {', '.join(robots)}"
     return Findings([expect(f"log-checks/{kind}", "found", words, np.mean(hits), FOUND, at_least=True)])
