@@ -170,7 +170,7 @@ def _hertz(text: str) -> float:
     except ValueError:
         value = -1.0
     if not value > 0:
-        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, auto or inf")
+        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, or auto (inf: no filter)")
     return value
 
 
