@@ -94,7 +94,7 @@ PACKAGES = {
     "metrics": "Numbers about a model",
     "figures": "Figures",
     "control": "Control",
-    "export": "Real time, C and StableHLO",
+    "export": "Real time and C",
     "softbody": "Soft bodies",
     "locomotion": "Locomotion",
     "nn": "Networks",

@@ -20,6 +20,7 @@ from dln_jax.export.c.load import STANDARD, compile_c, load_c
 from dln_jax.export.c.source import export_c, source_files
 from dln_jax.export.exports import described, read_export, write_exports
 from dln_jax.types import InputError
+from dln_jax.zoo.parameter_files import save_tree
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
@@ -356,3 +357,12 @@ def test_integers_have_the_types_of_stdint(tmp_path):
     for kind in types:
         assert f"const {np.dtype(kind).name}_t " in header
     assert not re.search(r"\bunsigned |long long", (tmp_path / "model.c").read_text())
+
+
+def test_an_export_never_takes_the_place_of_a_runs_file(tmp_path):
+    save_tree(tmp_path, "model", {"w": np.ones(2)}, {})
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for name in ("model.json", "config.json", "inverse.c"):
+        with pytest.raises(InputError, match="is the folder of a run"):
+            write_exports(tmp_path, {name: b"{}"}, overwrite=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
