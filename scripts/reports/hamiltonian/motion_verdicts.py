@@ -31,7 +31,7 @@ class Plant(NamedTuple):
 
     rates: Rates
     """t and (q, p) of all coordinates -> their rates."""
-    start: Callable[[np.random.Generator], Sequence[float]]
+    start: Callable[[np.random.Generator], Sequence[float] | np.ndarray]
     t: np.ndarray
     joints: tuple[str, ...]
     good: bool

@@ -52,7 +52,7 @@ class Recorded(NamedTuple):
 
 
 def _body(mass: float, centre: Any, size: float) -> np.ndarray:
-    return trees.inertial_parameters(mass, np.array(centre), mass * size**2 * np.diag([1.0, 1.2, 0.8]))
+    return np.asarray(trees.inertial_parameters(mass, np.array(centre), mass * size**2 * np.diag([1.0, 1.2, 0.8])))
 
 
 @functools.cache
