@@ -170,7 +170,10 @@ _WRAPPED = {
     "neg": "({c})(0 - ({u}){{0}})",
     "integer_abs": "({{0}} < 0 ? ({c})(0 - ({u}){{0}}) : {{0}})",
 }
-_ON_INTEGERS = {"max": "({0} > {1} ? {0} : {1})", "min": "({0} < {1} ? {0} : {1})"}
+# With a plus, because compilers warn about comparing bits, some of them constant, with a number that they never equal.
+_ON_INTEGERS = {
+    "max": "({0} > {1} ? {0} : {1})", "min": "({0} < {1} ? {0} : {1})", "and": "(+({0} & {1}))", "or": "(+({0} | {1}))",
+}  # fmt: skip
 _ON_UNSIGNED = {"neg": "(0 - {0})", "integer_abs": "{0}"}
 
 

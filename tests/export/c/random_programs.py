@@ -128,10 +128,18 @@ ON_TWO_REAL = (
     lambda a, b: jnp.fmod(a, 1.5 + jnp.abs(b)), lambda a, b: jnp.where(a > b, a, 2 * b),
     lambda a, b: jnp.nextafter(1 + a * a, b),  # never subnormal, which XLA takes for zero
 )  # fmt: skip
+
+
+def _not_zero_over_zero(a, b):
+    """The dividend a, not 0 where b is: XLA takes x / x for 1 where it sees that both are x."""
+    return a | (b == 0).astype(a.dtype)
+
+
 ON_TWO_WHOLE = (
-    jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, lax.div, lax.rem, jnp.bitwise_and, jnp.bitwise_or,
-    jnp.bitwise_xor, jnp.floor_divide, jnp.remainder, lax.shift_left, lax.shift_right_logical,
-    lax.shift_right_arithmetic,
+    jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, lambda a, b: lax.div(_not_zero_over_zero(a, b), b),
+    lax.rem, jnp.bitwise_and, jnp.bitwise_or, jnp.bitwise_xor,
+    lambda a, b: jnp.floor_divide(_not_zero_over_zero(a, b), b), jnp.remainder, lax.shift_left,
+    lax.shift_right_logical, lax.shift_right_arithmetic,
 )  # fmt: skip
 ON_WHOLE = (  # without squares, which XLA takes for positive though they wrap around
     jnp.negative, jnp.abs, jnp.sign, jnp.bitwise_not, lambda x: x * (x + 1), lambda x: x**3, lambda x: x & 1,

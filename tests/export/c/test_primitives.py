@@ -146,6 +146,9 @@ ON_INTEGERS = {
         *((a > 0) == (b > 0), (a > 0) < (b > 0), (a > 0) >= (b > 0), jnp.maximum(a > 0, b > 0), (a > 0).max()),
         *((a > 0) <= True, jnp.dot(a > 0, b > 0), jnp.sum(a > 0), jnp.where(a > 0, 2, 3) != 0),
     ),
+    "bits_that_differ": lambda a, b: (
+        *((a[:3] | -2) != 0, (b[:3] & 3) == 4, (a[:3].astype(jnp.uint32) | 3) == 4, ((a | -2).astype(bool) & (b > 0))),
+    ),
     "bitwise_reductions": lambda a, b: (
         *(jnp.bitwise_or.reduce(a), jnp.bitwise_and.reduce(b[1:4]), jnp.bitwise_xor.reduce(a)),
         jnp.bitwise_xor.reduce(b[:2]),
