@@ -82,7 +82,7 @@ def pair(random: np.random.Generator) -> np.ndarray:
     return np.concatenate([x, -x, v, -v])
 
 
-def times(seconds: float, rate: float) -> np.ndarray:
+def times(seconds: float | int, rate: float | int) -> np.ndarray:
     """Times of a recording."""
     return np.arange(0.0, seconds, 1 / rate)
 
