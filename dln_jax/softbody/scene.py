@@ -34,8 +34,8 @@ class Params(NamedTuple):
     @property
     def poses(self) -> dict[str, Pose]:
         """Poses of rigid surfaces by the names of their terms."""
-        found = {name: getattr(of, "pose", None) for name, of in self.terms.items()}
-        return {name: pose for name, pose in found.items() if pose is not None}
+        places = {name: getattr(of, "pose", None) for name, of in self.terms.items()}
+        return {name: pose for name, pose in places.items() if pose is not None}
 
 
 class SoftScene(NamedTuple):

@@ -349,7 +349,7 @@ def test_mistakes_of_actuators_say_what_is_wrong():
         (lambda: tendon_of_tension(mesh, [0, 0], tension=1.0), "points 0 and 1 of the path coincide"),
         (lambda: tendon_of_tension(mesh, [0], tension=1.0), "the path has 1 points"),
         (lambda: fibres(mesh, (0.0, 0.0), strength=1.0), "direction of fibres 0 has no length"),
-        (lambda: fibres(mesh, (0.0, 1.0), strength=1.0, elements=[99]), "in element 99; expected elements 0..15"),
+        (lambda: fibres(mesh, (0.0, 1.0), strength=1.0, elements=[99]), "names element 99; expected 0..15"),
         (lambda: traction(mesh, outer_surface(mesh), [1.0, 2.0, 3.0]), "has shape .3.; expected .2."),
         (lambda: gas(mesh, inner_surface(mesh), pressure=-2e5), "absolute pressure"),
     ):
