@@ -243,6 +243,8 @@ def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndar
 
 def _with_positive_inertias(log: Log, build: Build, now: Explanation) -> tuple[Log, Explanation]:
     """The log with the signs of torques changed where inertias are negative beyond doubt, if that fits as well."""
+    if not np.ptp(log.torques(), axis=0).all():  # a torque that stays the same contradicts every robot
+        return log, now
     inertias = _inertias(log, build, now)
     if min(*inertias, inertias.sum() / np.sqrt(len(inertias))) >= NEGATIVE:
         return log, now

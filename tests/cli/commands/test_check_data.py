@@ -88,7 +88,7 @@ def prepared(path, **options):
 
 
 def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_missing(log, tmp_path):
-    filtered, lines, causes = prepared(log)
+    filtered, lines, causes, _ = prepared(log)
     assert filtered is not None and 3 < filtered.cutoff < 30 and causes == () and "q is filtered" in lines[0]
     arrays = dict(np.load(log))
     np.savez(tmp_path / "rates.npz", **arrays, qd=np.gradient(arrays["q"], axis=0), qdd=arrays["tau"])
@@ -96,7 +96,7 @@ def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_mis
     t = arrays["t"]
     exact = {**arrays, "q": np.sin(5 * t + arrays["trajectory"])[:, None]}
     np.savez(tmp_path / "exact.npz", **exact)
-    filtered, lines, causes = prepared(tmp_path / "exact.npz")
+    filtered, lines, causes, _ = prepared(tmp_path / "exact.npz")
     assert filtered is None and not any("filtered" in line for line in lines), "exact data are used as they are"
     short = {key: value if key == "label" else value[arrays["t"] < 0.05] for key, value in arrays.items()}
     np.savez(tmp_path / "short.npz", **short)
@@ -106,7 +106,7 @@ def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_mis
 def test_faults_of_a_log_that_no_filter_repairs_are_causes_of_a_verdict(log, tmp_path):
     arrays = dict(np.load(log))
     np.savez(tmp_path / "degrees.npz", **{**arrays, "q": np.degrees(arrays["q"])})
-    _, _, causes = prepared(tmp_path / "degrees.npz", accept_log=True)
+    _, _, causes, _ = prepared(tmp_path / "degrees.npz", accept_log=True)
     assert any("q of joint 1 goes to" in cause for cause in causes)
 
 

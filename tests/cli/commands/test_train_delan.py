@@ -331,7 +331,7 @@ def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(workplace, ca
     with pytest.raises(SystemExit) as stop:
         command(train_delan, *options, "--out", "noise")
     said = capsys.readouterr()
-    assert stop.value.code == 1 and said.err.startswith("error: the fit is refused: the torque of joint 1 is predicted no")
+    assert stop.value.code == 1 and said.err.startswith("error: the fit is refused: the torque of joint 1 is predicted")
     assert json.loads((workplace / "noise" / "metrics.json").read_text())["verdict"] == 2
 
 
