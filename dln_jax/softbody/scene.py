@@ -120,14 +120,14 @@ def make_scene(
     names = [term.name for term in terms] + [contact.name for contact in contacts]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"two terms are named '{twice[0]}'; give each its own name")
-    for term in terms:
-        if len(wrong := np.argwhere((term.indices < 0) | (term.indices >= n))):
-            vertex = term.indices[tuple(wrong[0])]
-            raise InputError(f"term '{term.name}', element {wrong[0][0]} names vertex {vertex}; expected 0..{n - 1}")
     for part in (*terms, *contacts):
         of = mesh if part.mesh is None else part.mesh
         if not (np.array_equal(of.vertices, mesh.vertices) and np.array_equal(of.nodes, mesh.nodes)):
             raise InputError(f"'{part.name}' was made for another mesh; make it from the mesh of the scene")
+    for term in terms:
+        if len(wrong := np.argwhere((term.indices < 0) | (term.indices >= n))):
+            vertex = term.indices[tuple(wrong[0])]
+            raise InputError(f"term '{term.name}', element {wrong[0][0]} names vertex {vertex}; expected 0..{n - 1}")
     held = indices_of("held", held, n)
     if len(held) == n:
         raise InputError(f"held names all {n} vertices; expected at least one that is free to move")

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_gradient, pair_hessian
-from dln_jax.softbody.contact.candidates import Group, boxes, group, meetings, pairs_near, places
+from dln_jax.softbody.contact.candidates import Group, boxes, group, meeting, meetings, pairs_near, places
 from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact_parameters
 from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
 from dln_jax.softbody.contact.distances import EDGE_EDGE, POINT_TRIANGLE, squared_distance, stencil_of
@@ -89,7 +89,7 @@ def body_contact(
     kinds = _kinds(surface, mesh.vertices, distance)
     capacity = max(_AT_ONCE // 2, 2 * len(surface.vertices) if capacity is None else capacity)
     parameters = contact_parameters(distance, stiffness, friction)
-    _require_gaps(mesh, kinds, capacity, parameters)
+    _require_gaps(mesh, kinds, distance)
     barrier = MovingEnergy(
         elements=partial(_near, kinds, capacity),
         describe=partial(_described, surface),
@@ -132,17 +132,22 @@ def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, .
     return kind(vertices, triangles, POINT_TRIANGLE), kind(edges, edges, EDGE_EDGE)
 
 
-def _require_gaps(mesh: Mesh, kinds: tuple[Kind, ...], capacity: int, parameters: ContactParameters) -> None:
+def _require_gaps(mesh: Mesh, kinds: tuple[Kind, ...], distance: float) -> None:
     """Refuses a distance within which a body pushes itself apart in its rest shape; other bodies may be as close."""
-    rest = jnp.asarray(mesh.vertices)
-    corners, near, _ = _near(kinds, capacity, rest, jnp.zeros_like(rest), (parameters, rest))
-    body = components_of_vertices(mesh)
-    own = corners[near.used & (body[corners[:, 0]] == body[corners[:, -1]])]
-    if len(own):
-        raise InputError(
-            f"the vertices {own[0].tolist()} of one body are closer in its rest shape than the distance within which "
-            "contact acts, and would push it open; give a smaller distance"
-        )
+    rest, body = jnp.asarray(mesh.vertices), components_of_vertices(mesh)
+    for kind in kinds:
+        one, other = meeting(*(boxes(of, rest, rest, distance / 2) for of in (kind.one, kind.other))).T
+        one, other = kind.one.primitives[one], kind.other.primitives[other]
+        apart = ~(one[:, :, None] == other[:, None, :]).any(axis=(1, 2)) & (body[one[:, 0]] == body[other[:, 0]])
+        corners = np.concatenate([one, other], axis=1)[apart]
+        if not len(corners):
+            continue
+        near = jax.jit(jax.vmap(squared_distance, (0, None)))(rest[corners], kind.number) < distance**2
+        if near.any():
+            raise InputError(
+                f"the vertices {corners[np.argmax(near)].tolist()} of one body are closer in its rest shape than the "
+                "distance within which contact acts, and would push it open; give a smaller distance"
+            )
 
 
 def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: Any) -> Elements:

@@ -7,6 +7,7 @@ import pytest
 
 from dln_jax.softbody import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, make_scene, make_step
 from dln_jax.softbody.contact import box, capsule, half_space, heightfield, obstacle_contact, sphere
+from dln_jax.softbody.contact.barrier import barrier
 from dln_jax.softbody.contact.obstacles import Obstacle
 from dln_jax.softbody.mesh import make_mesh
 from dln_jax.softbody.terms import elastic, gravity, plane_contact, stable_neo_hookean
@@ -48,7 +49,11 @@ def carried(stepper, params_at, **start):
 
 @pytest.fixture(scope="module")
 def belt():
-    mesh = block()
+    # The block starts at the gap where the barrier carries its weight.
+    gaps = np.linspace(1e-3, 5e-3, 1000)
+    slopes = np.asarray(barrier(jnp.asarray(gaps**2), jnp.full(1000, 25e-6))[1])
+    pressures = -2 * gaps * slopes * NEAR["stiffness"] / NEAR["distance"] ** 3
+    mesh = block(np.interp(-1000 * 9.81 * 0.1, -pressures, gaps))
     return scene_of(mesh, contacts=[obstacle_contact(mesh, box([0.0, -0.05], [2.0, 0.05]), **NEAR)])
 
 
@@ -66,12 +71,11 @@ def travelled(belt, speed, integrator=BACKWARD_EULER, **settings):
 def test_a_belt_carries_a_block_along_by_coulombs_law(belt, integrator):
     way, (v, converged) = jax.jit(lambda: travelled(belt, SPEED, integrator))()
     assert converged.all()
-    # The block bounces without damping, so that only the mean of its friction is known.
-    assert v[25:].mean() == pytest.approx(SPEED, rel=0.05)
+    assert v[20:].mean() == pytest.approx(SPEED, rel=0.03)
     assert v.max() < 1.1 * SPEED
     # It accelerates at mu g up to the speed of the belt, which is at rest in the first step.
     sticking = SPEED / (FRICTION * 9.81)
-    assert way == pytest.approx(SPEED * ((STEPS - 1) * DT - sticking / 2), rel=0.2)
+    assert way == pytest.approx(SPEED * ((STEPS - 1) * DT - sticking / 2), rel=0.05)
 
 
 @pytest.mark.slow
@@ -82,7 +86,7 @@ def test_divided_steps_and_derivatives_take_the_motion_of_a_belt(belt):
     (more, (v, converged)), (less, _) = way(0.3 + 1e-5), way(0.3 - 1e-5)
     assert converged.all()
     assert v[-1] == pytest.approx(0.3, rel=0.01)
-    assert slope == pytest.approx((more - less) / 2e-5, rel=1e-4)
+    assert float(slope) == pytest.approx(float(more - less) / 2e-5, rel=1e-4)
 
 
 def test_a_plane_that_turns_about_the_origin_carries_a_block_along():
@@ -113,7 +117,7 @@ def test_damping_takes_the_velocity_of_a_plane():
 
         # The first step takes the plane to be at rest, before it touches the body.
         start = jnp.stack([0.0, v])
-        return carried(make_step(scene, 1e-3), params_at, x=mesh.vertices + 1e-3 * start, v=start)[0].v
+        return carried(make_step(scene, 1e-3), params_at, x=mesh.vertices - 1e-3 * start, v=start)[0].v
 
     rising, falling = jax.jit(lambda: jax.lax.map(lambda case: motion(*case), jnp.array([[1.0, 0.0], [0.0, -1.0]])))()
     np.testing.assert_allclose(rising - falling, np.broadcast_to([0.0, 1.0], (6, 2)), atol=1e-6)
@@ -129,7 +133,7 @@ def rotation(angle, axis):
 def test_points_of_obstacles_move_rigidly():
     axis = np.array([1.0, 2.0, -1.0])
     turn, shift, x = rotation(0.4, axis), np.array([0.3, -0.1, 0.2]), np.random.default_rng(0).normal(size=(5, 3))
-    mesh = make_mesh(np.eye(4, 3) + 10.0, np.array([[0, 1, 2, 3]]))
+    mesh = make_mesh(np.eye(4, 3) + np.array([20.0, -10.0, 10.0]), np.array([[0, 1, 2, 3]]))
 
     def moved(before, after):
         one, other = (obstacle_contact(mesh, obstacle, **NEAR).parameters for obstacle in (before, after))
