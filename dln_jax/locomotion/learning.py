@@ -228,7 +228,7 @@ def learn(
     identity = {"settings": {**(settings or {}), "seed": seed}}
     state = learner.start(seed)
     best, records = learner.parameters(state), []
-    if resume and has_checkpoint(directory, name):
+    if resume and directory is not None and has_checkpoint(directory, name):
         (state, best), records = _restored(directory, name, identity, (state, best))
     highest = max(map(rank, records), default=rank(None))
     before = records[-1].seconds if records else compiled.seconds

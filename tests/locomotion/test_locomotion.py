@@ -59,6 +59,8 @@ def same(one, other):
 @pytest.mark.filterwarnings("error", "ignore:.*infinity")
 def test_the_environment_passes_gymnasiums_checks(environment):
     check_env(environment, skip_render_check=True)
+    with pytest.raises(InputError, match="the options slope; this environment has none"):
+        environment.reset(options={"slope": 3.0})
 
 
 def test_reward_is_the_displacement_up_to_a_speed_less_the_posture(environment, task):
@@ -170,6 +172,8 @@ def test_a_resumed_run_continues_bit_for_bit(compiled, tmp_path):
             settings={"width": 4},
             resume=True,
         )
+    with pytest.raises(InputError, match="resume needs the directory"):
+        learn(compiled, seed=3, goal=Goal(999), resume=True)
 
 
 def test_an_interrupt_waits_for_the_checkpoint(compiled, tmp_path):

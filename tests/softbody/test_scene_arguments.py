@@ -1,5 +1,7 @@
 """Arguments that do not fit a scene are refused: none is ignored."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -64,7 +66,7 @@ def test_density_and_masses_together_are_refused():
 
 @pytest.mark.parametrize("other", [beam(0.4, 0.1, 2, 1), beam(0.4, 0.2, 4, 1), quadratic(MESH)])
 def test_parts_of_another_mesh_are_refused(other):
-    near = {"distance": 1e-3, "stiffness": 1e4}
+    near: dict[str, Any] = {"distance": 1e-3, "stiffness": 1e4}
     with pytest.raises(InputError, match="'elastic' was made for another mesh"):
         make_scene(MESH, [elastic(other, stable_neo_hookean)])
     with pytest.raises(InputError, match="'gravity' was made for another mesh"):
