@@ -6,8 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from dln_jax.cli.encoders import checked
-from dln_jax.cli.options import Checked
+from dln_jax.cli.arguments import arguments_of
+from dln_jax.cli.commands import train_delan
+from dln_jax.cli.encoders import prepare_log
 from dln_jax.data import schema
 from dln_jax.data.checks import as_recording, examine, quick
 from dln_jax.data.checks.channels import flat_share
@@ -96,11 +97,12 @@ def test_rotors_that_a_file_lacks_are_no_gears_and_no_clock():
 def test_torques_without_gravity_are_named_and_fitted_so():
     robot, lifted = arm(UPRIGHT), arm((0.0, 0.0, 0.0))
     data = schema.from_arrays(log(torques(lifted, rotors=(0.1, 0.1))))
-    lines, measured = checked(Checked(), data, Path("log.npz"), robot=robot, without=())
-    assert "tau holds no gravity" in lines[0] and "clock" not in lines[0]
+    options = arguments_of(train_delan.Arguments, data=Path("log.npz"))
+    _, lines, causes, measured = prepare_log(options, data, options.data, robot=robot)
+    assert any("tau holds no gravity" in line for line in lines) and not any("clock" in line for line in lines)
+    assert not any("gravity" in cause for cause in causes)
     assert not np.any(measured.tree.gravity) and np.array_equal(measured.tree.inertias, robot.tree.inertias)
-    lines, measured = checked(Checked(), schema.from_arrays(log(torques(robot))), Path("log.npz"), robot=robot)
-    assert measured is robot
+    assert prepare_log(options, schema.from_arrays(log(torques(robot))), options.data, robot=robot)[-1] is robot
 
 
 def test_commands_and_check_data_find_the_same():
