@@ -6,10 +6,12 @@ import pytest
 from dln_jax.data import schema
 from dln_jax.data.splits import Split
 from dln_jax.learning.objectives import CANONICAL
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.verdict import HeldOut
+from dln_jax.scenes import two_link_arm
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Task
-from dln_jax.training.dynamics.verdict import judge_torques, searched
+from dln_jax.training.dynamics.verdict import judge_fit, searched
 from dln_jax.training.identification.verdict import friction_verdict, spikes, weight_verdict
 from dln_jax.types import Needs
 
@@ -91,5 +93,6 @@ def test_hamiltonian_of_momenta_is_judged_by_torques():
     recorded = Recorded("", Split(data, data, data), None, needs, "", (), None, None, None, None, "", np.zeros(2))
     task = Task(recorded, "structured-hnn", {}, CANONICAL, None, 0, 0.0)
     for tau, level in ((-q, "good"), (q, "refused")):
-        verdict = judge_torques(task, tau, tau).verdict
-        assert verdict is not None and verdict.level == level
+        answers = {"tau": np.concatenate([tau, tau]), "qdd": np.concatenate([data.qdd, data.qdd])}
+        verdict, _ = judge_fit(task, dynamics(two_link_arm().energies), answers, [])
+        assert verdict.level == level
