@@ -1,9 +1,9 @@
-"""State estimation: Kalman filters, a moving horizon, filters in control loops, and external torques.
+"""State estimation: Kalman filters, filters in control loops, and external torques.
 
     process = mechanical(model, B, rate=500.0, band=[0.3, 1e-3], encoder_step=[2.3e-5, 3.1e-3])
     controller = with_estimate(law, extended(process), belief(x, 0.1), controls=1, measurements=2, delay=1)
 
-`extended`, `unscented` and `moving_horizon` make filters of a process. All have the same three pure functions `start`,
+`extended` and `unscented` make filters of a process. Both have the same three pure functions `start`,
 `predict` and `update`, for one state.
 """
 
@@ -18,7 +18,6 @@ from dln_jax.control.estimate.external import (
     momentum_observer,
     observed,
 )
-from dln_jax.control.estimate.horizon import Window, moving_horizon
 from dln_jax.control.estimate.loop import Estimating, filtered, with_estimate
 from dln_jax.control.estimate.process import Belief, Filter, Innovation, Process, belief, mechanical
 from dln_jax.control.estimate.tuning import Tuned, consistency, from_log, surprise, tuned
@@ -33,7 +32,6 @@ __all__ = [
     "MomentumObserver",
     "Process",
     "Tuned",
-    "Window",
     "Wrench",
     "belief",
     "consistency",
@@ -45,7 +43,6 @@ __all__ = [
     "from_log",
     "mechanical",
     "momentum_observer",
-    "moving_horizon",
     "observed",
     "surprise",
     "tuned",

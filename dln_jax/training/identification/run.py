@@ -108,13 +108,14 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     metrics, predicted = evaluate(case, solution, predict)
     if residual is not None and residual.settings:
         predicted[ADDED] = judge_residual(case, residual, metrics)
-    of_motions = []
+    of_motions, moves = [], False
     if choice is not None and case.motions is not None:
         numbers = prediction_metrics(case.model, case.known, case.motions, by_torques, solution.theta, motions)
         of_motions, metrics = motion_lines(options.by, motions, choice, numbers), metrics | numbers
+        moves = motions is not None and np.isclose(numbers["vpt_seconds"], numbers["predicted_seconds"])
     kept = ADDED if ADDED in predicted else KEPT
     torques = {name: prediction.torque for name, prediction in predicted.items()}
-    verdict, of_verdict = judged(case, solution, predict, torques, kept, robust=options.robust)
+    verdict, of_verdict = judged(case, solution, predict, torques, kept, robust=options.robust, moves=bool(moves))
     metrics |= of_verdict
     figures = figures_of(case, solution, predict, predicted[KEPT]) if options.figures else {}
     if options.uncertainty:

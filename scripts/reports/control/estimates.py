@@ -22,7 +22,7 @@ from dln_jax.control.desktop_plants import (
     model_of_plant,
     nominal_model,
 )
-from dln_jax.control.estimate import belief, extended, filtered, from_log, moving_horizon, unscented
+from dln_jax.control.estimate import belief, extended, filtered, from_log, unscented
 from dln_jax.control.estimate.process import Process
 from dln_jax.control.plants.estimators import by_differences, by_filter
 from dln_jax.control.state_space import Law, field_of, integrated, saturated
@@ -43,8 +43,6 @@ CLOSER = 0.5
 """Largest rms error of rates, as a share of that by differences."""
 LOGGED = 3.0
 """s: length of the swing-up along which rates are compared."""
-WINDOW = 10
-"""Samples in the moving horizon's window."""
 
 
 class Held(NamedTuple):
@@ -168,13 +166,7 @@ def rates(plant: DesktopPlant, model: Dynamics, process: Process, case: str) -> 
     true, by_difference, y, u = log()
     rms = lambda qd: np.sqrt(np.mean((np.asarray(qd) - np.asarray(true)) ** 2, axis=0))  # noqa: E731
     before, rows = rms(by_difference), []
-    filters = {
-        "extended": extended,
-        "unscented": unscented,
-        f"horizon-{WINDOW}": partial(
-            moving_horizon, window=WINDOW, controls=1, measurements=2, disturbances=2, iterations=2
-        ),
-    }
+    filters = {"extended": extended, "unscented": unscented}
     for key, make in filters.items():
         error = rms(jax.jit(lambda make=make: filtered(make(process), prior, y, u)[0][:, 2:])())
         for joint, value, other in zip(("driven", "pole"), error, before, strict=True):

@@ -129,7 +129,7 @@ def test_sound_log_is_good(identified):
     ("spoil", "said"),
     [
         (lambda tau: -tau, "no such robot"),
-        (lambda tau: 1e3 * tau, "times the torques of those in the robot's file; check the unit of tau"),
+        (lambda tau: 1e3 * tau, "times the tree's; check the unit of tau"),
     ],
     ids=["all-signs", "millinewton-metres"],
 )

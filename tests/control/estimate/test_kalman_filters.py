@@ -16,7 +16,6 @@ from dln_jax.control.estimate import (
     filtered,
     from_log,
     mechanical,
-    moving_horizon,
     surprise,
     tuned,
     unscented,
@@ -83,14 +82,6 @@ def test_the_covariance_converges_to_the_riccati_equation(make):
     Q = G * LINEAR.disturbance**2 @ G.T
     expected = solve_discrete_are(F.T, H.T, Q, np.diag(LINEAR.noise**2))
     np.testing.assert_allclose(memory.covariance, expected, rtol=1e-9, atol=1e-14)
-
-
-def test_a_moving_horizon_is_the_kalman_filter_while_its_window_fills_and_after():
-    y, u = linear_log(14)
-    seen = np.ones((14, 2), bool)
-    estimator = moving_horizon(LINEAR, 6, controls=1, measurements=2, disturbances=2, iterations=10)
-    x, _ = jax.jit(lambda: filtered(estimator, PRIOR, y, u, seen))()
-    np.testing.assert_allclose(x, textbook(y, u, seen), rtol=0, atol=1e-8)
 
 
 def test_the_covariance_stays_positive_with_encoders_a_million_times_better_than_the_prior():
@@ -196,5 +187,3 @@ def test_a_process_without_noise_is_refused_in_one_line():
         mechanical(model, rate=100.0, band=[0.1])
     with pytest.raises(InputError, match="deviation is"):
         belief(np.zeros(2), [0.0, 1.0])
-    with pytest.raises(InputError, match="constant deviations"):
-        moving_horizon(LINEAR._replace(disturbance=lambda x, u: x[:2]), 3, controls=1, measurements=2, disturbances=2)
