@@ -5,6 +5,7 @@ NaN, empty, swapped or half stated as no range, and a motion designed with it wo
 text of an MJCF file is read only for ranges of two zeros, which look like no range once compiled.
 """
 
+import os
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -12,14 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.files import is_file
+from dln_jax.files import is_file, is_folder
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
 
 LARGEST = 64 * 2**20
 """Largest file, bytes."""
 MOST_JOINTS = 200
-MOST_ELEMENTS = 20_000
+MOST_ELEMENTS, MOST_ATTRIBUTES = 20_000, 100
+"""Most elements of a file, and attributes of an element."""
 DEEPEST = 3 * MOST_JOINTS
 """Deepest nesting of elements: per joint, MJCF nests a body and perhaps a frame."""
 REPEATING = ("replicate", "composite", "flexcomp")
@@ -46,6 +48,8 @@ class _Elements(ET.TreeBuilder):
             raise InputError(f"its elements are nested more than {DEEPEST} deep; expected the file of a robot")
         if self.count > MOST_ELEMENTS:
             raise InputError(f"it has more than {MOST_ELEMENTS:,} elements; expected the file of one robot")
+        if len(attrs) > MOST_ATTRIBUTES:
+            raise InputError(f"<{tag:.40}> has {len(attrs):,} attributes; expected the file of a robot")
         # A composite has up to three counts; words are refused, too.
         if tag in REPEATING and not all(_number(text) <= MOST_JOINTS for text in attrs.get("count", "0").split()):
             raise InputError(f"<{tag}> repeats {attrs['count']:.20} times; expected at most {MOST_JOINTS}")
@@ -58,6 +62,20 @@ class _Elements(ET.TreeBuilder):
 
 def parsed(path: Path) -> ET.Element:
     """The root element of a URDF or MJCF file, comments included; errors as for `read_robot`."""
+    root = _root(path)
+    if root.tag not in ("robot", "mujoco"):
+        raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    for part in _with_included(path, root):
+        _require_readable(path, part)
+    # Drake and Bullet know a link "world" that no file has to define; MuJoCo does not.
+    parents = {parent.get("link") for joint in root.findall("joint") for parent in joint.findall("parent")}
+    if "world" in parents and all(link.get("name") != "world" for link in root.findall("link")):
+        root.append(ET.Element("link", name="world"))
+    return root
+
+
+def _root(path: Path) -> ET.Element:
+    """The outer element of a file, whatever it is; raises `InputError`."""
     if not is_file(path):
         raise InputError(f"{path}: no such file; give the URDF or MJCF file of a robot")
     try:
@@ -72,18 +90,11 @@ def parsed(path: Path) -> ET.Element:
     if b"<!ENTITY" in content.replace(b"\0", b""):  # in UTF-16 too
         raise InputError(f"{path}: it defines entities, which can grow without bound; expected plain XML")
     try:
-        root = ET.fromstring(content, ET.XMLParser(target=_Elements(insert_comments=True)))
+        return ET.fromstring(content, ET.XMLParser(target=_Elements(insert_comments=True)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (ET.ParseError, LookupError, ValueError) as error:  # the last two for unknown encodings
         raise InputError(f"{path}: not XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
-    if root.tag not in ("robot", "mujoco"):
-        raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
-    # Drake and Bullet know a link "world" that no file has to define; MuJoCo does not.
-    parents = {parent.get("link") for joint in root.findall("joint") for parent in joint.findall("parent")}
-    if "world" in parents and all(link.get("name") != "world" for link in root.findall("link")):
-        root.append(ET.Element("link", name="world"))
-    return root
 
 
 def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
@@ -216,13 +227,24 @@ def _number(text: str) -> float:
         return float("nan")
 
 
-def _with_included(path: Path, root: ET.Element) -> Iterator[ET.Element]:
-    """The root element and those of included or attached files; unreadable ones are skipped, as MuJoCo reports them."""
+def _with_included(path: Path, root: ET.Element, seen: Collection[Path] = ()) -> Iterator[ET.Element]:
+    """The outer element of an MJCF file and those of included or attached files; MuJoCo reports those not there."""
     yield root
+    seen = {*seen, path.resolve()}
     for part in (*root.iter("include"), *root.iter("model")):
         file = path.parent / part.get("file", "")
-        if file.is_file() and file.resolve() != path.resolve():
-            try:
-                yield from _with_included(file, ET.parse(file).getroot())
-            except (ET.ParseError, LookupError, ValueError):
-                continue
+        if is_file(file) and file.resolve() not in seen:
+            yield from _with_included(file, _root(file), seen)
+
+
+def _require_readable(path: Path, root: ET.Element) -> None:
+    """Raises `InputError` for a name of a pipe or device, which MuJoCo would wait for when it compiles the model."""
+    if root.tag == "robot":
+        return
+    compilers = list(root.iter("compiler"))
+    folders = {part.get(key, "") for part in compilers for key in ("meshdir", "texturedir", "assetdir")}
+    for part in root.iter():
+        for folder in {"", *folders}:
+            file = path.parent / folder / part.get("file", "")
+            if os.path.exists(file) and not (is_file(file) or is_folder(file)):
+                raise InputError(f"{path}: <{part.tag}> names {file}, which is no regular file; expected one")

@@ -1,5 +1,6 @@
 """Robots that MuJoCo reads move as they do in MuJoCo, and as in Pinocchio where it is installed."""
 
+import os
 import textwrap
 
 import jax
@@ -237,6 +238,9 @@ def test_inertias_that_no_body_has_are_read_as_they_are(tmp_path):
     np.testing.assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)
 
 
+ATTRIBUTES = "<mujoco><worldbody " + " ".join(f'a{k}=""' for k in range(1000)) + "/></mujoco>"
+
+
 def nested(depth):
     return "<mujoco><worldbody>" + "<body><joint/>" * depth + "</body>" * depth + "</worldbody></mujoco>"
 
@@ -261,6 +265,7 @@ MALFORMED = {
     "entities in UTF-16": ((HEADED.format("utf-16") + BOMB).encode("utf-16"), "entities"),
     "not XML": (b"\x00\xff" * 50, "not XML"),
     "nested": (nested(100_000), "nested"),
+    "many attributes": (ATTRIBUTES, "attributes"),
     "many joints": (links(3000), "elements|joints"),
     "300 joints": (links(300), "300 joints"),
     "many bodies": ('<mujoco><worldbody><replicate count="100000000"/></worldbody></mujoco>', "repeats"),
@@ -290,6 +295,18 @@ def test_a_malformed_file_is_refused_in_one_line(case, tmp_path, monkeypatch):
         read_robot(path)
     assert "\n" not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["robot.xml"]
+
+
+@pytest.mark.parametrize("name", ["include", "mesh"])
+def test_a_pipe_in_a_model_is_refused_and_not_waited_for(name, tmp_path):
+    (tmp_path / "parts").mkdir()
+    os.mkfifo(tmp_path / "parts" / "pipe.obj")
+    asset = '<compiler meshdir="parts"/><asset><mesh name="m" file="pipe.obj"/></asset>'
+    part = '<include file="parts/pipe.obj"/>' if name == "include" else asset
+    (tmp_path / "part.xml").write_text(f"<mujoco>{part}</mujoco>")
+    (tmp_path / "arm.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+    with pytest.raises(InputError, match="is no regular file"):
+        read_robot(tmp_path / "arm.xml")
 
 
 def test_a_diverging_simulation_leaves_no_log(tmp_path, monkeypatch):

@@ -72,7 +72,7 @@ class NetworkOptions(Objective, Limited, Scaled):
     activation: Unstated[ActivationName] = None
     """Activation of the hidden layers (default: tanh)."""
     steps: Unstated[int] = None
-    """Iterations (default: 150, adam 20000; for 4 joints or more 40 and 6000)."""
+    """Iterations (default: structured 150, others 400, adam 20000; for 4 joints or more 40 and 6000)."""
     seeds: int = 1
     """Number of seeds in one program; the best in cross-validation is kept."""
     folds: int = 3

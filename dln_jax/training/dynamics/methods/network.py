@@ -27,6 +27,8 @@ from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for
 
 OF_ADAM = tuple(AdamOptions.__dataclass_fields__)
+WITHOUT_STRUCTURE = 400
+"""Default number of iterations of a black box, which converges later than a structured network."""
 
 
 def plan(options: Any, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], Solver]:
@@ -50,6 +52,8 @@ def plan(options: Any, kind: str, recorded: Recorded, objective: Objective) -> t
         description["precision"] = precision = options.precision or ("f32" if optimizer == "adam" else "f64")
     settings = {name: getattr(options, name, None) for name in (*OF_ADAM, "steps", "target")}
     samples = getattr(options, "samples", None)
+    if optimizer == "gauss-newton" and not CATALOGUE[kind].properties.definite:
+        settings["steps"] = options.steps or WITHOUT_STRUCTURE
     if suited is not None:
         settings["steps"] = suited.steps if options.steps is None else options.steps
         samples = suited.samples if samples is None else samples
