@@ -1,5 +1,7 @@
 """Limits of a robot's file that are none are refused: MuJoCo would read each as a joint without limits."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -21,21 +23,20 @@ def read(folder, text, **settings):
     return read_robot(path, **settings)
 
 
-@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
 @pytest.mark.parametrize("stated", [*POSITIONS, "-2", "ten 2"])
-def test_urdf_position(tmp_path, kind, stated):
+def test_urdf_position(tmp_path, stated):
     sides = dict(zip(("lower", "upper"), stated.split(), strict=False))
     limit = " ".join(f'{side}="{value}"' for side, value in sides.items()) + ' effort="5" velocity="2"'
-    with pytest.raises(InputError, match=r"joint 'elbow' has limits of position .*; expected two finite numbers"):
-        read(tmp_path, URDF.format(kind, limit))
+    for kind in ("revolute", "prismatic"):
+        with pytest.raises(InputError, match=r"joint 'elbow' has limits of position .*; expected two finite numbers"):
+            read(tmp_path, URDF.format(kind, limit))
 
 
-@pytest.mark.parametrize("kind", ["revolute", "prismatic", "continuous"])
-@pytest.mark.parametrize("quantity", ["velocity", "effort"])
 @pytest.mark.parametrize("stated", ["nan", "-2", "fast"])
-def test_urdf_velocity_and_effort(tmp_path, kind, quantity, stated):
-    with pytest.raises(InputError, match=f"joint 'elbow' has a limit of {quantity} of '{stated}'"):
-        read(tmp_path, URDF.format(kind, f'lower="-2" upper="2" {quantity}="{stated}"'))
+def test_urdf_velocity_and_effort(tmp_path, stated):
+    for kind, quantity in itertools.product(("revolute", "prismatic", "continuous"), ("velocity", "effort")):
+        with pytest.raises(InputError, match=f"joint 'elbow' has a limit of {quantity} of '{stated}'"):
+            read(tmp_path, URDF.format(kind, f'lower="-2" upper="2" {quantity}="{stated}"'))
 
 
 def test_urdf_zero_velocity_and_effort_are_not_stated(tmp_path):
@@ -44,11 +45,11 @@ def test_urdf_zero_velocity_and_effort_are_not_stated(tmp_path):
     assert np.isinf(robot.velocity_limits).all() and np.isinf(robot.force_limits).all()
 
 
-@pytest.mark.parametrize(("attribute", "kind"), [("range", "position"), ("actuatorfrcrange", "torque")])
 @pytest.mark.parametrize("stated", POSITIONS)
-def test_mjcf(tmp_path, attribute, kind, stated):
-    with pytest.raises(InputError, match=f"joint 'elbow' has limits of {kind} {stated.split()[0]}"):
-        read(tmp_path, MJCF.format(f'{attribute}="{stated}"'))
+def test_mjcf(tmp_path, stated):
+    for attribute, kind in (("range", "position"), ("actuatorfrcrange", "torque")):
+        with pytest.raises(InputError, match=f"joint 'elbow' has limits of {kind} {stated.split()[0]}"):
+            read(tmp_path, MJCF.format(f'{attribute}="{stated}"'))
 
 
 def test_mjcf_default_class_and_included_file(tmp_path):

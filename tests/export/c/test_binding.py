@@ -51,13 +51,11 @@ def loaded(request, tmp_path_factory):
     return load_c(folder, flags=("-O0", *STRICT)), real
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
-@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int64, ">f8"])
-@pytest.mark.parametrize("k", [2.0, 2, np.float32(2), np.float64(2), np.array(2.0), jnp.array(2.0)], ids=repr)
-def test_any_real_numbers_of_the_shape_are_taken(loaded, order, dtype, k):
+@pytest.mark.parametrize("k", [2, np.float32(2), np.array(2.0), jnp.array(2.0)], ids=repr)
+def test_any_real_numbers_of_the_shape_are_taken(loaded, k):
     functions, real = loaded
-    array = np.array(MATRIX, dtype, order=order)
-    for a in (array, array.tolist(), np.repeat(array, 2, axis=1)[:, ::2]):
+    arrays = [np.array(MATRIX, dtype) for dtype in (np.float64, np.float32, np.int64, ">f8")]
+    for a in (*arrays, np.asfortranarray(MATRIX), MATRIX.tolist(), np.repeat(MATRIX, 2, axis=1)[:, ::2]):
         result = functions.matrix(a, k)
         assert result.dtype == real and result.shape == (3, 2)
         np.testing.assert_array_equal(result, 2 * MATRIX.T)
@@ -106,20 +104,20 @@ def test_threads_may_call_at_once(loaded):
         np.testing.assert_array_equal(result, a.T)
 
 
-@pytest.mark.parametrize(
-    "args, kwargs, message",
-    [
-        ((MATRIX,), {}, "matrix takes a, k; missing a required argument: 'k'$"),
-        ((MATRIX, 1.0, 2.0), {}, "matrix takes a, k; too many positional arguments$"),
-        ((MATRIX, 1.0), {"k": 1.0}, "matrix takes a, k; multiple values for argument 'k'$"),
-        ((MATRIX,), {"k": 1.0, "j": 1.0}, "matrix takes a, k; got an unexpected keyword argument 'j'$"),
-        ((MATRIX.T, 1.0), {}, r"a has shape \(3, 2\); expected \(2, 3\)"),
-        ((MATRIX, [1.0]), {}, r"k has shape \(1,\)"),
-        ((MATRIX, "1"), {}, "k has type <U1; expected real numbers"),
-        ((MATRIX + 1j, 1.0), {}, "a has type complex128"),
-        ((None, 1.0), {}, "a has type object"),
-    ],
-)
-def test_others_are_refused(loaded, args, kwargs, message):
-    with pytest.raises(InputError, match=message):
-        loaded[0].matrix(*args, **kwargs)
+REFUSED = [
+    ((MATRIX,), {}, "matrix takes a, k; missing a required argument: 'k'$"),
+    ((MATRIX, 1.0, 2.0), {}, "matrix takes a, k; too many positional arguments$"),
+    ((MATRIX, 1.0), {"k": 1.0}, "matrix takes a, k; multiple values for argument 'k'$"),
+    ((MATRIX,), {"k": 1.0, "j": 1.0}, "matrix takes a, k; got an unexpected keyword argument 'j'$"),
+    ((MATRIX.T, 1.0), {}, r"a has shape \(3, 2\); expected \(2, 3\)"),
+    ((MATRIX, [1.0]), {}, r"k has shape \(1,\)"),
+    ((MATRIX, "1"), {}, "k has type <U1; expected real numbers"),
+    ((MATRIX + 1j, 1.0), {}, "a has type complex128"),
+    ((None, 1.0), {}, "a has type object"),
+]
+
+
+def test_others_are_refused(loaded):
+    for args, kwargs, message in REFUSED:
+        with pytest.raises(InputError, match=message):
+            loaded[0].matrix(*args, **kwargs)

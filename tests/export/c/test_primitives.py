@@ -1,6 +1,5 @@
 """Each primitive, in each of its modes, gives in C what it gives in JAX, on what is not finite too."""
 
-import functools
 import shutil
 
 import jax
@@ -679,34 +678,26 @@ SINGLE = {
 """Tried in single precision too by default: both sorts of elementary functions, types, some others."""
 
 
-def pytest_generate_tests(metafunc):
-    """Draws from the cases in each precision; `--every-export` takes all of them."""
-    if "case" in metafunc.fixturenames:
-        every = metafunc.config.getoption("--every-export")
-        cases = [(kind, name) for kind in BOUND for name in CASES if every or kind == "f64" or name in SINGLE]
-        metafunc.parametrize("precision, case", cases)
-
-
-@pytest.fixture(scope="module")
-def results(pytestconfig, tmp_path_factory):
-    """By precision, what C and JAX give: all functions are exported and compiled at once."""
-    every = pytestconfig.getoption("--every-export")
-
-    @functools.cache
-    def of(precision):
-        cases = {name: pair for name, pair in CASES.items() if every or precision == "f64" or name in SINGLE}
-        got = in_c(cases, STATES, tmp_path_factory.mktemp(precision), precision=precision)
-        return got, in_jax(cases, STATES, precision=precision)
-
-    return of
-
-
 @needs_compiler
-def test_a_primitive_gives_what_it_gives_in_jax(precision, case, results):
-    got, expected = results(precision)
-    for ours, theirs in zip(got[case], expected[case], strict=True):
-        assert ours.shape == theirs.shape
-        if theirs.dtype.kind == "f":
-            np.testing.assert_allclose(ours, theirs, rtol=BOUND[precision], atol=BOUND[precision])
-        else:
-            np.testing.assert_array_equal(ours, theirs)
+@pytest.mark.parametrize("precision", BOUND)
+def test_a_primitive_gives_what_it_gives_in_jax(precision, pytestconfig, tmp_path):
+    """All are exported and compiled at once; `--every-export` takes all of them in single precision too."""
+    every = pytestconfig.getoption("--every-export") or precision == "f64"
+    cases = {name: pair for name, pair in CASES.items() if every or name in SINGLE}
+    got, expected = in_c(cases, STATES, tmp_path, precision=precision), in_jax(cases, STATES, precision=precision)
+    wrong = {}
+    for name in cases:
+        try:
+            for ours, theirs in zip(got[name], expected[name], strict=True):
+                assert_equal(ours, theirs, BOUND[precision])
+        except AssertionError as error:
+            wrong[name] = str(error)
+    assert not wrong, "\n".join(f"{name}: {error}" for name, error in wrong.items())
+
+
+def assert_equal(ours, theirs, bound):
+    assert ours.shape == theirs.shape
+    if theirs.dtype.kind == "f":
+        np.testing.assert_allclose(ours, theirs, rtol=bound, atol=bound)
+    else:
+        np.testing.assert_array_equal(ours, theirs)

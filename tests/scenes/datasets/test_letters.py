@@ -6,7 +6,6 @@ import jaxtyping
 import matplotlib
 import numpy as np
 import pytest
-from conftest import slow_among
 
 from dln_jax.scenes.datasets.letters import LETTERS, letter_path, outline
 from dln_jax.types import InputError
@@ -35,15 +34,26 @@ def motions(path, times):
     return tuple(np.asarray(values)[: len(times)] for values in compiled_motions(path.position, padded))
 
 
-OTHERS = sorted(set(LETTERS) - set("aegmsz"))  # the same steps on other shapes of the font
+@pytest.fixture(scope="module", params=["a", "m", "s", pytest.param("the others", marks=pytest.mark.slow)])
+def letters(request):
+    """Letters with their motions at SAMPLES times."""
+
+    def drawn(character):
+        path = letter_path(character)
+        times = np.linspace(0.0, path.duration, SAMPLES)
+        return character, path, times, *motions(path, times)
+
+    return [drawn(each) for each in (request.param if len(request.param) == 1 else sorted(set(LETTERS) - set("ams")))]
 
 
-@pytest.fixture(scope="module", params=slow_among(LETTERS, OTHERS.__contains__))
-def letter(request):
-    """A letter with its motion at SAMPLES times."""
-    path = letter_path(request.param)
-    times = np.linspace(0.0, path.duration, SAMPLES)
-    return request.param, path, times, *motions(path, times)
+def of_each(check):
+    """A test of a property that every letter has."""
+
+    def test(letters):
+        for letter in letters:
+            check(letter)
+
+    return test
 
 
 def junctions(path):
@@ -72,6 +82,7 @@ def distance(points, polygons):
     return np.linalg.norm(offset - part[..., None] * along, axis=-1).min(axis=1)
 
 
+@of_each
 def test_derivatives_agree_with_finite_differences(letter):
     _, path, times, _, velocity, acceleration = letter
 
@@ -88,6 +99,7 @@ def test_derivatives_agree_with_finite_differences(letter):
     assert fine[1] < coarse[1] / 8.0 and fine[1] < 5e-3
 
 
+@of_each
 def test_one_sided_values_agree_at_the_junctions(letter):
     _, path, *_ = letter
     inner = junctions(path)[1:-1]
@@ -101,6 +113,7 @@ def test_one_sided_values_agree_at_the_junctions(letter):
             np.testing.assert_allclose(left, right, rtol=0.0, atol=bound)
 
 
+@of_each
 def test_acceleration_does_not_jump(letter):
     """Halving the step halves the largest difference of neighbouring accelerations."""
     acceleration = letter[-1]
@@ -108,6 +121,7 @@ def test_acceleration_does_not_jump(letter):
     assert jumps[1] < 0.6 * jumps[0] and jumps[2] < 0.6 * jumps[1]
 
 
+@of_each
 def test_rests_at_every_junction_and_outside(letter):
     _, path, *_ = letter
     ends = np.concatenate([junctions(path), [-0.5, path.duration + 0.5]])
@@ -118,6 +132,7 @@ def test_rests_at_every_junction_and_outside(letter):
     np.testing.assert_allclose(position[-1], position[-3], atol=1e-12)
 
 
+@of_each
 def test_contours_are_closed(letter):
     character, path, *_ = letter
     corners = motions(path, junctions(path))[0]
@@ -125,6 +140,7 @@ def test_contours_are_closed(letter):
     np.testing.assert_allclose(corners[0::2], corners[1::2], rtol=0.0, atol=1e-12)
 
 
+@of_each
 def test_follows_the_outline(letter):
     character, path, times, position, *_ = letter
     polygons = placed_outline(character)
@@ -135,6 +151,7 @@ def test_follows_the_outline(letter):
     assert distance(np.concatenate(polygons), drawn).max() < 0.07 * HEIGHT
 
 
+@of_each
 def test_stays_in_the_workspace(letter):
     _, path, times, position, velocity, acceleration = letter
     assert np.all(position > [0.4, -0.15]) and np.all(position < [1.7, 1.2])
