@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.files import is_file, read_json, write_figure, write_json
+from dln_jax.files import is_file, read_json, write_json
 from dln_jax.types import InputError
 from scripts.reports.rows import Row, conditions, publish
 
@@ -20,22 +19,19 @@ REMEDY = "restore the file, or delete it to measure everything again"
 
 
 class Findings(NamedTuple):
-    """Results of a case: rows of a report, and curves for a figure."""
+    """Results of a case: rows of a report."""
 
     rows: list[Row]
-    curves: dict[str, Any] = {}  # noqa: RUF012  never written to
 
 
 class Case(NamedTuple):
-    """A measurement: its name, its function, the quantities it must return, and its figure."""
+    """A measurement: its name, its function and the quantities it must return."""
 
     name: str
     """Stable, lower case."""
     measure: Callable[[], Findings]
     quantities: Mapping[str, Collection[str]] = {}
     """Required quantities by case of the rows; stored results are checked against them."""
-    draw: Callable[[dict[str, Any]], Figure] | None = None
-    """Draws the curves."""
 
 
 class Done(NamedTuple):
@@ -62,10 +58,7 @@ def measure(
         if case.name not in results:
             results[case.name] = case.measure()
             if folder:
-                stored = {
-                    name: {"rows": [row[:3] for row in rows], "curves": curves}
-                    for name, (rows, curves) in results.items()
-                }
+                stored = {name: {"rows": [row[:3] for row in found.rows]} for name, found in results.items()}
                 write_json(folder / JOBS, stored)
         place = f"{number:{len(str(len(cases)))}d}/{len(cases)}"
         report(Done(place, case, results[case.name], time.perf_counter() - began))
@@ -73,7 +66,7 @@ def measure(
 
 
 def report_cases(options: Any, command: str, cases: Sequence[Case], **facts: Any) -> None:
-    """Body of a command: measures cases into its folder, with a line and a figure for each, and publishes all rows.
+    """Body of a command: measures cases into its folder, with a line for each, and publishes all rows.
 
     `facts`, and `quick` of the options, become conditions of the report.
     """
@@ -84,8 +77,6 @@ def report_cases(options: Any, command: str, cases: Sequence[Case], **facts: Any
             passed = f"{sum(bound)}/{len(bound)} pass  " if bound else ""
             missed = "".join(f"  {one.quantity} {one.value:.4g}" for one in done.findings.rows if one.passed is False)
             print(f"{done.place}  {done.case.name:30s} {passed}{done.seconds:.1f} s{missed}", flush=True)
-            if getattr(options, "figures", True):
-                draw(folder, done.case, done.findings)
 
         quick = {"quick": options.quick} if hasattr(options, "quick") else {}
         publish(folder, rows_in(measure(cases, show)), conditions(**facts, **quick))
@@ -118,12 +109,6 @@ def named(cases: Sequence[Case], *names: str) -> list[Case]:
 def in_subjects(cases: Sequence[Case], subjects: Sequence[str]) -> list[Case]:
     """The cases of some subjects, in the order of the subjects; a case's name begins with that of its subject."""
     return [case for subject in subjects for case in cases if case.name.split("/")[0] == subject]
-
-
-def draw(folder: Path, case: Case, findings: Findings) -> None:
-    """Writes the figure of a case, if it has one, as a PNG file named by the last part of the case's name."""
-    if case.draw is not None and findings.curves:
-        write_figure(folder / f"{case.name.split('/')[-1]}.png", case.draw(findings.curves))
 
 
 def by_case(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
@@ -171,8 +156,7 @@ def _from_json(place: str, values: Any) -> Findings:
         return math.nan if value is None else value + 0.0
 
     try:
-        rows = [Row(case, quantity, number(value)) for case, quantity, value in values["rows"]]
-        return Findings(rows, {name: [number(x) for x in points] for name, points in values["curves"].items()})
+        return Findings([Row(case, quantity, number(value)) for case, quantity, value in values["rows"]])
     except (AttributeError, KeyError, TypeError, ValueError):
-        expected = "rows of case, quantity and number, and curves of numbers"
+        expected = "rows of case, quantity and number"
         raise InputError(f"{place} holds {reprlib.repr(values)}; expected {expected}; {REMEDY}") from None

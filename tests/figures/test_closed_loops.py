@@ -13,7 +13,6 @@ from dln_jax.figures import (
     write_closed_loop_gif,
 )
 from dln_jax.types import InputError
-from scripts.reports.figures.starts import success_over_starts
 
 T = np.linspace(0, 1, 51)
 Q = np.stack([0.1 * np.sin(3 * T), np.pi * (1 - T)], axis=1)
@@ -43,13 +42,6 @@ def test_the_portrait_goes_round_and_fills_what_is_caught():
     drawn = np.asarray(axis.lines[0].get_xdata())
     assert np.isnan(drawn).sum() == 2 and np.nanmax(np.abs(drawn)) <= np.pi
     np.testing.assert_allclose(axis.patches[0].get_xy().max(axis=0), [0.5, 1.0], rtol=1e-2)
-
-
-def test_failures_are_crosses():
-    figure = success_over_starts(np.array([[0.0, 1.0], [1.0, 2.0], [2.0, 0.5]]), np.array([0.5, np.inf, np.nan]))
-    up, failed = figure.axes[0].collections
-    assert len(up.get_offsets()) == 1 and len(failed.get_offsets()) == 2
-    assert "1 of 3" in figure.axes[0].get_title(loc="left")
 
 
 @pytest.mark.parametrize("drawing", [cart_pole_drawing(0.3), rotary_pendulum_drawing(0.1, 0.13)])

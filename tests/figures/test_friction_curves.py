@@ -1,10 +1,8 @@
 """Friction curves: a panel for each joint, every curve and the measured points in it."""
 
 import numpy as np
-import pytest
 
 from dln_jax.figures import friction_curves
-from scripts.reports.figures.friction import friction_laws
 
 
 def test_each_joint_has_its_curves_in_the_order_of_its_rates():
@@ -16,11 +14,3 @@ def test_each_joint_has_its_curves_in_the_order_of_its_rates():
     np.testing.assert_array_equal(points.get_ydata(), rates[:, 4] ** 2)
     np.testing.assert_array_equal(fit.get_xdata(), np.sort(rates[:, 4]))
     np.testing.assert_array_equal(plant.get_ydata(), np.sort(rates[:, 4]))
-
-
-@pytest.mark.slow
-def test_the_laws_are_drawn_with_the_force_that_they_have():
-    (axis,) = friction_laws().axes
-    curves = {line.get_label(): np.asarray(line.get_ydata()) for line in axis.lines}
-    assert curves["coulomb + stribeck"].max() > 1.5 * curves["coulomb"].max()
-    np.testing.assert_allclose(curves["load, 1 N m carried"][[0, -1]], [-0.25, 0.25])

@@ -1,4 +1,4 @@
-"""Figures have one width, one look for each model, and labels that do not cover each other."""
+"""Figures have one width, and one look for each model."""
 
 import itertools
 
@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from dln_jax.figures import style
-from scripts.reports.figures.costs import error_against_time
-from scripts.reports.figures.labels import spread
 
 # How the colour-blind see linear RGB (Machado, Oliveira and Fernandes 2009, severity 1).
 SEEN = {
@@ -58,22 +56,3 @@ def test_logarithms_are_for_a_decade_or_more_and_prefixes_for_small_numbers():
     assert style.scale_of([0.0, 10.0]) == "linear" and style.scale_of([]) == "linear"
     assert style.prefixed(3e-5, "N m") == (1e-6, "µN m") and style.prefixed(5e3, "J") == (1e3, "kJ")
     assert style.prefixed(0.0, "J") == (1.0, "J") and style.prefixed(1e-18, "J") == (1e-15, "fJ")
-
-
-def test_heights_are_moved_apart_in_order():
-    heights = spread({"b": 0.5, "a": 0.5, "c": 0.9, "d": 2.0}, gap=0.1)
-    assert heights["c"] == pytest.approx(0.9) and heights["d"] == pytest.approx(1.0)
-    assert abs(heights["a"] - heights["b"]) == pytest.approx(0.1) and (
-        heights["a"] + heights["b"]
-    ) / 2 == pytest.approx(0.5)
-    assert sorted(spread(dict.fromkeys("abcd", 0.0), gap=0.9).values()) == pytest.approx([0, 1 / 3, 2 / 3, 1])
-
-
-def test_a_curve_that_is_not_finite_is_said_to_be_so_and_hides_no_other():
-    curves = {"structured-delan/letters": ([1.0, 2.0], [1e-3, 1e-9]), "black-box-hnn/letters": ([3.0], [np.nan])}
-    figure = error_against_time(curves)
-    figure.draw_without_rendering()
-    (axis,) = figure.axes
-    assert {"structured-delan", "black-box-hnn: not finite"} <= {text.get_text() for text in axis.texts}
-    (front,) = (line for line in axis.lines if line.get_label().startswith("front"))
-    assert np.isfinite(front.get_ydata()).all() and front.get_ydata()[-1] == 1e-9

@@ -31,7 +31,7 @@ def test_every_study_has_cases_with_names_of_their_own(study, tmp_path, monkeypa
 
 
 def numbers(name, error):
-    return Case(name, lambda: Findings(rows_of(name, {"error": error}), {"t": [1.0, np.inf]}), {name: ["error"]})
+    return Case(name, lambda: Findings(rows_of(name, {"error": error})), {name: ["error"]})
 
 
 def test_a_table_is_continued_with_what_was_measured(tmp_path):
@@ -41,7 +41,6 @@ def test_a_table_is_continued_with_what_was_measured(tmp_path):
     stored = stored_findings(tmp_path, [first, second])
     assert told == ["1/2", "2/2"] and np.isnan(by_case(stored["b"].rows)["b"]["error"])
     assert stored["a"].rows == rows_of("a", {"error": 1.0})
-    assert stored["a"].curves["t"][0] == 1.0 and np.isnan(stored["a"].curves["t"][1])
     again = measure([numbers("a", 2.0), second], told.append, folder=tmp_path, resume=True)
     assert list(again) == ["a", "b"] and again["a"].rows == stored["a"].rows
     assert stored_findings(tmp_path / "none", [first]) == {}
@@ -52,11 +51,9 @@ def test_a_table_is_continued_with_what_was_measured(tmp_path):
     [
         ({"c": {}}, "'c' is not a case"),
         ({"a": {"error": 1.0}}, "expected rows"),
-        ({"a": {"rows": [["a", "error", "small"]], "curves": {}}}, "expected rows"),
-        ({"a": {"rows": [["a", "other", 1.0]], "curves": {}}}, "a lacks error"),
-        ({"a": {"rows": [["b", "error", 1.0]], "curves": {}}}, "'b' is not a case of a"),
-        ({"a": {"rows": [["a", "error", 1.0]]}}, "expected rows .* and curves"),
-        ({"a": {"rows": [["a", "error", 1.0]], "curves": {"t": ["x"]}}}, "expected rows .* and curves"),
+        ({"a": {"rows": [["a", "error", "small"]]}}, "expected rows"),
+        ({"a": {"rows": [["a", "other", 1.0]]}}, "a lacks error"),
+        ({"a": {"rows": [["b", "error", 1.0]]}}, "'b' is not a case of a"),
     ],
 )
 def test_a_damaged_table_is_refused(tmp_path, stored, message):

@@ -23,7 +23,6 @@ from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm.rivals import IDENTIFIED, Rival, rivals, size
 from scripts.reports.case import Case, Findings, spread
-from scripts.reports.figures.letters import error_lines
 from scripts.reports.parts import partition_labels
 from scripts.reports.rows import Row
 
@@ -66,20 +65,20 @@ def against_letters(name: str, data: Trajectories, test: Sequence[str], *, quick
     """Errors against the number of training letters; `name` names the data, `test` is the first set of test letters."""
     most = _training_letters(data, test)
     counts = {f"{count}-letters": (count, 1.0) for count in (*(count for count in COUNTS if count < most), most)}
-    return _case(f"{name}/letters", data, test, counts, quick, "training letters")
+    return _case(f"{name}/letters", data, test, counts, quick)
 
 
 def at_speeds(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
     """Errors at other speeds of the test letters, after training on all other letters; arguments as above."""
     speeds = {f"speed-{speed:g}": (_training_letters(data, test), speed) for speed in SPEEDS}
-    return _case(f"{name}/speeds", data, test, speeds, quick, "speed of the test letters, times their own")
+    return _case(f"{name}/speeds", data, test, speeds, quick)
 
 
 def _training_letters(data: Trajectories, test: Sequence[str]) -> int:
     return len(np.unique(data.trajectory)) - len(test)
 
 
-def _case(name: str, data: Trajectories, test: Sequence[str], settings: Settings, quick: bool, x: str) -> Case:
+def _case(name: str, data: Trajectories, test: Sequence[str], settings: Settings, quick: bool) -> Case:
     if not np.allclose(faster(data, 1.0).tau, data.tau, atol=1e-6):
         raise InputError(
             "tau is not that of the published two-link arm, whose torques at other speeds are to be predicted; "
@@ -87,7 +86,7 @@ def _case(name: str, data: Trajectories, test: Sequence[str], settings: Settings
         )
     effort = QUICK if quick else Effort()
     run = partial(measure, name.split("/")[0], data, test_sets(data, test, effort.splits), effort, settings)
-    return Case(name, run, draw=partial(error_lines, x=x, zero="a guess of zero"))
+    return Case(name, run)
 
 
 def test_sets(data: Trajectories, test: Sequence[str], splits: int) -> list[list[str]]:
@@ -114,13 +113,7 @@ def measure(
         for quantity, unit in {ZERO: "N^2 m^2", OUT_OF_DISTRIBUTION: "1"}.items():
             median = float(np.median([run[setting][quantity] for run in runs]))
             rows.append(Row(f"data/{name}/{setting}", quantity, median, unit))
-    several = len({count for count, _ in settings.values()}) > 1
-    curves = {
-        key: [[run[setting][key] for run in runs] for setting in settings]
-        for key in (*known, ZERO, OUT_OF_DISTRIBUTION)
-    }
-    places = [count if several else speed for count, speed in settings.values()]
-    return Findings(rows, {"places": places, **curves})
+    return Findings(rows)
 
 
 def one_run(

@@ -39,7 +39,6 @@ from dln_jax.scenes.pendulums import two_link_arm
 from scripts.reports.arm.motions import RATE, RECORDED, Motion, capacity, drawn_letters
 from scripts.reports.arm.rivals import Rival, rivals
 from scripts.reports.case import Case, Findings, spread
-from scripts.reports.figures.letters import written_letters
 from scripts.reports.rows import Row
 
 GAINS = Gains(np.array([60.0, 30.0]), np.array([12.0, 5.0]))
@@ -93,21 +92,13 @@ class Written(NamedTuple):
     """Root mean square error of the tip, m; infinite for a lost letter."""
     saturated: float
     """Share of samples at a torque limit."""
-    path: np.ndarray
-    """Positions of the tip [N, 2], m, until the letter was lost."""
-    wanted: np.ndarray
-    """Reference of the tip for the whole letter, m."""
 
 
 def cases(name: str, data: Trajectories, *, quick: bool = False) -> list[Case]:
     """One case per condition."""
     effort = QUICK if quick else Effort()
     return [
-        Case(
-            f"{name}/online-{condition}",
-            partial(measure, name, data, condition, effort),
-            draw=partial(written_letters, title=f"{condition.replace('-', ' ')}, seed 0"),
-        )
+        Case(f"{name}/online-{condition}", partial(measure, name, data, condition, effort))
         for condition in effort.conditions
     ]
 
@@ -140,13 +131,7 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
         learner, seeds = learners.get(model), range(effort.seeds)
         written[model] = [written_by(drive, learner, motions[seed], seed, places) for seed in seeds]
     rows = [row for model, runs in written.items() for row in rows_of(f"{model}/{name}/{condition}", runs)]
-    curves = {
-        "letters": [motion.label for motion in motions[0]],
-        "wanted": [visit.wanted for visit in written["exact-model"][0]],
-        "paths": {model: [visit.path for visit in runs[0]] for model, runs in written.items()},
-        "errors": {model: [[visit.tip_error for visit in run] for run in runs] for model, runs in written.items()},
-    }
-    return Findings(rows, curves)
+    return Findings(rows)
 
 
 def written_by(
@@ -225,7 +210,7 @@ def write(loop: Loop, condition: Condition, parameters: Parameters, motion: Moti
         for deviation in (off, driven.tip - driven.wanted_tip)
     )
     saturated = float(np.mean((np.abs(run.u[: max(end, 1)]) >= LIMITS).any(axis=1)))
-    return Written(joint_error, tip_error, saturated, driven.tip[:end], driven.wanted_tip[: motion.samples]), recording
+    return Written(joint_error, tip_error, saturated), recording
 
 
 def _filtered(t: np.ndarray, q: np.ndarray, tau: np.ndarray, step: int) -> tuple[np.ndarray, ...]:

@@ -13,7 +13,7 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Report, Training, silent
 from dln_jax.learning.linear import LinearFit, fit_linear
-from dln_jax.learning.objectives import TORQUE, objective_of
+from dln_jax.learning.objectives import objective_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import Driven, dynamics
 from dln_jax.mechanics.hamiltonian import legendre
@@ -44,10 +44,6 @@ WIDTHS = {
 DEPTH, STEPS = 2, 150
 """Hidden layers of these tanh networks, and Gauss-Newton steps until the error levels off; chosen by validation."""
 
-Curve = dict[str, list[float]]
-"""Test torque "errors" against "seconds" of training per seed, including compilation; empty if not recorded."""
-Measured = tuple[dict[str, float], Curve]
-
 
 def whole_circle() -> Trajectories:
     """Random states of the arm over the whole circle, most of them far from all letters; torques in closed form.
@@ -73,7 +69,7 @@ def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5
     return float(np.median(np.where(left.any(axis=1), t[left.argmax(axis=1)], duration)))
 
 
-def measure_plant(scene: Scene, sets: Split) -> Measured:
+def measure_plant(scene: Scene, sets: Split) -> dict[str, float]:
     """Results of the true plant on the test: the best possible rollouts, and the error of the recorded momenta.
 
     The mean square of the torques over the whole circle is the error of a model that predicts zero.
@@ -82,7 +78,7 @@ def measure_plant(scene: Scene, sets: Split) -> Measured:
         **on_the_test(scene.energies, sets, H=legendre(scene.lagrangian)),
         "free_motion_inside_seconds": free_motion_inside_seconds(scene, sets),
         "whole_circle_torque_mean_square": mean_square(whole_circle().tau),
-    }, {}
+    }
 
 
 def linear_fit(data: Trajectories) -> tuple[LinearFit, Driven]:
@@ -92,13 +88,13 @@ def linear_fit(data: Trajectories) -> tuple[LinearFit, Driven]:
     return fitted, model.energies(fitted.parameters)
 
 
-def measure_trigonometric(sets: Split) -> Measured:
+def measure_trigonometric(sets: Split) -> dict[str, float]:
     """Measures the linear fit, without and with noise on the training torques."""
     fitted, energies = linear_fit(sets.train)
     noise = TORQUE_NOISE * np.random.default_rng(0).standard_normal(sets.train.tau.shape)
     _, noisy = linear_fit(sets.train._replace(tau=sets.train.tau + noise))
     system = compiled(dynamics(energies), jnp.float64)
-    numbers = {
+    return {
         **on_the_test(energies, sets),
         "noisy_torque_mse": torque_mse(dynamics(noisy), sets.test),
         "whole_circle_torque_mse": torque_mse(system, whole_circle()),
@@ -108,10 +104,9 @@ def measure_trigonometric(sets: Split) -> Measured:
         "parameters": float(fitted.parameter_count),
         "one_step_p50_us": latency(system, sets).p50_us,
     }
-    return numbers, end_of(numbers)
 
 
-def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
+def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> dict[str, float]:
     """Trains several seeds in one program by Gauss-Newton; medians over seeds, and the spread of the torque error."""
     training, energies = trained(kind, sets, seeds=seeds, steps=steps)
     systems = [compiled(dynamics(system), jnp.float64) for system in energies]
@@ -123,12 +118,11 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
         for numbers, system in zip(of_seeds, systems, strict=True):
             numbers["share_not_definite"] = definiteness(system, sets.test.q, sets.test.qd).share_not_definite
     torques = [numbers["torque_mse"] for numbers in of_seeds]
-    numbers = {
+    return {
         **{key: float(np.median([seed[key] for seed in of_seeds])) for key in of_seeds[0]},
         "torque_mse_largest": float(np.max(torques)),
         **costs(training, systems[0], sets, seeds=seeds),
     }
-    return numbers, curve(kind, sets, training, numbers, seeds)
 
 
 def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[Training, list[Driven]]:
@@ -140,22 +134,21 @@ def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[T
     return training, [model.energies(parameters) for parameters in of_seeds]
 
 
-def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
+def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> dict[str, float]:
     """Test torque errors of a further split, trained as the published split: median and largest over seeds."""
     if kind == TRIGONOMETRIC:
         energies = [linear_fit(sets.train)[1]]
     else:
         _, energies = trained(kind, sets, seeds=seeds, steps=steps)
     torques = [torque_mse(dynamics(system), sets.test) for system in energies]
-    return {"torque_mse": float(np.median(torques)), "torque_mse_largest": float(np.max(torques))}, {}
+    return {"torque_mse": float(np.median(torques)), "torque_mse_largest": float(np.max(torques))}
 
 
-def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
+def measure_adam(kind: str, sets: Split, *, steps: int) -> dict[str, float]:
     """Measures one seed of the published protocol."""
     training, energies = by_published_protocol(kind, sets, steps=steps)
     system = compiled(dynamics(energies), jnp.float32)
-    numbers = {**on_the_test(energies, sets, jnp.float32), **costs(training, system, sets, jnp.float32)}
-    return numbers, curve(kind, sets, training, numbers, 1)
+    return {**on_the_test(energies, sets, jnp.float32), **costs(training, system, sets, jnp.float32)}
 
 
 def by_published_protocol(
@@ -168,7 +161,7 @@ def by_published_protocol(
     return training, model.energies(training.parameters)
 
 
-def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measured:
+def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> dict[str, float]:
     """Trains structured models one by one: seconds to the target test errors, medians over seeds.
 
     Also the cost of ten seeds in one program relative to a single run. All times include compilation.
@@ -192,26 +185,12 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
         "torque_mse_largest": float(np.max(final)),
         "train_seconds": float(np.median(singles)),
         "cost_of_ten_seeds": (ten.compile_seconds + ten.train_seconds) / float(np.median(singles)),
-    }, {}
+    }
 
 
 def prepared(kind: str, sets: Split, *, steps: int | None) -> tuple[Model, GaussNewton]:
     """A model of this kind and its Gauss-Newton optimiser."""
     return build(described(kind, sets.train, width=WIDTHS[kind], depth=DEPTH)), GaussNewton(steps=steps or STEPS)
-
-
-def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float], seeds: int) -> Curve:
-    """The test error during training; only its final value for models that are not fitted to torques."""
-    if objective_of(kind, sets.train) is not TORQUE:
-        return end_of(numbers)
-    seconds = [(training.compile_seconds + at.seconds) / seeds for at in training.history]
-    errors = np.minimum.accumulate([np.median(at.monitor) for at in training.history]).tolist()
-    return {"seconds": seconds, "errors": errors}
-
-
-def end_of(numbers: dict[str, float]) -> Curve:
-    """A curve with only the final error."""
-    return {"seconds": [numbers["train_seconds"]], "errors": [max(numbers["torque_mse"], 1e-32)]}
 
 
 def on_the_test(energies: Driven, sets: Split, dtype=jnp.float64, *, H: Hamiltonian | None = None) -> dict[str, float]:

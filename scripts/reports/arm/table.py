@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
@@ -20,7 +19,6 @@ from dln_jax.types import InputError
 from scripts.reports.arm.models import (
     TRIGONOMETRIC,
     WIDTHS,
-    Measured,
     measure_adam,
     measure_one_by_one,
     measure_plant,
@@ -30,7 +28,6 @@ from scripts.reports.arm.models import (
 )
 from scripts.reports.arm.published_swings import uniform_tests
 from scripts.reports.case import Case, Findings, by_case, rows_in, rows_of
-from scripts.reports.figures.costs import error_against_time
 from scripts.reports.parts import partition_labels
 from scripts.reports.published import ARM, published
 from scripts.reports.rows import UNITS, Row, unit_of
@@ -132,12 +129,8 @@ def cases(
     return listed
 
 
-def _case(name: str, measure: Callable[[], Measured], quantities: Sequence[str] = ()) -> Case:
-    def findings() -> Findings:
-        numbers, curve = measure()
-        return Findings(rows_of(name, numbers), curve)
-
-    return Case(name, findings, {name: quantities})
+def _case(name: str, measure: Callable[[], dict[str, float]], quantities: Sequence[str] = ()) -> Case:
+    return Case(name, lambda: Findings(rows_of(name, measure())), {name: quantities})
 
 
 def table_rows(results: Mapping[str, Findings]) -> list[Row]:
@@ -176,9 +169,3 @@ def _beside(row: Row, numbers: Mapping[str, Mapping[str, float]]) -> Row:
         bound=BOUNDS.get(row.case, {}).get(row.quantity, bound),
         at_least=row.quantity == "vpt_seconds" and bound is not None,
     )
-
-
-def figure(results: Mapping[str, Findings]) -> Figure:
-    """Figure of error against training time."""
-    curves = {case: findings.curves for case, findings in results.items() if findings.curves}
-    return error_against_time({case: (curve["seconds"], curve["errors"]) for case, curve in curves.items()})

@@ -3,7 +3,7 @@
 Six models (structured and black-box Lagrangian, structured and black-box Hamiltonian, feed-forward, trigonometric), two
 data sets (letters: train 17, test e, q, v; random states: test three free swings), several seeds in one program; also
 on other splits of the letters, each a test once, and on states over the whole circle, which no letter holds.
-Prints a Markdown table, writes it as table.md with report.json, and draws error against training time.
+Prints a Markdown table, and writes it as table.md with report.json.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ import numpy as np
 from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.options import Resumable
 from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.files import write_bytes, write_figure
+from dln_jax.files import write_bytes
 from dln_jax.types import InputError
 from scripts.reports.arm import table
 from scripts.reports.case import Case, measure, say_numbers
@@ -68,10 +68,9 @@ def main(options: Arguments) -> None:
         )
         shown = markdown([row for row in rows if row.quantity in table.SHOWN])
         write_bytes(folder / "table.md", shown.encode())
-        write_figure(folder / "pareto.png", table.figure(results))
         beside = [row for row in rows if row.bound is not None or row.reference is not None]
         publish(folder, rows, facts, shown=beside, tables=[shown])
-        print(f"table: {folder / 'table.md'}, figure: {folder / 'pareto.png'}")
+        print(f"table: {folder / 'table.md'}")
 
 
 def _late(case: Case) -> bool:

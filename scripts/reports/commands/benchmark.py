@@ -1,4 +1,4 @@
-"""Measure speed against error: one report, a table and mostly a figure for each subject.
+"""Measure speed against error: a report and a table for each subject.
 
 Subjects: one-step (microseconds of single calls against test error, for every model and call path), throughput (batched
 states per second), scaling (cost against the number of joints), integrators (steps per second against energy drift and
@@ -15,26 +15,25 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from matplotlib.figure import Figure
 
 from dln_jax.cli.arguments import Unstated
 from dln_jax.cli.options import Folder
 from dln_jax.files import write_bytes
 from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import run_folder
-from scripts.reports.case import Case, Done, Findings, draw, measure
+from scripts.reports.case import Case, Done, Findings, measure
 from scripts.reports.rows import Row, conditions, markdown, publish
 from scripts.reports.speed import casadi_in_c, costs, exported_c, integrators, one_step
 
-SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Figure] | None]] = {
-    "one-step": (one_step.measure, one_step.draw),
-    "throughput": (costs.measure_throughput, None),
-    "scaling": (costs.measure_scaling, None),
-    "integrators": (integrators.measure, integrators.draw),
-    "c": (exported_c.measure, exported_c.draw),
-    "casadi": (casadi_in_c.measure, None),
+SUBJECTS: dict[str, Callable[..., Findings]] = {
+    "one-step": one_step.measure,
+    "throughput": costs.measure_throughput,
+    "scaling": costs.measure_scaling,
+    "integrators": integrators.measure,
+    "c": exported_c.measure,
+    "casadi": casadi_in_c.measure,
 }
-"""Functions that measure (quick -> findings) and draw the subjects."""
+"""Functions quick -> findings, by subject."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,6 @@ def main(options: Arguments) -> None:
         def keep(done: Done) -> None:
             rows = done.findings.rows
             published.extend(rows)
-            draw(folder, done.case, done.findings)
             write_bytes(folder / f"{done.case.name}.md", markdown(rows).encode())
             facts = conditions(
                 dtype="float32 unless said", seeds=[0], call_path="default jit unless said", quick=options.quick
@@ -80,7 +78,7 @@ def cases(*, quick: bool = False, **more: Mapping[str, Any]) -> list[Case]:
     """
 
     def measured(name: str) -> Findings:
-        findings = SUBJECTS[name][0](quick, **more.get(name, {}))
+        findings = SUBJECTS[name](quick, **more.get(name, {}))
         return findings._replace(rows=[row._replace(case=f"{name}/{row.case}") for row in findings.rows])
 
-    return [Case(name, partial(measured, name), draw=draw) for name, (_, draw) in SUBJECTS.items()]
+    return [Case(name, partial(measured, name)) for name in SUBJECTS]

@@ -1,18 +1,15 @@
 """Measure controllers: swing-ups, a board, learned models, foreign plants, value functions, tracking, plans, and C.
 
-Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), writes report.json, and draws
-figures.
+Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), and writes report.json.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
-
-from matplotlib.figure import Figure
+from typing import Annotated
 
 from dln_jax.cli.arguments import choice, names_in
-from dln_jax.cli.options import Drawn, Folder
+from dln_jax.cli.options import Folder
 from dln_jax.precision import in_float64
 from scripts.reports.case import Case, Findings, in_subjects, report_cases
 from scripts.reports.control import (
@@ -36,7 +33,6 @@ from scripts.reports.control import (
 )
 from scripts.reports.control.board import Motor
 from scripts.reports.control.values import equation, fits
-from scripts.reports.figures.robustness import shares
 
 MOTORS: dict[str, Motor] = {"acrobot": "elbow", "pendubot": "shoulder"}
 MEASURES: dict[str, Callable[[bool], Findings]] = {
@@ -64,17 +60,10 @@ MEASURES: dict[str, Callable[[bool], Findings]] = {
 }
 """Functions quick -> findings, by SUBJECT/NAME."""
 SUBJECTS = tuple(dict.fromkeys(name.split("/")[0] for name in MEASURES))
-DRAWN: Mapping[str, Callable[[dict[str, Any]], Figure]] = {
-    "swing-up": swing_ups.draw_traces,
-    "starts": swing_ups.draw_starts,
-    "robustness": shares,
-    "value/pendulum": fits.draw_pendulum,
-}
-"""Functions that draw the curves of a subject or a case."""
 
 
 @dataclass(frozen=True)
-class Arguments(Folder, Drawn):
+class Arguments(Folder):
     """What to measure."""
 
     only: Annotated[str, choice(SUBJECTS, several=True)] = ",".join(SUBJECTS)
@@ -91,7 +80,4 @@ def main(options: Arguments) -> None:
 
 def cases(*, quick: bool = False) -> list[Case]:
     """All cases, in float64."""
-    return [
-        Case(name, in_float64(partial(measure, quick)), draw=DRAWN.get(name, DRAWN.get(name.split("/")[0])))
-        for name, measure in MEASURES.items()
-    ]
+    return [Case(name, in_float64(partial(measure, quick))) for name, measure in MEASURES.items()]

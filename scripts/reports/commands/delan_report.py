@@ -4,7 +4,7 @@
 float32) and checks the generic mechanics against the closed form of the arm. `letters`, `speeds` and `online` are the
 experiments of the first DeLaN paper (Lutter, Ritter and Peters 2019): torque errors against the number of training
 letters, torque errors at 0.5 to 2 times the speed, and tracking errors of an arm that learns its model while it writes;
-each beside a feed-forward network and an identified arm. Prints tables, writes report.json and draws figures.
+each beside a feed-forward network and an identified arm. Prints a table and writes report.json.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from dln_jax.cli.arguments import Unstated, choice, names_in
-from dln_jax.cli.options import Drawn, Folder
+from dln_jax.cli.options import Folder
 from dln_jax.data.splits import split
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST
 from dln_jax.types import require_positive
@@ -27,7 +27,7 @@ QUICK_STEPS = 500
 
 
 @dataclass(frozen=True)
-class Arguments(Folder, Drawn):
+class Arguments(Folder):
     """What to measure, and on which letters."""
 
     MEASURES_COMPILATION: ClassVar = True

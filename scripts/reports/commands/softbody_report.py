@@ -49,7 +49,6 @@ MEASURES = {
     "rivals": (rivals.swing, rivals.drop, rivals.hanging, finer.mesh, finer.gradient, touching.blocks),
 }
 """Functions quick -> findings, by subject."""
-FIGURES = {elements.locking: elements.locking_figure, rivals.swing: rivals.figure}
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,6 @@ def cases(*, quick: bool = False) -> list[Case]:
         Case(
             f"{subject}/{measure.__name__.replace('_', '-')}",
             in_float64(partial(measure, quick)),
-            draw=FIGURES.get(measure),
         )
         for subject, measures in MEASURES.items()
         for measure in measures

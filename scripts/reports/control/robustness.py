@@ -140,18 +140,14 @@ def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
 
 def robust(motor: Motor, quick: bool) -> Findings:
     """Shares of successes by criterion, their mean, and the score of the undisturbed plant."""
-    name, table = plant(motor)[0].name, {}
+    name = plant(motor)[0].name
     rows: list[Row] = []
     best = max(shares[-1] for shares in PUBLISHED[name].values())
     words = "mean share of successes, beside the board's best"
     for which, controller in controllers(motor, quick).items():
         case = f"robustness/{name}/{which.removeprefix('ours-')}"
         shares = robustness(motor, controller, every=10 if quick else 1)
-        table[which] = shares
         rows += [Row(case, f"share_{key}", shares[key]) for key in CRITERIA]
         rows.append(Row(case, "share_mean", shares["mean"], reference=best, expected=words))
         rows.append(Row(case, "score_undisturbed", score(criteria(motor, play(motor, controller)))))
-    for rival, values in PUBLISHED[name].items():
-        shown = [*(percentage / 100 for percentage in values[:-1]), values[-1]]
-        table[rival] = dict(zip((*CRITERIA, "mean"), shown, strict=True))
-    return Findings(rows, {name: table})
+    return Findings(rows)

@@ -1,13 +1,12 @@
 """Swing-ups of plants of desktop size by known models, from many starts on simulated hardware."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from matplotlib.figure import Figure
 
 from dln_jax.control import (
     ClosedLoopRun,
@@ -27,19 +26,15 @@ from dln_jax.control import (
 )
 from dln_jax.control.closed_loop import Outcomes, hanging_starts, outcomes
 from dln_jax.control.desktop_plants import TURN
-from dln_jax.figures.closed_loops import closed_loop_traces
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 from dln_jax.scenes.scene import Scene
 from scripts.reports.case import Findings
-from scripts.reports.figures.starts import success_over_starts
 from scripts.reports.rows import Row
 
 RATE, SECONDS, CUTOFF = 500.0, 10.0, 50.0
 """Rate of the controller, Hz, length of a run, s, and cut-off of the rates, Hz."""
 STARTS, SUCCESS = 1000, 0.995
-SHOWN, SHOWN_SECONDS, EVERY = 6, 3.0, 4
-"""Runs in a figure, their length, s, and the stride of the drawn samples."""
 FASTEST = 15.0
 """Largest rate of the pole at the start, rad/s; the driven joint starts at rest at zero."""
 
@@ -129,7 +124,7 @@ def swing_up(name: str, quick: bool) -> Findings:
     case = SWING_UPS[name]
     result = tried(case, hanging_starts(50 if quick else STARTS, 0, position=case.position))
     words = f"of {len(result.seconds)} starts near hanging, on simulated hardware"
-    return Findings(_rows(f"swing-up/{name}/known", result, words, SUCCESS), traces(case))
+    return Findings(_rows(f"swing-up/{name}/known", result, words, SUCCESS))
 
 
 def from_anywhere(name: str, quick: bool) -> Findings:
@@ -138,7 +133,7 @@ def from_anywhere(name: str, quick: bool) -> Findings:
     x[:, 1], x[:, 3] = random.uniform(-np.pi, np.pi, len(x)), random.uniform(-FASTEST, FASTEST, len(x))
     result = tried(SWING_UPS[name], x)
     words = f"of {len(x)} starts at any angle of the pole and |rate| <= {FASTEST:g} rad/s, on simulated hardware"
-    return Findings(_rows(f"starts/{name}/known", result, words), {"x": x[:, [1, 3]], "seconds": result.seconds})
+    return Findings(_rows(f"starts/{name}/known", result, words))
 
 
 def _rows(case: str, result: Outcomes, words: str, bound: float | None = None) -> list[Row]:
@@ -149,28 +144,3 @@ def _rows(case: str, result: Outcomes, words: str, bound: float | None = None) -
         Row(case, "seconds_median", result.median, "s"),
         Row(case, "seconds_worst", result.worst, "s"),
     ]
-
-
-def traces(case: SwingUp, *, count: int = SHOWN, seconds: float = SHOWN_SECONDS) -> dict[str, Any]:
-    """Some runs from near hanging, for `draw_traces`."""
-    run = jax.jit(jax.vmap(closed_loop(case, seconds=seconds)))(hanging_starts(count, 0, position=case.position))
-    energy = dynamics(case.scene.energies).energy
-    shown = jax.tree.map(lambda leaf: leaf[:, ::EVERY], run)
-    joules = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(shown.x)
-    return {"case": case, "runs": shown, "energy": joules, "goal": energy(jnp.zeros(2), jnp.zeros(2))}
-
-
-def draw_traces(curves: Mapping[str, Any]) -> Figure:
-    """Draws the result of `traces`."""
-    case, kinds = curves["case"], curves["case"].scene.needs.joints
-    sliding = kinds[0] == "prismatic"
-    return closed_loop_traces(
-        curves["runs"], kinds, names=("cart" if sliding else "arm", "pole"),
-        limits=(-case.limit, case.limit), unit="N" if sliding else "N m",
-        energy=np.asarray(curves["energy"]), goal_energy=float(curves["goal"]),
-    )  # fmt: skip
-
-
-def draw_starts(curves: Mapping[str, Any]) -> Figure:
-    """Draws the time to swing up over the phase plane of `from_anywhere`."""
-    return success_over_starts(np.asarray(curves["x"]), np.asarray(curves["seconds"]))

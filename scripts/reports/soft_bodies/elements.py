@@ -10,11 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from scipy.spatial import Delaunay
 
-from dln_jax.figures import style
 from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh.mesh import Mesh, boundary_vertices, make_mesh, vertices_where, volumes
 from dln_jax.softbody.mesh.quadratic import barycentric_split, quadratic
@@ -43,14 +40,13 @@ SLENDERNESS = 100
 
 def locking(quick: bool) -> Findings:
     """Error and time of a clamped square by kind of element and Poisson's ratio, on unordered triangles."""
-    rows, curves = [], {}
+    rows = []
     for kind, sizes in CELLS.items():
         for cells in sizes[2:3] if quick else sizes:
             mesh, solve = _clamped(cells, kind)
             for nu in RATIOS:
                 seconds, (x, converged) = _processor_time(solve, jnp.asarray(nu), _forces(mesh, nu, kind))
                 error = _error(mesh, np.asarray(x) - mesh.vertices, kind) if converged else np.nan
-                curves.setdefault(f"{kind} {nu}", []).extend([seconds, error])
                 if cells != sizes[2 if quick else -1]:
                     continue
                 text = f"relative L2 error; {len(mesh.elements)} elements, {mesh.vertices.size} unknowns, "
@@ -58,7 +54,7 @@ def locking(quick: bool) -> Findings:
                 locks = kind == "linear" and nu == RATIOS[-1]
                 bound = LOCKED if locks else LINEAR if kind == "linear" else 3 * EXACT if quick else EXACT
                 rows.append(expect(f"locking/{kind}/nu={nu}", "error", text, error, bound, at_least=locks))
-    return Findings(rows, curves)
+    return Findings(rows)
 
 
 def slender(quick: bool) -> Findings:
@@ -80,24 +76,6 @@ def slender(quick: bool) -> Findings:
         text = f"{texts.get(bound, 'plane strain E/(1 - nu²) in 2-d')}; deflection over theory {ratio:.4f}"
         rows.append(expect(f"slender/{name}", "tip_error", text, abs(ratio - 1), bound, at_least=bound == LOCKED))
     return Findings(rows)
-
-
-def locking_figure(curves: dict[str, Any]) -> Figure:
-    """Error against the time of a static solve, one panel for each Poisson's ratio."""
-    figure, axes = style.figure(1, len(RATIOS), height=2.9, sharey=True)
-    labels = {"split": "quadratic, split mesh"}
-    looks = dict(zip(CELLS, ("v", "o", "s", "D"), strict=True))
-    for axis, nu in zip(axes[0], RATIOS, strict=True):
-        for kind, colour in style.colours_of(CELLS).items():
-            seconds, errors = np.reshape(curves[f"{kind} {nu}"], (-1, 2)).T
-            axis.loglog(seconds, errors, color=colour, marker=looks[kind], markersize=4, label=labels.get(kind, kind))
-        axis.axhline(EXACT, color="0.6", linewidth=0.8, linestyle="--")
-        axis.xaxis.set_minor_formatter(NullFormatter())
-        axis.set_xlabel("processor time, s")
-        style.title(axis, f"Poisson's ratio {nu}")
-    axes[0, 0].set_ylabel("relative L2 error")
-    style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(CELLS))
-    return figure
 
 
 def _clamped(cells: int, kind: str) -> tuple[Mesh, Any]:

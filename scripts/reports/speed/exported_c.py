@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import FLAGS, load_c
@@ -24,7 +23,6 @@ from dln_jax.scenes.pendulums import chain
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
-from scripts.reports.figures.costs import call_times
 from scripts.reports.robots.pinocchio import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
 from scripts.reports.rows import Row, expect
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, last_level_cache, programs, timed
@@ -56,14 +54,6 @@ SECONDS = 20.0
 """Time limit for writing and compiling the largest export."""
 AGREEMENT = {"f64": 1e-11, "f32": 1e-4}
 """Bound on the relative difference of sums of results of two exports."""
-WAYS = {
-    "hot_ns": "warm loop",
-    "cold_p50_ns": "cold, median",
-    "cold_p99_ns": "cold, p99",
-    "python_us": "from Python",
-    "pinocchio_us": "from Python",
-}
-"""Quantities to draw."""
 
 
 def export(arm: Arm, folder: Path) -> None:
@@ -124,7 +114,7 @@ def measure(quick: bool, against: Path | None = None) -> Findings:
     rows.append(Row("caches", "emptied_by_mib", evicting(), "MiB", expected="read before each cold call"))
     rows.append(Row("caches", "last_level_mib", last_level_cache() or math.nan, "MiB"))
     rows.append(Row("clock", "subtracted_ns", every[0].timer, "ns", expected="taken off each cold call"))
-    return Findings(rows, curves_of(rows))
+    return Findings(rows)
 
 
 def require_exports(against: Path | None, names: Sequence[str]) -> None:
@@ -207,26 +197,3 @@ def from_python(exports: Mapping[str, Any], *, repetitions: int) -> list[Row]:
             rows.append(Row(case, "pinocchio_us", 1e6 * seconds[rival], "us"))
             rows.append(expect(case, f"over_{rival}", words, seconds[case] / seconds[rival], 1.0))
     return rows
-
-
-def curves_of(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Times by ARM/FUNCTION, origin of the code, and kind of call, ns."""
-    panels: dict[str, dict[str, dict[str, float]]] = {}
-    for row in rows:
-        if row.quantity in WAYS:
-            case = row.case.removesuffix(f"/{OTHERS}")
-            owner = "exported C" if case == row.case else "other export"
-            owner = "Pinocchio" if row.quantity == "pinocchio_us" else owner
-            times = panels.setdefault(case, {}).setdefault(owner, {})
-            times[WAYS[row.quantity]] = row.value * (1e3 if row.unit == "us" else 1.0)
-    return panels
-
-
-def draw(times: dict[str, dict[str, dict[str, float]]]) -> Figure:
-    """Draws times of calls, one panel per function."""
-    panels: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
-    for case, by_owner in times.items():
-        arm, function = case.split("/")
-        width, precision, d, _ = ARMS[arm]
-        panels.setdefault(function.replace("_", " "), {})[f"{width}x{width}, {precision}, d = {d}"] = by_owner
-    return call_times(panels, x="one call, ns")

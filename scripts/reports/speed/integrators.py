@@ -16,7 +16,6 @@ from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import Hamiltonian
 from dln_jax.zoo.descriptions import build
 from scripts.reports.case import Findings
-from scripts.reports.figures.costs import cost_panels
 from scripts.reports.rows import Row
 from scripts.reports.turns import medians_in_turns
 
@@ -35,7 +34,6 @@ QUICK = ("stormer-verlet", "rk4")
 def measure(quick: bool) -> Findings:
     """Integrates motions of all scenes by all integrators, halving dt; the truth is integrated to 1e-12 per step."""
     rows: list[Row] = []
-    lines: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
     for scene in ("henon-heiles",) if quick else SCENES:
         problem = problem_of(scene, trajectories=20 if quick else 100 if scene == "two-body" else None)
         energies = {"exact": problem.energy, "learned": learned_energy(problem, quick=quick)}
@@ -45,8 +43,6 @@ def measure(quick: bool) -> Findings:
                 if step is None:
                     continue
                 swept = sweep(problem, H, step, dt=SCENES[scene], halvings=2 if quick else HALVINGS)
-                name = method if kind == "exact" else f"{method}, learned"
-                lines.setdefault(scene, {})[name] = ([1e6 / point[1] for point in swept], [point[3] for point in swept])
                 for dt, rate, drift, error in swept:
                     case = f"{scene}/{kind}/{method}/dt-{dt:.4g}"
                     rows += [
@@ -55,10 +51,7 @@ def measure(quick: bool) -> Findings:
                         Row(case, "energy_drift", drift, "J"),
                         Row(case, "trajectory_error", error, "1"),
                     ]
-    return Findings(rows, lines)
-
-
-draw = functools.partial(cost_panels, x="µs per simulated second", y="trajectory error, rms")
+    return Findings(rows)
 
 
 def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:

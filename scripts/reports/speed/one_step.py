@@ -8,7 +8,6 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,6 @@ from dln_jax.zoo.run import load, save
 from scripts.reports.arm.models import DEPTH, STEPS, TRIGONOMETRIC, WIDTHS, described
 from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
-from scripts.reports.figures.costs import EXACT, cost_points
 from scripts.reports.predictions import predictions
 from scripts.reports.process import called
 from scripts.reports.rows import Row, unit_of
@@ -65,22 +63,13 @@ def measure(quick: bool) -> Findings:
             for _ in range(1 if quick else PROCESSES)
             for dispatch in ("default", "low-latency")
         ]
-    rows, places = [], {}
+    rows = []
     for name, answers in zip(names, predicted, strict=True):
         error = errors(answers, sets.test)["torque_mse"]
         rows.append(Row(name, "torque_mse", error, "N^2 m^2"))
         for path, numbers in over_processes([turn[name] for turn in turns]).items():
             rows += rows_of(f"{name}/{path}", numbers)
-            if "p50_us" in numbers:
-                places[f"{name}, {path}"] = (numbers["p50_us"], error)
-    return Findings(rows, places)
-
-
-draw = partial(
-    cost_points,
-    **{"x": "one inverse-dynamics call, median, µs", "y": "test torque MSE, (N m)²"},
-    **{"title": "two-link arm, single calls", "front": True, "exact": EXACT},
-)
+    return Findings(rows)
 
 
 def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:

@@ -26,7 +26,6 @@ from scripts.reports.arm.table import letters, published_split
 from scripts.reports.case import Findings
 from scripts.reports.commands import benchmark
 from scripts.reports.commands.benchmark import SUBJECTS
-from scripts.reports.figures.costs import EXACT, FRONT, cost_panels, cost_points
 from scripts.reports.process import called
 from scripts.reports.rows import Row, markdown
 from scripts.reports.speed import costs as benchmark_costs
@@ -64,15 +63,13 @@ def test_halving_the_step_of_a_sweep_gains_by_the_order(method, order):
     assert benchmark_integrators.step_of("stormer-verlet", oscillator, separable=False) is None
 
 
-def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, capsys):
+def test_a_subject_writes_its_report_and_table(tmp_path, monkeypatch, capsys):
     rows = [Row("a/b", "p50_us", 3.0, "us", None, 2.0), Row("a/b", "ratio", 2.0, "1"), Row("c", "ratio", 4.0, "1")]
-    curves = {"pendulum": {"rk4": ([1.0, 2.0], [3.0, 4.0])}}
-    monkeypatch.setitem(SUBJECTS, "integrators", (lambda quick: Findings(rows, curves), SUBJECTS["integrators"][1]))
+    monkeypatch.setitem(SUBJECTS, "integrators", lambda quick: Findings(rows))
     command(benchmark, "integrators", "--quick", "--out", str(tmp_path / "out"))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert [row["case"] for row in report["rows"]] == ["integrators/a/b", "integrators/a/b", "integrators/c"]
     assert report["rows"][0]["pass"] is False and report["conditions"]["quick"] is True
-    assert (tmp_path / "out" / "integrators.png").read_bytes().startswith(b"\x89PNG")
     table = (tmp_path / "out" / "integrators.md").read_text()
     assert table == markdown([row._replace(case=f"integrators/{row.case}") for row in rows])
     assert (
@@ -80,20 +77,6 @@ def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, cap
         and table.splitlines()[-1] == "| integrators/c |  | 4 |"
     )
     assert "already contains" in refused(capsys, benchmark, "integrators", "--out", str(tmp_path / "out"))
-
-
-def test_figures_of_points_and_panels_draw():
-    places = {"a, jit": (1.0, 1e-3), "a, c": (2.0, 1e-3), "b, jit": (3.0, 1e-20)}
-    figure = cost_points(places, x="", y="", title="", front=True, exact=EXACT)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [FRONT, "jit", "c"]
-    (axis,) = figure.axes
-    assert {text.get_text() for text in axis.texts} == {"a", "b"}
-    assert axis.get_yticklabels()[0].get_text() == "exact" and axis.get_xscale() == "linear"
-    drawn = cost_panels(
-        {"s": {"rk4": ([1.0, 2.0], [1e-3, 1e-4]), "rk4, learned": ([1.0, 2.0], [1e-2, 1e-2])}}, x="", y=""
-    )
-    one, other = drawn.axes[0].lines
-    assert one.get_color() == other.get_color() and one.get_linestyle() != other.get_linestyle()
 
 
 def test_programs_take_turns():

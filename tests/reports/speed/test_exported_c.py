@@ -175,10 +175,6 @@ def test_two_exports_take_turns_and_are_drawn(tmp_path, monkeypatch, capsys):
         assert {f"{arm}/{FORWARD}", f"{arm}/{FORWARD}/against"} < {case for case, _ in values}
     bounds = {row.quantity: row.bound for row in found.rows}
     assert bounds["over_rnea"] == bounds["over_aba"] == 1
-    figure = exported_c.draw(found.curves)
-    assert [axis.get_title() for axis in figure.axes][:2] == ["inverse dynamics", "forward dynamics"]
-    said = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert said == ["exported C", "other export", "Pinocchio", "warm loop", "cold, median", "cold, p99", "from Python"]
     missing = tmp_path / exported_c.SMALLEST / "model.h"
     missing.unlink()
     line = refused(capsys, benchmark, "c", "--quick", "--out", str(tmp_path / "out"), "--against", str(tmp_path))

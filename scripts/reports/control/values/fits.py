@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from dln_jax.control.optimal.fitted import fit_values
 from dln_jax.control.optimal.flow import flow
@@ -24,7 +23,6 @@ from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.solvers.ending import reason
 from scripts.reports.case import Findings
 from scripts.reports.control.values.truths import direct_values, followed
-from scripts.reports.figures.values import value_figure
 from scripts.reports.rows import Row, expect
 
 SEEDS = 3
@@ -98,10 +96,7 @@ def pendulum(quick: bool) -> Findings:
         Row(case, "grid_median_relative_extrapolation", float(np.median(_relative([before], truth)[:, counted]))),
         Row(case, "grid_down_return", float(np.mean(evaluate(plant, by_grid, starts(plant, "down")).returns))),
     ]
-    runs = evaluate(plant, _law(plant, training.values[0]), starts(plant, "down", 12)).x
-    u = np.asarray(jax.jit(jax.vmap(_law(plant, training.values[0])))(nodes.reshape(-1, 2))).reshape(truth.shape)
-    curves = {"nodes": nodes, "truth": truth, "V": of_all[0], "runs": runs, "u": u}
-    return Findings(rows, {**curves, "best": np.asarray(interpolated(fine.grid, fine.u, nodes))})
+    return Findings(rows)
 
 
 def beside_shooting(name: str, quick: bool) -> Findings:
@@ -222,12 +217,3 @@ def _V(value: ValueAndGradient) -> Callable[[np.ndarray], Array]:
 
 def _law(plant: ValuePlant, value: ValueAndGradient) -> Callable[[Array], Array]:
     return hjb_policy(value, plant.problem)
-
-
-def draw_pendulum(curves: dict[str, Any]) -> Figure:
-    """Draws the first seed's value beside the grid solution."""
-    plant = PLANTS["pendulum"]()
-    values, controls = (curves["V"], curves["truth"]), (curves["u"], curves["best"])
-    return value_figure(
-        curves["nodes"], values, controls, curves["runs"], limit=plant.limit, seconds=plant.evaluation.seconds
-    )

@@ -6,12 +6,8 @@ displacement against `reference_motion`, which shares the mesh: what remains are
 contact. Processor time leaves compilation out. Set OPENBLAS_NUM_THREADS=1: waiting threads would count.
 """
 
-from typing import Any
-
 import numpy as np
-from matplotlib.figure import Figure
 
-from dln_jax.figures import style
 from dln_jax.softbody.mesh.shapes import box
 from scripts.reports.case import Findings
 from scripts.reports.rows import Row, expect
@@ -21,16 +17,6 @@ from scripts.reports.soft_bodies.rivals.finer import cantilever
 from scripts.reports.soft_bodies.rivals.simulators import findings, number, rivals
 
 STEPS = (0.02, 0.01, 0.005, 0.002)
-LABELS: dict[str, tuple[str, str, int, tuple[float, float]]] = {
-    "backward-euler": ("dln_jax, backward Euler", style.SKY, 0, (-8, 6)),
-    "midpoint": ("dln_jax, midpoint", style.BLUE, -1, (8, -2)),
-    "mujoco-discrete": ("MuJoCo, discrete", style.ORANGE, 0, (-8, -6)),
-    "mujoco-euler": ("MuJoCo, explicit Euler", style.VERMILLION, 0, (-8, 0)),
-    "newton-10": ("Newton VBD, 10 sweeps", style.GREEN, -1, (8, 0)),
-    "newton-50": ("Newton VBD, 50 sweeps", "#44AA99", 0, (8, 2)),
-    "newton-explicit": ("Newton, explicit", style.PURPLE, -1, (-2, -13)),
-}
-"""Label of a curve, its colour, its point, and its offset from there in points."""
 
 
 def swing(quick: bool) -> Findings:
@@ -43,7 +29,7 @@ def swing(quick: bool) -> Findings:
     if vbd := simulators.get("newton_vbd"):
         tried = ((10, 0.01), (10, 0.002), (10, 5e-4), (50, 0.01), (50, 0.002))
         runs |= {f"newton-{sweeps}/{dt}": vbd.motion(body, dt, sweeps) for sweeps, dt in tried}
-    results = [findings("swing", body, runs, reference, missing)]
+    rows = findings("swing", body, runs, reference, missing)
     # Explicit methods of rivals run other laws only, and are compared with references of these.
     for module, law, name, steps, run in (
         ("mujoco_flex", KIRCHHOFF, "mujoco-euler", (1e-3, 5e-4, 1e-4), lambda by, at, dt: by.motion(at, "Euler", dt)),
@@ -52,9 +38,8 @@ def swing(quick: bool) -> Findings:
         if module in simulators:
             other = body._replace(law=law)
             runs = {f"{name}/{dt}": run(simulators[module], other, dt) for dt in steps}
-            results.append(findings("swing", other, runs, reference_motion(other, 2e-4), ""))
-    curves = {key: values for result in results for key, values in result.curves.items()}
-    return Findings([row for result in results for row in result.rows], curves)
+            rows += findings("swing", other, runs, reference_motion(other, 2e-4), "")
+    return Findings(rows)
 
 
 def drop(quick: bool) -> Findings:
@@ -77,9 +62,9 @@ def drop(quick: bool) -> Findings:
     if vbd := simulators.get("newton_vbd"):
         runs |= {f"newton-10/{dt}": vbd.motion(body, dt, 10) for dt in (0.002, 5e-4)}
         runs["newton-10-stiff-contact/0.002"] = vbd.motion(body, 0.002, 10, 1e6)
-    rows, curves = findings("drop", body, runs, reference, missing)
+    rows = findings("drop", body, runs, reference, missing)
     text = "the reference with a floor of 1e6 N/m for each vertex instead of 1e7"
-    return Findings([*rows, number("drop/reference", "by_floor", text, softer)], curves)
+    return Findings([*rows, number("drop/reference", "by_floor", text, softer)])
 
 
 def hanging(quick: bool) -> Findings:
@@ -103,23 +88,6 @@ def hanging(quick: bool) -> Findings:
                 expect(f"rivals/hanging/{name}", "gradient_difference", text, abs(their_value / value - 1), 1e-5),
             ]
     return Findings(rows)
-
-
-def figure(curves: dict[str, Any]) -> Figure:
-    """Error against processor time per simulated second, each curve with its label."""
-    picture, [[axis]] = style.figure(1, 1, height=4.2)
-    for key, (label, colour, place, offset) in LABELS.items():
-        if key in curves:
-            points = np.reshape(curves[key], (-1, 2))
-            points = points[np.isfinite(points).all(axis=1)]
-            ours = not key.startswith(("mujoco", "newton"))
-            axis.loglog(*points.T, "o-", color=colour, markersize=5, linewidth=2.2 if ours else 1.3)
-            look = {"color": colour, "fontsize": style.TEXT, "va": "center", "ha": "left" if offset[0] > 0 else "right"}
-            axis.annotate(label, points[place], offset, textcoords="offset points", annotation_clip=False, **look)
-    axis.set(xlabel="processor time per simulated second, s", ylabel="relative error of the displacement")
-    low, high = axis.get_xlim()
-    axis.set_xlim(low / 8, high * 6)
-    return picture
 
 
 def _seconds(name: str, quantity: str, run: Run, text: str) -> Row:

@@ -2,11 +2,9 @@
 
 import importlib
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
-from scripts.reports.case import Findings
 from scripts.reports.rows import Row
 from scripts.reports.soft_bodies.rivals.body import Body, Run, relative_error
 
@@ -31,18 +29,16 @@ def rivals() -> tuple[dict[str, ModuleType], str]:
     return simulators, f"not installed: {', '.join(missing)} (pip install 'dln-jax[rivals]')" if missing else ""
 
 
-def findings(name: str, body: Body, runs: dict[str, Run], reference: np.ndarray, missing: str) -> Findings:
-    """Error and time of runs by SIMULATOR/STEP, and a curve of time and error for each simulator."""
+def findings(name: str, body: Body, runs: dict[str, Run], reference: np.ndarray, missing: str) -> list[Row]:
+    """Error and time of runs by SIMULATOR/STEP."""
     rows: list[Row] = []
-    curves: dict[str, Any] = {}
     for key, run in runs.items():
         error = relative_error(body, run.x, reference)
         case, text = f"{name}/{key}", f"{len(body.mesh.elements)} tetrahedra, {body.law}; {missing}".rstrip("; ")
         rows.append(number(case, "error", text, error))
         rows.append(number(case, "processor_seconds_per_second", text, run.seconds, "s"))
         rows.append(number(case, "compile_seconds", text, run.compiling, "s"))
-        curves.setdefault(key.split("/")[0], []).extend([run.seconds, error])
-    return Findings(rows, curves)
+    return rows
 
 
 def number(case: str, quantity: str, text: str, value: float, unit: str = "1") -> Row:
