@@ -10,6 +10,7 @@ from dln_jax.control import (
     Reference,
     computed_torque,
     energy_shaping,
+    feed_forward,
     field_of,
     linearise,
     lqr,
@@ -32,13 +33,15 @@ def test_laws_are_the_same_in_c(tmp_path):
     regulator = lqr(at.A, at.B, np.eye(4), np.eye(1))
     swing = energy_shaping(plant, parts_of(B), [0.0, 0.0], EnergyGains(2e7, 20.0, 5.0))
     near, cost = regulated(regulator, at.x, at.u, joints), value(regulator, at.x, joints)
-    follow = computed_torque(plant, Gains(np.full(2, 100.0), np.full(2, 20.0)))
+    gains = Gains(np.full(2, 100.0), np.full(2, 20.0))
+    follow, lead = computed_torque(plant, gains), feed_forward(plant, gains)
     laws = {
         "regulated": near,
         "swing_up": switched(lambda x: swing(x[:2], x[2:]), near, cost, 0.1),
         "computed_torque": lambda q, qd, *wanted: follow(q, qd, Reference(*wanted)),
+        "feed_forward": lambda q, qd, *wanted: lead(q, qd, Reference(*wanted)),
     }
-    sizes = {"regulated": (4,), "swing_up": (4,), "computed_torque": (2,) * 5}
+    sizes = {"regulated": (4,), "swing_up": (4,), "computed_torque": (2,) * 5, "feed_forward": (2,) * 5}
     export_c({name: (law, tuple(np.zeros(n) for n in sizes[name])) for name, law in laws.items()}, tmp_path / "laws")
     in_c = load_c(tmp_path / "laws")
     random = np.random.default_rng(0)

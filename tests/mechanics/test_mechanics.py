@@ -158,6 +158,31 @@ def test_inverse_after_forward_is_the_identity(d, seed):
     assert np.abs(round_trip(d)(weights, *random.normal(size=(3, d)))).max() < 1e-10
 
 
+@pytest.mark.parametrize("condition", [1.0, 1e6, 1e12])
+def test_residual_of_solve_does_not_grow_with_condition(condition, d=6):
+    """Backward stability (Higham 2002, theorem 9.4): |M qdd + c - tau| within 8 d eps of its terms."""
+    vectors = np.linalg.qr(np.random.default_rng(1).normal(size=(d, d)))[0]
+    upper = np.linalg.qr(np.sqrt(np.geomspace(1, 1 / condition, d))[:, None] * vectors.T, mode="r")
+    factor = upper.T * np.sign(np.diag(upper))
+    energies = natural.NaturalSystem(lambda q: (1 + 0.1 * jnp.sin(q[0])) * factor)
+    q, qd, qdd = np.random.default_rng(0).uniform(-1, 1, (3, d)) * np.array([[np.pi], [2.0], [5.0]])
+    for system in (dynamics(energies), dynamics(LagrangianSystem(natural.lagrangian(energies)))):
+        tau = system.inverse_dynamics(q, qd, qdd)
+        solved = system.forward_dynamics(q, qd, tau)
+        size = abs(factor @ factor.T).sum(axis=1).max() * (abs(qdd).max() + 2 * d * abs(qd).max() ** 2)
+        bound = 8 * d * np.finfo(float).eps
+        assert abs(system.inverse_dynamics(q, qd, solved) - tau).max() < bound * (size + abs(tau).max())
+        assert abs(solved - qdd).max() < bound * condition * (abs(qdd).max() + abs(qd).max() ** 2)
+
+
+@pytest.mark.slow
+def test_chain_of_thirty_equals_closed_form(d=30):
+    scene = chain(d)
+    q, qd, qdd = np.random.default_rng(0).uniform(-1, 1, (3, d)) * np.array([[np.pi], [2.0], [5.0]])
+    expected = closed_form.inverse_dynamics(scene.closed_form, q, qd, qdd)
+    assert relative_error(jax.jit(dynamics(scene.energies).inverse_dynamics)(q, qd, qdd), expected) < 1e-12
+
+
 def test_generic_functions_take_any_lagrangian():
     """A charged particle in a magnetic field: L is linear in qd as well, and M is not its whole story."""
 

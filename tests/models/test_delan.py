@@ -106,7 +106,30 @@ def test_a_full_turn_changes_nothing():
     def torque(q):
         return dynamics(model.energies(model.init(jax.random.key(1)))).inverse_dynamics(q, qd, qdd)
 
-    np.testing.assert_allclose(torque(q), torque(q + 2 * np.pi * np.array([1.0, -3.0])), rtol=1e-11)
+    for turns in (1.0, 1000.0):
+        np.testing.assert_allclose(torque(q), torque(q + 2 * np.pi * np.array([turns, -turns])), rtol=turns * 1e-11)
+
+
+def test_single_precision_and_nan():
+    """float32 loses no more than its rounding, and NaN in a state never becomes a finite answer."""
+    model = small(2)
+    parameters = jax.jit(model.init)(jax.random.key(1))
+    narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), parameters)
+    q, qd, x = np.array([[0.4, 1.0], [1.0, -1.0], [0.5, 2.0]], np.float32)
+
+    @jax.jit
+    def answers(parameters, *state):
+        system = dynamics(model.energies(parameters))
+        return jnp.stack([system.inverse_dynamics(*state), system.forward_dynamics(*state)])
+
+    single = answers(narrow, q, qd, x)
+    assert single.dtype == jnp.float32
+    exact = answers(parameters, *(array.astype(np.float64) for array in (q, qd, x)))
+    np.testing.assert_allclose(single, exact, rtol=1e-4, atol=1e-5)
+    for place in range(3):
+        state = [array.copy() for array in (q, qd, x)]
+        state[place][0] = np.nan
+        assert not np.isfinite(answers(narrow, *state)).all(axis=1).any()
 
 
 @pytest.mark.slow

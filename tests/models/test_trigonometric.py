@@ -211,6 +211,20 @@ def test_errors_fall_with_the_number_of_samples():
     assert excess[1] < excess[0] / 6
 
 
+def test_noise_on_accelerations_attenuates_the_inertia():
+    """Errors in variables (Fuller 1987): least squares finds M var(qdd) / (var(qdd) + s²)."""
+    scene, noise = pendulum(), 1.0
+    data = uniform(scene, samples=4000)
+    noisy = data._replace(qdd=data.qdd + noise * np.random.default_rng(0).normal(size=data.qdd.shape))
+    masses = [
+        dynamics(model.energies(fit_linear(model, each).parameters)).mass_matrix(np.zeros(1))[0, 0]
+        for model in (make_trigonometric(scene.needs, degree=1),)
+        for each in (data, noisy)
+    ]
+    variance = float(data.qdd.var())
+    assert masses[1] / masses[0] == pytest.approx(variance / (variance + noise**2), rel=0.02)
+
+
 def test_precision_does_not_depend_on_the_caller():
     """Computed in float64 for a single-precision model in a single-precision program, and in chunks of any size."""
     train, _ = sampled(ARM)

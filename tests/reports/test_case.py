@@ -14,10 +14,9 @@ from scripts.reports.differential_networks import table as differential_networks
 from scripts.reports.hamiltonian import table as hamiltonian
 from scripts.reports.published import ARM, DIFFERENTIAL_NETWORKS, HAMILTONIAN, published
 from scripts.reports.speed import derivatives
-from scripts.reports.stability import interruptions
 
 STUDIES = (
-    *(arm, differential_networks, one_pass, hamiltonian, interruptions),
+    *(arm, differential_networks, one_pass, hamiltonian),
     *(derivatives, softbody_report, benchmark, stability),
 )
 

@@ -1,4 +1,4 @@
-"""Controllers as C: agreement with JAX, and the time of one call from warm and cold caches.
+"""Controllers as C: the time of one call from warm and cold caches.
 
 Calls of a control loop are cold: other code has used the caches for a millisecond. To measure another controller, add a
 line to `LAWS`.
@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.control import Gains, Reference, computed_torque, feed_forward, first_plan
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
@@ -28,12 +26,9 @@ from scripts.reports.control.plans import in_jax
 from scripts.reports.control.real_time import HANGING, STACK, STEPS, cart_pole, renewed
 from scripts.reports.control.swing_ups import SWING_UPS, law_of, parts_of_law
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
-from scripts.reports.rows import Row, expect
+from scripts.reports.rows import Row
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
 
-AGREEMENT = 1e-10
-"""Largest difference of C and JAX at random states, relative to the largest control."""
-STATES = 8
 LEAST_EVICTED = 32
 """Minimum memory, MiB, that is read before a cold call to evict the caches."""
 
@@ -43,9 +38,7 @@ class Law(NamedTuple):
 
     function: Callable[..., Any]
     examples: tuple[Any, ...]
-    """Example arguments; random states are drawn about them."""
-    spread: float = 0.1
-    """Standard deviation of the random states."""
+    """Example arguments."""
 
 
 def regulator() -> Law:
@@ -55,7 +48,7 @@ def regulator() -> Law:
 
 def swing_up() -> Law:
     """The energy law, with the regulator near the top."""
-    return Law(law_of(SWING_UPS["rotary-pendulum"]), (np.array([0.0, np.pi, 0.0, 0.0]),), 0.3)
+    return Law(law_of(SWING_UPS["rotary-pendulum"]), (np.array([0.0, np.pi, 0.0, 0.0]),))
 
 
 def tree_by_computed_torque() -> Law:
@@ -90,7 +83,7 @@ def value_policy() -> Law:
 def one_iteration() -> Law:
     """A call of `prepare` for a cart-pole between walls over 1.2 s: (x, plan) -> plan."""
     problem = in_jax(cart_pole())
-    return Law(*renewed(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1)))), 1e-4)
+    return Law(*renewed(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1)))))
 
 
 LAWS: dict[str, Callable[[], Law]] = {
@@ -106,7 +99,7 @@ LAWS: dict[str, Callable[[], Law]] = {
 
 
 def laws(quick: bool) -> Findings:
-    """Agreement with JAX, and time of one call in microseconds."""
+    """Time of one call in microseconds."""
     rows: list[Row] = []
     effort = {"repeats": 3, "calls": 100, "cold": 50} if quick else {"repeats": 9, "calls": 1000, "cold": 1000}
     mebibytes = max(evicting(), LEAST_EVICTED)
@@ -115,26 +108,12 @@ def laws(quick: bool) -> Findings:
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / name
             export_c({name: (law.function, law.examples)}, folder, stack=STACK)
-            rows.append(agreement(name, law, load_c(folder)))
             program = programs(folder, compiled(folder, folder), [name])[name]
             # A plan takes a hundred times as long as a control law.
             spent = {**effort, "calls": max(effort["calls"] // 20, 10)} if name == "one_iteration" else effort
             rows += rows_of(name, timed(program, mebibytes=mebibytes, **spent))
     rows.append(Row("laws", "emptied_by_mib", mebibytes, "MiB", expected="read before each cold call"))
     return Findings(rows)
-
-
-def agreement(name: str, law: Law, loaded: Any) -> Row:
-    """Largest difference between C and JAX at random states, relative to the largest element of the result."""
-    in_jax, in_c, random, worst = jax.jit(law.function), getattr(loaded, name), np.random.default_rng(0), 0.0
-    for _ in range(STATES):
-        state = [example + law.spread * random.normal(size=np.shape(example)) for example in law.examples]
-        ours, theirs = (jax.tree.leaves(function(*state)) for function in (in_c, in_jax))
-        sizes = [max(float(jnp.max(jnp.abs(leaf))), 1e-12) for leaf in theirs]
-        off = [float(np.max(np.abs(a - np.asarray(b)))) for a, b in zip(ours, theirs, strict=True)]
-        worst = max(worst, *np.divide(off, sizes).tolist())
-    words = f"largest of {STATES} drawn states, relative to the answer"
-    return expect(f"laws/{name}", "difference_from_jax", words, worst, AGREEMENT)
 
 
 def rows_of(name: str, times: Times) -> list[Row]:
@@ -151,4 +130,4 @@ def _tracking(follow: Callable, d: int) -> Law:
     def law(q: Any, qd: Any, wanted_q: Any, wanted_qd: Any, wanted_qdd: Any) -> Any:
         return follow(q, qd, Reference(wanted_q, wanted_qd, wanted_qdd))
 
-    return Law(law, (np.zeros(d),) * 5, 1.0)
+    return Law(law, (np.zeros(d),) * 5)

@@ -1,37 +1,14 @@
-"""Controllers in C answer as in JAX, model-predictive control too; loops of the arm are as they are said to be."""
+"""Plants of the reports of control: the cart-pole is that of the scenes, and loops of the arm have limits and delay."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Gains, Reference, TrajectoryProblem, feed_forward, field_of, first_plan
-from dln_jax.export.c.load import load_c
-from dln_jax.export.c.source import export_c
+from dln_jax.control import field_of
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.poles import cart_pole, rotary_pendulum
-from scripts.reports.control import arm_loop, laws_in_c, real_time, tracking
+from dln_jax.scenes.poles import cart_pole
+from scripts.reports.control import arm_loop, real_time, tracking
 from scripts.reports.robots.arm import Motion
-
-
-def planning():
-    """A pendulum's plan, moved on and improved."""
-    field = lambda x, u: jnp.stack([x[1], jnp.sin(x[0]) + u[0]])  # noqa: E731
-    problem = TrajectoryProblem(
-        lambda x, u: x + 0.1 * field(x, u), lambda x, u: x @ x + u @ u, lambda x: 9 * x @ x, -0.5, 0.5,
-        states=lambda x: x[1:] - 0.3,
-    )  # fmt: skip
-    return laws_in_c.Law(*real_time.renewed(problem, first_plan(problem, np.zeros(2), np.zeros((3, 1)))), 0.2)
-
-
-def test_laws_agree(tmp_path):
-    follow = feed_forward(dynamics(rotary_pendulum().closed_form), Gains(np.ones(2), np.ones(2)))
-    tracker = laws_in_c.Law(lambda q, qd, *wanted: follow(q, qd, Reference(*wanted)), (np.zeros(2),) * 5)
-    table = {"plan": planning(), "tracker": tracker}
-    export_c({name: (law.function, law.examples) for name, law in table.items()}, tmp_path / "laws")
-    in_c = load_c(tmp_path / "laws", flags=("-O0",))
-    for name, law in table.items():
-        row = laws_in_c.agreement(name, law, in_c)
-        assert row.passed and row.value < 1e-12, name
 
 
 def test_the_cart_pole_of_the_report_is_that_of_the_scenes():
