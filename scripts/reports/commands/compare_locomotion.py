@@ -1,8 +1,7 @@
-"""Train one soft creature by gradients, PPO, SAC and evolution, and print what each needs for five body lengths.
+"""Train one soft creature by gradients and by PPO, and print what each needs for five body lengths.
 
-Several seeds each, until 6 body lengths or --steps. Writes report.json, a figure of the distance against environment
-steps and against wall time, and the model and gait of each method's best seed. Evolution needs the extra [rivals], PPO
-and SAC the extra [rl].
+Several seeds each, until 6 body lengths or --steps. Writes report.json, and the model and gait of each method's best
+seed. PPO needs the extra [rl].
 """
 
 import math
@@ -14,7 +13,7 @@ from dln_jax.cli.arguments import Unstated, choice, names_in
 from dln_jax.cli.options import Drawn, Folder, Scaled
 from dln_jax.cli.scaled import mesh_of
 from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.files import write_figure, write_json
+from dln_jax.files import write_json
 from dln_jax.locomotion.gradient import settings_of
 from dln_jax.locomotion.task import FALLEN
 from dln_jax.training.locomotion import (
@@ -27,15 +26,11 @@ from dln_jax.training.locomotion import (
     trained,
     write_run,
 )
-from scripts.reports.locomotion import comparison, evolution, ppo, sac
+from scripts.reports.locomotion import ppo
 from scripts.reports.locomotion.comparison import comparison_rows
 from scripts.reports.rows import conditions, print_report, write_report
 
-RIVALS = {
-    "ppo": (ppo, ppo.train_by_ppo),
-    "sac": (sac, sac.train_by_sac),
-    "evolution": (evolution, evolution.train_by_evolution),
-}
+RIVALS = {"ppo": (ppo, ppo.train_by_ppo)}
 
 
 @dataclass(frozen=True)
@@ -49,14 +44,13 @@ class Arguments(LocomotionOptions, Folder, Drawn, Scaled):
     seeds: int = 3
     """Seeds of each method, one after the other."""
     steps: Unstated[int] = None
-    """Environment steps of each seed (default: 400000 by gradients, 500000 by evolution, 300000 by
-    ppo, 20000 by sac)."""
+    """Environment steps of each seed (default: 400000 by gradients, 300000 by ppo)."""
     until: Unstated[float] = 6.0
     """A seed ends at this distance, in body lengths (default: 6)."""
     start: float = 0.0
     """Standard deviation of the vertices' initial positions, m; rivals start at rest."""
     lanes: Unstated[int] = None
-    """Creatures side by side, which devices share (default: 4 by gradients, 32 by evolution, 16 by ppo and sac)."""
+    """Creatures side by side, which devices share (default: 4 by gradients, 16 by ppo)."""
 
 
 def main(options: Arguments) -> None:
@@ -84,7 +78,7 @@ def main(options: Arguments) -> None:
             curves[method] = [seed.records for seed in policies.learned]
         rows = comparison_rows(options.creature, curves, goal=GOAL, seed=options.seed)
         facts = conditions(
-            dtype="float64; networks of ppo and sac float32",
+            dtype="float64; networks of ppo float32",
             seeds=list(range(options.seed, options.seed + options.seeds)),
             settings={method: values._asdict() for method, values in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
@@ -93,9 +87,6 @@ def main(options: Arguments) -> None:
         )
         write_report(folder / "report.json", rows, facts)
         write_json(folder / "metrics.json", numbers)
-        if options.figures:
-            title = f"{options.creature}: farthest so far, {options.seeds} seeds (thin) and their median (thick)"
-            write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
         print_report(rows, facts)
         if any(math.isinf(median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):
             print("where a median was not reached, ratios take the steps that were allowed: they are lower bounds")

@@ -1,1 +1,1 @@
-"""Ways of learning to move compared: what each needs until a creature travels five body lengths."""
+"""Gradients and PPO compared: what each needs until a creature travels five body lengths."""

@@ -66,10 +66,10 @@ def train_by_ppo(
     return learn_seeds(compile_ppo(task, settings_of(lanes), mesh=mesh), seeds, goal, report)
 
 
-def require_stable_baselines3(method: str = "ppo") -> None:
+def require_stable_baselines3() -> None:
     """Raises `InputError` if stable-baselines3 is not installed."""
     if importlib.util.find_spec("stable_baselines3") is None:
-        raise InputError(f"{method} needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
+        raise InputError("ppo needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
 
 
 def make_actor(task: LocomotionTask) -> Policy:
@@ -91,15 +91,10 @@ def make_actor(task: LocomotionTask) -> Policy:
 
 def actor_parameters(model: Any) -> Parameters:
     """Returns the parameters of `make_actor` from a stable-baselines3 model."""
-    return layers_of(model.policy, _ACTOR)
-
-
-def layers_of(network: Any, names: Sequence[str]) -> Parameters:
-    """Returns the linear layers of these names in a network of torch."""
-    stored = network.state_dict()
+    stored = model.policy.state_dict()
     return tuple(
         {"w": jnp.asarray(stored[f"{name}.weight"].numpy()), "b": jnp.asarray(stored[f"{name}.bias"].numpy())}
-        for name in names
+        for name in _ACTOR
     )
 
 

@@ -16,7 +16,6 @@ from dln_jax.locomotion.task import actuation_seen
 from dln_jax.scale.mesh import AXIS
 from scripts.reports.commands import compare_locomotion
 from scripts.reports.locomotion.ppo import make_actor
-from scripts.reports.locomotion.sac import make_squashed_actor
 
 
 @pytest.fixture(scope="module")
@@ -41,18 +40,6 @@ def test_the_actor_is_the_network_of_tanh_layers(task):
     target = 0.625 + 0.375 * np.clip(layers[2]["w"] @ h + layers[2]["b"], -1, 1)
     expected = 0.3 * np.tanh((target - actuation_seen(task, jnp.asarray(seen))) / 0.3)
     np.testing.assert_allclose(make_actor(task).apply(layers, jnp.asarray(seen)), expected, rtol=1e-5)
-
-
-def test_the_squashed_actor_is_the_network_of_rectified_layers(task):
-    random = np.random.default_rng(0)
-    sizes = (task.observation_size, 4, 4, 2)
-    layers = tuple({"w": random.normal(size=(m, n)), "b": random.normal(size=m)} for n, m in itertools.pairwise(sizes))
-    h = seen = random.normal(size=sizes[0])
-    for layer in layers[:2]:
-        h = np.maximum(layer["w"] @ h + layer["b"], 0)
-    target = 0.625 + 0.375 * np.tanh(layers[2]["w"] @ h + layers[2]["b"])
-    expected = 0.3 * np.tanh((target - actuation_seen(task, jnp.asarray(seen))) / 0.3)
-    np.testing.assert_allclose(make_squashed_actor(task).apply(layers, jnp.asarray(seen)), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("shared", [False, True])
