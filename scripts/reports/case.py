@@ -58,7 +58,7 @@ def measure(
         if case.name not in results:
             results[case.name] = case.measure()
             if folder:
-                stored = {name: {"rows": [row[:3] for row in found.rows]} for name, found in results.items()}
+                stored = {name: {"rows": [row[:3] for row in done.rows]} for name, done in results.items()}
                 write_json(folder / JOBS, stored)
         place = f"{number:{len(str(len(cases)))}d}/{len(cases)}"
         report(Done(place, case, results[case.name], time.perf_counter() - began))

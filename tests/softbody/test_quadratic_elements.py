@@ -35,6 +35,7 @@ from dln_jax.softbody.scene import element_energies, make_scene, potential, prep
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import point_force
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import element_hessians
@@ -196,6 +197,34 @@ def tip_over_beam_theory(mesh, nu, kind, length=1.0, height=0.01):
 
 def test_a_slender_beam_bends_with_one_element_through_the_thickness():
     assert tip_over_beam_theory(quadratic(beam(1.0, 0.01, 50, 1)), 0.3, "quadratic") == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.slow
+def test_elastica():
+    """P L²/EI = 10 at the tip: deflection and shortening of an inextensible rod over its length."""
+    height = 0.02
+    mesh = quadratic(beam(1.0, height, 50, 1))
+    tip = vertices_where(mesh, lambda x: x[:, 0] == 1.0)
+    rod = elastic(mesh, st_venant_kirchhoff, youngs_modulus=12 / height**3, poisson_ratio=0.0)
+    pull = point_force(mesh, tip, (0.0, -10.0 / len(tip)))
+    scene = make_scene(mesh, [rod, pull], held=vertices_where(mesh, lambda x: x[:, 0] == 0))
+    x, info = jax.jit(lambda params: static_solve(scene, params, iterations=500))(scene.params)
+    middle = np.asarray(x)[tip].mean(axis=0)
+    assert info.converged
+    assert height / 2 - middle[1] == pytest.approx(0.81061, rel=5e-3) and 1 - middle[0] == pytest.approx(
+        0.555, rel=5e-3
+    )
+
+
+def test_axial_frequency_of_a_bar():
+    """sqrt(E / rho) / 4 L."""
+    mesh = quadratic(beam(4.0, 1.0, 8, 2))
+    bar = solid(mesh, "quadratic", 0.0, held=vertices_where(mesh, lambda x: x[:, 0] == 0), density=st_venant_kirchhoff)
+    K = jax.jit(jax.hessian(lambda x: potential(bar, x, bar.params)))(bar.params.rest).reshape(2 * [mesh.vertices.size])
+    free, m = bar.free.ravel(), np.repeat(np.asarray(bar.params.masses), 2)
+    squared = np.linalg.eigvalsh(np.asarray(K / np.sqrt(np.outer(m, m)))[free][:, free])
+    exact = (np.pi / 2 / 4) ** 2 / (m.sum() / 2 / 4)
+    assert np.abs(squared / exact - 1).min() < 1e-3
 
 
 @pytest.mark.slow

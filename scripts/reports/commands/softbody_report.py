@@ -1,4 +1,4 @@
-"""Measure soft bodies: closed forms, hard cases, gradients and speed, each number beside what one may expect.
+"""Measure soft bodies: elements, hard cases, gradients, contact and speed, each number beside what one may expect.
 
 Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), and writes report.json. All of it
 is float64. Only `speed`, `compilation` and `rivals` depend on the machine. `rivals` measures the
@@ -18,21 +18,15 @@ from scripts.reports.soft_bodies import (
     contact,
     elements,
     gradients,
-    motions,
     robustness,
     speed,
-    statics,
     stiffness,
 )
 from scripts.reports.soft_bodies.rivals import cases as rivals
 from scripts.reports.soft_bodies.rivals import finer, touching
 
 MEASURES = {
-    "references": (
-        *(motions.invariants, motions.orders, motions.block, motions.slope),
-        *(statics.uniaxial, statics.patch_test, statics.elastica, statics.cantilever),
-        *(elements.locking, elements.slender),
-    ),
+    "references": (elements.locking, elements.slender),
     "hard": (
         *(robustness.time_steps, robustness.materials, robustness.bad_starts, robustness.mass_ratio, robustness.chain),
     ),

@@ -5,9 +5,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
@@ -16,7 +15,6 @@ from dln_jax.softbody.step import Step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.softbody.terms.term import Term
 from dln_jax.softbody.verdict import Info
 from scripts.reports.rows import Row, expect, largest
 
@@ -33,29 +31,11 @@ class Seen(NamedTuple):
     converged: Bool[np.ndarray, " T"]
 
 
-def solid(mesh: Mesh, *, modulus: float, poisson_ratio: float = 0.3, **scene: Any) -> SoftScene:
-    """A stable neo-Hookean body under its weight; Young's modulus in Pa."""
-    material = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus, poisson_ratio=poisson_ratio)
-    return make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY))], **scene)
-
-
-class Loads(NamedTuple):
-    """Parameters of dead loads."""
-
-    forces: Float[Array, "n dim"]
-    """In N, on each vertex."""
-
-
-def dead_load(mesh: Mesh) -> Term:
-    """-f·x of every vertex: the term "load", whose forces are zero by default."""
-    none, vertices = Loads(jnp.zeros(mesh.vertices.shape)), np.arange(len(mesh.vertices))[:, None]
-    work = lambda x, force: -jnp.asarray(sum(force[i] * c for i, c in enumerate(x[0])))  # noqa: E731
-    return Term("load", vertices, work, none, lambda loads, context: loads.forces)
-
-
 def cantilever_of(mesh: Mesh, modulus: float = 1e6, **others: Any) -> SoftScene:
     """A solid held at x = 0; a beam of 4 m x 1 m and 1e6 Pa sags by about its length."""
-    return solid(mesh, modulus=modulus, held=vertices_where(mesh, lambda x: x[:, 0] == 0), **others)
+    material = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus)
+    held = vertices_where(mesh, lambda x: x[:, 0] == 0)
+    return make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY))], held=held, **others)
 
 
 def converges(name: str, converged: Any, iterations: Any = None, most: int = 0, text: str = "") -> list[Row]:

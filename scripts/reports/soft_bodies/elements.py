@@ -20,10 +20,10 @@ from dln_jax.softbody.mesh.simplices import SIDES
 from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import point_force
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from scripts.reports.case import Findings
 from scripts.reports.rows import expect
-from scripts.reports.soft_bodies.common import dead_load
 
 RATIOS = (0.3, 0.49, 0.4999)
 CELLS = {"linear": (4, 8, 16, 32), "quadratic": (2, 4, 8, 16), "mixed": (2, 4, 8, 16), "split": (2, 3, 6, 12)}
@@ -87,10 +87,11 @@ def _clamped(cells: int, kind: str) -> tuple[Mesh, Any]:
     if kind != "linear":
         mesh = quadratic(barycentric_split(mesh) if kind == "split" else mesh)
     solid = elastic(mesh, stable_neo_hookean, youngs_modulus=MODULUS, poisson_ratio=RATIOS[-1], mixed=kind == "mixed")
-    scene = make_scene(mesh, [solid, dead_load(mesh)], density=1.0, held=boundary_vertices(mesh))
+    load = point_force(mesh, np.arange(len(mesh.vertices)), np.zeros(mesh.vertices.shape), name="load")
+    scene = make_scene(mesh, [solid, load], density=1.0, held=boundary_vertices(mesh))
 
     def solve(nu: Any, forces: Any) -> tuple[Any, Any]:
-        params = with_parameters(scene.params, elastic={"poisson_ratio": nu}, load={"forces": forces})
+        params = with_parameters(scene.params, elastic={"poisson_ratio": nu}, load={"force": forces})
         x, info = static_solve(scene, params, tolerance=TOLERANCE)
         return x, info.converged
 
