@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from dln_jax.mechanics.integrators import (
     adaptive_rollout,
@@ -255,6 +256,39 @@ def test_close_encounter_keeps_energy_and_collision_is_unfinished():
     energy = 0.5 * jnp.sum(qd**2, axis=1) - 1 / jnp.linalg.norm(q, axis=1)
     assert finished and jnp.abs(energy - energy[0]).max() < 100 * tolerance / nearest**2
     assert not orbit(jnp.array([0.1, 0.0]), jnp.zeros(2))[1]
+
+    def distance_at_end(factor):
+        (q, _), _ = adaptive_rollout(field, (start[0], factor * start[1]), t[:49], tolerance=tolerance, max_steps=4096)
+        return jnp.sum(q[-1] ** 2)
+
+    far, speed, h = 2.0 - nearest, float(start[1][1]), 1e-6
+    ends = [kepler_distance(speed * factor, far, float(t[48])) ** 2 for factor in (1 + h, 1 - h)]
+    slope = jax.jit(jax.grad(distance_at_end))(1.0)
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=100 * tolerance / nearest**2)
+
+
+def kepler_distance(speed, apocentre, t):
+    """Distance at the time t on the orbit that starts at its apocentre, by Kepler's equation."""
+    axis = 1 / (2 / apocentre - speed**2)
+    eccentricity = apocentre / axis - 1
+    anomaly = np.pi + t * axis**-1.5
+    eccentric = brentq(lambda x: x - eccentricity * np.sin(x) - anomaly, anomaly - 1, anomaly + 1, xtol=1e-15)
+    return axis * (1 - eccentricity * np.cos(eccentric))
+
+
+@pytest.mark.slow
+def test_implicit_steps_past_an_encounter_are_solutions_or_nan():
+    """The implicit midpoint from the nearest point, with steps of up to a thousand times the time spent there."""
+    field, dts = second_order(lambda t, q, qd: -q / jnp.sum(q**2) ** 1.5), jnp.geomspace(1e-4, 1.0, 33)
+    start = jnp.array([1e-3, 0.0]), jnp.array([0.0, ((2 - 1e-3) / 1e-3) ** 0.5])
+    ends = jax.jit(jax.vmap(lambda dt: implicit_midpoint(field)(0.0, start, dt)))(dts)
+    finite = np.isfinite(np.concatenate(ends, axis=1)).all(axis=1)
+    middle = [(first + last) / 2 for first, last in zip(start, ends, strict=True)]
+    for first, last, rate in zip(start, ends, jax.vmap(lambda *state: field(0.0, state))(*middle), strict=True):
+        change = dts[:, None] * rate
+        off = jnp.abs(last - first - change).max(axis=1) > 1e-9 * (1 + jnp.abs(change).max(axis=1))
+        assert not (np.asarray(off) & finite).any()
+    assert finite.any()
 
 
 def test_roots_have_derivatives_of_higher_order_in_both_modes():
