@@ -31,7 +31,8 @@ REDUCED = {
     "17_stiffness_from_a_motion": {},
     "18_tangle": {"STEPS": 40, "STRIPS": 3},
     "19_predictive_control": {"SECONDS": 2.0, "FRAMES_PER_SECOND": 2.0},
-    "20_state_estimation": {"SECONDS": 1.0, "WINDOW": 2},
+    "20_state_estimation": {"SECONDS": 1.0},
+    "21_gymnasium_environment": {"SAMPLES": 50},
 }
 """Constants of the examples, and what they are here."""
 
