@@ -75,6 +75,8 @@ if jax.__version_info__ < (0, 11):  # later ones do not know it, and abort at wh
 def pytest_addoption(parser):
     parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
+    parser.addoption("--pinned", action="store_true", help="compare the numbers of commands with those in tests/pinned")
+    parser.addoption("--renew", action="store_true", help="store what tests/pinned measures, and compare nothing")
     parser.addoption("--every-export", action="store_true", help="compare all of every export with JAX, for minutes")
 
 

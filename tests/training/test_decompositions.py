@@ -28,7 +28,7 @@ MASS, WEIGHT, SPRING, DAMPING, DRY = 2.0, 19.6, 30.0, 4.0, 3.0
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     """A folder with the embedded letters, as a file that states no needs."""
-    folder, data = tmp_path_factory.mktemp("decompositions"), characters()
+    folder, data = tmp_path_factory.mktemp("decompositions"), characters(dt=0.1)
     keys = ("t", "q", "qd", "qdd", "tau", "trajectory", "label", "tau_inertial", "tau_coriolis", "tau_gravity")
     np.savez(folder / LETTERS, **{key: getattr(data, key) for key in keys})
     with pytest.MonkeyPatch.context() as patch:

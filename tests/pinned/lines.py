@@ -1,0 +1,188 @@
+"""What every command gives on small data: the numbers that a change of the code must not move.
+
+`python -m pytest -n 0 tests/pinned --pinned` compares them with `pins.json`, and `--renew` stores them anew; a commit
+that does so says why. Another processor or JAX rounds otherwise: there, renew them before a change.
+"""
+
+import hashlib
+import importlib
+import inspect
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+from calls import command
+
+import dln_jax
+from dln_jax.cli.commands import COMMANDS
+from dln_jax.data import schema
+from dln_jax.data.checks import quick
+from dln_jax.data.splits import split
+from dln_jax.scenes import cart_pole, pendulum, two_link_arm
+from dln_jax.scenes.datasets import generators
+
+BODY = """<link name="{}"><inertial><origin xyz="0.1 0.05 0.2"/><mass value="{}"/>
+<inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="{}" type="continuous"><parent link="{}"/><child link="{}"/>
+<origin xyz="0.2 0 0.1" rpy="{} 0 0"/><axis xyz="0 0 1"/><dynamics damping="0.2"/></joint>"""
+ARM = '<robot name="arm"><link name="base"/>{}</robot>'.format(
+    BODY.format("upper", 2.0) + BODY.format("lower", 1.0)
+    + JOINT.format("shoulder", "base", "upper", 0.4) + JOINT.format("elbow", "upper", "lower", 1.2)
+)  # fmt: skip
+SMALL = "--width 4 --depth 1"
+BRIEF = "--no-figures --no-low-latency --no-uncertainty"
+LINES = {
+    **{
+        f"train_delan-{model}": f"train_delan --data arm.npz --model {model} {more} {BRIEF}"
+        for model, more in {
+            "structured-delan": f"--optimizer gauss-newton --steps 5 {SMALL}",
+            "black-box-delan": f"--optimizer gauss-newton --steps 5 {SMALL}",
+            "feed-forward": f"--optimizer adam --steps 20 {SMALL} --precision f64",
+            "trigonometric": "",
+            "trigonometric-kernel": "--samples 40",
+        }.items()
+    },
+    "train_delan-letters": f"train_delan --steps 3 {SMALL} {BRIEF}",
+    "train_delan-motors": "train_delan --data cart.npz --model structured-delan --steps 5 "
+    f"--optimizer gauss-newton {SMALL} {BRIEF}",
+    "train_hnn": f"train_hnn --data arm.npz --optimizer gauss-newton --steps 5 {SMALL} {BRIEF}",
+    "train_hnn_task-spring": "train_hnn_task --task spring --trajectories 10 --steps 5 --no-figures --no-low-latency",
+    "train_hnn_task-pendulum": "train_hnn_task --task pendulum --trajectories 10 --steps 5 --no-figures "
+    "--no-low-latency",
+    "train_hnn_task-measured": "train_hnn_task --task measured --data swings.npz --test 3 --steps 5 "
+    f"--model separable-hnn {SMALL} --no-figures --no-low-latency",
+    "train_hnn_task-momenta": "train_hnn_task --task measured --data momenta.npz --test 3 --steps 5 "
+    f"--model separable-hnn {SMALL} --no-figures --no-low-latency",
+    **{
+        f"identify-{name}": f"identify --robot arm.urdf --data log.npz --no-figures --no-uncertainty {more}"
+        for name, more in {
+            "torques": "--test last:30%",
+            "filtered": "--test last:30% --cutoff 8",
+            "motions": "--test last:30% --by motions --window 0.3 --cutoff 8",
+            "both": "--test last:30% --by both --window 0.3",
+        }.items()
+    },
+    "train_value": "train_value --plant pendulum --iterations 1 --width 8 --depth 1 --starts 4 --no-figures",
+    "train_diffnet": "train_diffnet --samples 50 --steps 2 --coarse-steps 0 --width 4 --depth 1 --no-figures",
+    "simulate-beam": "simulate --scene beam --cells 1 --seconds 0.05 --no-figures --precision f64",
+    "train_locomotion": "train_locomotion --steps 64 --window 4 --episode 8 --lanes 2 --width 4 --no-figures",
+    "swing_up": "swing_up --plant cart-pole --model known --starts 2 --no-figures",
+    "sweep": [
+        "sweep",
+        "--grid",
+        "width=2,3",
+        "--jobs",
+        "1",
+        "--fixed",
+        "data=arm.npz model=structured-delan steps=2 depth=1",
+    ],
+    "check_data": "check_data --data log.npz --no-figures",
+}
+"""Command lines by name."""
+TIMES = re.compile(r"seconds|_us$|per_second|latency|calls|_ms$")
+"""Entries of metrics.json that measure time."""
+LOGS = ("arm", "cart", "swings", "momenta", "log", "letters")
+
+
+def make_files(folder):
+    """Small logs and a robot's file."""
+    arm = generators.uniform(two_link_arm(), samples=60)
+    schema.save(folder / "arm.npz", arm)
+    schema.save(folder / "cart.npz", generators.uniform(cart_pole(friction=0.1), samples=60))
+    swings = generators.free_swing(pendulum(), trajectories=4, steps=40)
+    np.savez(folder / "swings.npz", t=swings.t, q=swings.q, trajectory=swings.trajectory)
+    np.savez(folder / "momenta.npz", t=swings.t, q=swings.q, p=swings.p, trajectory=swings.trajectory)
+    schema.save(folder / "letters.npz", generators.characters(letters=("a", "b", "c", "d")))
+    (folder / "arm.urdf").write_text(ARM)
+    t = np.arange(0, 6, 0.02)
+    amplitude, rate, phase = np.random.default_rng(0).uniform([0.2, 1, 0], [0.8, 4, 6], (2, 3, 3)).transpose(2, 0, 1)
+    angle = rate[..., None] * t + phase[..., None]
+    q, qd = (
+        np.sum(x, axis=1).T
+        for x in (amplitude[..., None] * np.sin(angle), (amplitude * rate)[..., None] * np.cos(angle))
+    )
+    qdd = np.sum(-(amplitude * rate**2)[..., None] * np.sin(angle), axis=1).T
+    true = read_tree(folder / "arm.urdf")
+    tau = np.array([true(*row) for row in zip(q, qd, qdd, strict=True)])
+    tau += 0.05 * np.random.default_rng(1).normal(size=tau.shape)
+    np.savez(folder / "log.npz", t=t, q=q, qd=qd, qdd=qdd, tau=tau, trajectory=np.repeat(np.arange(4), len(t) // 4))
+
+
+def read_tree(path):
+    """Torques of the file's robot with half as much mass again, armature and friction."""
+    import jax
+
+    from dln_jax.data.robots import read_robot
+    from dln_jax.mechanics.equations import dynamics
+    from dln_jax.mechanics.friction import joint_dissipation
+    from dln_jax.mechanics.trees import tree_system
+
+    tree = read_robot(path).tree
+    tree = tree._replace(inertias=1.5 * tree.inertias, armature=np.array([0.1, 0.2]))
+    return jax.jit(dynamics(tree_system(tree, joint_dissipation([0.4, 0.2], [0.5, 0.1]))).inverse_dynamics)
+
+
+def masked(text):
+    """The text with numbers and frames of tables taken out, so that a digit or a column's width does not matter."""
+    lines = (re.sub(r"[-+]?\d[\d.,]*(e[-+]?\d+)?", "#", line) for line in text.splitlines())
+    lines = (re.sub(r"[\s│┃━─┏┓┗┛┡┩└┘┳┻╇┴╭╮╰╯]+", " ", line).strip() for line in lines)
+    return [line for line in lines if line]
+
+
+def measured(name, capsys):
+    """What a command line leaves in the working folder and prints."""
+    line = LINES[name]
+    script, *words = line.split() if isinstance(line, str) else line
+    folder = Path(name)
+    try:
+        command(importlib.import_module(f"dln_jax.cli.commands.{script}"), *words, "--out", folder)
+        status = 0
+    except SystemExit as ended:
+        status = ended.code
+    told = capsys.readouterr()
+    found = {"status": status, "printed": masked(told.out), "error": masked(told.err)}
+    if (folder / "metrics.json").exists():
+        metrics = json.loads((folder / "metrics.json").read_text())
+        found["metrics"] = {key: value for key, value in metrics.items() if not TIMES.search(key)}
+    if (folder / "table.csv").exists():
+        found["columns"] = (folder / "table.csv").read_text().splitlines()[0]
+    if (folder / "config.json").exists():
+        config = json.loads((folder / "config.json").read_text())
+        found["keys of config"] = sorted(config)
+    return found
+
+
+def splits_and_findings(name):
+    """Sizes and marks of the parts of a log, and what its checks find."""
+    data = schema.load(f"{name}.npz")
+    parts = split(data)
+    rows = {
+        part: hashlib.sha256(np.ascontiguousarray(getattr(parts, part).t).tobytes()).hexdigest()[:12]
+        for part in parts._fields
+        if hasattr(getattr(parts, part), "t")
+    }
+    return {"parts": rows, "findings": [f"{f.severity} {f.check} {list(f.joints)}" for f in quick(data)]}
+
+
+def public_names():
+    """Public names and their signatures."""
+    found = {}
+    for name in sorted(dln_jax.__all__):
+        value = getattr(dln_jax, name)
+        try:
+            found[name] = str(inspect.signature(value))
+        except (TypeError, ValueError):
+            found[name] = type(value).__name__
+    return found
+
+
+def help_texts(capsys):
+    """Options of every command with their types and defaults, as its help shows them."""
+    found = {}
+    for name in COMMANDS:
+        try:
+            command(importlib.import_module(f"dln_jax.cli.commands.{name}"), "--help")
+        except SystemExit:
+            found[name] = re.findall(r"--[a-z][\w-]*", capsys.readouterr().out)
+    return found
