@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
 import dln_jax
 from dln_jax.data.schema import from_arrays
@@ -116,25 +117,32 @@ def test_a_stored_model_is_the_same_after_every_default_has_changed(name, tmp_pa
     again = load(tmp_path)
     assert {"name", "precision", *received} - {"dtype"} == set(description)
     assert answer(name, again) == before
-    for leaf, other in zip(jax.tree.leaves(run.parameters), jax.tree.leaves(again.parameters), strict=True):
-        np.testing.assert_array_equal(leaf, other)
+    jax.tree.map(np.testing.assert_array_equal, run.parameters, again.parameters)
+    if "needs" in MODELS[name]:
+        assert_properties(entry.properties, run.energies, MODELS[name]["needs"])
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_a_missing_keyword_is_refused_and_never_filled_in(name, tmp_path):
-    description = stored(tmp_path, name)
-    for key in description:
-        if key in ("name", "precision", *LATER):
-            continue
-        altered(tmp_path, lambda model, key=key: model.pop(key))
-        with pytest.raises(InputError, match=f"model.json: model description: lacks {key}; restore") as caught:
-            load(tmp_path)
-        assert "\n" not in str(caught.value)
-        altered(tmp_path, lambda model, key=key: model.update({key: description[key]}))
-    if "needs" in description:
-        altered(tmp_path, lambda model: model["needs"].pop("friction"))
-        with pytest.raises(InputError, match="needs lack friction"):
-            load(tmp_path)
+def assert_properties(properties, energies, needs):
+    """The catalogue describes a model by its energies."""
+    assert isinstance(energies, Energies) == properties.energy
+    assert isinstance(energies, Canonical | PhaseRates) == properties.canonical
+    if properties.definite:
+        q = np.linspace(0.1, 0.7, len(needs.joints)) ** 2
+        assert np.linalg.eigvalsh(dynamics(energies).mass_matrix(q)).min() > 0
+    if properties.canonical:
+        assert flow(energies).rates is not None
+
+
+def test_missing_keywords_are_refused_and_never_filled_in():
+    for name, settings in MODELS.items():
+        description = describe(name, precision="f64", **settings)
+        for key in {*description} - {"name", "precision", *LATER}:
+            with one_line(f"model description: lacks {key}; restore"):
+                build({other: value for other, value in description.items() if other != key})
+    description = describe("feed-forward", precision="f64", **MODELS["feed-forward"])
+    needs = {key: value for key, value in description["needs"].items() if key != "friction"}
+    with one_line("needs lack friction"):
+        build({**description, "needs": needs})
 
 
 def test_a_default_that_changes_leaves_stored_results(tmp_path, monkeypatch):
@@ -249,9 +257,8 @@ def test_a_factory_is_imported_by_name_only_when_it_is_trusted(tmp_path, module)
     assert module()
     for name in ("rods:number", "rods:nothing", "no.such.module:make", ":", "rods:", "..rods:make_rod"):
         altered(tmp_path, lambda model, name=name: model.update(name=name))
-        with pytest.raises(InputError) as caught:
+        with one_line():
             load(tmp_path, trust=True)
-        assert "\n" not in str(caught.value)
 
 
 def test_a_named_model_takes_no_other_factory(tmp_path):
@@ -297,19 +304,3 @@ def test_typical_sizes_are_those_of_the_data():
         typical_sizes("black-box-hnn", without, pooled=True)
     needs = Needs(joints=("prismatic",) * 2)
     assert describe_for("black-box-hnn", without, needs, precision="f64")["momentum_scale"] == 1.0
-
-
-def test_properties_are_those_of_the_energies():
-    """The catalogue describes a model by its energies."""
-    for name, entry in CATALOGUE.items():
-        if "needs" not in MODELS[name]:
-            continue
-        model = build(describe(name, precision="f64", **MODELS[name]))
-        energies = model.energies(random_parameters(model))
-        assert isinstance(energies, Energies) == entry.properties.energy
-        assert isinstance(energies, Canonical | PhaseRates) == entry.properties.canonical
-        if entry.properties.definite:
-            q = np.linspace(0.1, 0.7, len(MODELS[name]["needs"].joints)) ** 2
-            assert np.linalg.eigvalsh(dynamics(energies).mass_matrix(q)).min() > 0
-        if entry.properties.canonical:
-            assert flow(energies).rates is not None

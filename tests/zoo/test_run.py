@@ -1,14 +1,18 @@
 """Every model comes back from its folder as it was, and anything wrong with a folder is refused in one line."""
 
+import hashlib
 import json
+import struct
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
+from calls import json_of, one_line
 
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.types import InputError, Needs
+from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import load, save
 
@@ -41,7 +45,7 @@ def test_a_loaded_run_answers_as_the_model_does(run_folder):
 def edit(name, change):
     def damage(folder):
         path = folder / name
-        manifest = json.loads(path.read_text())
+        manifest = json_of(path)
         change(manifest)
         path.write_text(json.dumps(manifest))
 
@@ -60,27 +64,89 @@ def flip_one_bit(folder):
     path.write_bytes(bytes(data))
 
 
-DAMAGES = {
-    "truncated": (truncate, "truncated or altered"),
-    "one bit": (flip_one_bit, "truncated or altered"),
-    "no tensors": (lambda folder: (folder / "model.safetensors").unlink(), "missing, though model.json names it"),
-    "no manifest": (lambda folder: (folder / "model.json").unlink(), "no such file"),
-    "no json": (lambda folder: (folder / "model.json").write_text("{"), "not readable as JSON"),
-    "future schema": (edit("model.json", lambda m: m.update(schema_version=99)), "schema version 99"),
-    "foreign path": (edit("model.json", lambda m: m.update(tensor_file="../x")), "tensor_file is"),
-    "no description": (edit("model.json", lambda m: m.pop("model")), "describes no model"),
-    "unknown name": (edit("model.json", lambda m: m["model"].update(name="oracle")), "knows structured-delan"),
-    "other width": (edit("model.json", lambda m: m["model"].update(width=6)), "expected float32"),
-    "other depth": (edit("model.json", lambda m: m["model"].update(depth=3)), "no tensor|expected float32"),
-    "unknown setting": (edit("model.json", lambda m: m["model"].update(colour="red")), "colour"),
-    "missing setting": (edit("model.json", lambda m: m["model"].pop("needs")), "needs"),
+DAMAGES = [
+    (truncate, "truncated or altered"),
+    (flip_one_bit, "truncated or altered"),
+    (lambda folder: (folder / "model.safetensors").unlink(), "missing, though model.json names it"),
+    (lambda folder: (folder / "model.json").unlink(), "no such file"),
+    (lambda folder: (folder / "model.json").write_text("{"), "not readable as JSON"),
+    (edit("model.json", lambda m: m.update(schema_version=99)), "schema version 99"),
+    (edit("model.json", lambda m: m.update(tensor_file="../x")), "tensor_file is"),
+    (edit("model.json", lambda m: m.pop("model")), "describes no model"),
+    (edit("model.json", lambda m: m["model"].update(name="oracle")), "knows structured-delan"),
+    (edit("model.json", lambda m: m["model"].pop("width")), "model.json: model description: lacks width; restore"),
+    (edit("model.json", lambda m: m["model"].update(width=6)), "expected float32"),
+    (edit("model.json", lambda m: m["model"].update(depth=3)), "no tensor|expected float32"),
+]
+
+
+def test_damaged_runs_are_refused_in_one_line(run_folder):
+    whole = {path: path.read_bytes() for path in run_folder.iterdir()}
+    for act, message in DAMAGES:
+        act(run_folder)
+        with one_line(message):
+            load(run_folder)
+        for path, data in whole.items():
+            path.write_bytes(data)
+
+
+LONG = "x" * 5000
+OF_MANIFEST = {
+    "schema_version": [None, "1", True, 1],
+    "tensor_file": [None, 3, ["model.safetensors"], "../model.safetensors", "..", LONG],
+    "sha256": [None, [1]],
+    "model": [None, "delan", [], {}],
 }
+OF_DELAN = {
+    "name": [["structured-delan"], 3, "os:system", "own"],
+    "precision": [["f64"], 64, "f16"],
+    "activation": [["tanh"], 1],
+    "needs": [[], None, {"joints": {"revolute": 1}}],
+    "width": ["3", [3], None, 3.5, True, 0, -3],
+    "depth": ["1", 0, 10**9],
+    "diagonal_shift": ["2", float("nan")],
+    "shared_trunk": ["yes"],
+    "colour": [1.0],
+}
+OF_DIFFNET = {
+    "sizes": ["1-3-1", None, [1], ["1", "3", "1"], [1, -3, 1], [1] * 5000],
+    "members": ["1", 0],
+}
+"""Wrong values by key."""
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_run_is_refused_in_one_line(run_folder, damage):
-    act, message = DAMAGES[damage]
-    act(run_folder)
-    with pytest.raises(InputError, match=message) as caught:
-        load(run_folder)
-    assert "\n" not in str(caught.value)
+def replaced(stored, wrong):
+    return [{**stored, key: value} for key, values in wrong.items() for value in values]
+
+
+def test_values_that_no_model_has_are_refused_in_one_line(run_folder, tmp_path_factory):
+    other = tmp_path_factory.mktemp("diffnet")
+    description = describe("differential-network", sizes=[1, 3, 1], activation="cos", members=1, precision="f64")
+    save(other, description, build(description).init(jax.random.key(0)))
+    for folder, wrong in ((run_folder, OF_DELAN), (other, OF_DIFFNET)):
+        manifest = json_of(folder / "model.json")
+        described = [{**manifest, "model": model} for model in replaced(manifest["model"], wrong)]
+        for stored in [*replaced(manifest, OF_MANIFEST), *described]:
+            (folder / "model.json").write_text(json.dumps(stored))
+            with one_line() as caught:
+                load(folder)
+            assert len(str(caught.value)) < 1000 + len(LONG), stored
+
+
+TENSORS = [
+    b"",
+    b"no tensors",
+    struct.pack("<Q", 2**60) + b"{}",
+    struct.pack("<Q", 2) + b"[]",
+    # A type that NumPy lacks.
+    struct.pack("<Q", 60) + b'{"a":{"dtype":"F8_E4M3","shape":[1],"data_offsets":[0,1]}}'.ljust(60) + b"\0",
+    safetensors.numpy.save({"a": np.zeros(3)}),
+]
+
+
+def test_damaged_tensors_are_refused_even_if_the_digest_is_right(run_folder):
+    for tensors in TENSORS:
+        edit("model.json", lambda m, data=tensors: m.update(sha256=hashlib.sha256(data).hexdigest()))(run_folder)
+        (run_folder / "model.safetensors").write_bytes(tensors)
+        with one_line("model.safetensors"):
+            load(run_folder)
