@@ -1,7 +1,7 @@
 """Arrays of jobs on a Slurm cluster that four programs on the PATH simulate."""
 
 import pytest
-from calls import command, refused
+from calls import assert_refused, exit_status, refused
 
 from dln_jax.cli.commands import sweep
 from dln_jax.cli.sweeps.executors import Requeued
@@ -32,17 +32,16 @@ def cluster(tmp_path, monkeypatch):
     return folder
 
 
-GRID = ("--grid", "width=4,8,16", "--where", "slurm")
+GRID = "--grid width=4,8,16 --where slurm"
 
 
 def test_array_is_submitted_and_slurm_s_reasons_are_printed(cluster, tmp_path, capsys):
     (cluster / "states").write_text("7_0|OUT_OF_MEMORY|a\n7_1|TIMEOUT|a\n7_2|CANCELLED by 0|a\n")
-    with pytest.raises(SystemExit) as stop:
-        command(
-            sweep, *GRID, "--slurm", "partition=gpu time=30 gpus_per_node=1", "--jobs", "2", "--out", tmp_path / "s"
-        )
+    status = exit_status(
+        sweep, GRID, "--slurm", "partition=gpu time=30 gpus_per_node=1", "--jobs 2 --out", tmp_path / "s"
+    )
     text = capsys.readouterr().out
-    assert stop.value.code == 1 and "0000 killed: did not start (OUT_OF_MEMORY)" in text and "(TIMEOUT)" in text
+    assert status == 1 and "0000 killed: did not start (OUT_OF_MEMORY)" in text and "(TIMEOUT)" in text
     script = (cluster / "scripts").read_text()
     for line in (
         "--array=0-2%2",
@@ -63,25 +62,19 @@ def test_a_job_that_is_queued_again_is_the_same_job(tmp_path):
     assert queued.function == Requeued(run_job) and queued.args == (job,) and not queued.kwargs
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("partion=gpu", "partion"),
-        ("time", "no NAME=VALUE"),
-        ("time=5 time=6", "names time twice"),
-        ("time=1-00:00", "whole minutes"),
-    ],
-)
-def test_options_of_sbatch_are_checked(cluster, tmp_path, capsys, options, message):
-    assert message in refused(capsys, sweep, *GRID, "--slurm", options, "--out", tmp_path / "s")
-
-
-def test_a_larger_array_than_slurm_s_is_refused(cluster, tmp_path, capsys):
-    line = refused(capsys, sweep, "--grid", "seed=0:1001", "--where", "slurm", "--out", tmp_path / "s")
-    assert "1001 jobs for one Slurm array" in line
+def test_options_of_sbatch_are_checked(cluster, tmp_path, capsys):
+    rows = [
+        ("--slurm partion=gpu", "partion"),
+        ("--slurm time", "no NAME=VALUE"),
+        ("--slurm", "time=5 time=6", "names time twice"),
+        ("--slurm time=1-00:00", "whole minutes"),
+        # Larger than Slurm's arrays.
+        ("--grid seed=0:1001", "1001 jobs for one Slurm array"),
+    ]
+    assert_refused(capsys, sweep, rows, GRID, out=tmp_path / "s")
 
 
 def test_refusal_by_sbatch_is_one_line(cluster, tmp_path, capsys):
     (cluster / "sbatch").write_text("#!/bin/sh\necho 'invalid partition specified: gpu' >&2; exit 1\n")
-    line = refused(capsys, sweep, *GRID, "--out", tmp_path / "s")
+    line = refused(capsys, sweep, GRID, "--out", tmp_path / "s")
     assert "invalid partition specified: gpu" in line

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax.cli.commands import sweep
 from dln_jax.cli.sweeps import command as sweep_command
@@ -83,10 +83,9 @@ def executor(monkeypatch):
 @pytest.mark.parametrize("option", ["metric", "error"])
 def test_unknown_metrics_are_refused_and_jobs_are_kept(tmp_path, executor, capfd, option):
     out = tmp_path / "sweep"
-    with pytest.raises(SystemExit) as stop:
-        command(sweep, "--grid", "width=4 seed=0:2", "--out", out, f"--{option}", "torque_msee")
+    status = exit_status(sweep, "--grid", "width=4 seed=0:2", "--out", out, f"--{option}", "torque_msee")
     message = capfd.readouterr().err
-    assert stop.value.code == 2 and not (out / "table.csv").exists()
+    assert status == 2 and not (out / "table.csv").exists()
     assert f"--{option}: no job has the metric 'torque_msee'; choose from torque_mse, train_seconds, valid" in message
     begun = len(executor)
     command(sweep, "--out", out, "--resume", f"--{option}", "torque_mse")
@@ -95,11 +94,10 @@ def test_unknown_metrics_are_refused_and_jobs_are_kept(tmp_path, executor, capfd
 
 def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
     out = tmp_path / "sweep"
-    with pytest.raises(SystemExit) as stop:
-        command(sweep, "--grid", "width=2,4,8 seed=0:3", "--fixed", "steps=3", "--out", out)
+    status = exit_status(sweep, "--grid", "width=2,4,8 seed=0:3", "--fixed steps=3 --out", out)
     text = capfd.readouterr().out
-    assert stop.value.code == 1 and len(executor) == 9
-    results = json.loads((out / "sweep.json").read_text())
+    assert status == 1 and len(executor) == 9
+    results = json_of(out / "sweep.json")
     states = [job["state"] for job in results["jobs"]]
     assert states == ["done", "killed", *["done"] * 5, "failed", "done"]
     assert "0001 killed: ended without a word (OUT_OF_MEMORY)" in text
@@ -119,9 +117,9 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
     assert four["medians"]["validation_error"] == pytest.approx(2e-4) and four["worst"]["train_seconds"] == 3.0
     assert two["done"] == 2 and two["medians"]["validation_error"] == pytest.approx(np.median([3e-3, 9e-3]))
 
-    command(sweep, "--out", out, "--resume", "--best", "largest")
+    command(sweep, "--out", out, "--resume --best largest")
     assert executor[9:] == [{"width": "2", "seed": "1"}, {"width": "8", "seed": "1"}]
-    results = json.loads((out / "sweep.json").read_text())
+    results = json_of(out / "sweep.json")
     assert {job["state"] for job in results["jobs"]} == {"done"}
     (best,) = [job for job in results["jobs"] if job["best"]]
     assert best["values"] == {"width": "2", "seed": "2"}
@@ -133,7 +131,7 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
 
 def test_any_scheduler_may_run_the_lines_of_later(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
-    command(sweep, "--grid", "width=2,4 seed=0", "--where", "later", "--out", out)
+    command(sweep, "--grid", "width=2,4 seed=0", "--where later --out", out)
     assert "2 jobs, a line each" in capsys.readouterr().out and not (out / "sweep.json").exists()
     lines = [shlex.split(line) for line in (out / "jobs.sh").read_text().splitlines()]
     for width, line in zip(("2", "4"), lines, strict=True):
@@ -141,7 +139,7 @@ def test_any_scheduler_may_run_the_lines_of_later(tmp_path, executor, capsys):
         run = Path(line[-1].removeprefix("--out="))
         run.mkdir(parents=True)
         (run / "metrics.json").write_text(json.dumps({"validation_error": WIDTHS[width]}))
-    command(sweep, "--out", out, "--resume", "--where", "here")
+    command(sweep, "--out", out, "--resume --where here")
     assert not executor and "best by validation_error: width=4" in capsys.readouterr().out
 
 
@@ -174,29 +172,26 @@ def test_a_table_holds_no_formula_and_no_metric_that_is_none(tmp_path):
     assert [(row["width"], row["shift"]) for row in rows] == [("'=1+1", "-1")] * 3
 
 
-STATUS = {
-    "a run elsewhere": {"run": "../../X"},
-    "a run at the root": {"run": "/tmp/X"},
-    "a run that is a number": {"run": 5},
-    "attempts in words": {"attempt": "x"},
-    "attempts below zero": {"attempt": -1},
-    "an unknown state": {"state": "happy"},
-    "seconds in words": {"seconds": "few"},
-}
+STATUS = [
+    *({"run": run} for run in ("../../X", "/tmp/X", 5)),
+    *({"attempt": attempt} for attempt in ("x", -1)),
+    {"state": "happy"},
+    {"seconds": "few"},
+]
 
 
-@pytest.mark.parametrize("damage", STATUS)
-def test_damaged_status_is_refused(tmp_path, damage):
-    (tmp_path / "status.json").write_text(json.dumps({**Status("done", attempt=1)._asdict(), **STATUS[damage]}))
-    with pytest.raises(InputError, match=r"status\.json"):
-        status_of(tmp_path)
+def test_damaged_status_is_refused(tmp_path):
+    for damage in STATUS:
+        (tmp_path / "status.json").write_text(json.dumps({**Status("done", attempt=1)._asdict(), **damage}))
+        with pytest.raises(InputError, match=r"status\.json"):
+            status_of(tmp_path)
 
 
 def test_damaged_status_is_one_line(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
     (out / "jobs" / "0000").mkdir(parents=True)
     (out / "jobs" / "0000" / "status.json").write_text('{"run": "../../X"}')
-    command(sweep, "--grid", "width=2 seed=0", "--where", "later", "--out", tmp_path / "other")
+    command(sweep, "--grid", "width=2 seed=0", "--where later --out", tmp_path / "other")
     (out / "config.json").write_bytes((tmp_path / "other" / "config.json").read_bytes())
     assert "status.json" in refused(capsys, sweep, "--out", out, "--resume")
     assert not (tmp_path / "X").exists() and not executor
@@ -214,16 +209,9 @@ def test_finished_job_whose_run_is_gone_is_repeated(tmp_path, executor):
 def test_every_problem_has_its_best_job(tmp_path, executor):
     for name in "ab":
         (tmp_path / name).touch()
-    command(
-        sweep,
-        "--grid",
-        f"data={tmp_path}/a,{tmp_path}/b width=2,4 seed=0:4:2",
-        "--over",
-        "seed,width",
-        "--out",
-        tmp_path / "s",
-    )
-    results = json.loads((tmp_path / "s" / "sweep.json").read_text())
+    grid = f"data={tmp_path}/a,{tmp_path}/b width=2,4 seed=0:4:2"
+    command(sweep, "--grid", grid, "--over seed,width --out", tmp_path / "s")
+    results = json_of(tmp_path / "s" / "sweep.json")
     assert [job["values"]["width"] for job in results["jobs"] if job["best"]] == ["4", "4"]
     assert [group["jobs"] for group in results["groups"]] == [4, 4]
 
@@ -239,9 +227,8 @@ def test_an_interrupt_cancels_the_jobs(tmp_path, monkeypatch, capsys):
             cancelled.append(self)
 
     use(monkeypatch, lambda function, job: Future())
-    with pytest.raises(SystemExit) as stop:
-        command(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
-    assert stop.value.code == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
+    status = exit_status(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
+    assert status == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
     assert len(cancelled) == 3
 
 
@@ -280,29 +267,26 @@ def test_jobs_get_the_gpus_that_the_user_has_made_visible(visible, expected, mon
 
 
 MISTAKES = [
-    (("--grid", "width=a"), "--width must be a whole number"),
-    ((), "--grid names no option"),
-    (("--command", "train_delen", "--grid", "width=8"), "did you mean train_delan?"),
-    (("--command", "sweep", "--grid", "width=8"), "there is no 'sweep'"),
-    (("--command", "make_data", "--grid", "seed=0:2"), "make_data"),
-    (("--grid", "width=8", "--over", "seed"), "'seed' is not in --grid"),
-    (("--grid", "width=8", "--jobs", "0"), "jobs is 0"),
-    (("--grid", "width=8", "--jobs", "4", "--gpus", "2"), "each job has one"),
-    (("--grid", "width=8", "--where", "slurm"), "no sbatch on the PATH"),
+    ("--grid width=a", "--width must be a whole number"),
+    ("--grid names no option",),
+    ("--command train_delen --grid width=8", "did you mean train_delan?"),
+    ("--command sweep --grid width=8", "there is no 'sweep'"),
+    ("--command make_data --grid seed=0:2", "make_data"),
+    ("--grid width=8 --over seed", "'seed' is not in --grid"),
+    ("--grid width=8 --jobs 0", "jobs is 0"),
+    ("--grid width=8 --jobs 4 --gpus 2", "each job has one"),
+    ("--grid width=8 --where slurm", "no sbatch on the PATH"),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "message"), MISTAKES)
-def test_mistakes_are_one_line_and_leave_nothing(arguments, message, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert message in refused(capsys, sweep, *arguments)
-    assert not list(tmp_path.iterdir())
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
+    assert_refused(capsys, sweep, MISTAKES, out=tmp_path / "sweep")
 
 
 @pytest.mark.parametrize(("where", "package", "extra"), [("slurm", "submitit", "sweep"), ("ray", "ray", "ray")])
 def test_missing_executor_is_named_with_its_extra(where, package, extra, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, package, None)
-    line = refused(capsys, sweep, "--grid", "width=8", "--where", where, "--out", tmp_path / "s")
+    line = refused(capsys, sweep, "--grid width=8 --where", where, "--out", tmp_path / "s")
     assert f"pip install 'dln-jax[{extra}]'" in line and not (tmp_path / "s").exists()
 
 
@@ -346,8 +330,8 @@ def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
     killer.start()
     with pytest.raises(SystemExit) as stop:
         command(
-            sweep, "--command", "check_data", "--grid", f"data={files}", "--fixed", "figures=no", "--where", where,
-            "--jobs", "2", "--out", tmp_path / "sweep",
+            sweep, "--command check_data --grid", f"data={files}", "--fixed figures=no --where", where,
+            "--jobs 2 --out", tmp_path / "sweep",
         )  # fmt: skip
     killer.join()
     assert stop.value.code == 1

@@ -1,10 +1,9 @@
 """Grids: the jobs that a text means, and refusals before anything starts."""
 
-import pytest
+from calls import one_line
 
 from dln_jax.cli.commands import check_data, train_delan, train_locomotion
 from dln_jax.cli.sweeps.grid import grid_of, jobs_of, pairs
-from dln_jax.types import InputError
 
 GRIDS = [
     ("seed=0:3", {"seed": ("0", "1", "2")}),
@@ -16,9 +15,9 @@ GRIDS = [
 ]
 
 
-@pytest.mark.parametrize(("text", "grid"), GRIDS)
-def test_grid_of_a_text(text, grid):
-    assert grid_of(text) == grid
+def test_grid_of_a_text():
+    for text, grid in GRIDS:
+        assert grid_of(text) == grid
 
 
 def test_fixed_values_keep_their_commas():
@@ -49,12 +48,11 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), MISTAKES)
-def test_mistakes_are_refused_before_anything_starts(text, message, tmp_path):
-    with pytest.raises(InputError, match=message.replace("?", r"\?")) as error:
-        jobs_of("train_delan", train_delan.Arguments, grid_of(text), {"depth": "2"}, tmp_path)
-    assert "\n" not in str(error.value)
-    assert not list(tmp_path.iterdir())
+def test_mistakes_are_refused_before_anything_starts(tmp_path):
+    for text, message in MISTAKES:
+        with one_line(message.replace("?", r"\?")):
+            jobs_of("train_delan", train_delan.Arguments, grid_of(text), {"depth": "2"}, tmp_path)
+        assert not list(tmp_path.iterdir())
 
 
 def test_jobs_are_command_lines(tmp_path):
