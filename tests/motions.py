@@ -14,3 +14,10 @@ def quick_motion(H, q, p, t, *, dissipation=None, tolerance=None):
     step = rk4(lambda t, state: flow(HamiltonianSystem(H, dissipation)).rates(*state))
     motion = jax.jit(jax.vmap(lambda q, p: rollout(step, (q, p), jnp.asarray(t), substeps=10)))
     return tuple(np.asarray(state) for state in motion(q, p))
+
+
+def sums_of_sines(t, sizes, rates, phases):
+    """Coordinates, rates and accelerations [T, d] of sums of sines, whose numbers are [d, n] or [T, d, n]."""
+    angles = rates * np.asarray(t)[:, None, None] + phases
+    waves = sizes * np.sin(angles), sizes * rates * np.cos(angles), -sizes * rates**2 * np.sin(angles)
+    return tuple(wave.sum(axis=2) for wave in waves)

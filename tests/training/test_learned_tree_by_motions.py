@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from motions import sums_of_sines
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split
@@ -28,10 +29,7 @@ TRUE = SerialTreeParameters(
 def motion(seed):
     """A sum of sines for 4 s, with torques with noise."""
     random, t = np.random.default_rng(seed), np.linspace(0, 4, 81)
-    size, rate, phase = random.uniform([0.3, 0.5, 0], [0.8, 3, 6], (3, 3)).T
-    angle = np.outer(t, rate) + phase
-    waves = np.sin(angle) @ size, np.cos(angle) @ (size * rate), -np.sin(angle) @ (size * rate**2)
-    q, qd, qdd = (wave[:, None] for wave in waves)
+    q, qd, qdd = sums_of_sines(t, *random.uniform([0.3, 0.5, 0], [0.8, 3, 6], (1, 3, 3)).transpose(2, 0, 1))
     known = dynamics(make_serial_tree(NEEDS, velocity_scale=0.01).energies(TRUE))
     tau = np.asarray(jax.jit(jax.vmap(known.inverse_dynamics))(q, qd, qdd)) + 0.05 * random.normal(size=q.shape)
     return from_arrays({"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": np.zeros(81, int)})

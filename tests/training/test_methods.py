@@ -1,6 +1,5 @@
 """A new way of fitting is a method and two entries: the rest of the pipeline needs no change."""
 
-import json
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import json_of
 
 import dln_jax
 from dln_jax.cli.arguments import arguments_of
@@ -77,7 +77,7 @@ def test_a_method_and_an_entry_are_all_that_a_new_model_needs(rod, tmp_path, mon
     schema.save("log.npz", generators.uniform(scene, samples=80))
     options = {"data": tmp_path / "log.npz", "out": tmp_path / "run", "figures": False, "low_latency": False}
     run(arguments_of(Arguments, heaviness=1.0, **options), "train_delan")
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    metrics = json_of(tmp_path / "run" / "metrics.json")
     assert metrics["torque_mse"] < 1e-20 and metrics["verdict"] == 0
     plant = dln_jax.load(tmp_path / "run").dynamics
     q, qd, qdd = jnp.array([0.7]), jnp.array([-1.0]), jnp.array([2.0])

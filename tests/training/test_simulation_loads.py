@@ -42,9 +42,8 @@ def test_a_scene_that_holds_nothing_says_that_it_does_not_use_the_held_vertices_
         assert any("`held` is not used" in line for line in statements) == said
 
 
-@pytest.mark.parametrize(
-    "mistake, message",
-    [
+def test_a_mistake_is_one_line(path):
+    for mistake, message in [
         ({"pressure": "bag=2"}, r"--mesh the mesh has no set 'bag'"),
         ({"pressure": "inner"}, r"--pressure is 'inner'; expected SET=PA"),
         ({"load": "tip=1,2,3"}, r"--load is 'tip=1,2,3'; expected SET=FX,FY,"),
@@ -53,8 +52,6 @@ def test_a_scene_that_holds_nothing_says_that_it_does_not_use_the_held_vertices_
         ({"load": "tip=0,-5"}, r"the mesh has no set 'tip'"),
         ({"load": "tip=0,-5;tip=0,5"}, r"--load names 'tip' twice"),
         ({"pressure": "inner=1,inner=2"}, r"--pressure names 'inner' twice"),
-    ],
-)
-def test_a_mistake_is_one_line(path, mistake, message):
-    with pytest.raises(InputError, match=message):
-        own_mesh(options(path, **mistake), 1e6)
+    ]:
+        with pytest.raises(InputError, match=message):
+            own_mesh(options(path, **mistake), 1e6)

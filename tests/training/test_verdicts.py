@@ -1,7 +1,6 @@
 """Verdicts beyond errors on held-out motions: agreement of descents, heavy bodies, friction, spikes."""
 
 import numpy as np
-import pytest
 
 from dln_jax.data import schema
 from dln_jax.data.splits import Split
@@ -20,9 +19,8 @@ def held_out(error, noise=1e-4):
     return HeldOut(np.full(2, error), np.ones(2), np.ones(2), None if noise is None else np.full(2, noise))
 
 
-@pytest.mark.parametrize(
-    ("agreeing", "error", "noise", "said"),
-    [
+def test_learned_tree_says_how_its_frames_were_found():
+    for agreeing, error, noise, said in [
         (5, 1e-4, 1e-4, None),
         (1, 1e-4, 1e-4, None),  # at the noise there is nothing lower
         (1, 3e-4, 1e-4, "only 1 of 31 descents reached the lowest loss"),
@@ -30,31 +28,33 @@ def held_out(error, noise=1e-4):
         (5, 3e-4, 1e-4, None),
         (5, 5e-4, 1e-4, "held-out errors are 5 times the noise, though 5 descents agree"),
         (5, 5e-4, None, None),
-    ],
-)
-def test_learned_tree_says_how_its_frames_were_found(agreeing, error, noise, said):
-    verdict, numbers = searched(np.arange(31.0), agreeing, 5, held_out(error, noise))
-    assert numbers["descents"] == 31 and numbers["descents_agreeing"] == agreeing
-    assert verdict is None if said is None else verdict is not None and verdict.level == "doubtful"
-    assert said is None or (verdict is not None and said in verdict.reason)
+    ]:
+        verdict, numbers = searched(np.arange(31.0), agreeing, 5, held_out(error, noise))
+        assert numbers["descents"] == 31 and numbers["descents_agreeing"] == agreeing
+        assert verdict is None if said is None else verdict is not None and verdict.level == "doubtful"
+        assert said is None or (verdict is not None and said in verdict.reason)
 
 
-@pytest.mark.parametrize(
-    ("factor", "level"),
-    [(1.5, "good"), (0.3, "good"), (10, "doubtful"), (0.1, "doubtful"), (1e3, "refused"), (1e-3, "refused")],
-)
-def test_bodies_are_compared_with_the_file(factor, level):
-    torques = np.random.default_rng(0).normal(size=(100, 3)) * [100, 1, 0]
-    assert weight_verdict(factor * torques, torques).level == level
+def test_bodies_are_compared_with_the_file():
+    for factor, level in [
+        (1.5, "good"),
+        (0.3, "good"),
+        (10, "doubtful"),
+        (0.1, "doubtful"),
+        (1e3, "refused"),
+        (1e-3, "refused"),
+    ]:
+        torques = np.random.default_rng(0).normal(size=(100, 3)) * [100, 1, 0]
+        assert weight_verdict(factor * torques, torques).level == level
 
 
-@pytest.mark.parametrize(("wrong", "factor"), [(0, 1e3), (1, 1e-3), (2, 1e3), (2, 1e-3), (3, 1e3)])
-def test_a_unit_error_in_one_joint_of_a_scara_is_doubtful_and_names_the_joint(wrong, factor):
-    torques = np.random.default_rng(0).normal(size=(100, 4)) * [8, 4, 20, 0.1]
-    changed = torques * np.where(np.arange(4) == wrong, factor, 1)
-    verdict = weight_verdict(changed, torques)
-    assert weight_verdict(torques, torques).level == "good" and verdict.level == "doubtful"
-    assert f"in joint {wrong + 1}" in verdict.reason
+def test_a_unit_error_in_one_joint_of_a_scara_is_doubtful_and_names_the_joint():
+    for wrong, factor in [(0, 1e3), (1, 1e-3), (2, 1e3), (2, 1e-3), (3, 1e3)]:
+        torques = np.random.default_rng(0).normal(size=(100, 4)) * [8, 4, 20, 0.1]
+        changed = torques * np.where(np.arange(4) == wrong, factor, 1)
+        verdict = weight_verdict(changed, torques)
+        assert weight_verdict(torques, torques).level == "good" and verdict.level == "doubtful"
+        assert f"in joint {wrong + 1}" in verdict.reason
 
 
 def test_a_payload_or_a_flange_without_mass_in_the_file_is_no_unit_error():
