@@ -175,20 +175,16 @@ def of_mass(diagonal):
     return dynamics(LagrangianSystem(lambda q, qd: 0.5 * jnp.sum(diagonal(q) * qd**2)))
 
 
-@pytest.mark.parametrize(
-    "diagonal, expected",
-    [
+def test_definiteness_is_reported():
+    for diagonal, expected in [
         (lambda q: jnp.array([1.0, 4.0]), (1.0, 0.0, 4.0)),
         (lambda q: jnp.stack([1.0 + q[1] ** 2, 0.0 * q[1]]), (0.0, 1.0, np.inf)),
         (lambda q: jnp.array([1.0, -2.0]), (-2.0, 1.0, 2.0)),
         (lambda q: jnp.stack([jnp.ones_like(q[0]), q[0]]), (-0.5, 0.25, 2.0)),
         (lambda q: jnp.array([1.0, 1e-17]), (1e-17, 1.0, np.inf)),
-    ],
-    ids=["definite", "singular", "indefinite", "in places", "singular to rounding"],
-)
-def test_definiteness_is_reported(diagonal, expected):
-    q = np.array([[-0.5, 0.0], [0.5, 0.0], [1.0, 0.0], [2.0, 0.0]])
-    np.testing.assert_allclose(definiteness(of_mass(diagonal), q, q), expected, rtol=1e-12)
+    ]:
+        q = np.array([[-0.5, 0.0], [0.5, 0.0], [1.0, 0.0], [2.0, 0.0]])
+        np.testing.assert_allclose(definiteness(of_mass(diagonal), q, q), expected, rtol=1e-12)
 
 
 def test_definiteness_of_networks():
@@ -210,9 +206,8 @@ def test_definiteness_of_networks():
     assert (report.share_not_definite, report.largest_condition_number) == (1.0, np.inf)
 
 
-@pytest.mark.parametrize(
-    "call, message",
-    [
+def test_wrong_use_raises_one_clear_line():
+    for call, message in [
         (lambda: make_black_box_lagrangian(MIXED, rate_scale=(1.0, 2.0, 3.0)), "rate_scale has 3 sizes"),
         (lambda: make_black_box_hamiltonian(MIXED, momentum_scale=0.0), "momentum_scale is 0.0"),
         (lambda: make_black_box_hamiltonian(MIXED, iterations=0), "iterations is 0"),
@@ -226,8 +221,6 @@ def test_definiteness_of_networks():
             lambda: definiteness(plain_dynamics(), np.zeros((1, 2)), np.zeros((1, 2))),
             "no mass",
         ),
-    ],
-)
-def test_wrong_use_raises_one_clear_line(call, message):
-    with pytest.raises(InputError, match=message):
-        call()
+    ]:
+        with pytest.raises(InputError, match=message):
+            call()

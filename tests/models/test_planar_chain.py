@@ -20,6 +20,14 @@ TO_RELATIVE = np.array([[1.0, 0.0], [-1.0, 1.0]])
 STATE = tuple(map(np.array, ([0.4, -1.3], [1.1, 2.0], [0.3, -0.7])))
 
 
+def torque(system, state=STATE):
+    return jax.jit(dynamics(system).inverse_dynamics)(*state)
+
+
+def by_energy(system, state=STATE):
+    return jax.jit(functools.partial(lagrangian.inverse_dynamics, scalar(system)))(*state)
+
+
 def random_parameters(model):
     """Returns parameters with a definite mass matrix."""
     like = model.init(jax.random.key(0))
@@ -36,11 +44,8 @@ def test_textbook_double_pendulum():
         moments=jnp.array([sum(masses) * inner**2, masses[1] * inner * outer, masses[1] * outer**2]),
         weight=jnp.array([sum(masses) * g * inner, masses[1] * g * outer]),
     )
-    ours, book = (
-        dynamics(each)
-        for each in (model.energies(parameters), double_pendulum(masses=masses, lengths=lengths).energies)
-    )
-    np.testing.assert_allclose(*(jax.jit(each.inverse_dynamics)(*STATE) for each in (ours, book)), rtol=1e-13)
+    book = double_pendulum(masses=masses, lengths=lengths).energies
+    np.testing.assert_allclose(torque(model.energies(parameters)), torque(book), rtol=1e-13)
 
 
 def test_textbook_cart_pole():
@@ -51,8 +56,7 @@ def test_textbook_cart_pole():
     parameters = model.init(jax.random.key(0))._replace(
         moments=jnp.array([M[0, 0], M[1, 0], M[1, 1]]), weight=jnp.array([0.0, (above - below) / 2])
     )
-    ours, theirs = (jax.jit(dynamics(each).inverse_dynamics)(*STATE) for each in (model.energies(parameters), book))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-13)
+    np.testing.assert_allclose(torque(model.energies(parameters)), torque(book), rtol=1e-13)
 
 
 def test_forces_on_two_slides_and_two_hinges_are_derivatives_of_the_energy():
@@ -63,8 +67,7 @@ def test_forces_on_two_slides_and_two_hinges_are_derivatives_of_the_energy():
     assert parameters.armature.shape == (1,)
     parameters = parameters._replace(moments=parameters.moments + 9 * model.init(jax.random.key(0)).moments)
     system, state = model.energies(parameters), random.normal(size=(3, 4))
-    by_energy = jax.jit(functools.partial(lagrangian.inverse_dynamics, scalar(system)))(*state)
-    np.testing.assert_allclose(jax.jit(dynamics(system).inverse_dynamics)(*state), by_energy, rtol=1e-10)
+    np.testing.assert_allclose(torque(system, state), by_energy(system, state), rtol=1e-10)
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
@@ -75,17 +78,14 @@ def test_coordinates_do_not_matter(symmetric):
         for each in ("absolute", "relative")
     )
     parameters = random_parameters(absolute)
-    own = jax.jit(dynamics(absolute.energies(parameters)).inverse_dynamics)(*STATE)
-    of_joints = jax.jit(dynamics(relative.energies(parameters)).inverse_dynamics)
-    turned = of_joints(*(TO_RELATIVE @ each for each in STATE))
-    np.testing.assert_allclose(own, TO_RELATIVE.T @ turned, rtol=1e-12)
+    turned = torque(relative.energies(parameters), [TO_RELATIVE @ each for each in STATE])
+    np.testing.assert_allclose(torque(absolute.energies(parameters)), TO_RELATIVE.T @ turned, rtol=1e-12)
 
 
 def test_forces_are_derivatives_of_the_energy():
     model = make_planar_chain(NEEDS._replace(friction=False), symmetric=False, armature=True)
     system = model.energies(random_parameters(model))
-    by_energy = jax.jit(functools.partial(lagrangian.inverse_dynamics, scalar(system)))(*STATE)
-    np.testing.assert_allclose(jax.jit(dynamics(system).inverse_dynamics)(*STATE), by_energy, rtol=1e-12)
+    np.testing.assert_allclose(torque(system), by_energy(system), rtol=1e-12)
 
 
 def test_friction_acts_in_the_joints():

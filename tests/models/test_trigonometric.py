@@ -253,9 +253,8 @@ def nonlinear() -> Model:
     return Model(lambda key: jnp.zeros(2), energies)
 
 
-@pytest.mark.parametrize(
-    ("run", "message"),
-    [
+def test_mistakes_are_named():
+    for run, message in [
         (lambda: make_trigonometric(ARM.needs, degree=-1), "degree is -1; expected a whole number >= 0"),
         (lambda: make_trigonometric(ARM.needs, degree=(1,)), r"degree is \(1,\); .* each of the 2 joints"),
         (lambda: fit_linear(nonlinear(), sampled(ARM)[0]), "not linear in its parameters"),
@@ -265,11 +264,9 @@ def nonlinear() -> Model:
         (lambda: solve(np.eye(2), np.ones(2), rank_tolerance=1.0), "rank_tolerance is 1.0"),
         (lambda: solve(np.eye(2), np.array([1.0, np.nan])), "NaN or infinite"),
         (lambda: solve_chunks([]), "no equations"),
-    ],
-)
-def test_mistakes_are_named(run, message):
-    with pytest.raises(InputError, match=message):
-        run()
+    ]:
+        with pytest.raises(InputError, match=message):
+            run()
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(40, 7), (7, 7), (8, 7), (5, 9)])
