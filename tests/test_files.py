@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from calls import one_line
 from matplotlib.figure import Figure
 
 from dln_jax.cli import compilation_cache
@@ -55,13 +56,12 @@ def test_a_file_is_written_whole_or_not_at_all_and_through_no_link():
     assert names() == ["figure.png", "precious", "report.json"]
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "3", "[" * 100_000, "\x00", '{"a": 1' + "0" * 5000 + "}"])
-def test_what_is_no_json_object_is_refused_in_one_line(text):
-    Path("file.json").write_text(text)
-    for path in ("file.json", "missing.json", "x" * 5000):
-        with pytest.raises(InputError, match="try again") as caught:
-            read_json(Path(path), remedy="try again")
-        assert "\n" not in str(caught.value)
+def test_what_is_no_json_object_is_refused_in_one_line():
+    for text in ["", "{", "[]", "3", "[" * 100_000, "\x00", '{"a": 1' + "0" * 5000 + "}"]:
+        Path("file.json").write_text(text)
+        for path in ("file.json", "missing.json", "x" * 5000):
+            with one_line("try again"):
+                read_json(Path(path), remedy="try again")
 
 
 def test_json_values_are_told_apart_by_type():

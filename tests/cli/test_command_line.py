@@ -52,23 +52,20 @@ def called(monkeypatch, *arguments):
     run(say, Arguments, prog="command")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
+def test_what_cannot_be_parsed_is_one_line(monkeypatch, capsys):
+    for arguments, complaint in [
         (["--kind", "other"], "--kind is 'other'; choose from this, that"),
         (["--steps", "many"], "--steps must be a whole number; got 'many'"),
         (["--steps"], "--steps lacks a value"),
         (["--stepz", "3"], "unrecognised option: --stepz"),
         (["--precision", "None"], "--precision is 'None'; choose from f32, f64"),
         (["stray"], "unrecognised option: stray"),
-    ],
-)
-def test_what_cannot_be_parsed_is_one_line(monkeypatch, capsys, arguments, complaint):
-    with pytest.raises(SystemExit) as stop:
-        called(monkeypatch, *arguments)
-    line = capsys.readouterr().err
-    assert stop.value.code == 2 and line.count("\n") == 1
-    assert line.startswith(f"error: {complaint}") and "--help)" in line
+    ]:
+        with pytest.raises(SystemExit) as stop:
+            called(monkeypatch, *arguments)
+        line = capsys.readouterr().err
+        assert stop.value.code == 2 and line.count("\n") == 1
+        assert line.startswith(f"error: {complaint}") and "--help)" in line
 
 
 def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsys):
@@ -82,16 +79,16 @@ def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsy
     assert "None" not in text
 
 
-@pytest.mark.parametrize("name", PACKAGES)
-def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [name, "--help"])
-    monkeypatch.setenv("COLUMNS", "100")
-    with pytest.raises(SystemExit) as stop:
-        command(name, name, package=PACKAGES[name])
-    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
-    assert stop.value.code == 0
-    assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
-    assert "--gif" not in text and "--no-compilation-cache" in text
+def test_every_command_says_its_choices_and_defaults(monkeypatch, capsys):
+    for name in PACKAGES:
+        monkeypatch.setattr(sys, "argv", [name, "--help"])
+        monkeypatch.setenv("COLUMNS", "100")
+        with pytest.raises(SystemExit) as stop:
+            command(name, name, package=PACKAGES[name])
+        text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+        assert stop.value.code == 0
+        assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
+        assert "--gif" not in text and "--no-compilation-cache" in text
 
 
 @pytest.mark.parametrize(

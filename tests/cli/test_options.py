@@ -27,6 +27,7 @@ from dln_jax.zoo.catalogue import CATALOGUE
 
 HELP = """
 import importlib, io, contextlib, sys
+import dln_jax.__main__
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.running import run
 for name in COMMANDS:
@@ -67,9 +68,8 @@ def test_defaults_in_options_are_those_of_the_library():
     assert defaults["friction"] == ",".join(USUAL)
 
 
-@pytest.mark.parametrize(
-    ("command", "stated", "present", "absent"),
-    [
+def test_an_option_exists_for_the_choices_that_read_it():
+    for command, stated, present, absent in [
         (train_delan, {}, {"width", "target", "scene"}, {"batch", "samples", "robot", "degree"}),
         (train_delan, {"optimizer": "adam"}, {"batch", "width"}, {"samples"}),
         (train_delan, {"data": "log.npz"}, {"robot", "parents", "seconds"}, {"width", "optimizer"}),
@@ -81,11 +81,9 @@ def test_defaults_in_options_are_those_of_the_library():
         (train_diffnet, {"optimizer": "adam"}, {"epochs", "samples"}, {"steps"}),
         (train_diffnet, {"function": "own.npz"}, {"steps"}, {"samples", "noise", "epochs"}),
         (train_value, {"stored": "run"}, {"starts"}, {"plant", "width", "seed"}),
-    ],
-)
-def test_an_option_exists_for_the_choices_that_read_it(command, stated, present, absent):
-    names = {field.name for field in dataclasses.fields(arguments_for(command.Arguments, stated))}
-    assert present <= names and not absent & names
+    ]:
+        names = {field.name for field in dataclasses.fields(arguments_for(command.Arguments, stated))}
+        assert present <= names and not absent & names
 
 
 def test_an_option_of_another_choice_names_that_choice():
