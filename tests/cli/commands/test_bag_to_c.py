@@ -1,10 +1,8 @@
 """From a ROS bag whose joints have other names than the URDF to a verdict and C, in three commands."""
 
-import json
-
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, json_of
 
 from dln_jax.cli.commands import check_data, export_c, identify
 from dln_jax.data.robots import read_robot
@@ -18,6 +16,7 @@ pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the
 pytest.importorskip("rosbags", reason="rosbags reads bags; it is in the extra [bag]")
 import jax
 from made_bags import state, write_bag
+from motions import sums_of_sines
 
 LINK = """<link name="{0}"><inertial><origin xyz="0.2 0.02 0"/><mass value="1"/>
 <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
@@ -40,18 +39,12 @@ def place(tmp_path_factory):
     friction = joint_dissipation([0.3, 0.1], [0.3, 0.1], velocity_scale=0.05)
     true = tree_system(tree._replace(inertias=2 * tree.inertias, armature=np.array([0.1, 0.05])), friction)
     random = np.random.default_rng(0)
-    a, w, p = random.uniform([0.2, 1, 0], [0.8, 4, 6], (2, 3, 3)).transpose(2, 0, 1)
-
-    def motion(t):
-        angle = w * t[:, None, None] + p
-        parts = a * np.sin(angle), a * w * np.cos(angle), -a * w * w * np.sin(angle)
-        return [part.sum(axis=2) for part in parts]
-
+    sines = random.uniform([0.2, 1, 0], [0.8, 4, 6], (2, 3, 3)).transpose(2, 0, 1)
     fast, slow = np.arange(0, 16, 0.004), np.arange(0.0013, 15.9, 0.01)
     with jax.enable_x64(True):
-        tau = np.asarray(jax.jit(jax.vmap(dynamics(true).inverse_dynamics))(*motion(slow)))
+        tau = np.asarray(jax.jit(jax.vmap(dynamics(true).inverse_dynamics))(*sums_of_sines(slow, *sines)))
     tau = tau + 0.02 * random.normal(size=tau.shape)
-    q, qd, _ = motion(fast)
+    q, qd, _ = sums_of_sines(fast, *sines)
     names = ["panda_elbow", "panda_shoulder", "panda_finger"]
     states = [state(t, names, [*q[k, ::-1], 0.02], [*qd[k, ::-1], 0.0]) for k, t in enumerate(fast)]
     currents = [state(t, names[1::-1], tau=tau[k] / KT) for k, t in enumerate(slow)]
@@ -61,37 +54,36 @@ def place(tmp_path_factory):
         yield folder
 
 
-LOG = ("--data", "motion", "--robot", "arm.urdf", "--topics", "/joint_states,/currents", "--torque-factor", str(KT))
+LOG = f"--data motion --robot arm.urdf --topics /joint_states,/currents --torque-factor {KT}"
 
 
 @pytest.mark.slow
 def test_three_commands_take_a_bag_to_c(place, capsys):
-    command(check_data, *LOG, "--out", "check")
+    command(check_data, LOG, "--out check")
     said = capsys.readouterr().out
     assert "joints matched by name: panda_shoulder=fer_shoulder, panda_elbow=fer_elbow" in said
     assert "joints left out: panda_finger" in said and "100 Hz; q and qd by cubic splines" in said
     assert "error: " not in said
-    command(identify, *LOG, "--cutoff", "auto", "--out", "run", "--no-figures", "--no-uncertainty")
+    command(identify, LOG, "--cutoff auto --out run --no-figures --no-uncertainty")
     said = capsys.readouterr().out
     assert "\nverdict: good" in said and "joints matched by name" in said and f"times panda_shoulder {KT}" in said
-    numbers = json.loads((place / "run" / "metrics.json").read_text())
+    numbers = json_of(place / "run" / "metrics.json")
     assert numbers["nmse"] < 1e-3 < numbers["file_nmse"]
-    command(export_c, "--run", "run", "--out", "c")
+    command(export_c, "--run run --out c")
     at = np.array([0.3, 0.2]), np.array([0.5, -0.4]), np.array([1.0, 2.0])
     expected = load(place / "run").dynamics.inverse_dynamics(*at)
     np.testing.assert_allclose(load_c(place / "c").inverse_dynamics(*at), expected, rtol=1e-6)
 
 
 def test_bags_that_do_not_suit_the_robot_are_one_line(place, capsys):
-    for more, words in (
-        (("--topics", "/states"), "topic /states is not in the bag; the bag has /currents (sensor_msgs"),
-        (("--topics", "/joint_states"), "no efforts in the messages"),
-        (("--joints", "panda_elbow,panda_finger"), "the robot's joint 'fer_shoulder' is not among the data's"),
-        (("--joints", "elbow=fer_elbow"), "'elbow' is not among the log's joints (panda_elbow, panda_shoulder, panda_"),
-        (("--torque-factor", "fer_elbow=2"), "'fer_elbow' is not among the log's joints (panda_shoulder, panda_elbow)"),
-        (("--torque-factor", "panda_elbow=1,panda_elbow=2"), "--torque-factor names 'panda_elbow' twice"),
-        (("--torque-factor", "much"), "--torque-factor is 'much'; expected finite numbers"),
-    ):  # fmt: skip
-        # The last of an option that is given twice counts.
-        line = refused(capsys, identify, *LOG, *more, "--out", "none")
-        assert words in line and not (place / "none").exists()
+    rows = [
+        ("--topics /states", "topic /states is not in the bag; the bag has /currents (sensor_msgs"),
+        ("--topics /joint_states", "no efforts in the messages"),
+        ("--joints panda_elbow,panda_finger", "the robot's joint 'fer_shoulder' is not among the data's"),
+        ("--joints elbow=fer_elbow", "'elbow' is not among the log's joints (panda_elbow, panda_shoulder, panda_"),
+        ("--torque-factor fer_elbow=2", "'fer_elbow' is not among the log's joints (panda_shoulder, panda_elbow)"),
+        ("--torque-factor panda_elbow=1,panda_elbow=2", "--torque-factor names 'panda_elbow' twice"),
+        ("--torque-factor much", "--torque-factor is 'much'; expected finite numbers"),
+    ]
+    # The last of an option that is given twice counts.
+    assert_refused(capsys, identify, rows, LOG, out=place / "none")

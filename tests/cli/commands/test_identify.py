@@ -1,12 +1,12 @@
 """The command end to end: a URDF and a log become a run folder, a robot's file and C; mistakes are one line."""
 
-import json
 import re
 
 import jax
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, exit_status, json_of, one_line
+from motions import sums_of_sines
 
 from dln_jax.cli.commands import identify
 from dln_jax.data import schema
@@ -15,6 +15,7 @@ from dln_jax.export.c.run import export_run
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
+from dln_jax.training.identification.task import noises, split
 from dln_jax.zoo.run import load
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
@@ -42,10 +43,7 @@ def workplace(tmp_path_factory):
     true = true._replace(inertias=1.5 * true.inertias, armature=np.array([0.1, 0.2]))
     friction = joint_dissipation([0.4, 0.2], [0.5, 0.1], [0.0, 0.3])
     random, t = np.random.default_rng(0), np.arange(0, 8, 0.02)
-    a, w, p = random.uniform([0.2, 1, 0], [0.8, 4, 6], (2, 3, 3)).transpose(2, 0, 1)[:, :, :, None]
-    states = [
-        np.sum(x, axis=1).T for x in (a * np.sin(w * t + p), a * w * np.cos(w * t + p), -a * w * w * np.sin(w * t + p))
-    ]
+    states = sums_of_sines(t, *random.uniform([0.2, 1, 0], [0.8, 4, 6], (2, 3, 3)).transpose(2, 0, 1))
     tau = jax.jit(jax.vmap(dynamics(tree_system(true, friction)).inverse_dynamics))(*states)
     tau = np.asarray(tau) + 0.05 * random.normal(size=(len(t), 2))
     swapped = {key: x[:, ::-1] for key, x in zip(("q", "qd", "qdd", "tau"), (*states, tau), strict=True)}
@@ -58,7 +56,7 @@ def workplace(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def identified(workplace):
-    command(identify, "--robot", "arm.urdf", "--data", "log.npz", "--out", "run")
+    command(identify, "--robot arm.urdf --data log.npz --out run")
     return workplace / "run"
 
 
@@ -69,13 +67,13 @@ def test_a_run_folder_like_every_other(identified):
         *("torque.png", "friction.png", "arm_identified.urdf"),
         *("uncertainty.json", "uncertainty.safetensors", "uncertainty.png"),
     }
-    metrics = json.loads((identified / "metrics.json").read_text())
+    metrics = json_of(identified / "metrics.json")
     assert all(isinstance(value, int | float) for value in metrics.values())
     assert metrics["nmse"] < 1.1 * metrics["least_squares_nmse"] + 1e-4 < metrics["file_nmse"]
     assert metrics["coverage_95_share"] > 0.85
     assert metrics["noise_joint_1"] == pytest.approx(0.05, rel=0.15)
-    assert json.loads((identified / "config.json").read_text())["consistent"] is True
-    stored = json.loads((identified / "parameters.json").read_text())
+    assert json_of(identified / "config.json")["consistent"] is True
+    stored = json_of(identified / "parameters.json")
     assert len(stored["base"]) == metrics["base_parameters"] and len(stored["parameters"]) == metrics["parameters"]
 
 
@@ -99,18 +97,7 @@ def test_the_file_has_what_was_identified(identified):
 
 
 def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys):
-    command(
-        identify,
-        "--robot",
-        "arm.urdf",
-        "--data",
-        "log.npz",
-        "--out",
-        "free",
-        "--no-consistent",
-        "--no-figures",
-        "--robust",
-    )
+    command(identify, "--robot arm.urdf --data log.npz --out free --no-consistent --no-figures --robust")
     said = capsys.readouterr().out
     assert "no arm_identified.urdf: the least-squares links behind" in said
     assert "10 blocks" not in said and "blocks of time of the one trajectory" in said
@@ -118,8 +105,8 @@ def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys)
 
 
 def test_sound_log_is_good(identified):
-    metrics = json.loads((identified / "metrics.json").read_text())
-    verdict = json.loads((identified / "config.json").read_text())["chosen"]["verdict"]
+    metrics = json_of(identified / "metrics.json")
+    verdict = json_of(identified / "config.json")["chosen"]["verdict"]
     assert metrics["verdict"] == 0 and verdict["level"] == "good" and "the robot's file" in verdict["reason"]
     assert metrics["noise_nmse"] < metrics["nmse"] < 0.05 < metrics["file_nmse"]
 
@@ -139,14 +126,13 @@ def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys, spoil, s
     np.savez(workplace / f"{name}.npz", **{**log, "tau": spoil(log["tau"])})
     options = ("--robot", "arm.urdf", "--data", f"{name}.npz", "--out", name, "--no-figures", "--no-uncertainty")
     options += ("--accept-log",)  # the check of the log sees some of them before
-    with pytest.raises(SystemExit) as ended:
-        command(identify, *options)
+    status = exit_status(identify, *options)
     told = capsys.readouterr()
-    assert ended.value.code == 1 and told.err.startswith("error: the fit is refused: ") and told.err.count("\n") == 1
+    assert status == 1 and told.err.startswith("error: the fit is refused: ") and told.err.count("\n") == 1
     assert "verdict: refused: " in told.out and "no arm_identified.urdf: the fit is refused" in told.out
     assert said in told.err or said == "no such robot"
     assert not list((workplace / name).glob("*.urdf"))
-    assert json.loads((workplace / name / "metrics.json").read_text())["verdict"] == 2
+    assert json_of(workplace / name / "metrics.json")["verdict"] == 2
 
 
 @pytest.mark.slow
@@ -156,10 +142,10 @@ def test_spikes_ask_for_a_robust_fit(workplace, capsys):
     np.savez(workplace / "spikes.npz", **{**log, "tau": log["tau"] + 20 * hit * log["tau"].std(axis=0)})
     options = ("--robot", "arm.urdf", "--data", "spikes.npz", "--no-figures", "--no-uncertainty")
     with pytest.raises(SystemExit):
-        command(identify, *options, "--out", "spiky")
+        command(identify, *options, "--out spiky")
     assert "give --robust" in capsys.readouterr().err
-    command(identify, *options, "--out", "robust", "--robust")
-    assert json.loads((workplace / "robust" / "metrics.json").read_text())["verdict"] == 0
+    command(identify, *options, "--out robust --robust")
+    assert json_of(workplace / "robust" / "metrics.json")["verdict"] == 0
 
 
 def test_mistakes_are_one_line(workplace, capsys):
@@ -174,24 +160,18 @@ def test_mistakes_are_one_line(workplace, capsys):
     for name, arrays in variants.items():
         np.savez(workplace / name, **arrays)
     (workplace / "broken.urdf").write_text("<robot>")
-    for robot, log, more, message in (
-        ("arm.urdf", "other.npz", (), "joint 'shoulder' is not among the data's (elbow, wrist)"),
-        ("arm.urdf", "three.npz", (), "the data have 3 joints, the robot 2"),
-        ("arm.urdf", "silent.npz", (), "have no tau"),
-        ("broken.urdf", "log.npz", (), "not XML"),
-        ("arm.urdf", "log.npz", ("--noise", "1"), "expected 2 positive numbers"),
-        ("arm.urdf", "log.npz", ("--test", "0"), "one only"),
-        ("arm.urdf", "log.npz", ("--regularisation", "0"), "regularisation is 0.0"),
-        ("arm.urdf", "log.npz", ("--velocity-scale", "0"), "velocity_scale is 0.0"),
-    ):
-        line = refused(capsys, identify, "--robot", robot, "--data", log, "--out", "refused", *more)
-        assert message in line
-        assert not (workplace / "refused").exists()
+    rows = [
+        ("--data other.npz", "joint 'shoulder' is not among the data's (elbow, wrist)"),
+        ("--data three.npz", "the data have 3 joints, the robot 2"),
+        ("--data silent.npz", "have no tau"),
+        ("--robot broken.urdf", "not XML"),
+        ("--regularisation 0", "regularisation is 0.0"),
+        ("--velocity-scale 0", "velocity_scale is 0.0"),
+    ]
+    assert_refused(capsys, identify, rows, "--robot arm.urdf --data log.npz", out=workplace / "refused")
 
 
 def test_trajectories_are_held_out_whole():
-    from dln_jax.training.identification.task import split
-
     random = np.random.default_rng(0)
     arrays = {key: random.normal(size=(60, 1)) for key in ("q", "qd", "qdd", "tau")}
     data = schema.from_arrays({**arrays, "t": np.tile(np.arange(10.0), 6), "trajectory": np.repeat(np.arange(6), 10)})
@@ -204,3 +184,7 @@ def test_trajectories_are_held_out_whole():
     blocks = split(one, None)
     assert blocks.blocks and [blocks.test.label[k] for k in np.unique(blocks.test.trajectory)] == ["0[2]", "0[7]"]
     assert len(blocks.train.t) == 40
+    with one_line("one only"):
+        split(one, ["0"])
+    with one_line("expected 2 positive numbers"):
+        noises("1", 2)

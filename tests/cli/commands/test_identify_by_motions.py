@@ -1,12 +1,10 @@
 """identify --by motions and both: forces that no log records spoil torques of filtered motions, but hardly motions."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, json_of
 
 from dln_jax.cli.commands import identify
 from dln_jax.data.robots import read_robot
@@ -92,16 +90,16 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
 
 @pytest.mark.slow
 def test_motions_identify_the_pendulum_and_predict_longer(place, capsys):
-    log = ("--robot", "rod.urdf", "--data", "log.npz", "--cutoff", "4", "--friction", "viscous", "--test", "last:25%")
+    log = "--robot rod.urdf --data log.npz --cutoff 4 --friction viscous --test last:25% --no-figures --no-uncertainty"
     numbers = {}
-    for by, window in (("motions", ()), ("both", ("--window", "0.3"))):
-        command(identify, *log, "--by", by, *window, "--out", by, "--no-figures", "--no-uncertainty")
+    for by, options in (("motions", "--out motions"), ("both", "--window 0.3 --out both")):
+        command(identify, log, options, "--by", by)
         said = capsys.readouterr().out
         assert ("chosen by inner splits of the training data: windows of" in said) == (by == "motions")
         assert f"by {by}: windows are off" in said and "verdict: good" in said
-        numbers[by] = json.loads((place / by / "metrics.json").read_text())
+        numbers[by] = json_of(place / by / "metrics.json")
         assert numbers[by]["vpt_seconds"] >= numbers[by]["by_torques_vpt_seconds"]
-        parameters = json.loads((place / by / "parameters.json").read_text())["parameters"]
+        parameters = json_of(place / by / "parameters.json")["parameters"]
         value = {row["name"]: row["identified"] for row in parameters}
         assert value["viscous_1"] == pytest.approx(0.1, abs=0.01)
         assert value["I_yy_1"] + value["armature_1"] == pytest.approx(2 * (0.02 + 0.04) + 0.02, rel=0.02)
@@ -109,10 +107,9 @@ def test_motions_identify_the_pendulum_and_predict_longer(place, capsys):
 
 
 def test_what_cannot_be_simulated_is_refused(place, capsys):
-    log = ("--robot", "rod.urdf", "--data", "log.npz")
-    for more, words in (
-        (("--window", "0.3"), "--window is for --by motions or both"),
-        (("--by", "motions", "--window", "-1"), "window is -1.0; expected a positive number"),
-        (("--by", "forces"), "choose from torques, motions, both"),
-    ):
-        assert words in refused(capsys, identify, *log, *more)
+    rows = [
+        ("--window 0.3", "--window is for --by motions or both"),
+        ("--by motions --window -1", "window is -1.0; expected a positive number"),
+        ("--by forces", "choose from torques, motions, both"),
+    ]
+    assert_refused(capsys, identify, rows, "--robot rod.urdf --data log.npz", out=place / "none")

@@ -1,18 +1,20 @@
 """identify with coupled motors, friction by load and by temperature, from MJCF to the model, its file and its C."""
 
-import json
-
 import jax
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, json_of, one_line
+from motions import sums_of_sines
 
+from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import identify
+from dln_jax.data import schema
 from dln_jax.data.robots import read_robot
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.training.identification.terms import wanted
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
 
@@ -41,10 +43,7 @@ def place(tmp_path_factory):
         armature=np.array([0.15, 0.3]), viscous=np.array([0.5, 0.4]), coulomb=np.array([0.4, 0.3])
     )
     random, t = np.random.default_rng(3), np.arange(0, 30, 0.02)
-    a, w, p = random.uniform([0.2, 0.5, 0], [0.6, 4, 6], (2, 5, 3)).transpose(2, 0, 1)[:, :, :, None]
-    states = [
-        np.sum(x, axis=1).T for x in (a * np.sin(w * t + p), a * w * np.cos(w * t + p), -a * w * w * np.sin(w * t + p))
-    ]
+    states = sums_of_sines(t, *random.uniform([0.2, 0.5, 0], [0.6, 4, 6], (2, 5, 3)).transpose(2, 0, 1))
     temperature = 20 + 25 * (1 - np.exp(-t / 12))
 
     def one(q, qd, qdd, temperature):
@@ -63,10 +62,8 @@ def place(tmp_path_factory):
 
 @pytest.mark.slow
 def test_all_terms_are_identified_and_written(place, capsys):
-    command(
-        identify, "--robot", "arm.xml", "--data", "log.npz", "--friction", "viscous,coulomb,load", "--temperature",
-        "--motors", "1,0;1,1", "--out", "run", "--no-figures",
-    )  # fmt: skip
+    terms = "--friction viscous,coulomb,load --temperature --motors 1,0;1,1"
+    command(identify, "--robot arm.xml --data log.npz --out run --no-figures", terms)
     said = capsys.readouterr().out
     assert "friction by load: kept" in said and "friction by temperature: kept" in said and "verdict: good" in said
     with jax.enable_x64(True):
@@ -81,7 +78,7 @@ def test_all_terms_are_identified_and_written(place, capsys):
         hot = dynamics(run.model.energies(run.parameters, 60.0)).inverse_dynamics(*state)
         np.testing.assert_allclose(load_c("c").inverse_dynamics(*state), hot, rtol=1e-10)
         assert np.abs(hot - run.dynamics.inverse_dynamics(*state)).max() > 0.05
-    metrics = json.loads((place / "run" / "metrics.json").read_text())
+    metrics = json_of(place / "run" / "metrics.json")
     assert metrics["nmse"] < 2 * metrics["noise_nmse"]
     # MuJoCo reads the same mass matrix, with the coupled motor as a tendon.
     theirs = mujoco.MjModel.from_xml_path("run/arm_identified.xml")
@@ -98,22 +95,20 @@ def test_all_terms_are_identified_and_written(place, capsys):
     )
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        (("--motors", "1,0"), "--motors has 1 rows; expected 2"),
-        (("--motors", "1,1;1,1"), "--motors is .* that can be inverted"),
-        (("--coupled", "1-2"), "--coupled has '1-2'; expected pairs of joints such as 2:3"),
-        (("--coupled", "1:3"), "--coupled is 1:3; expected each pair of different joints"),
-        (("--temperature",), "friction is to depend on temperature, which the data do not have"),
-        (("--temperature", "--friction", "coulomb"), "--temperature changes viscous friction"),
-    ],
-)
-def test_terms_that_are_none_are_refused(place, capsys, options, message):
-    import re
-
-    line = refused(capsys, identify, "--robot", "arm.xml", "--data", "cold.npz", "--out", "none", *options)
-    assert re.search(message, line) and not (place / "none").exists()
+def test_terms_that_are_none_are_refused(place, capsys):
+    data = schema.load("cold.npz")
+    for terms, words in (
+        ({"motors": "1,0"}, "--motors has 1 rows; expected 2"),
+        ({"motors": "1,1;1,1"}, "--motors is .* that can be inverted"),
+        ({"coupled": "1-2"}, "--coupled has '1-2'; expected pairs of joints such as 2:3"),
+        ({"coupled": "1:3"}, "--coupled is 1:3; expected each pair of different joints"),
+        ({"temperature": True, "friction": "coulomb"}, "--temperature changes viscous friction"),
+    ):
+        options = arguments_of(identify.Arguments, robot=place / "arm.xml", data=place / "cold.npz", **terms)
+        with one_line(words):
+            wanted(options, tuple(options.friction.split(",")), data)
+    rows = [("--temperature", "friction is to depend on temperature, which the data do not have")]
+    assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz", out=place / "none")
 
 
 def test_a_run_without_temperature_is_not_exported_for_one(place, tmp_path):
