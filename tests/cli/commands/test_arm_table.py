@@ -1,10 +1,8 @@
 """The table of all models of the arm: its bookkeeping with training stubbed, and one model measured for real."""
 
-import json
-
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import command, json_of, refused
 
 from dln_jax.data import schema
 from dln_jax.scenes.datasets import generators
@@ -51,8 +49,8 @@ def stubbed(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys):
-    command(arm_table, "--out", "table")
-    report = json.loads((tmp_path / "table" / "report.json").read_text())
+    command(arm_table, "--out table")
+    report = json_of(tmp_path / "table" / "report.json")
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
     for case, values in ARM.values.items():
         # Published Hamiltonian torques are computed from recorded momenta, and compared with ours of that kind.
@@ -83,17 +81,17 @@ def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys
     assert worst["value"] == pytest.approx((before + 7) * 1e-8)
     # A table that is continued measures nothing twice.
     measured = len(stubbed)
-    command(arm_table, "--out", "table", "--resume")
+    command(arm_table, "--out table --resume")
     assert len(stubbed) == measured == 2 + 3 * len(table.WIDTHS) + 7 * len(table.MODELS)
-    assert json.loads((tmp_path / "table" / "report.json").read_text())["rows"] == report["rows"]
+    assert json_of(tmp_path / "table" / "report.json")["rows"] == report["rows"]
 
 
 def test_data_of_another_plant_is_refused(stubbed, tmp_path, capsys):
     schema.save(tmp_path / "pendulum.npz", generators.uniform(pendulum(), samples=20))
     for option in ("--data", "--uniform"):
-        assert "that of the two-link arm" in refused(capsys, arm_table, option, "pendulum.npz", "--out", "no")
-    assert "seeds is 0" in refused(capsys, arm_table, "--seeds", "0", "--out", "no")
-    assert "20 trajectories cannot be cut into 21 tests" in refused(capsys, arm_table, "--splits", "21", "--out", "no")
+        assert "that of the two-link arm" in refused(capsys, arm_table, option, "pendulum.npz", "--out no")
+    assert "seeds is 0" in refused(capsys, arm_table, "--seeds 0 --out no")
+    assert "20 trajectories cannot be cut into 21 tests" in refused(capsys, arm_table, "--splits 21 --out no")
     assert not (tmp_path / "no").exists()
 
 

@@ -10,7 +10,7 @@ from scripts.reports.control.swing_ups import SWING_UPS, tried
 
 def test_an_unknown_subject_is_one_line(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert "'dance' is unknown; choose from" in refused(capsys, control_report, "--only", "dance", "--out", "run")
+    assert "'dance' is unknown; choose from" in refused(capsys, control_report, "--only dance --out run")
     assert not (tmp_path / "run").exists()
 
 

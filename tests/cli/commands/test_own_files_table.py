@@ -1,7 +1,5 @@
 """The table of own files beside the named tasks."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,12 @@ from scripts.reports.case import rows_of
 from scripts.reports.commands import hnn_table
 from scripts.reports.hamiltonian.own_files import with_bounds
 from scripts.reports.rows import markdown
-from tests.calls import command, refused
+from tests.calls import command, json_of, refused
 from tests.published_motions import published_arrays
 
 
 def test_a_folder_without_files_is_refused(tmp_path, capsys):
-    line = refused(capsys, hnn_table, "--own", tmp_path, "--tasks", "spring", "--out", tmp_path / "table")
+    line = refused(capsys, hnn_table, "--own", tmp_path, "--tasks spring --out", tmp_path / "table")
     assert "has no files such as spring-101.npz" in line and not (tmp_path / "table").exists()
 
 
@@ -35,8 +33,8 @@ def test_own_orbits_are_judged_on_the_starts_of_the_named_task(tmp_path, monkeyp
     """Files go axis by axis and the task body by body: what was learned from one predicts the other exactly."""
     monkeypatch.chdir(tmp_path)
     np.savez("two-body-7.npz", **published_arrays("two-body", 7, trajectories=30))
-    command(hnn_table, "--own", ".", "--tasks", "two-body", "--seeds", "1", "--steps", "30", "--out", "table")
-    rows = json.loads((tmp_path / "table" / "report.json").read_text())["rows"]
+    command(hnn_table, "--own . --tasks two-body --seeds 1 --steps 30 --out table")
+    rows = json_of(tmp_path / "table" / "report.json")["rows"]
     numbers = {row["case"]: row["value"] for row in rows if row["quantity"] == "energy_mse"}
     assert set(numbers) == {"two-body/named-task", "two-body/own-files", "two-body/own-files-without-needs"}
     assert max(numbers.values()) < 1e-9
