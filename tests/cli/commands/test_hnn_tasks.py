@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, json_of, refused
 from motions import quick_motion
 from safetensors.numpy import load_file
 
@@ -101,13 +101,13 @@ def workplace(tmp_path_factory):
         yield folder
 
 
-TINY = ("--seeds", "1", "--steps", "1", "--trajectories", "10")
+TINY = "--seeds 1 --steps 1 --trajectories 10"
 
 
 @pytest.mark.slow
 def test_every_task_runs_and_reports(workplace, capsys):
-    command(hnn_table, *TINY, "--real-pendulum", "swing.npz", "--out", "all")
-    report = json.loads((workplace / "all" / "report.json").read_text())
+    command(hnn_table, TINY, "--real-pendulum swing.npz --out all")
+    report = json_of(workplace / "all" / "report.json")
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
     assert rows["pixels/black-box-hnn", "energy_mse_over_baseline"]["pass"] is True
     assert "| pixels/phase-network |" in (workplace / "all" / "table.md").read_text()
@@ -133,7 +133,7 @@ def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch)
     monkeypatch.setattr(table, "problem_of", lambda *a, **k: pytest.fail("measured again"))
     monkeypatch.setattr(hnn_table, "chosen_tasks", lambda given: list(TASKS))
     before = (workplace / "all" / "jobs.json").read_bytes()
-    command(hnn_table, "--out", "all", "--resume")
+    command(hnn_table, "--out all --resume")
     assert (workplace / "all" / "jobs.json").read_bytes() == before
 
 
@@ -141,11 +141,11 @@ def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypat
     numbers = {"energy_mse": 1e-6, "train_seconds": 6.0}
     monkeypatch.setattr(table, "models_of", lambda task: ("separable-hnn",))
     monkeypatch.setattr(table, "phase_task", lambda name, **given: Findings(rows_of(f"{name}/separable-hnn", numbers)))
-    command(hnn_table, *TINY, "--tasks", "spring,real-pendulum", "--no-figures", "--out", "part")
+    command(hnn_table, TINY, "--tasks spring,real-pendulum --no-figures --out part")
     out = capsys.readouterr().out
     assert "real-pendulum is left out" in out
     assert not (workplace / "part" / "spring.png").exists()
-    assert "needs its data" in refused(capsys, hnn_table, "--tasks", "real-pendulum", "--out", "no")
+    assert "needs its data" in refused(capsys, hnn_table, "--tasks real-pendulum --out no")
 
 
 def test_bounds_decide():
@@ -176,16 +176,15 @@ def test_measured_motions_are_cut_at_gaps(workplace):
 def test_mistakes_are_one_line(workplace, capsys):
     two = schema.load("swing.npz")
     schema.save("double.npz", two._replace(q=np.hstack([two.q, two.q]), estimated=("qd", "qdd", "tau")))
-    cases = [
-        (("--tasks", "spring,pixel"), "--tasks: 'pixel' is unknown"),
-        (("--seeds", "0"), "seeds is 0"),
-        (("--steps", "0"), "steps is 0"),
-        (("--real-pendulum", "missing.npz"), "no such file"),
-        (("--real-pendulum", "double.npz"), "has 2 coordinates"),
-        (("--tasks", "two-body", "--trajectories", "3"), "trajectories is 3"),
+    rows = [
+        ("--tasks spring,pixel", "--tasks: 'pixel' is unknown"),
+        ("--seeds 0", "seeds is 0"),
+        ("--steps 0", "steps is 0"),
+        ("--real-pendulum missing.npz", "no such file"),
+        ("--real-pendulum double.npz", "has 2 coordinates"),
+        ("--tasks two-body --trajectories 3", "trajectories is 3"),
     ]
-    for number, (options, message) in enumerate(cases):
-        assert message in refused(capsys, hnn_table, *options, "--out", f"no-{number}")
+    assert_refused(capsys, hnn_table, rows, out=workplace / "no")
     for name, message in (("delan", "model is 'delan'; this release knows"), ("feed-forward", "is of no phase space")):
         with pytest.raises(InputError, match=message):
             description_of(problem_of(hnn_tasks.REAL, data=workplace / "swing.npz"), name)
@@ -210,7 +209,8 @@ def positions(workplace):
     return workplace / "positions.npz"
 
 
-OWN = ("--task", "measured", "--data", "positions.npz", "--needs", '{"joints": ["prismatic"]}', "--no-low-latency")
+OWN = "--task measured --data positions.npz --no-low-latency"
+SLIDING = ("--needs", '{"joints": ["prismatic"]}')
 
 
 @pytest.mark.slow
@@ -218,18 +218,18 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys, mon
     """A recipe's time is that of the table: it does not end the fit."""
     slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}
     monkeypatch.setattr(hnn_models, "RECIPES", slow)
-    command(train_hnn_task, *OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out", "whole")
+    command(train_hnn_task, OWN, *SLIDING, "--optimizer adam --steps 2 --no-figures --out whole")
     out = capsys.readouterr().out
     assert "finite differences" in out and "out of time" not in out
     assert "2/2 steps  rates: loss" in out and "2/2 steps  motions: loss" in out
     folder = positions.parent / "whole"
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = json_of(folder / "metrics.json")
     assert {"rollout_mse", "train_seconds", "one_step_p50_us", "validation_error"} <= set(metrics)
     assert "energy_mse" not in metrics
     stored = load_file(folder / "model.safetensors")
     for name in ("model.json", "model.safetensors", "metrics.json"):
         (folder / name).unlink()
-    command(train_hnn_task, "--out", str(folder), "--resume", "--no-figures", "--no-low-latency")
+    command(train_hnn_task, "--out", str(folder), "--resume --no-figures --no-low-latency")
     again = load_file(folder / "model.safetensors")
     assert set(again) == set(stored) and all(np.array_equal(again[key], stored[key]) for key in stored)
     field = load(folder).flow
@@ -239,45 +239,41 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys, mon
 
 
 def test_what_a_task_does_not_take_is_one_line(positions, capsys):
-    cases = [
-        (("--task", "juggling"), "task 'juggling' is unknown"),
-        (("--task", "pixels"), "task 'pixels' is unknown"),
-        (("--task", "measured"), "needs its data"),
-        (("--task", "measured", "--data", "forced.npz"), "applied forces"),
-        (("--task", "spring", "--data", "positions.npz"), "--data is an option of --task measured"),
-        ((*OWN, "--model", "pairwise-hnn"), "positions of bodies"),
-        ((*OWN, "--precision", "f32"), "unrecognised option: --precision"),
-        ((*OWN, "--seeds", "3"), "unrecognised option: --seeds"),
-        ((*OWN, "--target", "1e-6"), "unrecognised option: --target"),
-        ((*OWN, "--steps", "0"), "steps is 0"),
-        ((*OWN[:4], "--needs", "{"), "--needs is not JSON"),
-        ((*OWN[:4], "--needs", '{"joints": ["revolute", "revolute"]}'), "have 2 joints"),
-        ((*OWN, "--seed", "-1"), "seed is -1"),
-        ((*OWN, "--seconds", "nan"), "--seconds is nan"),
-        ((*OWN, "--batch", "-1"), "unrecognised option: --batch"),
-        ((*OWN, "--patience", "4"), "unrecognised option: --patience"),
-        ((*OWN, "--weight-decay", "0.1"), "unrecognised option: --weight-decay"),
-        ((*OWN, "--learning-rate", "0.1"), "an option of --optimizer adam"),
-        ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "--learning-rate is nan"),
-        ((*OWN, "--degree", "3"), "--degree is an option of --model polynomial-hamiltonian"),
-        ((*OWN, "--model", "polynomial-hamiltonian", "--width", "3"), "--width is an option of networks"),
-        ((*OWN, "--trajectories", "3"), "--trajectories is an option of tasks that generate their data"),
-        (("--task", "spring", "--needs", '{"joints": ["prismatic"]}'), "--needs is an option of --task measured"),
-        (("--task", "measured", "--data", "marked.npz"), "q has numbers of up to 1.0e+308"),
-        (("--task", "measured", "--data", "points.npz"), "no trajectory has two samples"),
+    rows = [
+        ("--task juggling", "task 'juggling' is unknown"),
+        ("--task pixels", "task 'pixels' is unknown"),
+        ("--task measured", "needs its data"),
+        ("--task measured --data forced.npz", "applied forces"),
+        ("--task measured --data marked.npz", "q has numbers of up to 1.0e+308"),
+        ("--task measured --data points.npz", "no trajectory has two samples"),
+        ("--task spring --data positions.npz", "--data is an option of --task measured"),
+        ("--task spring", *SLIDING, "--needs is an option of --task measured"),
+        (OWN, "--needs", "{", "--needs is not JSON"),
+        (OWN, "--needs", '{"joints": ["revolute", "revolute"]}', "have 2 joints"),
     ]
-    for number, (options, message) in enumerate(cases):
-        assert message in refused(capsys, train_hnn_task, *options, "--out", f"none-{number}")
-        assert not (positions.parent / f"none-{number}").exists()
+    assert_refused(capsys, train_hnn_task, rows, out=positions.parent / "none")
+    others = ("precision f32", "seeds 3", "target 1e-6", "batch -1", "patience 4", "weight-decay 0.1")
+    rows = [
+        *((f"--{option}", f"unrecognised option: --{option.split()[0]}") for option in others),
+        ("--model pairwise-hnn", "positions of bodies"),
+        ("--steps 0", "steps is 0"),
+        ("--seed -1", "seed is -1"),
+        ("--seconds nan", "--seconds is nan"),
+        ("--learning-rate 0.1", "an option of --optimizer adam"),
+        ("--optimizer adam --learning-rate nan", "--learning-rate is nan"),
+        ("--degree 3", "--degree is an option of --model polynomial-hamiltonian"),
+        ("--model polynomial-hamiltonian --width 3", "--width is an option of networks"),
+        ("--trajectories 3", "--trajectories is an option of tasks that generate their data"),
+    ]
+    assert_refused(capsys, train_hnn_task, rows, OWN, *SLIDING, out=positions.parent / "none")
 
 
 def test_options_and_models_of_other_commands_are_refused(positions, capsys):
-    cases = [
-        (("--model", "baseline"), "--model is 'baseline'"),
-        (("--trajectories", "5"), "unrecognised option: --trajectories"),
+    rows = [
+        ("--model baseline", "--model is 'baseline'"),
+        ("--trajectories 5", "unrecognised option: --trajectories"),
     ]
-    for options, message in cases:
-        assert message in refused(capsys, train_hnn, *options, "--out", "none")
+    assert_refused(capsys, train_hnn, rows, out=positions.parent / "none")
     old = positions.parent / "old"
     old.mkdir()
     (old / "config.json").write_text(
@@ -289,8 +285,8 @@ def test_options_and_models_of_other_commands_are_refused(positions, capsys):
 @pytest.mark.slow
 def test_out_of_time_the_fit_of_rates_is_the_result(positions, capsys):
     """In a folder like any other."""
-    options = (*OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--seconds", "1e-6")
-    command(train_hnn_task, *options, "--out", "hurried")
+    options = (OWN, *SLIDING, "--optimizer adam --steps 2 --no-figures --seconds 1e-6")
+    command(train_hnn_task, *options, "--out hurried")
     assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
-    assert np.isfinite(json.loads((positions.parent / "hurried" / "metrics.json").read_text())["validation_error"])
+    assert np.isfinite(json_of(positions.parent / "hurried" / "metrics.json")["validation_error"])
     assert isinstance(load(positions.parent / "hurried").flow, Flow)

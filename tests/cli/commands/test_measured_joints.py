@@ -1,7 +1,5 @@
 """Measured motions of two coupled joints, by the command: momenta of the model, stated tests and noise, the report."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +13,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
 from dln_jax.types import InputError, Needs
-from tests.calls import command, refused
+from tests.calls import assert_refused, command, json_of
 from tests.standard_errors import SURE
 
 NEEDS = Needs(joints=("revolute", "revolute"), friction=True)
@@ -44,15 +42,15 @@ def double(tmp_path_factory):
         yield folder
 
 
-MEASURE = ("--task", "measured", "--data", "double.npz", "--no-low-latency", "--no-figures")
+MEASURE = "--task measured --data double.npz --no-low-latency --no-figures"
 
 
 @pytest.mark.slow
 def test_coupled_joints_are_learned_and_reported(double, capsys):
-    options = ("--model", "planar-chain", "--coordinates", "absolute", "--test", "d", "--steps", "20")
-    command(train_hnn_task, *MEASURE, *options, "--out", "run")
+    options = "--model planar-chain --coordinates absolute --test d --steps 20"
+    command(train_hnn_task, MEASURE, options, "--out run")
     assert "here the mean inertia at q = (0, 0) is 1" in capsys.readouterr().out
-    metrics = json.loads((double / "run" / "metrics.json").read_text())
+    metrics = json_of(double / "run" / "metrics.json")
     assert {"vpt_seconds", "vpt_median_seconds", "energy_drift", "rollout_mse", "validation_error"} <= set(metrics)
     # A deviation from N residuals is off by 1 / √(2 N) of it; polynomials take up less than a third of N.
     assert metrics["q1_noise"] == pytest.approx(NOISE, rel=SURE / np.sqrt(2 * 0.7 * 3 * LENGTH))
@@ -85,14 +83,12 @@ def test_tests_and_noise_may_be_stated(double):
 
 @pytest.mark.slow
 def test_mistakes_are_one_line(double, capsys):
-    cases = [
-        ((*MEASURE, "--noise", "small"), "--noise is 'small'"),
-        ((*MEASURE, "--noise", "0"), "finite positive numbers"),
-        ((*MEASURE, "--coordinates", "absolute"), "--coordinates is an option of --model planar-chain"),
-        ((*MEASURE, "--model", "trigonometric", "--width", "3"), "--width is an option of networks"),
-        (("--task", "spring", "--test", "a"), "--test is an option of --task measured"),
-        (("--task", "spring", "--model", "trigonometric"), "is of no phase space"),
+    rows = [
+        (MEASURE, "--noise small", "--noise is 'small'"),
+        (MEASURE, "--noise 0", "finite positive numbers"),
+        (MEASURE, "--coordinates absolute", "--coordinates is an option of --model planar-chain"),
+        (MEASURE, "--model trigonometric --width 3", "--width is an option of networks"),
+        ("--task spring --test a", "--test is an option of --task measured"),
+        ("--task spring --model trigonometric", "is of no phase space"),
     ]
-    for number, (options, message) in enumerate(cases):
-        assert message in refused(capsys, train_hnn_task, *options, "--out", f"no-{number}")
-        assert not (double / f"no-{number}").exists()
+    assert_refused(capsys, train_hnn_task, rows, out=double / "no")

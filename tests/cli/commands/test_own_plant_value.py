@@ -1,12 +1,10 @@
 """A value function of a file's plant: trained, interrupted, resumed, loaded, judged; and what is refused."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax.cli.commands import train_value
 from dln_jax.control.optimal.action_costs import quadratic
@@ -25,7 +23,7 @@ pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra
 ROD = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.05"/>
 <inertial mass="1" pos="0 0 0.5" diaginertia="0.08333 0.08333 0.001"/></body></worldbody>
 <actuator><motor joint="hinge" ctrlrange="-2.5 2.5" ctrllimited="true"/></actuator></mujoco>"""
-TINY = ("--width", "3", "--depth", "1", "--iterations", "2", "--starts", "3", "--no-figures")
+TINY = "--width 3 --depth 1 --iterations 2 --starts 3 --no-figures"
 
 
 @pytest.fixture
@@ -47,7 +45,7 @@ def brief(monkeypatch):
 
 @pytest.mark.slow
 def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, capsys, rod, brief, monkeypatch):
-    arguments = ("--plant", rod, *TINY, "--robust", "0.1")
+    arguments = ("--plant", rod, TINY, "--robust 0.1")
     command(train_value, *arguments, "--out", tmp_path / "whole")
     output = capsys.readouterr().out
     assert "hinge 2.5 N m" in output and "box, half widths: hinge 3.14 rad" in output and "verdict: " in output
@@ -59,16 +57,15 @@ def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, ca
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Kept, "store", stop)
-    with pytest.raises(SystemExit) as exit_:
-        command(train_value, *arguments, "--out", tmp_path / "cut")
-    assert exit_.value.code == 130 and len(count) == 1
+    status = exit_status(train_value, *arguments, "--out", tmp_path / "cut")
+    assert status == 130 and len(count) == 1
     assert "--resume" in capsys.readouterr().err
     monkeypatch.setattr(Kept, "store", store)
     command(train_value, "--out", tmp_path / "cut", "--resume")
     whole, cut = (load_value(tmp_path / name) for name in ("whole", "cut"))
     x = jnp.array([1.0, -0.5])
     np.testing.assert_array_equal(whole.law(x), cut.law(x))
-    numbers = [json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("whole", "cut")]
+    numbers = [json_of(tmp_path / name / "metrics.json") for name in ("whole", "cut")]
     assert numbers[0]["heavy_weak_return_mean"] == numbers[1]["heavy_weak_return_mean"]
     # The model in the folder is the file's plant.
     expected = (2.0 + 9.81 / 2 * np.sin(1.0) - 0.05 * -0.5) / (0.25 + 0.08333)
@@ -114,29 +111,25 @@ def test_error_of_a_known_value_is_that_of_the_quadrature():
 
 
 MISTAKES = [
-    (("--actuated", "\u00b2"), "there is no joint '\u00b2'"),
-    (("--actuated", "elbow"), "there is no joint 'elbow'"),
-    (("--control", "-1"), "expected finite positive numbers"),
-    (("--control", "1", "--goal", "0.6"), "the limits are"),
-    (("--positions", "1:0"), "expected LOW:HIGH or free"),
-    (("--positions", "free,free"), "2 ranges; the plant has 1 joints"),
-    (("--positions", "-1:1"), "is outside"),
-    (("--weights", "1"), "expected 2 positive numbers"),
-    (("--robust", "1.5"), "robust is 1.5"),
+    ("--actuated ²", "there is no joint '\u00b2'"),
+    ("--actuated elbow", "there is no joint 'elbow'"),
+    ("--control -1", "expected finite positive numbers"),
+    ("--control 1 --goal 0.6", "the limits are"),
+    ("--positions 1:0", "expected LOW:HIGH or free"),
+    ("--positions free,free", "2 ranges; the plant has 1 joints"),
+    ("--positions -1:1", "is outside"),
+    ("--weights 1", "expected 2 positive numbers"),
+    ("--robust 1.5", "robust is 1.5"),
 ]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"), MISTAKES, ids=lambda value: value[0] if isinstance(value, tuple) else ""
-)
-def test_mistakes_are_one_line_and_leave_nothing(arguments, message, tmp_path, capsys, rod):
-    assert message in refused(capsys, train_value, "--plant", rod, *arguments, "--out", tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
+    assert_refused(capsys, train_value, MISTAKES, "--plant", rod, out=tmp_path / "run")
 
 
 def test_options_of_an_own_plant_need_one(capsys):
-    assert "--effort is an option of one's own plant" in refused(capsys, train_value, "--effort", "1")
-    assert "no such file" in refused(capsys, train_value, "--run", "/nowhere")
+    assert "--effort is an option of one's own plant" in refused(capsys, train_value, "--effort 1")
+    assert "no such file" in refused(capsys, train_value, "--run /nowhere")
 
 
 def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):

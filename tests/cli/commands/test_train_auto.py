@@ -7,7 +7,8 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from calls import refused
+from calls import assert_refused, json_of, refused
+from motions import sums_of_sines
 
 from dln_jax import load
 from dln_jax.cli.arguments import arguments_of
@@ -27,8 +28,8 @@ LINK = inertial_parameters(2.0, [0.1, 0.05, 0.2], np.diag([0.03, 0.04, 0.02]))
 ROWS = [[0.4, 0, 0.1, 0], [1.2, 0.2, 0.1, 0]]
 ARM = serial(*dh_frames(ROWS), [LINK] * 2, armature=np.array([0.1, 0.2]))
 RUBBED = tree_system(ARM, joint_dissipation([0.4, 0.2]))
-AUTO = ("--model", "auto", "--data", "rigid.npz")
-TREE = ("--model", "learned-tree", "--data", "rigid.npz")
+AUTO = "--model auto --data rigid.npz"
+TREE = "--model learned-tree --data rigid.npz"
 PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'
 
 
@@ -41,9 +42,8 @@ def motions():
     """Eight noisy motions of the arm with viscous friction."""
     random, T = np.random.default_rng(0), 60
     t, trajectory = np.tile(0.05 * np.arange(T), 8), np.repeat(np.arange(8), T)
-    a, w, p = random.uniform([0.2, 1, 0], [0.9, 3, 6], (8, 2, 3, 3)).transpose(3, 0, 1, 2)[:, trajectory]
-    phase = w * t[:, None, None] + p
-    states = [x.sum(axis=2) for x in (a * np.sin(phase), a * w * np.cos(phase), -a * w * w * np.sin(phase))]
+    sines = random.uniform([0.2, 1, 0], [0.9, 3, 6], (8, 2, 3, 3)).transpose(3, 0, 1, 2)[:, trajectory]
+    states = sums_of_sines(t, *sines)
     tau = torques(RUBBED, states) + 0.02 * random.normal(size=states[0].shape)
     return {"t": t, **dict(zip(("q", "qd", "qdd"), states, strict=True)), "tau": tau, "trajectory": trajectory}
 
@@ -68,7 +68,7 @@ def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workpla
     options = {"data": Path("rigid.npz"), "robot": Path("arm.xml"), "velocity_scale": 0.01}
     typed = arguments_of(train_delan.Arguments, model="auto", **options)
     task, training = selection.fit(prepare(typed), typed, workplace, None)
-    said, stored = capsys.readouterr().out, json.loads((workplace / "model_selection.json").read_text())
+    said, stored = capsys.readouterr().out, json_of(workplace / "model_selection.json")
     assert stored["kept"] == task.kind == "rigid-tree" and "are the noise" in stored["ended"]
     assert "│ rigid-tree " in said and [candidate["tried"] for candidate in stored["candidates"]].count(True) == 1
     found = dynamics(build(task.description).energies(training.parameters))
@@ -96,9 +96,7 @@ def test_finished_candidates_are_stored_and_not_fitted_again(workplace, tmp_path
     task, training = selection.fit(prepare(typed), dataclasses.replace(typed, resume=True), tmp_path, None)
     assert task.kind == "rigid-tree" and task.description == kept.description
     jax.tree.map(np.testing.assert_array_equal, training.parameters, kept.parameters)
-    assert json.loads((tmp_path / "candidates" / "trigonometric" / "candidate.json").read_text()) == {
-        "reason": "not in this test"
-    }
+    assert json_of(tmp_path / "candidates" / "trigonometric" / "candidate.json") == {"reason": "not in this test"}
 
 
 def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monkeypatch):
@@ -114,18 +112,8 @@ def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monke
         raise InputError("seen")
 
     monkeypatch.setattr(learned_tree, "fit_tree", searched)
-    options = (
-        *TREE,
-        "--needs",
-        PLAIN,
-        "--velocity-scale",
-        "0.02",
-        "--kinematic-prior",
-        "prior.json",
-        "--parents",
-        "0,1",
-    )
-    assert "seen" in refused(capsys, train_delan, *options, "--out", "near")
+    options = "--velocity-scale 0.02 --kinematic-prior prior.json --parents 0,1 --out near --needs"
+    assert "seen" in refused(capsys, train_delan, TREE, options, PLAIN)
     assert seen["parents"] == (-1, 0) and seen["scale"] == 0.02
     np.testing.assert_allclose(seen["kinematic_prior"].rotations, ARM.rotations, atol=1e-12)
     assert seen["angle"] == pytest.approx(np.radians(10))
@@ -142,45 +130,28 @@ def test_one_trajectory_is_cut_into_blocks_of_time(workplace):
     )
 
 
-MISTAKES = {
-    "width": ((*AUTO, "--width", "4"), "--width is an option of networks"),
-    "degree": ((*AUTO, "--degree", "2"), "--degree is an option of --model trigonometric"),
-    "lock": ((*AUTO, "--lock", "x"), "--lock is for joints of --robot"),
-    "robot of a network": (
-        ("--model", "structured-delan", "--data", "rigid.npz", "--robot", "arm.xml"),
-        "--robot is an option of --model auto",
-    ),
-    "robot that is not there": ((*AUTO, "--robot", "none.urdf"), "none.urdf"),
-    "parents": ((*TREE, "--parents", "0,3"), "--parents is '0,3'"),
-    "parents of a network": (
-        ("--data", "rigid.npz", "--width", "4", "--parents", "0,1"),
-        "--parents is an option of --model auto",
-    ),
-    "kinematic prior that is not there": ((*TREE, "--kinematic-prior", "none.json"), "none.json: no such file"),
-    "kinematic prior of something else": ((*TREE, "--kinematic-prior", "wrong.json"), "wrong.json: expected"),
-    "scale": ((*AUTO, "--velocity-scale", "-1"), "velocity_scale is -1"),
-    "scale without friction": (
-        (*TREE, "--velocity-scale", "0.1", "--needs", '{"joints": ["revolute", "revolute"]}'),
-        "--velocity-scale is for dry friction",
-    ),
-    "friction that no learned tree has": (
-        (*TREE, "--needs", PLAIN.replace("viscous", "stribeck")),
-        "a learned tree has no stribeck friction",
-    ),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line(workplace, capsys, mistake):
-    arguments, message = MISTAKES[mistake]
+def test_mistakes_are_one_line(workplace, capsys):
+    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     (workplace / "wrong.json").write_text('{"colour": "red"}')
-    if "arm.xml" in arguments or "none.urdf" in arguments:
-        pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
-    assert message in refused(capsys, train_delan, *arguments, "--out", workplace / "refused")
-    assert not (workplace / "refused").exists()
+    frictionless = '{"joints": ["revolute", "revolute"]}'
+    rows = [
+        (AUTO, "--width 4", "--width is an option of networks"),
+        (AUTO, "--degree 2", "--degree is an option of --model trigonometric"),
+        (AUTO, "--lock x", "--lock is for joints of --robot"),
+        ("--model structured-delan --data rigid.npz --robot arm.xml", "--robot is an option of --model auto"),
+        (AUTO, "--robot none.urdf", "none.urdf"),
+        (TREE, "--parents 0,3", "--parents is '0,3'"),
+        ("--data rigid.npz --width 4 --parents 0,1", "--parents is an option of --model auto"),
+        (TREE, "--kinematic-prior none.json", "none.json: no such file"),
+        (TREE, "--kinematic-prior wrong.json", "wrong.json: expected"),
+        (AUTO, "--velocity-scale -1", "velocity_scale is -1"),
+        (TREE, "--velocity-scale 0.1 --needs", frictionless, "--velocity-scale is for dry friction"),
+        (TREE, "--needs", PLAIN.replace("viscous", "stribeck"), "a learned tree has no stribeck friction"),
+    ]
+    assert_refused(capsys, train_delan, rows, out=workplace / "refused")
 
 
-@pytest.mark.parametrize("model", ["auto", "trigonometric", "trigonometric-kernel", "learned-tree"])
-def test_a_fit_that_processes_do_not_share_is_refused(model):
-    with pytest.raises(InputError, match="--processes is an option of networks"):
-        arguments_of(train_delan.Arguments, model=model, processes=2)
+def test_fits_that_processes_do_not_share_are_refused():
+    for model in ("auto", "trigonometric", "trigonometric-kernel", "learned-tree"):
+        with pytest.raises(InputError, match="--processes is an option of networks"):
+            arguments_of(train_delan.Arguments, model=model, processes=2)

@@ -1,14 +1,13 @@
 """Every model and optimiser through the command line, on a pendulum and a tiny budget."""
 
 import io
-import json
 import re
 import subprocess
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import command, json_of, refused
 
 from dln_jax.cli.commands import train_delan, train_hnn
 from dln_jax.data import schema
@@ -21,8 +20,8 @@ from dln_jax.training import low_latency_calls
 from dln_jax.training.dynamics.methods import growth as dynamics_growth
 from dln_jax.zoo.run import load
 
-QUICK = ("--data", "swing.npz", "--width", "3", "--depth", "1", "--steps", "6", "--no-figures", "--no-low-latency")
-BRIEF = (*QUICK[-2:], "--no-uncertainty")
+BRIEF = "--no-figures --no-low-latency --no-uncertainty"
+QUICK = f"--data swing.npz --width 3 --depth 1 --steps 6 {BRIEF}"
 
 
 @pytest.fixture(scope="module")
@@ -40,32 +39,32 @@ def workplace(tmp_path_factory):
 
 
 def metrics_of(folder):
-    return json.loads((folder / "metrics.json").read_text())
+    return json_of(folder / "metrics.json")
 
 
 @pytest.mark.slow
 def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
-    options = ("--data", "swing.npz", "--model", "learned-tree", "--no-figures", "--no-low-latency")
-    command(train_delan, *options, "--out", "tree")
+    options = "--data swing.npz --model learned-tree --no-figures --no-low-latency"
+    command(train_delan, options, "--out tree")
     assert "descents" in capsys.readouterr().out
     assert metrics_of(workplace / "tree")["torque_mse"] < 1e-12
     assert load(workplace / "tree").description["name"] == "learned-tree"
-    assert "--width is an option of networks" in refused(capsys, train_delan, *options, "--width", "3")
-    assert "--seeds is an option of networks" in refused(capsys, train_delan, *options, "--seeds", "2")
+    assert "--width is an option of networks" in refused(capsys, train_delan, options, "--width 3")
+    assert "--seeds is an option of networks" in refused(capsys, train_delan, options, "--seeds 2")
 
 
 @pytest.mark.slow
 def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workplace, capsys):
-    options = ("--data", "swing.npz", "--model", "trigonometric-kernel", "--no-figures", "--no-low-latency")
-    command(train_delan, *options, "--samples", "40", "--out", "kernel")
+    options = "--data swing.npz --model trigonometric-kernel --no-figures --no-low-latency"
+    command(train_delan, options, "--samples 40 --out kernel")
     said = capsys.readouterr().out
     assert re.search(r"kernel: 40 of \d+ samples", said) and "by order of the bodies: a chain: " in said
     assert metrics_of(workplace / "kernel")["torque_mse"] < 1e-4
     assert load(workplace / "kernel").description["samples"] == 40
-    assert "--width is an option of networks" in refused(capsys, train_delan, *options, "--width", "3")
-    assert "samples is 0" in refused(capsys, train_delan, *options, "--samples", "0")
-    linear = ("--data", "swing.npz", "--model", "trigonometric", "--samples", "9")
-    assert "--samples" in refused(capsys, train_delan, *linear)
+    assert "--width is an option of networks" in refused(capsys, train_delan, options, "--width 3")
+    assert "samples is 0" in refused(capsys, train_delan, options, "--samples 0")
+    linear = "--data swing.npz --model trigonometric --samples 9"
+    assert "--samples" in refused(capsys, train_delan, linear)
 
 
 def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
@@ -76,7 +75,7 @@ def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, 
         return subprocess.CompletedProcess(command, 0, b'a warning\n{"p50_us": 11.75, "p99_us": 14.5}\n', b"")
 
     monkeypatch.setattr(low_latency_calls.subprocess, "run", answer)
-    command(train_delan, "--data", "swing.npz", "--model", "trigonometric", "--no-figures", "--out", "linear")
+    command(train_delan, "--data swing.npz --model trigonometric --no-figures --out linear")
     metrics = metrics_of(workplace / "linear")
     assert metrics["torque_mse"] < 1e-20 and metrics["one_step_p50_us"] > 0
     assert (metrics["one_step_low_latency_p50_us"], metrics["one_step_low_latency_p99_us"]) == (11.75, 14.5)
@@ -101,15 +100,15 @@ def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, 
     q, qdd = random.uniform(-3, 3, (2, 60, 1))
     moving = {"q": q, "qd": np.zeros((60, 1)), "qdd": qdd, "tau": -np.cos(q) * qdd}
     np.savez("negative.npz", t=np.zeros(60), trajectory=np.arange(60), **moving)
-    options = ("--data", "negative.npz", "--model", "trigonometric", *BRIEF, "--out")
-    command(train_delan, *options, "negative", "--degree", "1")
+    options = ("--data negative.npz --model trigonometric", BRIEF, "--out")
+    command(train_delan, *options, "negative", "--degree 1")
     assert re.search(r"not positive definite at \d\d\.\d%", capsys.readouterr().out)
     assert metrics_of(workplace / "negative")["share_not_definite"] > 0.3
 
 
 @pytest.mark.slow
 def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_their_spread(workplace, capsys):
-    command(train_delan, *QUICK, "--no-uncertainty", "--seeds", "2", "--out", "seeds")
+    command(train_delan, QUICK, "--seeds 2 --out seeds")
     metrics = metrics_of(workplace / "seeds")
     assert metrics["torque_mse_largest"] >= metrics["torque_mse_median"] > 0
     assert metrics["torque_mse_standard_deviation"] > 0
@@ -118,28 +117,28 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
     assert "gauss-newton (27 parameters: the normal equations take" in out
     assert "cross-validated errors by seed, 3 folds: 0: " in out and "the best in cross-validation" in out
     assert "gauss-newton needs f64" in refused(
-        capsys, train_delan, *QUICK, "--optimizer", "gauss-newton", "--precision", "f32", "--out", "no"
+        capsys, train_delan, QUICK, "--optimizer gauss-newton --precision f32 --out no"
     )
-    command(train_delan, *QUICK, "--width", "2000", "--steps", "1", "--no-uncertainty", "--out", "wide")
+    command(train_delan, QUICK, "--width 2000 --steps 1 --out wide")
     assert "adam (" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_black_box_models_report_their_mass_matrix(workplace, capsys):
-    brief = (*QUICK, "--no-uncertainty", "--model")
-    command(train_delan, *brief, "black-box-delan", "--out", "black-box")
+    brief = (QUICK, "--model")
+    command(train_delan, *brief, "black-box-delan", "--out black-box")
     metrics = metrics_of(workplace / "black-box")
     assert 0 <= metrics["share_not_definite"] <= 1 and "smallest_mass_eigenvalue" in metrics
-    command(train_delan, *brief, "feed-forward", "--out", "feed-forward")
+    command(train_delan, *brief, "feed-forward", "--out feed-forward")
     assert isinstance(load(workplace / "feed-forward").dynamics, PlainDynamics)
 
 
 @pytest.mark.slow
 def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
-    command(train_hnn, *QUICK, "--no-uncertainty", "--out", "hamiltonian")
+    command(train_hnn, QUICK, "--out hamiltonian")
     assert "structured-hnn" in capsys.readouterr().out
     assert np.isfinite(load(workplace / "hamiltonian").flow.energy([1.0], [1.0]))
-    command(train_hnn, "--data", "bare.npz", *QUICK[2:], "--no-uncertainty", "--out", "bare")
+    command(train_hnn, QUICK, "--data bare.npz --out bare")
     assert "no momenta p in the data" in capsys.readouterr().out
 
 
@@ -147,17 +146,17 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
 def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys, monkeypatch):
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2, 3))
     monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
-    command(train_delan, "--data", "swing.npz", "--steps", "8", *BRIEF, "--target", "1e6", "--out", "easy")
-    easy = json.loads((workplace / "easy" / "candidates.json").read_text())["candidates"]
+    command(train_delan, "--data swing.npz --steps 8", BRIEF, "--target 1e6 --out easy")
+    easy = json_of(workplace / "easy" / "candidates.json")["candidates"]
     assert {(each["width"], each["networks"]) for each in easy} == {(2, 1), (2, 2)}
     assert min(each["parameters"] for each in easy) == 2 * 2 + 2 + 2 * 2 + 2 + 1
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2,))
-    command(train_delan, "--data", "swing.npz", "--steps", "2", *BRIEF, "--target", "1e-30", "--out", "hard")
+    command(train_delan, "--data swing.npz --steps 2", BRIEF, "--target 1e-30 --out hard")
     assert "no candidate meets 1e-30; kept is the most accurate" in capsys.readouterr().out
-    candidates = json.loads((workplace / "hard" / "candidates.json").read_text())["candidates"]
+    candidates = json_of(workplace / "hard" / "candidates.json")["candidates"]
     best = min(candidates, key=lambda each: each["validation_error"])
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]
-    line = refused(capsys, train_delan, "--target", "1e-8", "--model", "black-box-delan", "--out", "no")
+    line = refused(capsys, train_delan, "--target 1e-8 --model black-box-delan --out no")
     assert "--target is an option of --model structured-delan" in line
 
 
@@ -180,14 +179,14 @@ def test_a_table_has_the_plant_beside_the_model_and_a_test_that_stands_still_is_
     torque = np.random.default_rng(0).normal(size=data.tau.shape)
     data = data._replace(tau=data.tau + 1e-3 * torque)
     schema.save("swings.npz", data)
-    options = ("--width", "3", "--depth", "1", "--steps", "2", *BRIEF, "--scene", "pendulum", "--data")
-    command(train_delan, *options, "swings.npz", "--out", "swings")
+    options = ("--width 3 --depth 1 --steps 2", BRIEF, "--scene pendulum --data")
+    command(train_delan, *options, "swings.npz", "--out swings")
     out = capsys.readouterr().out
     assert "true plant" in out and re.search(r"valid prediction time, torque held +│ +[\d.]+ │ +[\d.]+ │ s", out)
     metrics = metrics_of(workplace / "swings")
     assert metrics["normalised_state_error_ceiling"] < metrics["normalised_state_error"]
     still = np.where((data.trajectory == 5)[:, None], 0.3, data.q)
     schema.save("still.npz", data._replace(q=still))
-    command(train_delan, *options, "still.npz", "--out", "still")
+    command(train_delan, *options, "still.npz", "--out still")
     assert "no rollouts: q[:, 0] is the same in all samples" in capsys.readouterr().out
     assert "torque_mse" in metrics_of(workplace / "still")
