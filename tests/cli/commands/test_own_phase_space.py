@@ -1,7 +1,7 @@
 """Own files with momenta: published protocols made by numpy and scipy, trained by the command that a user types."""
 
-import json
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -20,10 +20,10 @@ from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
 from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build
-from tests.calls import command, refused
+from tests.calls import command, exit_status, json_of, refused
 from tests.published_motions import PUBLISHED, integrated, published_arrays
 
-TASK = ("--task", "measured", "--no-low-latency", "--no-figures", "--data")
+TASK = "--task measured --no-low-latency --no-figures --data"
 SLIDING = Needs(joints=("prismatic",))
 
 
@@ -38,9 +38,13 @@ def files(tmp_path_factory):
         yield folder
 
 
+def own_problem(name, **stated):
+    return problem_of(MEASURED, data=Path(f"{name}.npz").absolute(), stated=Stated(SLIDING, **stated))
+
+
 def test_noise_of_states_and_rates_weighs_motions(files):
     """Own data show what the named task states: sd 0.1 of q and p, and exact rates."""
-    problem = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    problem = own_problem("spring")
     assert problem.trust is not None and not problem.trust.free_of_noise
     np.testing.assert_allclose(problem.trust.weights.state, 0.1, rtol=0.15)
     named = recipes.RECIPES["spring"].weights
@@ -54,11 +58,11 @@ def test_noise_that_nobody_measured_is_none(files):
     t = np.arange(0, 20, 0.25)
     q = np.cos(4 * t + np.arange(6)[:, None]).reshape(-1, 1)
     np.savez("coarse.npz", t=np.tile(t, 6), q=q, trajectory=np.repeat(np.arange(6), len(t)))
-    problem = problem_of(MEASURED, data=files / "coarse.npz", stated=Stated(SLIDING))
+    problem = own_problem("coarse")
     assert problem.trust is not None and not problem.trust.noise.any()
     known = units_of_judgement(problem)
     assert known["measured"].tolist() == [True, False] and not np.any(known["noise"])
-    noisy = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    noisy = own_problem("spring")
     np.testing.assert_allclose(units_of_judgement(noisy)["noise"], 0.1, rtol=0.15)
 
 
@@ -74,13 +78,10 @@ def test_recordings_are_counted_and_no_windows(files):
 
 
 def test_stated_noise_is_used_or_refused(files, capsys):
-    one, two = (
-        problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING, noise=noise)).trust
-        for noise in ((0.3,), (0.3, 0.2))
-    )
+    one, two = (own_problem("spring", noise=noise).trust for noise in ((0.3,), (0.3, 0.2)))
     assert one is not None and two is not None and two.weights.state == (0.3, 0.2)
     assert one.weights.state == (0.3, pytest.approx(0.1, rel=0.15))
-    options = (*TASK, "spring.npz", "--noise", "0.1,0.1,0.1", "--out", "none")
+    options = (TASK, "spring.npz", "--noise 0.1,0.1,0.1 --out none")
     assert "noise has 3 numbers; expected one, or one for each of 1 coordinates, or 2 of q and then p" in refused(
         capsys, train_hnn_task, *options
     )
@@ -90,7 +91,7 @@ def test_a_file_without_rates_of_momenta_is_no_mass_of_one(files):
     """p = ½ qd on this spring: the rate of p is estimated from p, and is not qdd."""
     arrays = published_arrays("spring", 11, trajectories=24)
     np.savez("momenta.npz", **{key: value for key, value in arrays.items() if key != "pd"})
-    problem = problem_of(MEASURED, data=files / "momenta.npz", stated=Stated(SLIDING))
+    problem = own_problem("momenta")
     assert "pd" in problem.fitted.estimated and problem.trust is not None
     assert problem.trust.weights.rate is not None and np.isinf(problem.trust.weights.rate[1])
 
@@ -110,7 +111,7 @@ def test_own_springs_are_learned_as_the_named_task(files):
     """Same model, start and budget: 20 own trajectories, 4 more for the test, and 20 of the generated task."""
     errors = {}
     named = problem_of("spring", trajectories=40)
-    own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    own = own_problem("spring")
     for name, problem in {"named": named, "own": own}.items():
         description = description_of(problem, "separable-hnn")
         trained = train(problem, description, seed=0, steps=12)
@@ -122,13 +123,13 @@ def test_own_springs_are_learned_as_the_named_task(files):
 @pytest.mark.slow
 def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
     """Nothing is stated: order, bodies and model are found, rates are exact, and the true energy is conserved."""
-    command(train_hnn_task, *TASK, "orbits.npz", "--out", "orbits", "--steps", "25")
+    command(train_hnn_task, TASK, "orbits.npz", "--out orbits --steps 25")
     out = capsys.readouterr().out
     assert "auto: pairwise-hnn" in out and "motions need no fit" in out and "motions: loss" not in out
     run = load(files / "orbits")
     assert (run.description["order"], run.description["dimension"], run.description["alike"]) == ("axes", 2, True)
     assert energy_error("two-body", run.flow.rates, K=1) < 1e-9
-    assert json.loads((files / "orbits" / "metrics.json").read_text())["validation_error"] < 1e-9
+    assert json_of(files / "orbits" / "metrics.json")["validation_error"] < 1e-9
 
 
 def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
@@ -136,13 +137,11 @@ def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
     random = np.random.default_rng(0)
     np.savez("shuffled.npz", **arrays | {"pd": random.normal(size=arrays["pd"].shape)})
     still = ("--needs", '{"joints": ["prismatic", "prismatic", "prismatic", "prismatic"]}', "--out", "none")
-    options = (*TASK, "shuffled.npz", "--model", "pairwise-hnn", *still)
+    options = (TASK, "shuffled.npz", "--model pairwise-hnn", *still)
     assert "state --order bodies (x1, y1, x2, y2) or --order axes" in refused(capsys, train_hnn_task, *options)
     problem = problem_of(MEASURED, data=files / "orbits.npz")
     assert description_of(problem, "pairwise-hnn", order="bodies")["order"] == "bodies"
-    assert "--order is an option of --task measured" in refused(
-        capsys, train_hnn_task, "--order", "axes", "--out", "none"
-    )
+    assert "--order is an option of --task measured" in refused(capsys, train_hnn_task, "--order axes --out none")
 
 
 @pytest.mark.slow
@@ -153,7 +152,7 @@ def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
         raise InputError("the fit of motions ended")
 
     monkeypatch.setattr(training, "second_problem", broken)
-    options = (*TASK, "spring.npz", "--model", "separable-hnn", "--steps", "3", "--out", "half")
+    options = (TASK, "spring.npz", "--model separable-hnn --steps 3 --out half")
     assert "the fit of motions ended" in refused(capsys, train_hnn_task, *options)
     assert np.isfinite(load(files / "half").flow.rates([0.1], [0.2])).all()
 
@@ -161,7 +160,7 @@ def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
 @pytest.mark.slow
 def test_the_fit_of_motions_ends_where_it_is_flat(files):
     """At the floor of the noise iterations bring nothing: the fit stops by itself, and says that it has finished."""
-    own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    own = own_problem("spring")
     trained = train(own, description_of(own, "separable-hnn", width=3), seed=0, steps=200)
     motions = trained.fits["motions"]
     assert motions.stop.reason == "finished" and motions.stop.step < 100
@@ -170,7 +169,7 @@ def test_the_fit_of_motions_ends_where_it_is_flat(files):
 
 
 def test_a_file_without_torques_names_the_command_for_it(files, capsys):
-    line = refused(capsys, train_hnn, "--data", "spring.npz", "--out", "none")
+    line = refused(capsys, train_hnn, "--data spring.npz --out none")
     assert "spring.npz has no tau" in line and "train_hnn_task --task measured --data spring.npz" in line
 
 
@@ -184,12 +183,11 @@ def test_a_model_whose_motions_explode_is_refused(files, capsys):
     qd, pd = system.rates(q, p)
     np.savez("away.npz", t=arrays["t"], trajectory=arrays["trajectory"], q=q, p=p, qd=qd, pd=-pd)
     still = ("--needs", '{"joints": ["prismatic"]}', "--model", "polynomial-hamiltonian", "--degree", "2")
-    with pytest.raises(SystemExit) as stop:
-        command(train_hnn_task, *TASK, "away.npz", *still, "--out", "away")
+    status = exit_status(train_hnn_task, TASK, "away.npz", *still, "--out away")
     said = capsys.readouterr()
-    assert stop.value.code == 1 and said.err.startswith("error: the fit is refused: ")
+    assert status == 1 and said.err.startswith("error: the fit is refused: ")
     assert "verdict: refused: 1 of 1 predicted test motions grow beyond 10 times the range" in said.out
-    assert json.loads((files / "away" / "metrics.json").read_text())["verdict"] == 2
+    assert json_of(files / "away" / "metrics.json")["verdict"] == 2
 
 
 class Clock:
@@ -223,5 +221,5 @@ def test_seconds_count_from_the_start_of_the_command_to_the_stored_model(files, 
         monkeypatch.setattr(module, "save", lambda *_: stored.append(clock.now - 1000.0))
     monkeypatch.setattr(phase_space, "evaluate", lambda *_, **__: (_ for _ in ()).throw(InputError("enough")))
     with pytest.raises(SystemExit):
-        command(train_hnn_task, *TASK, "spring.npz", "--seconds", "60", "--out", "limited")
+        command(train_hnn_task, TASK, "spring.npz", "--seconds 60 --out limited")
     assert 60.0 <= stored[-1] <= 64.0

@@ -332,7 +332,7 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     assert "verdict: good: told" in capsys.readouterr().out
     stored = (tmp_path / "run" / "model.safetensors").read_bytes()
     (tmp_path / "run" / "model.safetensors").unlink()
-    command(train_hnn_pixels, "--out", str(tmp_path / "run"), "--resume", "--no-figures")
+    command(train_hnn_pixels, "--out", str(tmp_path / "run"), "--resume --no-figures")
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == stored
     system = load(tmp_path / "run").images
     pair = pixel_task.pixel_data().test.pairs[0, 0]
@@ -340,9 +340,9 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     assert system.decode(q, p).shape == pair.shape and isinstance(system.field, PlainFlow)
     qd, pd = system.field.rates(q, p)
     assert np.isfinite([qd, pd]).all()
-    assert "unrecognised option: --width" in refused(capsys, train_hnn_pixels, "--width", "8", "--out", "no")
-    assert "--model is 'pairwise'" in refused(capsys, train_hnn_pixels, "--model", "pairwise", "--out", "no")
-    assert "steps is 0" in refused(capsys, train_hnn_pixels, "--steps", "0", "--out", "no")
+    assert "unrecognised option: --width" in refused(capsys, train_hnn_pixels, "--width 8 --out no")
+    assert "--model is 'pairwise'" in refused(capsys, train_hnn_pixels, "--model pairwise --out no")
+    assert "steps is 0" in refused(capsys, train_hnn_pixels, "--steps 0 --out no")
     pixel_task.pixel_data.cache_clear()
 
 

@@ -1,13 +1,12 @@
 """The command line of differential networks end to end on a tiny budget: what it writes, and what it refuses."""
 
-import json
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax.cli.commands import train_diffnet
 from dln_jax.data import functions
@@ -25,9 +24,9 @@ from scripts.reports.commands import diffnet_report, diffnet_table
 from scripts.reports.differential_networks import one_pass, table
 from scripts.reports.published import DIFFERENTIAL_NETWORKS
 
-SMALL = ("--samples", "200", "--width", "4")
-TINY = (*SMALL, "--steps", "4")
-ADAM = (*SMALL, "--optimizer", "adam", "--epochs", "2", "--batch", "64")
+SMALL = "--samples 200 --width 4"
+TINY = f"{SMALL} --steps 4"
+ADAM = f"{SMALL} --optimizer adam --epochs 2 --batch 64"
 FILES = {".lock", "config.json", "metrics.json", "model.json", "model.safetensors"}
 METRICS = {
     *("value_mse", "gradient_mse", "hessian_mse", "parameters", "validation_loss"),
@@ -36,7 +35,7 @@ METRICS = {
 
 
 def metrics_of(folder):
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = json_of(folder / "metrics.json")
     assert all(isinstance(value, int | float) for value in metrics.values())
     return metrics
 
@@ -69,12 +68,12 @@ def own_file(path, **changes):
 
 
 def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplace, capsys):
-    command(train_diffnet, *TINY)
+    command(train_diffnet, TINY)
     folder = workplace / "runs" / "train_diffnet-1"
     assert names_in(folder) == FILES | {"curves.png", "training.png"}
     metrics = metrics_of(folder)
     assert set(metrics) >= METRICS and metrics["parameters"] == 4 + 4 + 4 + 1
-    config = json.loads((folder / "config.json").read_text())
+    config = json_of(folder / "config.json")
     assert (config["function"], config["optimizer"]) == ("sin", "gauss-newton")
     assert (config["chosen"]["width"], config["chosen"]["precision"]) == (4, "f64")
     loaded = load(folder)
@@ -84,7 +83,7 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
     out = capsys.readouterr().out
     assert "value, gradient; gauss-newton, f64" in out and "almost everywhere" not in out
     assert "verdict: " in out and metrics["verdict"] == LEVELS.index(config["chosen"]["verdict"]["level"])
-    assert "already contains a run" in refused(capsys, train_diffnet, *TINY, "--out", folder)
+    assert "already contains a run" in refused(capsys, train_diffnet, TINY, "--out", folder)
 
 
 def test_verdict_counts_every_component_of_what_was_fitted():
@@ -103,7 +102,7 @@ def test_verdict_counts_every_component_of_what_was_fitted():
 def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch, capsys):
     coarse = partial(functions.cosine_sine_grid, points=9)
     monkeypatch.setitem(function_task.NAMED, "cos_sin", (functions.cosine_sine, coarse))
-    command(train_diffnet, *ADAM, "--function", "cos_sin", "--ensemble", "3", "--out", "run")
+    command(train_diffnet, ADAM, "--function cos_sin --ensemble 3 --out run")
     folder = workplace / "run"
     assert names_in(folder) == FILES | {f"{name}.png" for name in ("ensemble", "heat_maps", "surfaces", "training")}
     metrics = metrics_of(folder)
@@ -118,7 +117,7 @@ def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(w
 def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(workplace):
     data = own_file("mine.npz")
     run = ("--function", "mine.npz", "--activation", "tanh", "--width", "6", "--depth", "1", "--steps", "30")
-    command(train_diffnet, *run, "--out", "run")
+    command(train_diffnet, *run, "--out run")
     folder = workplace / "run"
     assert names_in(folder) == FILES | {"parity.png", "training.png"}
     metrics = metrics_of(folder)
@@ -130,8 +129,8 @@ def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(wo
 
 
 def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
-    quick = ("--loss", "type2", "--no-figures")
-    command(train_diffnet, *ADAM, *quick, "--activation", "relu", "--derivative", "2", "--out", "run")
+    quick = "--loss type2 --no-figures"
+    command(train_diffnet, ADAM, quick, "--activation relu --derivative 2 --out run")
     out = capsys.readouterr().out
     assert "Hessian is zero almost everywhere" in out and "teaches it nothing" in out
     assert names_in(workplace / "run") == FILES
@@ -143,10 +142,9 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
 def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys):
     """Stopped after a few reports, and continued: the width is chosen again."""
     own_file("mine.npz")
-    growing = ("--steps", "12", "--coarse-steps", "6")
-    wanted = ("--function", "mine.npz", "--loss", "type2", "--depth", "1", "--optimizer", "gauss-newton")
+    wanted = "--function mine.npz --loss type2 --depth 1 --optimizer gauss-newton --steps 12 --coarse-steps 6"
     monkeypatch.setattr(function_runs, "WIDTHS", (2,))
-    command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "unbroken")
+    command(train_diffnet, wanted, "--no-figures --out unbroken")
     stored = checkpoint.store
     left = iter(range(1))
 
@@ -156,60 +154,48 @@ def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(engine_fit, "store", store_and_die)
-    with pytest.raises(SystemExit) as exit_:
-        command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "broken")
-    assert exit_.value.code == 130 and not (workplace / "broken" / "model.json").exists()
+    status = exit_status(train_diffnet, wanted, "--no-figures --out broken")
+    assert status == 130 and not (workplace / "broken" / "model.json").exists()
     monkeypatch.setattr(engine_fit, "store", stored)
-    line = refused(capsys, train_diffnet, "--resume", "--out", "broken", "--seed", "3")
+    line = refused(capsys, train_diffnet, "--resume --out broken --seed 3")
     assert "started with seed = 0; leave --seed out" in line
-    command(train_diffnet, "--resume", "--no-figures", "--out", "broken")
+    command(train_diffnet, "--resume --no-figures --out broken")
     ours, theirs = ((workplace / run / "model.safetensors").read_bytes() for run in ("broken", "unbroken"))
     assert ours == theirs
 
 
-MISTAKES = {
-    "missing file": (None, [], "no such file"),
-    "missing key": ({"y": None}, [], "key 'y' is missing"),
-    "rank of x": ({"x": np.zeros(60)}, [], "x has shape (60,); expected [N, n]"),
-    "mismatched dy": ({"dy": np.zeros((60, 3, 2))}, [], "dy has shape (60, 3, 2); expected (60, 2, 3)"),
-    "not a number": ({"y": np.full((60, 2), np.nan)}, [], "y has 120 NaN"),
-    "pickle": ({"y": np.array([None] * 60)}, [], "without pickled objects"),
-    "no gradient": ({"dy": None}, [], "no dy; add it or choose type2"),
-    "no Hessian": ({"d2y": None}, ["--derivative", "2"], "no d2y"),
-    "activation": ({}, ["--activation", "sigmoidal"], "activation is 'sigmoidal'; choose one of relu"),
-    "loss": ({}, ["--loss", "type3"], "--loss is 'type3'; choose from type1, type2"),
-    "width": ({}, ["--width", "0"], "width is 0"),
-    "depth": ({}, ["--depth", "-1"], "depth is -1"),
-    "ensemble": ({}, ["--ensemble", "0"], "members is 0"),
-    "precision": ({}, ["--precision", "f32"], "gauss-newton needs f64"),
-    "batch": ({}, ["--batch", "-1"], "--batch is an option of --optimizer adam"),
-    "steps of adam": ({}, ["--optimizer", "adam", "--steps", "5"], "--steps is an option of --optimizer gauss-newton"),
-    "rate": ({}, ["--optimizer", "adam", "--learning-rate", "nan"], "--learning-rate is nan"),
-    "coarse steps": ({}, ["--coarse-steps", "-1"], "coarse_steps is -1"),
-    "samples of a file": ({}, ["--samples", "5"], "--samples is an option of --function sin and cos_sin"),
-    "seed": ({}, ["--seed", "-1"], "seed is -1"),
-    "mark in y": (
-        {"y": np.where(np.arange(120).reshape(60, 2) == 3, 1e200, 0.5)},
-        [],
-        "y has numbers of up to",
-    ),
-    "mark in dy": ({"dy": np.full((60, 2, 3), 1e200)}, [], "dy has numbers of up to"),
-}
+MISTAKES = [
+    ("--activation sigmoidal", "activation is 'sigmoidal'; choose one of relu"),
+    ("--loss type3", "--loss is 'type3'; choose from type1, type2"),
+    ("--width 0", "width is 0"),
+    ("--depth -1", "depth is -1"),
+    ("--ensemble 0", "members is 0"),
+    ("--precision f32", "gauss-newton needs f64"),
+    ("--batch -1", "--batch is an option of --optimizer adam"),
+    ("--optimizer adam --steps 5", "--steps is an option of --optimizer gauss-newton"),
+    ("--optimizer adam --learning-rate nan", "--learning-rate is nan"),
+    ("--coarse-steps -1", "coarse_steps is -1"),
+    ("--samples 5", "--samples is an option of --function sin and cos_sin"),
+    ("--seed -1", "seed is -1"),
+    ("--function none.npz", "no such file"),
+    ("--function tan", "expected sin, cos_sin or an npz file"),
+    ("--function sin --noise -1", "noise is -1"),
+]
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line_and_leaves_nothing_behind(workplace, capsys, mistake):
-    changes, arguments, message = MISTAKES[mistake]
-    if changes is not None:
+def test_mistakes_are_one_line_and_leave_nothing_behind(workplace, capsys):
+    out = workplace / "refused"
+    for changes, *row in (
+        ({"y": None}, "key 'y' is missing"),
+        ({"dy": None}, "no dy; add it or choose type2"),
+        ({"d2y": None}, "--derivative 2", "no d2y"),
+        ({"y": np.where(np.arange(120).reshape(60, 2) == 3, 1e200, 0.5)}, "y has numbers of up to"),
+        ({"dy": np.full((60, 2, 3), 1e200)}, "dy has numbers of up to"),
+    ):
         own_file("wrong.npz", **changes)
-    file = () if "--table" in arguments else ("--function", "wrong.npz")
-    assert message in refused(capsys, train_diffnet, *file, "--out", "refused", *arguments)
-    assert not (workplace / "refused").exists()
-
-
-def test_an_unknown_function_is_refused_with_the_names(workplace, capsys):
-    assert "expected sin, cos_sin or an npz file" in refused(capsys, train_diffnet, "--function", "tan")
-    assert "noise is -1" in refused(capsys, train_diffnet, "--noise", "-1")
+        assert_refused(capsys, train_diffnet, [row], "--function wrong.npz", out=out)
+    own_file("good.npz")
+    assert_refused(capsys, train_diffnet, MISTAKES, "--function good.npz", out=out)
 
 
 def test_a_folder_with_another_model_is_refused(workplace):
@@ -224,8 +210,8 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     numbers = {"value_mse": 1e-9, "gradient_mse": 1e-8, "hessian_mse": 1e-5}
     costs = {"train_seconds": 1.0, "compile_seconds": 2.0, "job_seconds": 3.0, "width": 4}
     monkeypatch.setattr(table, "trained", lambda *given: {**numbers, **costs})
-    command(diffnet_table, "--samples", "50", "--out", "table")
-    report = json.loads((workplace / "table" / "report.json").read_text())
+    command(diffnet_table, "--samples 50 --out table")
+    report = json_of(workplace / "table" / "report.json")
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
     assert rows["sin/type1/cos/gauss-newton", "value_mse"]["reference"] == 2.0e-7
     assert rows["cos_sin/type2/relu/adam", "hessian_mse"]["reference"] == 1.0
@@ -237,7 +223,7 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     assert [rows["sin/best", key]["pass"] for key in numbers] == [False, True, False]
     # What is measured is not measured again.
     monkeypatch.setattr(table, "trained", None)
-    command(diffnet_table, "--resume", "--out", "table")
+    command(diffnet_table, "--resume --out table")
     out = capsys.readouterr().out
     assert "almost everywhere" in out and "…" not in out
     type2 = [values for case, values in DIFFERENTIAL_NETWORKS.values.items() if case.startswith("sin/type2/")]
@@ -247,8 +233,8 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
 @pytest.mark.slow
 def test_the_report_states_the_ratio_for_every_number_of_inputs(workplace, monkeypatch):
     monkeypatch.setattr(one_pass, "INPUTS", (1, 2))
-    command(diffnet_report, "--width", "4", "--depth", "1", "--batch", "8", "--repetitions", "2", "--out", "report")
-    rows = json.loads((workplace / "report" / "report.json").read_text())["rows"]
+    command(diffnet_report, "--width 4 --depth 1 --batch 8 --repetitions 2 --out report")
+    rows = json_of(workplace / "report" / "report.json")["rows"]
     ratios = {row["case"]: row for row in rows if row["quantity"] == "speedup_over_jax_hessian"}
     assert {case: row["bound"] for case, row in ratios.items()} == {"diffnet-pass/n-1": None, "diffnet-pass/n-2": 4.0}
     assert ratios["diffnet-pass/n-2"]["pass"] == (ratios["diffnet-pass/n-2"]["value"] >= 4.0)
