@@ -120,9 +120,8 @@ def test_letters_come_apart_by_default(workplace):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "test"), [("auto", "a,d,h"), ("structured-delan", "e,q,v"), ("black-box-delan", "c,g,s")]
-)
+@pytest.mark.parametrize("model", ["auto", "structured-delan", "black-box-delan"])
+@pytest.mark.parametrize("test", ["e,q,v", "a,d,h", "c,g,s"])
 def test_letters_come_apart_for_every_model_and_split(workplace, model, test):
     """The published two-link arm, of which only the total torque is fitted."""
     out = f"{model}-{test[0]}"
