@@ -42,7 +42,7 @@ class Work(NamedTuple):
     fresh: Callable[[], Any]
     """Creates the argument of `run`; not timed."""
     run: Callable[[Any], Any]
-    count: float
+    steps: float
     """Steps in a run."""
     rows: Mapping[str, float] = {}
     """Further quantities."""
@@ -110,7 +110,7 @@ def compared(case: str, make: Callable[[Mesh | None], Work], count: int, turns: 
     works = {f"{devices}-devices": make(batch_mesh(devices)) for devices in dict.fromkeys((1, count))}
     times = medians(works, turns)
     first = works["1-devices"]
-    rows = [Row(f"{case}/{name}", "seconds_per_step", time / works[name].count, "s") for name, time in times.items()]
+    rows = [Row(f"{case}/{name}", "seconds_per_step", time / works[name].steps, "s") for name, time in times.items()]
     rows += [Row(f"{case}/{name}", "speed_up", times["1-devices"] / time) for name, time in times.items()]
     return Findings(rows + [Row(case, name, float(value)) for name, value in first.rows.items()])
 
