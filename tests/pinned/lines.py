@@ -166,12 +166,15 @@ def splits_and_findings(name):
 
 
 def public_names():
-    """Public names and their signatures."""
+    """Public names, and the names of their arguments: their types are written otherwise by other versions."""
     found = {}
     for name in sorted(dln_jax.__all__):
         value = getattr(dln_jax, name)
         try:
-            found[name] = str(inspect.signature(value))
+            arguments = inspect.signature(value).parameters.values()
+            found[name] = [
+                f"{each.kind.name} {each.name}{'=' * (each.default is not each.empty)}" for each in arguments
+            ]
         except (TypeError, ValueError):
             found[name] = type(value).__name__
     return found
