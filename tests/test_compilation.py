@@ -26,10 +26,16 @@ AS_USERS_COMPILE = (
         )
     ),
     "nn/test_differential_mlp.py::test_parameter_gradients_equal_those_through_autodiff[silu-sizes0]",
-    "cli/commands/test_stability.py::test_hard_cases_meet_their_bounds[float32]",
+    "mechanics/test_integrators.py::test_single_precision_states_stay_so_and_converge",
     "cli/commands/test_train_models.py::test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes",
 )
 """Tests that fusion, fast approximations and reordering could break, and that compile quickly with them."""
+
+
+def test_the_named_tests_exist():
+    for name in AS_USERS_COMPILE:
+        path, test = name.split("[")[0].split("::")
+        assert f"def {test}(" in (ROOT / "tests" / path).read_text(), name
 
 
 def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
