@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("benchmark", "python -m scripts.benchmark", package="scripts.reports.commands")
+report("benchmark")

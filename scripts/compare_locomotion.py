@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("compare_locomotion", "python -m scripts.compare_locomotion", package="scripts.reports.commands")
+report("locomotion", "comparison")

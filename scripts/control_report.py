@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("control_report", "python -m scripts.control_report", package="scripts.reports.commands")
+report("control")

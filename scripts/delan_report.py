@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("delan_report", "python -m scripts.delan_report", package="scripts.reports.commands")
+report("arm", "published", "letters", "speeds")

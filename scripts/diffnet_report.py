@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("diffnet_report", "python -m scripts.diffnet_report", package="scripts.reports.commands")
+report("diffnet", "one-pass")

@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("diffnet_table", "python -m scripts.diffnet_table", package="scripts.reports.commands")
+report("diffnet", "table")

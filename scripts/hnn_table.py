@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("hnn_table", "python -m scripts.hnn_table", package="scripts.reports.commands")
+report("hnn")

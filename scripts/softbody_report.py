@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("softbody_report", "python -m scripts.softbody_report", package="scripts.reports.commands")
+report("softbody")

@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("stability", "python -m scripts.stability", package="scripts.reports.commands")
+report("stability")

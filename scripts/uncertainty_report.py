@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("uncertainty_report", "python -m scripts.uncertainty_report", package="scripts.reports.commands")
+report("uncertainty")

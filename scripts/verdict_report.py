@@ -1,3 +1,3 @@
-from dln_jax.__main__ import command
+from scripts.reports.run import report
 
-command("verdict_report", "python -m scripts.verdict_report", package="scripts.reports.commands")
+report("verdict")

@@ -30,6 +30,7 @@ def run(
     *,
     prog: str,
     line: Sequence[str] | None = None,
+    description: str | None = None,
     from_shell: bool = False,
     joining: int | None = None,
 ) -> None:
@@ -38,12 +39,14 @@ def run(
     Args:
         prog: the command as the user typed it.
         line: words after the command (default: those of this process).
+        description: what the command does, for its help (default: the docstring of the module of `main`).
         from_shell: whether the process runs only this command; compiled programs are then kept.
         joining: seconds that several processes wait for each other to start (default: that of `scale.processes`).
     """
     with as_one_line(prog, None):
         common = NoCompilationCache if getattr(arguments, "MEASURES_COMPILATION", False) else CompilationCache
-        description, line = sys.modules[main.__module__].__doc__, sys.argv[1:] if line is None else line
+        description = description or sys.modules[main.__module__].__doc__
+        line = sys.argv[1:] if line is None else line
         try:
             whole = parse(arguments, prog=prog, description=description, line=line, common=common)
         finally:

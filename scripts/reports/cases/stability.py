@@ -1,0 +1,1 @@
+"""Measure numerical stability on hard cases."""

@@ -1,0 +1,249 @@
+"""One run of a report: measures its cases, stores each as it ends, resumes, prints tables and writes report.json."""
+
+import importlib
+import inspect
+import math
+import os
+import sys
+import time
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import field, make_dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import tyro
+
+from dln_jax.cli.arguments import names_listed
+from dln_jax.cli.options import Resumable
+from dln_jax.cli.running import run
+from dln_jax.cli.stored_arguments import command_folder
+from dln_jax.files import as_type, is_file, read_json, write_bytes, write_json
+from dln_jax.metrics.report import Row, conditions, write_report
+from dln_jax.precision import in_float64
+from dln_jax.types import InputError
+
+JOBS = "jobs.json"
+REMEDY = "restore the file, or delete it to measure everything again"
+UNITS = {
+    "seconds": "s",
+    "milliseconds": "ms",
+    "ms": "ms",
+    "us": "us",
+    "ns": "ns",
+    "rad": "rad",
+    "hz": "Hz",
+    "joules": "J",
+    "j": "J",
+    "newtons": "N",
+    "nm": "N m",
+    "metres": "m",
+    "mm": "mm",
+    "torque_mse": "N^2 m^2",
+    "percent": "%",
+    "mib": "MiB",
+}
+"""Units by the words in a quantity's name; all others are numbers without a unit."""
+
+Numbers = Mapping[str, Mapping[str, float]]
+"""Measured numbers by case of a row and quantity."""
+
+
+class AtLeast(NamedTuple):
+    """A bound from below; a plain number bounds from above."""
+
+    number: float
+
+
+class Case(NamedTuple):
+    """A measurement, and the numbers that its results stand beside."""
+
+    name: str
+    """SUBJECT/NAME, stable and lower case."""
+    function: Callable[..., Numbers]
+    """Its keywords are options of the report's command line; one that is `None` by default takes text or a path."""
+    settings: Mapping[str, Any] = {}
+    """Keywords of the function that no option changes."""
+    quick: Mapping[str, Any] = {}
+    """Keywords of the function with --quick."""
+    published: Mapping[str, float] = {}
+    """Reference values by "QUANTITY", for all rows, or by "ROW QUANTITY"."""
+    bound: Mapping[str, float | AtLeast] = {}
+    """Numbers to reach, by the same keys."""
+    by_name_only: bool = False
+    """Whether the case is measured only if --only names it, such as one that needs other simulators."""
+
+
+def report(name: str, *usual: str) -> None:
+    """Runs the command line of a report: the words that the user typed.
+
+    Args:
+        name: module of `scripts.reports.cases`.
+        usual: subjects that are measured unless --only names others. A first word without dashes is such a subject.
+    """
+    # Factorisations here are small, and OpenBLAS's threads wait for each other by spinning.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    words = sys.argv[1:]
+    if words and not words[0].startswith("-"):
+        words.insert(0, "--only")
+    elif usual and not any(word.startswith("--only") for word in words):
+        words += ["--only", ",".join(usual)]
+    module = importlib.import_module(f"scripts.reports.cases.{name}")
+    sys.argv[0] = prog = f"python -m scripts.{Path(sys.argv[0]).stem}"  # reports state the command that made them
+    run(
+        lambda options: measure_report(name, module.CASES, options),
+        arguments_of(module.CASES),
+        prog=prog,
+        line=words,
+        description=module.__doc__,
+        from_shell=True,
+    )
+
+
+def arguments_of(cases: Sequence[Case]) -> type:
+    """The options of a report: those of every run, and the keywords of its functions."""
+    subjects = ",".join(dict.fromkeys(case.name.split("/")[0] for case in cases))
+    kinds: dict[str, Any] = {"only": str, "quick": bool}
+    texts = {
+        "only": f"Subjects, or whole names of cases, comma separated: {subjects} (default: all).",
+        "quick": "Less of everything, to try the command.",
+    }
+    for case in cases:
+        for name, keyword in inspect.signature(case.function).parameters.items():
+            if name not in case.settings and (kind := kind_of(case.function, name)) is not None:
+                default = "none" if keyword.default is None else keyword.default
+                kinds.setdefault(name, kind)
+                texts.setdefault(name, f"Of {case.name.split('/')[0]} (default: {default}).")
+    fields: list[Any] = [("MEASURES_COMPILATION", ClassVar[bool], True)]
+    for name, kind in kinds.items():
+        empty = False if kind is bool else None
+        shown = Annotated[bool if kind is bool else kind | None, tyro.conf.arg(help=texts[name], help_behavior_hint="")]
+        fields.append((name, shown, field(default=empty)))
+    return make_dataclass("Arguments", fields, bases=(Resumable,), frozen=True)
+
+
+def kind_of(function: Callable[..., Numbers], keyword: str) -> Any:
+    """The type of a keyword as an option: a number, a text or a path; `None` if it is no option."""
+    annotation = annotation_of(function, keyword)
+    if annotation == tuple[str, ...]:
+        return str  # names with commas between them
+    members = {member for member in typing.get_args(annotation) if member is not type(None)} or {annotation}
+    return next((kind for kind in (int, float, str, Path) if members == {kind}), None)
+
+
+def annotation_of(function: Callable[..., Numbers], keyword: str) -> Any:
+    """The type of a function's keyword; the function may be partial."""
+    while hasattr(function, "func"):
+        function = function.func
+    return typing.get_type_hints(function).get(keyword)
+
+
+def measure_report(name: str, cases: Sequence[Case], options: Any) -> None:
+    """Measures the chosen cases into the folder of the run, with a line for each, and publishes all rows."""
+    chosen = chosen_cases(cases, names_listed(options.only))
+    with command_folder(options, name) as folder:
+        stored = stored_numbers(folder, chosen) if options.resume else {}
+        for number, case in enumerate(chosen, start=1):
+            began = time.perf_counter()
+            if case.name not in stored:
+                stored[case.name] = in_float64(case.function)(**settings_of(case, options))
+                write_json(folder / JOBS, stored)
+            rows = rows_of(case, stored[case.name])
+            judged = [row.passed for row in rows if row.passed is not None]
+            passed = f"{sum(judged)}/{len(judged)} pass  " if judged else ""
+            missed = "".join(f"  {row.quantity} {row.value:.4g}" for row in rows if row.passed is False)
+            seconds = time.perf_counter() - began
+            print(f"{number:2d}/{len(chosen)}  {case.name:30s} {passed}{seconds:.1f} s{missed}", flush=True)
+        rows = [row for case in chosen for row in rows_of(case, stored[case.name])]
+        publish(folder, rows, conditions(dtype="float64", quick=options.quick))
+
+
+def chosen_cases(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
+    """The cases of some subjects, or with these names; all but those that must be named, if there are no names.
+
+    Raises:
+        InputError: a name is neither that of a subject nor that of a case.
+    """
+    known = {case.name: {case.name, case.name.split("/")[0]} for case in cases}
+    subjects = dict.fromkeys(name.split("/")[0] for name in known)
+    for name in names:
+        if not any(name in words for words in known.values()):
+            raise InputError(
+                f"--only: '{name}' is unknown; choose from {', '.join(subjects)}, or a case of one of them"
+            )
+    if not names:
+        return [case for case in cases if not case.by_name_only]
+    return [case for case in cases if known[case.name] & set(names)]
+
+
+def settings_of(case: Case, options: Any) -> dict[str, Any]:
+    """The keywords of a case's function: those that the user stated, before those of --quick and of the table."""
+    stated = {}
+    for name in inspect.signature(case.function).parameters:
+        value = getattr(options, name, None)
+        if value is not None and name not in case.settings:
+            several = annotation_of(case.function, name) == tuple[str, ...]
+            stated[name] = names_listed(value) if several else value
+    return {**case.settings, **(case.quick if options.quick else {}), **stated}
+
+
+def rows_of(case: Case, numbers: Numbers) -> list[Row]:
+    """Rows of a report: numbers with their units, beside the published ones and the bounds."""
+    rows = []
+    for name, values in numbers.items():
+        for quantity, value in values.items():
+            keys = f"{name} {quantity}", quantity
+            reference = next((case.published[key] for key in keys if key in case.published), None)
+            bound = next((case.bound[key] for key in keys if key in case.bound), None)
+            at_least = isinstance(bound, AtLeast)
+            number = bound.number if isinstance(bound, AtLeast) else bound
+            rows.append(Row(name, quantity, float(value), unit_of(quantity), reference, number, at_least))
+    return rows
+
+
+def unit_of(quantity: str) -> str:
+    """Unit of a quantity: that of the first words in its name that have one, else 1."""
+    return next((unit for words, unit in UNITS.items() if f"_{words}_" in f"_{quantity}_"), "1")
+
+
+def stored_numbers(folder: Path, cases: Sequence[Case]) -> dict[str, Numbers]:
+    """The numbers of these cases in a folder's jobs.json; empty if there is none. A null value becomes NaN.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = folder / JOBS
+    values = read_json(path, remedy=REMEDY) if is_file(path) else {}
+    read = as_type(values, dict[str, dict[str, dict[str, float | None]]], name=str(path), remedy=REMEDY)
+    if unknown := [name for name in read if name not in {case.name for case in cases}]:
+        raise InputError(f"{path}: {unknown[0]!r:.60} is not a case of this run; {REMEDY}")
+
+    def numbers(row: Mapping[str, float | None]) -> dict[str, float]:
+        return {quantity: math.nan if value is None else value for quantity, value in row.items()}
+
+    return {name: {row: numbers(values) for row, values in rows.items()} for name, rows in read.items()}
+
+
+def publish(folder: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
+    """Writes report.json and table.md, and prints the table and the rows that miss their bounds."""
+    write_report(folder / "report.json", rows, facts)
+    write_bytes(folder / "table.md", markdown(rows).encode())
+    print(markdown(rows))
+    print("; ".join((facts["machine"], facts["dtype"], f"{facts['threads']} threads", facts["command"])))
+    judged = [row for row in rows if row.passed is not None]
+    failing = [f"{row.case} {row.quantity}" for row in judged if not row.passed]
+    if judged:
+        print(f"{len(judged) - len(failing)} of {len(judged)} pass", *(f"fails: {name}" for name in failing), sep="\n")
+    print(f"report: {folder / 'report.json'}")
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A line per number: case, quantity, value, and what stands beside it."""
+    lines = [["case", "quantity", "value", "unit", "reference", "to reach", "pass"], ["---"] * 7]
+    for row in rows:
+        reference = "" if row.reference is None else f"{row.reference:.3g}"
+        reach = "" if row.bound is None else f"{'≥' if row.at_least else '≤'} {row.bound:.3g}"
+        passed = {True: "yes", False: "no", None: ""}[row.passed]
+        lines.append([row.case, row.quantity, f"{row.value:.3g}", row.unit, reference, reach, passed])
+    kept = [column for column in zip(*lines, strict=True) if any(column[2:])]
+    return "".join(f"| {' | '.join(line)} |\n" for line in zip(*kept, strict=True))
