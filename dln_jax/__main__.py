@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dln_jax.cli.commands import COMMANDS
 
+
 def command(name: str, prog: str) -> None:
     """Runs one command with the arguments of this process.
 

@@ -89,7 +89,9 @@ def report(name: str, *usual: str) -> None:
     elif usual and not any(word.startswith("--only") for word in words):
         words += ["--only", ",".join(usual)]
     module = importlib.import_module(f"scripts.reports.cases.{name}")
-    sys.argv[0] = prog = f"python -m scripts.{Path(sys.argv[0]).stem}"  # reports state the command that made them
+    command = Path(sys.argv[0]).stem
+    prog = f"python -m scripts.{f'report {name}' if command == 'report' else command}"
+    sys.argv[0] = prog  # reports state the command that made them
     run(
         lambda options: measure_report(name, module.CASES, options),
         arguments_of(module.CASES),

@@ -1,1 +1,1 @@
-"""The two-link arm that writes letters: all models, compared with published results."""
+"""The two-link arm that writes letters."""

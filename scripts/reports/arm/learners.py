@@ -1,4 +1,7 @@
-"""The models compared in the first DeLaN paper, with sizes and scales fixed in advance of the data."""
+"""The models compared in the first DeLaN paper, each with a fit that is compiled once.
+
+Lutter, Ritter and Peters (2019, arXiv:1907.04490). Sizes and scales are fixed in advance of the data.
+"""
 
 import functools
 from collections.abc import Callable
@@ -22,8 +25,8 @@ RATE, ACCELERATION, TORQUE = 0.5, 2.0, 2.0
 IDENTIFIED = "identified-arm"
 
 
-class Rival(NamedTuple):
-    """A model and its fit; the functions are compiled once for all cases of a report."""
+class Learner(NamedTuple):
+    """A model and its fit."""
 
     model: Model
     refit: Refit
@@ -34,42 +37,36 @@ class Rival(NamedTuple):
 
 
 @functools.cache
-def rivals(*, rounds: int) -> dict[str, Rival]:
+def learners(*, rounds: int) -> dict[str, Learner]:
     """The models by name; networks are fitted by `rounds` of five Levenberg-Marquardt iterations.
 
     The identified arm is a planar chain of two links with unknown inertias, weights and joint friction: 12 parameters
     by linear least squares.
     """
     needs = two_link_arm().needs
-    width = {name: {"width": WIDTHS[name], "dtype": jnp.float64} for name in WIDTHS}
+    size = {name: {"width": width, "dtype": jnp.float64} for name, width in WIDTHS.items()}
     both_sides = make_feed_forward(
-        needs, rate_scale=RATE, acceleration_scale=ACCELERATION, tau_scale=TORQUE, **width["feed-forward"]
+        needs, rate_scale=RATE, acceleration_scale=ACCELERATION, tau_scale=TORQUE, **size["feed-forward"]
     )
+
+    def inverse_side(key: Array) -> Parameters:
+        return {name: layers for name, layers in both_sides.init(key).items() if name.startswith("inverse")}
+
     networks = {
-        "structured-delan": make_delan(needs, **width["structured-delan"]),
-        "black-box-delan": make_black_box_lagrangian(needs, rate_scale=RATE, **width["black-box-delan"]),
-        "feed-forward": Model(lambda key: _inverse_side(both_sides.init(key)), both_sides.energies),
+        "structured-delan": make_delan(needs, **size["structured-delan"]),
+        "black-box-delan": make_black_box_lagrangian(needs, rate_scale=RATE, **size["black-box-delan"]),
+        "feed-forward": Model(inverse_side, both_sides.energies),
     }
     chain = make_planar_chain(needs._replace(friction=True), symmetric=False)
     return {
-        **{name: _rival(model, make_refit(model, rounds=rounds)) for name, model in networks.items()},
-        IDENTIFIED: _rival(chain, make_linear_refit(chain)),
+        **{name: _learner(model, make_refit(model, rounds=rounds)) for name, model in networks.items()},
+        IDENTIFIED: _learner(chain, make_linear_refit(chain)),
     }
 
 
-def _rival(model: Model, refit: Refit) -> Rival:
+def _learner(model: Model, refit: Refit) -> Learner:
     @jax.jit
     def torques(parameters: Parameters, *motion: Array) -> Array:
         return jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*motion)
 
-    return Rival(model, refit, jax.jit(lambda seed: model.init(jax.random.key(seed))), torques)
-
-
-def _inverse_side(parameters: Parameters) -> Parameters:
-    """Drops the network of the forward dynamics, which is not used here."""
-    return {name: layers for name, layers in parameters.items() if name.startswith("inverse")}
-
-
-def size(rival: Rival) -> int:
-    """Number of fitted parameters."""
-    return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(rival.model.init, jax.random.key(0))))
+    return Learner(model, refit, jax.jit(lambda seed: model.init(jax.random.key(seed))), torques)

@@ -1,0 +1,84 @@
+"""Data of the two-link arm: letters and random states, their splits, and the published free swings."""
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.data import schema
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split, select, split
+from dln_jax.mechanics.integrators import rollout, symplectic_euler
+from dln_jax.precision import in_float64
+from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.datasets.generators import CHARACTERS_TEST
+from dln_jax.scenes.pendulums import two_link_arm
+from dln_jax.scenes.scene import closed_form_forward_dynamics
+from dln_jax.types import InputError
+
+STARTS = np.array([[np.pi / 4, np.pi / 4], [-np.pi, -np.pi / 2], [-np.pi / 4, np.pi / 2]])
+"""Postures at rest of the published test, rad: q2 is relative to link 1, zero is horizontal."""
+HELD_OUT = 300
+"""Random states that select among iterates."""
+
+
+@functools.cache
+def letters(path: Path | None = None) -> Trajectories:
+    """The letters of the arm, embedded or from a file."""
+    data = generators.default_data(two_link_arm()) if path is None else schema.load(path)
+    if data.degrees_of_freedom != 2:
+        raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the report is that of the two-link arm")
+    return data._replace(needs=two_link_arm().needs)
+
+
+@functools.cache
+def published_split(path: Path | None = None, seed: int = 0) -> Split:
+    """The letters with the published ones as the test."""
+    return split(letters(path), test=CHARACTERS_TEST, seed=seed)
+
+
+@functools.cache
+def random_states(samples: int = 3_000) -> Split:
+    """Random states of the arm for training, and the published free swings for the test."""
+    arm = two_link_arm()
+    data = generators.uniform(arm, samples=samples)._replace(needs=arm.needs)
+    permuted = np.random.default_rng(0).permutation(np.unique(data.trajectory))
+    validation = permuted[: min(HELD_OUT, max(1, len(permuted) // 10))]
+    return Split(select(data, np.setdiff1d(permuted, validation)), select(data, validation), published_swings())
+
+
+def whole_circle() -> Trajectories:
+    """Random states over the whole circle, most of them far from all letters, with the letters' rates in 1/s."""
+    bounds = {"position_bound": np.pi, "rate_bound": 2.0, "acceleration_bound": 8.0}
+    return generators.uniform(two_link_arm(), samples=1_000, seed=1, **bounds)
+
+
+def partition_labels(data: Trajectories, parts: int) -> list[list[str]]:
+    """Labels in groups of nearly equal size for cross-validation: every trajectory is in one test.
+
+    Raises:
+        InputError: fewer than two parts, or more than there are trajectories.
+    """
+    labels = np.sort(data.label[np.unique(data.trajectory)])
+    if not 2 <= parts <= len(labels):
+        raise InputError(f"{len(labels)} trajectories cannot be cut into {parts} tests; ask for 2 to {len(labels)}")
+    permuted = np.random.default_rng(0).permutation(labels)
+    return [part.tolist() for part in np.array_split(permuted, parts)]
+
+
+@in_float64
+def published_swings() -> Trajectories:
+    """The published test motions of the two-link arm (Lutter et al. 2019, the `uniform` experiment), from `STARTS`.
+
+    Three free swings from rest, 400 samples at 0.02 s, by symplectic Euler at 2 ms. The integrator is part of the data:
+    an accurate rollout of the true plant departs from these motions after some seconds (valid prediction time 6.47 s).
+    """
+    scene, t = two_link_arm(), 0.02 * np.arange(400)
+    step = symplectic_euler(
+        velocity=lambda t, q, qd: qd,
+        force=lambda t, q, qd: closed_form_forward_dynamics(scene, q, qd, jnp.zeros_like(q)),
+    )
+    motion = jax.jit(jax.vmap(lambda q, qd: rollout(step, (q, qd), jnp.asarray(t), substeps=10)))
+    return generators.swings(scene, t, *map(np.asarray, motion(STARTS, np.zeros_like(STARTS))))

@@ -1,1 +1,0 @@
-"""Differential networks on the published functions."""

@@ -1,1 +1,0 @@
-"""Gradients and PPO compared: what each needs until a creature travels five body lengths."""

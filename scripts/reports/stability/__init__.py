@@ -1,1 +1,0 @@
-"""Hard cases: measured values compared with theory."""
