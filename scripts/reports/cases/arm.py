@@ -40,7 +40,7 @@ STATES = {
     "black-box-hnn": {"torque_from_momenta_mse": 4.0e-2, "vpt_seconds": 4.84},
 }
 """Lutter et al. (2019) and Lutter and Peters (2021), means of ten seeds; squared errors are sums over joints.
-Prediction times of swings are means over all three motions, from the stored results; the printed ones leave the last out."""
+Prediction times of swings are means over all three motions, from the stored results; the printed ones are of two."""
 PUBLISHED = {"characters": LETTERS, "uniform": STATES}
 PLANT_VPT = {"characters": 3.31, "uniform": 6.47}
 """Valid prediction times of the true plant, s."""
