@@ -32,8 +32,7 @@ from dln_jax.softbody.mesh.solids import FileMesh, solid_mesh
 from dln_jax.types import InputError
 
 BODIES = {2: beam(2.0, 1.0, 4, 2), 3: box((2.0, 1.0, 1.0), (4, 2, 2))}
-TYPES = {2: 2, 3: 4}  # Gmsh's numbers of triangles and tetrahedra; their facets are one less.
-FACET_TYPES = {2: 1, 3: 2}
+TYPES = {1: 1, 2: 2, 3: 4}  # Gmsh's numbers of lines, triangles and tetrahedra
 
 
 def parts(mesh):
@@ -71,8 +70,7 @@ def gmsh_file(mesh, version, binary, *, names=True, parametric=False):
     if names:
         line(f'$PhysicalNames\n3\n{d} 1 "whole body"\n{d} 2 "tip"\n{d - 1} 3 "base"\n$EndPhysicalNames')
     tags = 3 + 2 * np.arange(len(x))  # sparse, from 3 on
-    rows = [(dimension, cells, groups) for dimension, cells, groups in parts(mesh)]
-    types = {d: TYPES[d], d - 1: FACET_TYPES[d]}
+    rows = parts(mesh)
     if version == "4.1":
         line("$Entities")
         put("4Q", *[sum(dimension == k for dimension, *_ in rows) for k in range(4)], end=True)
@@ -93,14 +91,14 @@ def gmsh_file(mesh, version, binary, *, names=True, parametric=False):
         line("\n$EndNodes\n$Elements")
         put("4Q", len(rows), sum(len(cells) for _, cells, _ in rows), 1, 999, end=True)
         for tag, (dimension, cells, _) in enumerate(rows):
-            put("3iQ", dimension, tag, types[dimension], len(cells), end=True)
+            put("3iQ", dimension, tag, TYPES[dimension], len(cells), end=True)
             for number, cell in enumerate(cells):
                 put(f"{1 + len(cell)}Q", number + 1, *tags[cell], end=True)
     else:
         line(f"$Nodes\n{len(x)}")
         for tag, point in zip(tags, x, strict=True):
             put("i3d", tag, *point, end=True)
-        listed = [(types[k], group, cell) for k, cells, groups in rows for group in groups for cell in cells]
+        listed = [(TYPES[k], group, cell) for k, cells, groups in rows for group in groups for cell in cells]
         line(f"\n$EndNodes\n$Elements\n{len(listed)}")
         for number, (kind, group, cell) in enumerate(listed):
             header = (kind, 1, 2, number) if binary else (number, kind, 2)
@@ -173,10 +171,9 @@ def test_a_mesh_is_repaired_and_says_how(tmp_path):
 
 def test_elements_of_higher_order_are_reduced_to_their_corners():
     mesh = BODIES[2]
-    middles = mesh.vertices[mesh.elements][:, [[0, 1], [1, 2], [2, 0]]].mean(axis=2)
     n, m = len(mesh.vertices), len(mesh.elements)
-    curved = np.concatenate([mesh.elements, n + np.arange(3 * m).reshape(m, 3)], axis=1)
-    points = np.pad(np.concatenate([mesh.vertices, middles.reshape(-1, 2)]), ((0, 0), (0, 1)), constant_values=0.2)
+    points = np.pad(mesh.vertices, ((0, 1), (0, 1)), constant_values=0.2)
+    curved = np.pad(mesh.elements, ((0, 0), (0, 3)), constant_values=n)
     read = solid_mesh(FileMesh(points, {"triangle6": curved}, {}, {"all": {"triangle6": np.arange(m)}}))
     np.testing.assert_array_equal(read.mesh.vertices, mesh.vertices)
     np.testing.assert_array_equal(read.mesh.elements, mesh.elements)
@@ -228,13 +225,10 @@ def test_files_that_cannot_be_read_are_refused(tmp_path, monkeypatch):
 
 def test_sets_survive_a_round_trip_exactly(tmp_path):
     """Overlapping sets, an empty one, names with hyphens and spaces, and one of a surface and elements."""
-    mesh, random = BODIES[2], np.random.default_rng(0)
-    sets = {
-        name: NamedSet(np.unique(mesh.elements[chosen]), chosen)
-        for name, chosen in (("left-end", np.arange(5)), ("soft part", np.arange(3, 9)), ("0", np.arange(1)))
-    }
-    sets["skin"] = NamedSet(np.unique(random.integers(0, len(mesh.vertices), 6)), np.zeros(0, np.int64))
-    sets["none"] = NamedSet(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    mesh, none = BODIES[2], np.zeros(0, np.int64)
+    chosen = {"left-end": np.arange(5), "soft part": np.arange(3, 9), "0": np.arange(1)}
+    sets = {name: NamedSet(np.unique(mesh.elements[of]), of) for name, of in chosen.items()}
+    sets |= {"skin": NamedSet(np.array([1, 7, 9]), none), "none": NamedSet(none, none)}
     sets["both"] = NamedSet(np.unique([0, *mesh.elements[4], len(mesh.vertices) - 1]), np.array([4]))
     write_mesh(tmp_path / "mesh.vtu", mesh._replace(sets=sets))
     again, statements = read_mesh(tmp_path / "mesh.vtu")
@@ -248,27 +242,19 @@ def test_sets_survive_a_round_trip_exactly(tmp_path):
 
 def test_files_of_meshio_are_read(tmp_path):
     flat, solid = BODIES[2], BODIES[3]
-    points = np.pad(flat.vertices, ((0, 0), (0, 1)))
+    points, m = np.pad(flat.vertices, ((0, 0), (0, 1))), len(solid.elements)
     meshio.Mesh(points, [("triangle", flat.elements)]).write(tmp_path / "flat.obj")
     np.testing.assert_array_equal(read_mesh(tmp_path / "flat.obj").mesh.elements, flat.elements)
-    m = len(solid.elements)
-    region = np.arange(m) // (m // 3)
+    region = 2 + np.arange(m) // (m // 2)
     for name in ("solid.vtk", "solid.vtu"):
-        content = meshio.Mesh(solid.vertices, [("tetra", solid.elements)], cell_data={"region": [region + 2]})
+        content = meshio.Mesh(solid.vertices, [("tetra", solid.elements)], cell_data={"region": [region]})
         content.point_sets = {"base": np.arange(5), "end": np.arange(5, 9), "other": np.arange(9, 11)}
         content.cell_sets = {"lower": [np.arange(4)], "upper": [np.arange(4, m)]}
         content.write(tmp_path / name)
         sets = read_mesh(tmp_path / name).mesh.sets
-        assert {key: len(part.elements) for key, part in sets.items()} == {
-            **{"base": 0, "end": 0, "other": 0, "lower": 4, "upper": m - 4},
-            **{f"region-{number}": (region + 2 == number).sum() for number in np.unique(region + 2)},
-        }
+        counts = {"base": 0, "end": 0, "other": 0, "lower": 4, "upper": m - 4, "region-2": m // 2, "region-3": m // 2}
+        assert {key: len(part.elements) for key, part in sets.items()} == counts
         assert sets["base"].vertices.tolist() == [0, 1, 2, 3, 4] and sets["end"].vertices.tolist() == [5, 6, 7, 8]
-    rows = "".join(f"{i} {' '.join(map(str, cell))}\n" for i, cell in enumerate(solid.elements))
-    (tmp_path / "solid.1.ele").write_text(f"{m} 4 0\n{rows}")
-    rows = "".join(f"{i} {' '.join(map(repr, point))}\n" for i, point in enumerate(solid.vertices.tolist()))
-    (tmp_path / "solid.1.node").write_text(f"{len(solid.vertices)} 3 0 0\n{rows}")
-    np.testing.assert_array_equal(read_mesh(tmp_path / "solid.1.ele").mesh.elements, solid.elements)
 
 
 def test_motions_are_written_with_times_velocities_and_volumes(tmp_path):
@@ -327,11 +313,8 @@ def test_mistakes_with_mesh_files_are_one_line(tmp_path, capsys, monkeypatch):
     finger = tmp_path / "finger.msh"
     finger.write_bytes(gmsh_file(BODIES[2], "4.1", False))
     rows = [
-        ("--mesh", finger, "--pin", "base,bottom", "the mesh has no set 'bottom'; the sets are base, tip, whole body"),
         ("--mesh", finger, "--pin", ",", "--pin names no set"),
         ("--mesh", finger, "--youngs-modulus-of", "tip", "expected SET=PA"),
-        ("--mesh", finger, "--youngs-modulus-of", "tip=-1", "youngs_modulus of element"),
-        ("--mesh", finger, "--scale", "0", "scale is 0.0; expected a positive number"),
         ("--mesh", tmp_path / "absent.msh", "absent.msh: no such file"),
         ("--scene", "drop", "--mesh", finger, "--pin", "base", "the drop scene has no --pin"),
         ("--pin", "base", "--pin is an option of --mesh"),
