@@ -220,7 +220,7 @@ def test_derivatives_equal_finite_differences(answers):
         expected = (of.gradient["forward"] - of.gradient["backward"]).ravel() / (2 * STEP)
         product, largest = hessian @ of.direction.ravel(), np.abs(expected).max()
         np.testing.assert_allclose(product, expected, rtol=1e-6, atol=1e-6 * largest, err_msg=of.case.name)
-        np.testing.assert_allclose(hessian, hessian.T, rtol=1e-9, atol=1e-8, err_msg=of.case.name)
+        np.testing.assert_allclose(hessian, hessian.T, rtol=1e-9, atol=1e-8)
 
 
 def test_internal_forces_and_torques_cancel_and_derivatives_are_finite_where_elements_collapse(answers):
@@ -230,9 +230,9 @@ def test_internal_forces_and_torques_cancel_and_derivatives_are_finite_where_ele
         for name in ("stretched", "flat", "inverted", "joined"):
             force = of.gradient[name] / (1e-12 + np.abs(of.gradient[name]).max())
             torque = of.positions[name].T @ force
-            np.testing.assert_allclose(force.sum(0), 0.0, atol=1e-12, err_msg=of.case.name)
+            np.testing.assert_allclose(force.sum(0), 0.0, atol=1e-12)
             tolerance = 1e-7 if name == "flat" else 1e-11
-            np.testing.assert_allclose(torque - torque.T, 0.0, atol=tolerance, err_msg=of.case.name)
+            np.testing.assert_allclose(torque - torque.T, 0.0, atol=tolerance)
 
 
 def test_all_solids_have_the_same_stiffness_at_rest_and_no_force(answers):
@@ -241,7 +241,7 @@ def test_all_solids_have_the_same_stiffness_at_rest_and_no_force(answers):
             if of.case.is_solid and other.case.is_solid and of.case.dimension == other.case.dimension:
                 largest = np.abs(of.hessian["rest"]).max()
                 np.testing.assert_allclose(of.hessian["rest"], other.hessian["rest"], atol=1e-9 * largest)
-                np.testing.assert_allclose(of.gradient["rest"], 0.0, atol=1e-12 * largest, err_msg=of.case.name)
+                np.testing.assert_allclose(of.gradient["rest"], 0.0, atol=1e-12 * largest)
 
 
 def test_the_crease_of_the_corotated_energy_keeps_the_slope_of_a_change_of_size():

@@ -146,7 +146,7 @@ def test_parameters_of_terms_are_replaced_by_name_and_mistakes_are_named():
         with_parameters(params, ground={"friction": 0.1})
     with one_line("'elastic' has no parameter 'mu'; expected one of youngs_modulus"):
         with_parameters(params, elastic={"mu": 1.0})
-    with one_line("gravity': acceleration has shape .3.; expected .2."):
+    with one_line("gravity': acceleration has shape .3,.; expected .2,."):
         with_parameters(params, gravity={"acceleration": [0.0, 0.0, -1.6]})
 
 

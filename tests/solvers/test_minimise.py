@@ -189,14 +189,6 @@ def test_convergence_at_the_level_of_rounding_far_below_which_energies_are_blind
     np.testing.assert_allclose(x, 1.0, atol=1e-14)
 
 
-def test_single_precision_stays_single():
-    x, info = jax.jit(lambda x, one: minimise(rosenbrock, x, one, tolerance=1e-3))(
-        jnp.zeros((4, 1), jnp.float32), jnp.float32(1.0)
-    )
-    assert x.dtype == jnp.float32 and info.converged
-    np.testing.assert_allclose(x, 1.0, atol=1e-3)
-
-
 def well(curvature):
     """An element of the first block with the energy -½ c x² + x⁴/40 - x/20 of the first unknown."""
 
