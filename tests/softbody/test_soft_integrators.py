@@ -38,7 +38,7 @@ DT = 1e-2
 
 @functools.cache
 def free_disc():
-    mesh = disc(0.5, 2)
+    mesh = disc(0.5, 3)
     return make_scene(mesh, [elastic(mesh, stable_neo_hookean, youngs_modulus=1e6, poisson_ratio=0.3)])
 
 
