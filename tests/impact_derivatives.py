@@ -27,3 +27,13 @@ def compare_derivatives_with_differences(scene, v, *, steps, tolerance):
         moved = change * np.eye(3)[place]
         difference = (value(at + moved) - value(at - moved)) / (2 * change)
         assert float(gradient[place]) == pytest.approx(float(difference), rel=1e-6)
+
+
+def require_gradient_of_differences(outcome, at, changes):
+    """Requires agreement to 1e-6 of the gradient of `outcome(at [k])`, a number and whether its steps converged."""
+    program = jax.jit(jax.value_and_grad(outcome, has_aux=True))
+    (_, converged), gradient = program(jnp.asarray(at))
+    assert np.all(converged)
+    for place, moved in enumerate(np.diag(changes)):
+        difference = (program(at + moved)[0][0] - program(at - moved)[0][0]) / (2 * changes[place])
+        assert float(gradient[place]) == pytest.approx(float(difference), rel=1e-6), place

@@ -1,12 +1,11 @@
-"""Minima under inequalities, against closed forms and SciPy's SLSQP."""
+"""Minima under inequalities, against closed forms and a published minimum."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from calls import one_line
 
 from dln_jax.solvers.augmented_lagrangian import make_minimiser
-from dln_jax.types import InputError
 
 
 def rosenbrock(x):
@@ -15,18 +14,13 @@ def rosenbrock(x):
 
 PROBLEMS = {
     "nearest point of a half-plane": (lambda x: (x @ x, 1 - x[:1] - x[1:]), [2.0, 0.0], [0.5, 0.5]),
-    "nothing is active": (lambda x: (jnp.sum((x - 1) ** 2), x - 5), [4.0, 0.0], [1.0, 1.0]),
     "corner of a box": (lambda x: (-jnp.sum(x), jnp.concatenate([x - 1, -x])), [0.2, 0.7], [1.0, 1.0]),
-    "valley cut by a disc": (lambda x: (rosenbrock(x), jnp.sum(x**2)[None] - 1), [0.0, 0.0], None),
+    "valley cut by a disc": (lambda x: (rosenbrock(x), jnp.sum(x**2)[None] - 1), [0.0, 0.0], [0.786415, 0.617698]),
 }
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_minima(name):
-    function, start, expected = PROBLEMS[name]
-    if expected is None:
-        disc = {"type": "ineq", "fun": lambda x: -np.asarray(function(x)[1])}
-        expected = minimize(lambda x: float(function(x)[0]), start, constraints=[disc], tol=1e-12).x
+@pytest.mark.parametrize("function, start, expected", PROBLEMS.values(), ids=PROBLEMS)
+def test_minima(function, start, expected):
     found = make_minimiser(function, rounds=20, tolerance=1e-7)(np.array(start))
     assert np.allclose(found.x, expected, atol=1e-4)
     assert found.violation <= 1e-5 and 1 <= found.rounds <= 20
@@ -39,7 +33,7 @@ def test_arguments_are_handed_on():
 
 
 def test_a_start_that_is_not_finite_is_refused():
-    with pytest.raises(InputError, match="not finite at the start"):
+    with one_line("not finite at the start"):
         make_minimiser(lambda x: (jnp.log(x[0]), x))(np.array([-1.0]))
-    with pytest.raises(InputError, match="rounds"):
+    with one_line("rounds"):
         make_minimiser(lambda x: (x @ x, x), rounds=0)
