@@ -8,11 +8,9 @@ from dln_jax.data import schema
 from dln_jax.data.splits import segments
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.motions import Weights, Windows, cut_windows, problem
-from dln_jax.learning.rates import match_linear
+from dln_jax.learning.motions import Weights, cut_windows, problem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.model import Model
-from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.types import InputError, Needs
 
 NEEDS = Needs(joints=("prismatic",))
@@ -45,37 +43,6 @@ def test_windows_never_cross_trajectories():
     data = motion_of([0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 1])
     assert [segment.tolist() for segment in segments(data.t, data.trajectory)] == [[0, 1, 2], [3, 4, 5]]
     assert (cut_windows(data, 6).weight.sum(axis=1) == 3).all()
-
-
-@pytest.mark.slow
-def test_a_noisy_oscillator_is_recovered_without_the_bias_of_its_noise():
-    """H = q² + p² from states with noise of 0.1: derivative matching flattens it, trajectories do not."""
-    random, t = np.random.default_rng(0), np.linspace(0, 3, 30)
-    angle = 2 * t + random.uniform(0, 2 * np.pi, (12, 1))
-    radius = random.uniform(0.2, 1.0, (12, 1))
-    q, p = ((radius * wave(angle)).reshape(-1, 1) for wave in (np.sin, np.cos))
-    noise = 0.1 * random.standard_normal((2, *q.shape))
-    arrays = {"t": np.tile(t, 12), "trajectory": np.repeat(np.arange(12), 30), "qdd": -4 * q}
-    arrays |= {"q": q + noise[0], "p": p + noise[1], "qd": 2 * p, "pd": -2 * q}
-    data = schema.from_arrays(arrays)
-    model = make_polynomial_hamiltonian(NEEDS, degree=2, dtype=jnp.float64)
-    biased = match_linear(model, data)[0].parameters
-    windows = cut_windows(data, 30)
-    fitted = fit(
-        problem(
-            model,
-            biased,
-            Windows(*(array[:10] for array in windows)),
-            Windows(*(array[10:] for array in windows)),
-            weights=Weights(0.1),
-        ),
-        GaussNewton(12),
-    )
-    # Terms in the order p, p², q, qp, q².
-    true = np.array([0, 1, 0, 0, 1.0])
-    error, bias = (np.abs(np.asarray(c) - true).max() for c in (fitted.parameters["model"], biased))
-    assert error < 0.03 < bias
-    assert fitted.validation < 3
 
 
 def damped() -> Model:

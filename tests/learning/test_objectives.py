@@ -6,13 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.data.splits import Split, split
-from dln_jax.learning import BOTH_WAYS, FORWARD, TORQUE, objective_of
+from dln_jax.data.splits import split
+from dln_jax.learning import BOTH_WAYS, objective_of
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import loss_of
-from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import STATED, arrays, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
@@ -85,26 +84,6 @@ def test_exact_data_have_the_same_optimum_by_every_objective(objective):
     ours, plant = dynamics(model.energies(found)), dynamics(scene.energies)
     for state in np.random.default_rng(1).normal(size=(5, 3, 1)):
         np.testing.assert_allclose(ours.inverse_dynamics(*state), plant.inverse_dynamics(*state), atol=1e-7)
-
-
-@pytest.mark.slow
-def test_forward_errors_fall_where_they_are_asked_for(data):
-    """From the best torques of a model without friction, which the plant has: both errors cannot vanish."""
-    data = data._replace(needs=data.needs._replace(friction=False))
-    sets = Split(data, data, data)  # what is kept is the best of these samples
-    model = model_of("trigonometric", data)
-    start = fit_linear(model, data).parameters
-
-    def errors(parameters):
-        plant = model.energies(parameters)
-        sides = [
-            residuals(side, plant, arrays(side, data, jnp.float64)) / side.scale(data) for side in (TORQUE, FORWARD)
-        ]
-        return [float(jnp.mean(side**2)) for side in sides]
-
-    found = fit(problem(model, sets, FORWARD)._replace(parameters=start), GaussNewton(steps=10)).parameters
-    (inverse_before, forward_before), (inverse, forward) = errors(start), errors(found)
-    assert forward < 0.99 * forward_before and inverse > inverse_before
 
 
 def test_only_an_energy_can_be_fitted_by_one_of_two_sides(data):

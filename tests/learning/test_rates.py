@@ -7,10 +7,7 @@ import pytest
 from motions import quick_motion
 
 from dln_jax.data.splits import hold_out
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.rates import match_linear, problem
-from dln_jax.mechanics.dynamics import PlainFlow
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
@@ -66,15 +63,6 @@ def test_friction_takes_energy_and_never_gives_it():
     np.testing.assert_allclose(power, 2 * loss, rtol=1e-9)
 
 
-def test_what_a_scene_lacks_is_not_built():
-    model = make_separable_hamiltonian(FREE, **SMALL)
-    parameters = jax.eval_shape(model.init, jax.random.key(0))
-    free = make_dissipative(separable, FREE, **FRICTION)
-    assert jax.tree.structure(jax.eval_shape(free.init, jax.random.key(0))) == jax.tree.structure(parameters)
-    baseline = make_phase_network(NEEDS, **SMALL)
-    assert isinstance(flow(baseline.energies(jax.jit(baseline.init)(jax.random.key(0)))), PlainFlow)
-
-
 def test_dynamics_with_friction_become_their_field():
     """The viscous friction of a model for a scene with friction: pd = -dH/dq - b qd."""
     model = make_black_box_hamiltonian(NEEDS, **SMALL)
@@ -103,24 +91,6 @@ def test_the_polynomial_recovers_the_pendulum(swing):
     assert len(errors) == len(swing.test.data.t) and errors.max() < 1e-18
     # Of d = 1 and degree 2: 1, cos, sin, cos 2q, sin 2q times 1, p, p², without the constant and what exceeds it.
     assert len(coefficients) == 2 + 2 + 1 + 1 + 2
-
-
-@pytest.mark.slow
-def test_networks_learn_the_field(swing):
-    model = make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL)
-    training = fit(problem(model, *hold_out(swing.train.data, 0.1, 0)), GaussNewton(20))
-    found = phase_metrics.field_errors(model, training.parameters, swing.test)
-    assert found["loss"] == pytest.approx(found["clean_field_mse"])
-    # A field of zero has an error of 5.
-    assert found["clean_field_mse"] < 1e-3
-    data = swing.test.data
-    predicted = phase_metrics.predict(model, training.parameters, data.q[:1], data.p[:1], swing.t)
-    truth = phase_metrics.Motions(swing.t, data.q[None, :45], data.p[None, :45])
-    errors = phase_metrics.motion_errors(
-        [predicted], [truth], swing.hamiltonian, published_energy=swing.published_energy
-    )
-    assert errors["energy_mse"] < 1e-3 and errors["rollout_mse"] < 1e-2
-    assert np.isnan(errors["energy_mse_standard_error"]) and errors["published_energy_mse"] > 0
 
 
 def test_metrics_by_hand_and_motions_that_end():
