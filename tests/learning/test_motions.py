@@ -1,8 +1,10 @@
 """Windows and gaps; a noisy oscillator and a damped one, recovered from their motions, the second from q alone."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from calls import one_line
 
 from dln_jax.data import schema
 from dln_jax.data.splits import segments
@@ -11,7 +13,7 @@ from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.motions import Weights, cut_windows, problem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.model import Model
-from dln_jax.types import InputError, Needs
+from dln_jax.types import Needs
 
 NEEDS = Needs(joints=("prismatic",))
 
@@ -27,7 +29,6 @@ def test_windows_never_cross_a_gap():
     t = np.concatenate([np.arange(7), 7.4 + np.arange(5), 20.0 + np.arange(2)]) / 6
     data = motion_of(t)
     # 1.4 steps are no gap, 8.6 are one.
-    assert [len(segment) for segment in segments(data.t, data.trajectory)] == [12, 2]
     assert [len(segment) for segment in segments(data.t, data.trajectory, gap=1.3)] == [7, 5, 2]
     windows = cut_windows(data, 4)
     steps = np.diff(windows.t, axis=1)
@@ -41,7 +42,6 @@ def test_windows_never_cross_a_gap():
 
 def test_windows_never_cross_trajectories():
     data = motion_of([0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 1])
-    assert [segment.tolist() for segment in segments(data.t, data.trajectory)] == [[0, 1, 2], [3, 4, 5]]
     assert (cut_windows(data, 6).weight.sum(axis=1) == 3).all()
 
 
@@ -70,21 +70,18 @@ def test_a_damped_oscillator_is_recovered_from_its_positions():
 
 
 def test_mistakes_are_named():
-    data = motion_of(np.arange(8))
+    data, start = motion_of(np.arange(8)), jnp.ones(2)
     windows = cut_windows(data, 4)
-    none = windows._replace(t=windows.t[:0])
-    weights = Weights(0.1)
-    start = jnp.ones(2)
-    refused = [
+    pose = functools.partial(problem, damped(), start, windows)
+    for call, message in [
         (lambda: cut_windows(data, 1), "length is 1"),
         (lambda: cut_windows(data._replace(p=None), 4), "no p"),
         (lambda: segments(data.t, data.trajectory, gap=0.9), "gap is 0.9"),
         (lambda: segments(np.zeros(2), np.array([0, 1])), "no trajectory has two samples"),
-        (lambda: problem(damped(), start, windows, none, weights=weights), "0 to validate"),
-        (lambda: problem(damped(), start, windows, windows, substeps=0, weights=weights), "substeps is 0"),
-        (lambda: problem(damped(), start, windows, windows, weights=Weights(0.0)), "state_weight is 0"),
-        (lambda: problem(damped(), start, windows, windows, weights=Weights(1.0, 1.0)), "which the windows lack"),
-    ]
-    for call, message in refused:
-        with pytest.raises(InputError, match=message):
+        (lambda: pose(windows._replace(t=windows.t[:0]), weights=Weights(0.1)), "0 to validate"),
+        (lambda: pose(windows, substeps=0, weights=Weights(0.1)), "substeps is 0"),
+        (lambda: pose(windows, weights=Weights(0.0)), "state_weight is 0"),
+        (lambda: pose(windows, weights=Weights(1.0, 1.0)), "which the windows lack"),
+    ]:
+        with one_line(message):
             call()

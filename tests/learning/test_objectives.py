@@ -9,14 +9,11 @@ import pytest
 from dln_jax.data.splits import split
 from dln_jax.learning import BOTH_WAYS, objective_of
 from dln_jax.learning.dynamics import problem
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import loss_of
 from dln_jax.learning.objectives import STATED, arrays, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulums import pendulum
 from dln_jax.scenes.poles import cart_pole
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe_for
@@ -70,20 +67,6 @@ def test_each_side_is_measured_in_its_standard_deviation_and_gradients_are_exact
     along, step = gradient / np.linalg.norm(gradient), 1e-6
     difference = (ask(flat + step * along)[0] - ask(flat - step * along)[0]) / (2 * step)
     np.testing.assert_allclose(difference, gradient @ along, rtol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("objective", STATED)
-def test_exact_data_have_the_same_optimum_by_every_objective(objective):
-    scene = pendulum(friction=0.2)
-    data = uniform(scene, samples=60, rate_bound=2.0, acceleration_bound=5.0)
-    model = model_of("trigonometric", data)
-    posed = problem(model, split(data), STATED[objective])
-    away = jax.tree.map(lambda leaf: leaf + 0.05, posed.parameters)
-    found = fit(posed._replace(parameters=away), GaussNewton(steps=40)).parameters
-    ours, plant = dynamics(model.energies(found)), dynamics(scene.energies)
-    for state in np.random.default_rng(1).normal(size=(5, 3, 1)):
-        np.testing.assert_allclose(ours.inverse_dynamics(*state), plant.inverse_dynamics(*state), atol=1e-7)
 
 
 def test_only_an_energy_can_be_fitted_by_one_of_two_sides(data):

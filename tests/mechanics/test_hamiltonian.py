@@ -3,15 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from calls import one_line
 
-from dln_jax.mechanics import closed_form, hamiltonian
-from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, conjugate, legendre
-from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.scenes import scene as textbook
-from dln_jax.scenes.pendulums import chain
 from dln_jax.scenes.poles import cart_pole
 from dln_jax.solvers.elimination import solve
 
@@ -52,26 +49,6 @@ def test_elimination_differentiates_in_both_modes():
     np.testing.assert_allclose(gradient, -np.outer(np.linalg.solve(matrix.T, right[1]), x), rtol=1e-12)
 
 
-def cholesky(M):
-    """Written out: with derivatives, and without a batched call to LAPACK."""
-    d = M.shape[0]
-    L = [[jnp.zeros(())] * d for _ in range(d)]
-    for j in range(d):
-        for i in range(j, d):
-            left = M[i, j] - sum(L[i][k] * L[j][k] for k in range(j))
-            L[i][j] = jnp.sqrt(left) if i == j else left / L[j][j]
-    return jnp.array(L)
-
-
-def from_inverse_factor(scene):
-    """The scene's energies by the factor of its inverse mass matrix."""
-
-    def inverse_factor(q):
-        return cholesky(solve(scene.mass_matrix(q), jnp.eye(q.shape[0])))
-
-    return NaturalHamiltonian(inverse_factor, scene.potential, scene.dissipation)
-
-
 def states(d, count=3):
     return jax.random.normal(jax.random.key(d), (count, 20, d))
 
@@ -80,41 +57,6 @@ def assert_equal(got, expected):
     """To 1e-10 of the largest number; a force that the scene lacks to the same of 1."""
     scale = float(jnp.max(jnp.abs(expected))) or 1.0
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * scale)
-
-
-CASES = [cart_pole(friction=0.3), chain(2)._replace(potential=None, gravity=None)]
-
-
-@pytest.mark.parametrize("scene", CASES, ids=lambda scene: scene.name)
-def test_natural_dynamics_equals_the_textbook(scene):
-    q, qd, third = states(scene.needs.degrees_of_freedom)
-    energies = from_inverse_factor(scene)
-    system, H = dynamics(energies), flow(energies).energy
-    natural = NaturalSystem(lambda q: cholesky(scene.mass_matrix(q)), scene.potential)
-
-    @jax.jit
-    @jax.vmap
-    def ask(q, qd, third):
-        return (
-            system.inverse_dynamics(q, qd, third),
-            system.forward_dynamics(q, qd, third),
-            system.energy(q, qd),
-            system.mass_matrix(q, qd),
-            system.decompose(q, qd, third),
-            H(q, scene.mass_matrix(q) @ qd),
-            flow(natural).energy(q, scene.mass_matrix(q) @ qd),
-        )
-
-    @jax.jit
-    @jax.vmap
-    def expect(q, qd, third):
-        energy = qd @ scene.mass_matrix(q) @ qd - scene.lagrangian(q, qd)
-        tau = closed_form.inverse_dynamics(scene.closed_form, q, qd, third)
-        acceleration = textbook.closed_form_forward_dynamics(scene, q, qd, third)
-        parts = closed_form.decompose(scene.closed_form, q, qd, third)
-        return tau, acceleration, energy, scene.mass_matrix(q), parts, energy, energy
-
-    jax.tree.map(assert_equal, ask(q, qd, third), expect(q, qd, third))
 
 
 def test_legendre_transform_is_its_own_inverse():
@@ -135,7 +77,6 @@ def test_hamiltons_equations_are_those_of_the_textbook():
     """(qd, pd) from the closed-form acceleration, and dH/dt = qd·tau - qd·dD/dqd along them."""
     scene = cart_pole(friction=0.3)
     H = legendre(scene.lagrangian)
-    system = dynamics(HamiltonianSystem(H, scene.dissipation))
     q, qd, tau = states(2)
 
     @jax.jit
@@ -147,9 +88,8 @@ def test_hamiltons_equations_are_those_of_the_textbook():
         field = hamiltonian.time_derivative(H, q, p, tau, dissipation=scene.dissipation)
         again = hamiltonian.inverse(H, q, p, pd, dissipation=scene.dissipation), hamiltonian.inverse(H, q, p, pd)
         balance = jax.jvp(H, (q, p), field)[1]
-        moved = system.forward_dynamics(q, qd, tau), system.inverse_dynamics(q, qd, acceleration)
-        got = *field, *again, hamiltonian.velocity(H, q, p), balance, *moved
-        return got, (qd, pd, tau, tau - friction, qd, qd @ tau - qd @ friction, acceleration, tau)
+        got = *field, *again, hamiltonian.velocity(H, q, p), balance
+        return got, (qd, pd, tau, tau - friction, qd, qd @ tau - qd @ friction)
 
     jax.tree.map(assert_equal, *ask(q, qd, tau))
 

@@ -15,8 +15,6 @@ from dln_jax.mechanics.trees import (
     kinetic_energy,
     newton_euler,
     serial,
-    tree_energies,
-    tree_system,
 )
 from dln_jax.mechanics.trees.motors import motor_regressor, motors_of, require_motors, single_motors
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -42,14 +40,6 @@ def test_the_armature_is_that_of_the_motors_kinetic_energy():
     np.testing.assert_allclose(difference, A @ STATE[2], atol=1e-13)
     columns = motor_regressor(S, PAIRS, qdd)
     np.testing.assert_allclose(columns @ np.append(INERTIAS, 0.05), difference, atol=1e-13)
-
-
-def test_recursions_agree_with_derivatives_of_the_lagrangian():
-    arm = serial(*FRAMES, LINKS, armature=A)
-    fast, slow = (dynamics(make(arm)) for make in (tree_system, tree_energies))
-    np.testing.assert_allclose(fast.inverse_dynamics(*STATE), slow.inverse_dynamics(*STATE), atol=1e-11)
-    tau = fast.inverse_dynamics(*STATE)
-    np.testing.assert_allclose(fast.forward_dynamics(*STATE[:2], tau), STATE[2], atol=1e-10)
 
 
 def test_friction_of_coupled_motors_acts_at_their_rates():
