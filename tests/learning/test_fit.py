@@ -184,21 +184,19 @@ def test_a_run_of_other_settings_or_data_is_not_continued(tmp_path):
     assert finished.stop.reason == "finished" and finished.compile_seconds == 0
 
 
-@pytest.mark.parametrize("kind", ["newton", "adam"])
-def test_seeds_in_one_program_equal_single_runs(kind):
-    together, (given, optimiser) = unbroken(f"{kind}, seeds"), TRAINED[f"{kind}, seeds"]
-    if kind == "newton":
-        assert [at.stage for at in together.history] == 3 * [newton.SOME] + 4 * [newton.ALL]
-        assert [at.step for at in together.history] == [2, 4, 5, 7, 9, 11, 13]
-    alone = fit(
-        given._replace(parameters=jax.tree.map(lambda leaf: leaf[1], given.parameters), seed=1),
-        optimiser,
-    )
+@pytest.mark.parametrize("name", ["newton, seeds", "adam, seeds"])
+def test_seeds_in_one_program_equal_single_runs(name):
+    together, (given, optimiser) = unbroken(name), TRAINED[name]
+    second = jax.tree.map(lambda leaf: leaf[1], given.parameters)
+    alone = fit(given._replace(parameters=second, seed=1), optimiser)
     assert together.validation[1] == pytest.approx(alone.validation, rel=1e-6)
     assert together.best_step[1] == alone.best_step
+    if name == "newton, seeds":
+        assert [at.stage for at in together.history] == 3 * [newton.SOME] + 4 * [newton.ALL]
+        assert [at.step for at in together.history] == [2, 4, 5, 7, 9, 11, 13]
 
 
-def test_the_best_of_some_samples_starts_the_stage_on_all(monkeypatch):
+def test_the_best_of_some_samples_starts_the_stage_on_all_and_a_target_ends_it(monkeypatch):
     started = []
     solver = newton.levenberg_marquardt.init
     monkeypatch.setattr(newton.levenberg_marquardt, "init", lambda x: started.append(x) or solver(x))
@@ -209,19 +207,16 @@ def test_the_best_of_some_samples_starts_the_stage_on_all(monkeypatch):
     assert best is not some[-1] and abs(float(started[1][0][0]) - 1.2) == pytest.approx(best.validation, rel=1e-12)
     few = fit(bumps(BUMPS), optimiser._replace(coarse_samples=40))
     assert {at.stage for at in few.history} == {""}
-
-
-def test_a_target_and_time_end_a_run_between_dispatches():
-    optimiser = NEWTON._replace(steps_per_dispatch=1)
-    whole = fit(bumps(BUMPS), optimiser)
-    validations = np.minimum.accumulate([at.validation for at in whole.history])
+    validations = np.minimum.accumulate([at.validation for at in training.history])
     for place in (1, 6):
         reached = fit(bumps(BUMPS), optimiser._replace(target=float(validations[place])))
         first = int(np.argmax(validations <= validations[place]))
         assert reached.stop == Stop("finished", first + 1) and len(reached.history) == first + 1
-    for short in (optimiser, Adam(steps=300, batch=16, steps_per_dispatch=30)):
-        given = bumps(BUMPS) if short is optimiser else line()
-        late = fit(given, short, seconds=1e-6)
+
+
+def test_time_ends_a_run_between_dispatches():
+    for given, optimiser in ((bumps(BUMPS), NEWTON), (line(), Adam(steps=300, batch=16, steps_per_dispatch=30))):
+        late = fit(given, optimiser, seconds=1e-6)
         assert late.stop == Stop("time", late.history[0].step) and len(late.history) == 1
 
 
@@ -250,16 +245,6 @@ def test_the_order_of_many_samples_is_not_that_of_the_file(takes):
     )
     in_order = -float(fit(given, Adam(steps=samples // 2, batch=2, steps_per_dispatch=samples // 2)).parameters)
     assert abs(in_order - samples / 4) < 5 * np.sqrt(samples / 8)  # standard deviations
-
-
-def test_a_constant_rate_is_one():
-    """The published recipe of differential networks, against optax."""
-    rates = [
-        optimisers.transformation(Adam(steps=9, warm_up_share=0, final_share=1, learning_rate=0.1)),
-        optax.adamw(0.1, b2=0.99, weight_decay=1e-5),
-    ]
-    moves = [rate.update(jnp.ones(2), rate.init(jnp.ones(2)), jnp.ones(2))[0] for rate in rates]
-    np.testing.assert_array_equal(*moves)
 
 
 def test_torque_scale_never_divides_by_zero():

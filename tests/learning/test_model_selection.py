@@ -63,12 +63,8 @@ def test_the_search_ends_at_the_noise_and_not_where_that_is_overestimated():
 
 
 def test_out_of_time_the_first_that_can_be_fitted_is_kept():
-    found = select_model(
-        [Candidate("refused", refuse), candidate("first", 1, 1), candidate("second", 1, 1)],
-        TRAIN,
-        VALIDATION,
-        seconds=1e-9,
-    )
+    candidates = [Candidate("refused", refuse), candidate("first", 1, 1), candidate("second", 1, 1)]
+    found = select_model(candidates, TRAIN, VALIDATION, seconds=1e-9)
     assert found.chosen.name == "first" and found.ended == "time is out"
     assert found.steps[-1].reason == "time is out" and not found.steps[-1].tried
 

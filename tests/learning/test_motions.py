@@ -25,7 +25,7 @@ def motion_of(t, trajectory=None):
     return schema.from_arrays({**arrays, "trajectory": np.zeros(len(t)) if trajectory is None else trajectory})
 
 
-def test_windows_never_cross_a_gap():
+def test_windows_never_cross_a_gap_nor_trajectories():
     t = np.concatenate([np.arange(7), 7.4 + np.arange(5), 20.0 + np.arange(2)]) / 6
     data = motion_of(t)
     # 1.4 steps are no gap, 8.6 are one.
@@ -38,11 +38,8 @@ def test_windows_never_cross_a_gap():
     np.testing.assert_array_equal(windows.state[1, 0], windows.state[0, -1])
     np.testing.assert_allclose(windows.t, windows.state[..., 0] - windows.state[:, :1, 0], atol=1e-15)
     assert windows.rate is None
-
-
-def test_windows_never_cross_trajectories():
-    data = motion_of([0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 1])
-    assert (cut_windows(data, 6).weight.sum(axis=1) == 3).all()
+    apart = cut_windows(motion_of([0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 1]), 6)
+    assert (apart.weight.sum(axis=1) == 3).all()
 
 
 def damped() -> Model:

@@ -44,29 +44,21 @@ def test_residuals_vanish_for_the_true_plant_as_lagrangian_and_as_hamiltonian(da
 
 
 @pytest.mark.parametrize("name", ENERGIES)
-def test_each_side_is_measured_in_its_standard_deviation_and_gradients_are_exact(data, name):
+def test_each_side_is_measured_in_its_standard_deviation(name, data):
     model, sets = model_of(name, data), split(data)
     posed, train = problem(model, sets, BOTH_WAYS), sets.train
-    flat, unravel = jax.flatten_util.ravel_pytree(posed.parameters)
 
     @jax.jit
-    def ask(flat):
-        plant = dynamics(model.energies(unravel(flat)))
+    def ask(parameters):
+        plant = dynamics(model.energies(parameters))
         sides = jax.vmap(lambda q, qd, x, tau: (plant.inverse_dynamics(q, qd, x), plant.forward_dynamics(q, qd, tau)))
-        loss = jax.value_and_grad(lambda vector: loss_of(posed)(unravel(vector), posed.arrays))(flat)
-        return *loss, *sides(train.q, train.qd, train.qdd, train.tau)
+        return loss_of(posed)(parameters, posed.arrays), *sides(train.q, train.qd, train.qdd, train.tau)
 
-    loss, _, torque, acceleration = ask(flat)
+    loss, torque, acceleration = ask(posed.parameters)
     # Only the cart is driven: the pole's torque, which is zero, counts in units of the cart's.
     expected = np.sum(((torque - train.tau) / train.tau[:, 0].std()) ** 2, axis=1).mean()
     expected += np.sum(((acceleration - train.qdd) / train.qdd.std(axis=0)) ** 2, axis=1).mean()
     np.testing.assert_allclose(loss, expected, rtol=1e-9)
-
-    flat = flat + 0.1 * np.random.default_rng(0).normal(size=flat.shape)
-    gradient = np.asarray(ask(flat)[1])
-    along, step = gradient / np.linalg.norm(gradient), 1e-6
-    difference = (ask(flat + step * along)[0] - ask(flat - step * along)[0]) / (2 * step)
-    np.testing.assert_allclose(difference, gradient @ along, rtol=1e-5)
 
 
 def test_only_an_energy_can_be_fitted_by_one_of_two_sides(data):

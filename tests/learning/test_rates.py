@@ -9,11 +9,11 @@ from motions import quick_motion
 
 from dln_jax.data.splits import hold_out
 from dln_jax.learning.rates import match_linear, problem
-from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
 from dln_jax.models.baselines import make_phase_network
-from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_dissipative, make_separable_hamiltonian
+from dln_jax.models.hamiltonian import make_dissipative, make_separable_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
@@ -52,17 +52,6 @@ def test_friction_takes_energy_and_never_gives_it():
     assert (loss > 0).all() and float(loss.max()) > 1e-3
     np.testing.assert_allclose(rate, -2 * loss, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(power, 2 * loss, rtol=1e-9)
-
-
-def test_dynamics_with_friction_become_their_field():
-    """The viscous friction of a model for a scene with friction: pd = -dH/dq - b qd."""
-    model = make_black_box_hamiltonian(NEEDS, **SMALL)
-    energies = model.energies(jax.jit(model.init)(jax.random.key(0)))
-    q, p = jnp.array([0.3, -0.2]), jnp.array([1.0, 0.5])
-    slope, qd = jax.jit(jax.grad(energies.hamiltonian, argnums=(0, 1)))(q, p)
-    friction = dynamics(energies).friction(q, qd)
-    np.testing.assert_allclose(flow(energies).rates(q, p), (qd, -slope - friction), rtol=1e-12)
-    assert np.abs(friction).max() > 1e-4
 
 
 def test_the_polynomial_recovers_the_pendulum(swing):

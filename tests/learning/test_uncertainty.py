@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from planar_arm import ARM as PLANAR
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import split
@@ -13,7 +14,6 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
 from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.coverage import coverage
 from dln_jax.models.model import linearised
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -22,9 +22,7 @@ from dln_jax.models.uncertainty import out_of_distribution, predictive, scores
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
 
-FRAMES = dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0]])
-LINKS = [inertial_parameters(m, [0.05, -0.02, 0.1], np.diag([0.02, 0.03, 0.01])) for m in (3.0, 2.0)]
-ARM = make_rigid_tree(serial(*FRAMES, LINKS, armature=[0.1, 0.2]), friction=True, velocity_scale=0.1)
+ARM = make_rigid_tree(PLANAR, friction=True, velocity_scale=0.1)
 TRUTH = ARM.init(jax.random.key(0))._replace(
     viscous=jnp.array([0.2, 0.1]), coulomb=jnp.array([0.5, 0.3]), offset=jnp.array([0.1, 0.0])
 )
@@ -143,7 +141,7 @@ def test_leading_directions_are_those_of_the_singular_value_decomposition(monkey
     np.testing.assert_allclose(np.linalg.norm(right[:3] @ basis, axis=1), 1.0, atol=1e-3)
     monkeypatch.setattr(uncertainty, "MOST_PARAMETERS", 10)
     monkeypatch.setattr(uncertainty, "DIRECTIONS", 3)
-    assert estimate(ARM, TRUTH, drawn(0), drawn(1), ridge=0.1).uncertainty.factor.shape == (30, 3)
+    assert estimate(ARM, TRUTH, drawn(0), drawn(1), ridge=0.1).uncertainty.factor.shape == (28, 3)
 
 
 def test_the_covariance_is_that_of_bayes_where_all_joints_are_alike():

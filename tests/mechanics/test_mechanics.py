@@ -6,13 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dln_jax.mechanics import closed_form, lagrangian, natural
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
-from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.scenes.pendulums import double_pendulum, pendulum
 from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import closed_form_forward_dynamics
@@ -42,8 +39,10 @@ PATHS = {
 }
 
 
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
+CASES = [(scene, path) for scene in SCENES for path in PATHS if path != "hamiltonian" or scene.name == "cart-pole"]
+
+
+@pytest.mark.parametrize(("scene", "path"), CASES, ids=lambda case: getattr(case, "name", case))
 def test_every_path_equals_the_textbook_and_balances_power(scene, path):
     """Forces, accelerations, M and the parts of a force; dE/dt = qdᵀ tau - qdᵀ dD/dqd; H(q, M qd) is the energy."""
     energies = PATHS[path](scene)
@@ -81,33 +80,6 @@ def test_every_path_equals_the_textbook_and_balances_power(scene, path):
     np.testing.assert_allclose(power, supplied, atol=1e-12 * np.abs(supplied).max())
 
 
-@functools.cache
-def round_trip(d):
-    """Both paths' residual of inverse after forward, and of the momentum, compiled once per size."""
-
-    @jax.jit
-    def residuals(weights, q, qd, tau):
-        def cholesky(q):
-            return jnp.tril(jnp.tanh(weights @ q), -1) + jnp.diag(1.0 + jnp.cos(q) ** 2)
-
-        system = natural.NaturalSystem(cholesky, lambda q: jnp.sum(jnp.sin(q) ** 2))
-        L = natural.lagrangian(system)
-        paths = dynamics(system), dynamics(LagrangianSystem(L))
-        residuals = [path.inverse_dynamics(q, qd, path.forward_dynamics(q, qd, tau)) - tau for path in paths]
-        return jnp.stack([*residuals, lagrangian.momentum(L, q, qd) - natural.mass_matrix(system, q) @ qd])
-
-    return residuals
-
-
-@settings(max_examples=30, deadline=None)
-@given(d=st.sampled_from([1, 3]), seed=st.integers(0, 2**16))
-def test_inverse_after_forward_is_the_identity(d, seed):
-    """Random energies of every size, not only textbook ones."""
-    random = np.random.default_rng(seed)
-    weights = random.normal(size=(d, d, d)) / d
-    assert np.abs(round_trip(d)(weights, *random.normal(size=(3, d)))).max() < 1e-10
-
-
 def test_residual_of_solve_does_not_grow_with_condition(d=6):
     """Backward stability (Higham 2002, theorem 9.4): |M qdd + c - tau| within 8 d eps of its terms."""
     vectors = np.linalg.qr(np.random.default_rng(1).normal(size=(d, d)))[0]
@@ -128,18 +100,6 @@ def test_residual_of_solve_does_not_grow_with_condition(d=6):
         bound = 8 * d * np.finfo(float).eps
         assert abs(again - tau).max() < bound * (size + abs(tau).max())
         assert abs(solved - qdd).max() < bound * condition * (abs(qdd).max() + abs(qd).max() ** 2)
-
-
-def test_generic_functions_take_any_lagrangian():
-    """A charged particle in a magnetic field: L is linear in qd as well, and M is not its whole story."""
-
-    def L(q, qd):
-        return 0.5 * jnp.sum(qd**2) + 0.5 * 1.7 * (q[0] * qd[1] - q[1] * qd[0])
-
-    q, qd = jnp.array([[0.2, 0.9], [1.0, -0.5]])
-    acceleration = lagrangian.forward_dynamics(L, q, qd, jnp.zeros(2))
-    np.testing.assert_allclose(acceleration, 1.7 * jnp.array([qd[1], -qd[0]]), rtol=1e-13)
-    assert lagrangian.energy(L, q, qd) == pytest.approx(0.5 * float(qd @ qd), rel=1e-14)
 
 
 def test_a_singular_mass_matrix_is_not_hidden():

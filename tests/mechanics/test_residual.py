@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from planar_arm import ARM
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
@@ -11,11 +12,9 @@ from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.residual import Residual, with_residual
-from dln_jax.mechanics.trees import inertial_parameters, lagrangian, serial, tree_system
+from dln_jax.mechanics.trees import lagrangian, tree_system
 from dln_jax.scenes.pendulums import two_link_arm
 
-TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-ARM = serial([np.eye(3), TURN], [[0, 0, 0.1], [0.3, 0, 0]], [inertial_parameters(2, [0.1, 0.2, 0], np.eye(3))] * 2)
 STATE = tuple(np.random.default_rng(0).normal(size=(3, 2)))
 RESIDUAL = Residual(
     potential=lambda q: jnp.sin(3 * q[0]) * q[1],

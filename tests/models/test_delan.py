@@ -7,7 +7,6 @@ from costs import flops_and_parameters
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.model import joint_features
 from dln_jax.types import Needs
 
 
@@ -27,30 +26,6 @@ def test_absent_terms_cost_nothing():
     potential = 4 * 6 + 6 + 6 * 6 + 6 + 6 + 1
     assert full_parameters - frictionless_parameters == 2
     assert frictionless_parameters - weightless_parameters == potential
-
-
-def test_prismatic_joints_take_no_trigonometry():
-    def text(**kinds):
-        model = small(**kinds)
-        parameters = jax.tree.map(lambda leaf: np.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
-        return str(jax.make_jaxpr(dynamics(model.energies(parameters)).mass_matrix)(jnp.zeros(2)))
-
-    assert " cos" in text() and " sin" in text()
-    assert " cos" not in text(prismatic=True) and " sin" not in text(prismatic=True)
-    mixed = joint_features(Needs(("prismatic", "revolute")), jnp.array([2.0, 0.0]))
-    np.testing.assert_array_equal(mixed, [1.0, 0.0, 2.0])
-
-
-def test_a_full_turn_changes_nothing():
-    model = small()
-    q, qd, qdd = np.array([[0.4, 1.0], [1.0, -1.0], [0.5, 2.0]])
-
-    @jax.jit
-    def torque(q):
-        return dynamics(model.energies(model.init(jax.random.key(1)))).inverse_dynamics(q, qd, qdd)
-
-    for turns in (1.0, 1000.0):
-        np.testing.assert_allclose(torque(q), torque(q + 2 * np.pi * np.array([turns, -turns])), rtol=turns * 1e-11)
 
 
 def test_single_precision_and_nan():

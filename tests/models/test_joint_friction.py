@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.data.schema import from_arrays
-from dln_jax.learning.linear import fit_linear
-from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import LAWS, FrictionShape, joint_dissipation
-from dln_jax.mechanics.joint_friction import with_friction
 from dln_jax.models.joint_friction import friction_of, with_joint_friction
-from dln_jax.scenes import double_pendulum
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
 
@@ -68,17 +64,6 @@ def test_every_kind_has_the_friction_that_its_needs_name(kind):
         np.testing.assert_allclose(again, qdd, rtol=1e-7, atol=1e-7)
 
 
-def test_a_phase_network_loses_momentum_by_friction():
-    needs = Needs(joints=("revolute",), joint_friction=("viscous", "coulomb"))
-    model, bare = (model_of("phase-network", each) for each in (needs, needs._replace(joint_friction=())))
-    parameters = drawn(model)
-    velocity, change = flow(model.energies(parameters)).rates([0.3], [0.1])
-    alike, free = flow(bare.energies(parameters["model"])).rates([0.3], [0.1])
-    b, c = (jax.nn.softplus(parameters["friction"].coefficients[name]) for name in ("viscous", "coulomb"))
-    np.testing.assert_allclose(velocity, alike)
-    np.testing.assert_allclose(free - change, b * velocity + c * np.tanh(velocity / 0.01), rtol=1e-12)
-
-
 @pytest.mark.parametrize("laws", [("viscous", "coulomb", "stribeck", "sigmoid"), ("asymmetric", "load")], ids="-".join)
 def test_what_is_trained_takes_power_whatever_the_parameters(laws):
     model, free = (model_of("structured-delan", NEEDS._replace(joint_friction=each)) for each in (laws, ()))
@@ -94,23 +79,6 @@ def test_what_is_trained_takes_power_whatever_the_parameters(laws):
     for seed in range(5):
         parameters = jax.tree.map(lambda leaf: 10 * leaf, drawn(model, seed))
         assert (np.asarray(power(parameters, rates)) >= -1e-9).all()
-
-
-def test_a_linear_model_stays_one_and_finds_the_friction_of_joints():
-    """The double pendulum in absolute angles: friction of the joint between the links acts on both."""
-    scene = double_pendulum()
-    needs = scene.needs._replace(joint_friction=("viscous", "coulomb", "offset"), joint_map=ABSOLUTE)
-    true = {"viscous": [0.1, 0.2], "coulomb": [0.3, 0.15], "offset": [0.05, -0.02]}
-    plant = with_friction(scene.closed_form, joint_dissipation(**true, joint_map=np.array(ABSOLUTE)))
-    state = np.random.default_rng(0).normal(size=(3, 200, 2))
-    tau = jax.jit(jax.vmap(dynamics(plant).inverse_dynamics))(*state)
-    names = dict(zip(("q", "qd", "qdd"), state, strict=True))
-    data = from_arrays({**names, "t": np.zeros(200), "tau": np.asarray(tau), "trajectory": np.arange(200)})
-    fit = fit_linear(build(describe("trigonometric", needs=needs, precision="f64")), data)
-    assert fit.torque_mse < 1e-20
-    for name, value in true.items():
-        np.testing.assert_allclose(fit.parameters["friction"].coefficients[name], value, atol=1e-9)
-    assert fit.parameters["friction"].shape == {}
 
 
 def test_learned_shapes_start_where_they_are_stated_and_the_scale_is_held():

@@ -1,14 +1,10 @@
 """Planar chains against the textbook double pendulum and cart-pole, and a tree of rigid bodies, in both coordinates."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from calls import one_line
 
-from dln_jax.mechanics import lagrangian
-from dln_jax.mechanics.closed_form import lagrangian as scalar
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.scenes.pendulums import double_pendulum
@@ -22,10 +18,6 @@ STATE = tuple(map(np.array, ([0.4, -1.3], [1.1, 2.0], [0.3, -0.7])))
 
 def torque(system, state=STATE):
     return jax.jit(dynamics(system).inverse_dynamics)(*state)
-
-
-def by_energy(system, state=STATE):
-    return jax.jit(functools.partial(lagrangian.inverse_dynamics, scalar(system)))(*state)
 
 
 def random_parameters(model):
@@ -57,17 +49,6 @@ def test_textbook_cart_pole():
         moments=jnp.array([M[0, 0], M[1, 0], M[1, 1]]), weight=jnp.array([0.0, (above - below) / 2])
     )
     np.testing.assert_allclose(torque(model.energies(parameters)), torque(book), rtol=1e-13)
-
-
-def test_forces_on_two_slides_and_two_hinges_are_derivatives_of_the_energy():
-    needs = Needs(joints=("prismatic", "prismatic", "revolute", "revolute"), friction=False)
-    model = make_planar_chain(needs, directions=(1, 1, 1, -1), symmetric=False, armature=True)
-    random = np.random.default_rng(1)
-    parameters = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)), model.init(jax.random.key(0)))
-    assert parameters.armature.shape == (1,)
-    parameters = parameters._replace(moments=parameters.moments + 9 * model.init(jax.random.key(0)).moments)
-    system, state = model.energies(parameters), random.normal(size=(3, 4))
-    np.testing.assert_allclose(torque(system, state), by_energy(system, state), rtol=1e-10)
 
 
 def test_coordinates_do_not_matter():

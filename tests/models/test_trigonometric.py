@@ -7,13 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
-from costs import flops_and_parameters
-from jax.flatten_util import ravel_pytree
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, split
-from dln_jax.learning.linear import choose_degrees, fit_linear, linearised
-from dln_jax.mechanics import closed_form, lagrangian
+from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
@@ -57,18 +54,15 @@ def test_textbook_scenes_are_identified_to_rounding(scene, friction):
     @jax.jit
     @jax.vmap
     def ask(q, qd, qdd, tau):
-        accelerations = system.forward_dynamics(q, qd, tau)
-        parts = system.decompose(q, qd, qdd)
         potential = 0.0 if scene.potential is None else scene.potential(q)
         masses = system.mass_matrix(q), scene.mass_matrix(q)
-        return system.inverse_dynamics(q, qd, qdd), accelerations, parts, masses, system.energy(q, qd), potential
+        accelerations, parts = system.forward_dynamics(q, qd, tau), system.decompose(q, qd, qdd)
+        return accelerations, parts, masses, system.energy(q, qd), potential
 
-    tau, accelerations, parts, masses, energy, potential = ask(test.q, test.qd, test.qdd, test.tau)
+    accelerations, parts, masses, energy, potential = ask(test.q, test.qd, test.qdd, test.tau)
     assert fit.rank == fit.parameter_count == sum(leaf.size for leaf in jax.tree.leaves(fit.parameters))
     assert 1 <= fit.condition < 1e4
-    variance = float(test.tau.var(axis=0).sum())
-    assert fit.torque_mse < 1e-22 * variance
-    assert float(np.mean(np.sum((tau - test.tau) ** 2, axis=1))) < 1e-22 * variance
+    assert fit.torque_mse < 1e-22 * float(test.tau.var(axis=0).sum())
     truths = test.qdd, test.tau_inertial, test.tau_coriolis, test.tau_gravity, masses[1]
     for got, expected in zip((accelerations, *parts, masses[0]), truths, strict=True):
         assert np.abs(got - expected).max() < 1e-10 * max(1.0, np.abs(expected).max())
@@ -79,42 +73,6 @@ def test_textbook_scenes_are_identified_to_rounding(scene, friction):
         assert fit.parameters.friction is None
     else:
         np.testing.assert_allclose(fit.parameters.friction, friction, rtol=1e-11)
-
-
-def test_the_design_matrix_is_that_of_the_differentiated_energy():
-    """Against Euler-Lagrange of an energy that is written out here; three joints of both kinds, three degrees."""
-    needs = Needs(("revolute", "prismatic", "revolute"), friction=True)
-    model = make_trigonometric(needs, degree=(2, 1, 0))
-    like = model.init(jax.random.key(0))
-    theta, unravel = ravel_pytree(like)
-    assert theta.size == 6 * (5 * 2 * 1) + (5 * 3 * 1 - 1) + 3
-    theta = jnp.asarray(np.random.default_rng(0).normal(size=theta.size))
-    parameters = unravel(theta)
-
-    def basis(q, powers):
-        angular = [1.0, jnp.cos(q[0]), jnp.cos(2 * q[0]), jnp.sin(q[0]), jnp.sin(2 * q[0])]
-        return jnp.array([f * q[1] ** power for f in angular for power in range(powers)])
-
-    def kinetic(q, qd):
-        elements = parameters.mass @ basis(q, 2)
-        pairs = [(i, j) for i in range(3) for j in range(i + 1)]
-        return sum(m * qd[i] * qd[j] * (0.5 if i == j else 1.0) for m, (i, j) in zip(elements, pairs, strict=True))
-
-    def L(q, qd):
-        return kinetic(q, qd) - basis(q, 3)[1:] @ parameters.potential
-
-    @jax.jit
-    def compare(q, qd, qdd):
-        system = dynamics(model.energies(parameters))
-        expected = lagrangian.inverse_dynamics(L, q, qd, qdd) + parameters.friction * qd
-        got = [linearised(model, each, q, qd, qdd)[0] for each in (like, parameters)]
-        mass = 0.5 * qd @ system.mass_matrix(q, qd) @ qd, kinetic(q, qd)
-        energy = system.energy(q, qd), 2 * kinetic(q, qd) - L(q, qd)
-        tau = system.inverse_dynamics(q, qd, qdd)
-        return [*((columns @ theta, expected) for columns in got), mass, energy, (tau, expected)]
-
-    for got, expected in compare(*np.random.default_rng(1).normal(size=(3, 3))):
-        assert relative_error(got, expected) < 1e-13
 
 
 def test_an_indefinite_mass_matrix_is_used_and_a_singular_one_not_hidden():
@@ -132,27 +90,6 @@ def test_an_indefinite_mass_matrix_is_used_and_a_singular_one_not_hidden():
     assert np.linalg.eigvalsh(mass).min() < 0
     np.testing.assert_allclose(again, qdd, rtol=1e-12)
     assert not jnp.isfinite(evaluate(0 * indefinite)[1]).all()
-
-
-def test_absent_terms_cost_nothing():
-    def flops(**terms):
-        return flops_and_parameters(make_trigonometric(Needs(("revolute", "revolute"), **terms)), "inverse_dynamics", 2)
-
-    (full, _), (frictionless, _), (weightless, _) = flops(friction=True), flops(), flops(gravity=False)
-    assert full == frictionless + 4
-    assert weightless <= frictionless - 2 * (8 + 8 + 1), "two rows of slopes times the coefficients"
-
-
-def test_undetermined_combinations_are_reported_and_harmless():
-    """An elbow that never moves: its inertia and its angle's basis functions cannot be told apart."""
-    q, qd, qdd = 2 * np.random.default_rng(3).normal(size=(3, 200, 2)) * np.array([1.0, 0.0])
-    tau = np.asarray(jax.jit(jax.vmap(functools.partial(closed_form.inverse_dynamics, ARM.closed_form)))(q, qd, qdd))
-    data = select(sampled(ARM)[0], np.arange(200))._replace(q=q, qd=qd, qdd=qdd, tau=tau)
-    fit = fit_linear(make_trigonometric(ARM.needs), data)
-    assert fit.rank < fit.parameter_count == 35
-    assert fit.condition < 1e4
-    assert fit.torque_mse < 1e-22
-    assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(fit.parameters)) < 10
 
 
 def test_precision_does_not_depend_on_the_caller():
@@ -191,23 +128,6 @@ def test_mistakes_are_named():
     ]:
         with one_line(message):
             run()
-
-
-def test_least_squares_against_its_normal_equations():
-    for rows, columns, ridge in ((40, 7, 0.0), (7, 7, 0.3), (8, 7, 0.3), (5, 9, 0.0)):
-        random = np.random.default_rng(5)
-        A = random.normal(size=(rows, columns)) * 10.0 ** np.linspace(-9, 9, columns)  # units that differ widely
-        b = random.normal(size=rows)
-        solution = solve(A, b, ridge=ridge)
-        norms = np.linalg.norm(A, axis=0)
-        gradient = (A / norms).T @ (A @ solution.x - b) + ridge * norms * solution.x
-        assert np.abs(gradient).max() < 1e-12 * np.abs(solution.x * norms).max()
-        assert solution.rank == min(rows, columns)
-        assert solution.residual == pytest.approx(np.linalg.norm(A @ solution.x - b), abs=1e-11)
-        chunked = solve_chunks(((A[k : k + 3], b[k : k + 3]) for k in range(0, rows, 3)), ridge=ridge)
-        np.testing.assert_allclose(chunked.x * norms, solution.x * norms, atol=1e-11 * np.abs(solution.x * norms).max())
-        assert chunked.rank == solution.rank
-        assert chunked.residual == pytest.approx(solution.residual, abs=1e-11)
 
 
 def test_rank_condition_and_the_shortest_solution():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.models.hamiltonian import make_separable_hamiltonian
 from dln_jax.models.n_body import make_pairwise_hamiltonian
@@ -94,46 +93,6 @@ def test_the_scale_divides_distances():
     scaled = make_pairwise_hamiltonian(positions(3, 3), dimension=3, distance_scale=2.5, **SMALL)
     near, far = (flow(each.energies(parameters)).energy for each in (model, scaled))
     np.testing.assert_allclose(far(2.5 * x.ravel(), p.ravel()), near(x.ravel(), p.ravel()), rtol=1e-13)
-
-
-def test_absent_features_and_terms_cost_nothing():
-    def seen(features):
-        model = make_pairwise_hamiltonian(positions(2, 2), features=features, **SMALL)
-        parameters = jax.eval_shape(model.init, jax.random.key(0))
-        text = str(jax.make_jaxpr(lambda p, q: flow(model.energies(p)).energy(q, q))(parameters, jnp.ones(4)))
-        return "= log" in text, sum(leaf.size for leaf in jax.tree.leaves(parameters))
-
-    # A mass, w, and a network of five units; each feature adds a w and five weights.
-    assert seen(("distance",)) == (False, 1 + 1 + (5 + 5) + (5 + 1))
-    assert seen(("inverse", "logarithm", "distance")) == (True, 1 + 3 + (15 + 5) + (5 + 1))
-
-
-def test_separable_follows_its_energy_without_a_mixed_derivative():
-    """At velocities that the network has a momentum for."""
-    p = jnp.array([0.6, -0.8])
-    model = make_separable_hamiltonian(
-        MIXED, momentum_scale=(2.0, 0.5), initial_guess=lambda q, qd: p + 0.01, iterations=6, **SMALL
-    )
-    parameters = parameters_of(model)
-    q, tau = jax.random.normal(jax.random.key(5), (2, 2))
-
-    @jax.jit
-    def ask():
-        system = dynamics(model.energies(parameters))
-        H = flow(model.energies(parameters)).energy
-        qd = hamiltonian.velocity(H, q, p)
-        qdd = system.forward_dynamics(q, qd, tau)
-        friction = jax.nn.softplus(parameters["~"]["viscous_friction"]) * qd
-        second = jax.jacfwd(jax.grad(H, argnums=1), argnums=(0, 1))(q, p)
-        pd = tau - friction - jax.grad(H)(q, p)
-        same = ((system.friction(q, qd), friction), (qdd, second[1] @ pd))
-        return same, second, H(q + 1, p) - H(q, p), H(q, p + 1) - H(q, p)
-
-    same, (mixed, curvature), by_position, by_momentum = ask()
-    for got, expected in same:
-        np.testing.assert_allclose(got, expected, atol=1e-9)
-    assert not np.any(mixed) and np.abs(curvature).max() > 1e-3
-    assert abs(by_position) > 1e-3 and abs(by_momentum) > 1e-3
 
 
 def test_mistakes_are_named():

@@ -7,7 +7,6 @@ import pytest
 import scipy.special
 from calls import one_line
 
-from dln_jax.mechanics import jacobians
 from dln_jax.mechanics.dynamics import friction_force
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import (
@@ -20,7 +19,6 @@ from dln_jax.mechanics.friction import (
     unit_force,
 )
 from dln_jax.mechanics.friction.curves import POTENTIALS
-from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.scenes import two_link_arm
 
 SHAPE = FrictionShape(velocity_scale=0.02, stribeck_velocity=0.3, sigmoid_slope=8.0, sigmoid_shift=-0.05)
@@ -90,29 +88,9 @@ def test_derivatives_by_rate_and_shape_are_differences():
         np.testing.assert_allclose(slopes[..., place], differences, rtol=1e-5, atol=1e-6)
 
 
-def test_what_is_not_needed_is_not_computed():
-    """Stribeck's integral takes an error function and 40 nodes, its force neither."""
+def test_what_is_not_needed_is_not_there():
     assert joint_dissipation() is None and joint_dissipation(np.zeros(3), 0.0) is None
-    D = joint_dissipation(stribeck=0.2)
-    programs = [
-        jax.jit(function).lower(jnp.zeros(2), jnp.zeros(2)).as_text() for function in (D, jax.grad(D, argnums=1))
-    ]
-    assert ["chlo.erf" in text or "2x40xf64" in text for text in programs] == [True, False]
     assert dynamics(two_link_arm().closed_form).friction([0.1, 0.2], [1.0, 2.0]).tolist() == [0, 0]
-
-
-def test_a_joint_at_rest_has_the_slope_of_its_scale():
-    system = LagrangianSystem(two_link_arm().lagrangian, joint_dissipation([0.2, 0.1], [0.5, 0.3], velocity_scale=V))
-    _, by_velocity, _ = jacobians.inverse_dynamics_jacobians(system, *jnp.zeros((3, 2)))
-    np.testing.assert_allclose(by_velocity, np.diag([0.2 + 0.5 / V, 0.1 + 0.3 / V]), rtol=1e-12, atol=1e-12)
-
-
-def test_rates_of_joints_are_those_of_a_map():
-    J = np.array([[1.0, 0.0], [-1.0, 1.0]])
-    D, mapped = (joint_dissipation([0.2, 0.1], [0.5, 0.3], joint_map=map_) for map_ in (None, J))
-    qd = jnp.array([0.7, -0.4])
-    np.testing.assert_allclose(mapped(qd, qd), D(qd, J @ qd))
-    np.testing.assert_allclose(friction_force(mapped, qd, qd), J.T @ friction_force(D, qd, J @ qd))
 
 
 def test_what_are_no_laws_and_no_coefficients_is_refused():

@@ -94,7 +94,3 @@ def test_free_motion_loses_what_friction_takes(name, load):
     rubbing = dynamics(with_friction(free, D, load))
     lost = known.forward_dynamics(q, qd, 0 * q) - rubbing.forward_dynamics(q, qd, 0 * q)
     np.testing.assert_allclose(flow(free).rates(q, p)[1] - change, ARM.mass_matrix(q) @ lost, rtol=1e-9)
-
-
-def test_without_friction_a_system_is_as_it_was():
-    assert with_friction(RECORDS["natural"], None) is RECORDS["natural"]

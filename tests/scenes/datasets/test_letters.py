@@ -52,26 +52,6 @@ def junctions(path):
     return np.append(starts, path.duration)
 
 
-def placed_outline(character):
-    """The font's polygons in m, where `letter_path` puts them."""
-    polygons = outline(character)
-    widths = np.concatenate(polygons)[:, 0]
-    x_height = outline("x")[0][:, 1].max()
-    middle = 0.5 * np.array([widths.min() + widths.max(), x_height])
-    return [(polygon - middle) * HEIGHT / x_height + CENTRE for polygon in polygons]
-
-
-def distance(points, polygons):
-    """Distance of each point [n, 2] to the nearest edge of the polygons."""
-    edges = [np.concatenate([polygon[:-1], polygon[1:]], axis=1) for polygon in polygons]
-    start, end = np.split(np.concatenate(edges), 2, axis=1)
-    along = end - start
-    length_squared = np.maximum((along**2).sum(-1), 1e-30)
-    offset = points[:, None] - start
-    part = np.clip((offset * along).sum(-1) / length_squared, 0.0, 1.0)
-    return np.linalg.norm(offset - part[..., None] * along, axis=-1).min(axis=1)
-
-
 def test_derivatives_agree_with_finite_differences(letters):
     for character, path, times, _, velocity, acceleration in letters:
         errors = []
@@ -87,13 +67,6 @@ def test_derivatives_agree_with_finite_differences(letters):
         assert fine[1] < coarse[1] / 8.0 and fine[1] < 5e-3, character
 
 
-def test_acceleration_does_not_jump(letters):
-    """Halving the step halves the largest difference of neighbouring accelerations."""
-    for character, *_, acceleration in letters:
-        jumps = [np.abs(np.diff(acceleration[::stride], axis=0)).max() for stride in (4, 2, 1)]
-        assert jumps[1] < 0.6 * jumps[0] and jumps[2] < 0.6 * jumps[1], character
-
-
 def test_rests_at_every_junction_and_outside_and_closes_contours(letters):
     for character, path, *_ in letters:
         corners = junctions(path)
@@ -104,16 +77,6 @@ def test_rests_at_every_junction_and_outside_and_closes_contours(letters):
         np.testing.assert_allclose(position[-1], position[-3], atol=1e-12)
         assert len(corners) == 2 * len(outline(character))
         np.testing.assert_allclose(position[0:-2:2], position[1:-2:2], rtol=0.0, atol=1e-12)
-
-
-def test_follows_the_outline(letters):
-    for character, path, times, position, *_ in letters:
-        polygons = placed_outline(character)
-        stroke = np.searchsorted(junctions(path), times, side="right") - 1
-        drawn = [position[stroke == index] for index in range(0, 2 * len(polygons) - 1, 2)]
-        assert distance(np.concatenate(drawn), polygons).max() < 0.03 * HEIGHT, character
-        # Corners of the font lie farther out than the pen goes.
-        assert distance(np.concatenate(polygons), drawn).max() < 0.07 * HEIGHT, character
 
 
 def test_stays_in_the_workspace(letters):
@@ -153,17 +116,12 @@ def test_settings_change_nothing():
         "text.hinting": "force_autohint",
         "path.simplify_threshold": 1.0,
     }
-    for character in "g$\\":
+    for character in "g$\\%":
         before = outline(character)
         with matplotlib.rc_context(settings):
             after = outline(character)
         for first, second in zip(before, after, strict=True):
             np.testing.assert_array_equal(first, second)
-
-
-def test_other_characters_work():
-    path = letter_path("%")
-    assert np.all(np.isfinite(motions(path, np.linspace(0.0, path.duration, SAMPLES))))
 
 
 def test_refuses_what_has_no_outline_and_wrong_numbers(monkeypatch):
