@@ -21,7 +21,6 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.scale.mesh import batch_mesh, of_first_process
-from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError
 
 SAMPLES = 61
@@ -96,8 +95,6 @@ def main(folder, name):
     for key, (seeds, optimiser) in TRAININGS.items():
         found[key] = numbers(fit(bumps(seeds), optimiser, seconds=LONG, mesh=mesh))
         found[f"{key}, continued"] = numbers(continued(folder, key, name, mesh))
-    levenberg_marquardt.KEPT_BYTES = 0
-    found["newton, recomputed"] = numbers(fit(bumps(), GaussNewton(3), mesh=mesh))
     said = {"devices": 1 if mesh is None else mesh.size, "refusal": ""}
     try:
         fit(bumps(), ADAM._replace(batch=19), mesh=mesh)

@@ -13,9 +13,6 @@ from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.motions import Weights, cut_windows, problem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.model import Model
-from dln_jax.types import Needs
-
-NEEDS = Needs(joints=("prismatic",))
 
 
 def motion_of(t, trajectory=None):

@@ -5,6 +5,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
 from dln_jax.data.splits import split
 from dln_jax.learning import BOTH_WAYS, objective_of
@@ -15,7 +16,6 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.poles import cart_pole
-from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe_for
 
 ENERGIES = ("structured-delan", "black-box-hnn", "trigonometric")
@@ -64,5 +64,5 @@ def test_each_side_is_measured_in_its_standard_deviation(name, data):
 def test_only_an_energy_can_be_fitted_by_one_of_two_sides(data):
     assert objective_of("structured-hnn", data, "both") is BOTH_WAYS
     assert objective_of("feed-forward", data, "both") is objective_of("feed-forward", data) is BOTH_WAYS
-    with pytest.raises(InputError, match="feed-forward model has no energy"):
+    with one_line("feed-forward model has no energy"):
         objective_of("feed-forward", data, "inverse")

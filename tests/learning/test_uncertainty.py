@@ -95,12 +95,8 @@ def test_exact_linear_model_is_nowhere_outside():
     parameters = fit_linear(model, sets.train).parameters
     found = estimate(model, parameters, sets.train, sets.validation, ridge=0.0)
     away = np.random.default_rng(1).uniform(-1, 1, (3, 200, 2)) * np.array([6.0, 30.0, 300.0])[:, None, None]
-    flag = out_of_distribution(model, parameters, found.uncertainty)
-    plants = dynamics(scene.energies), dynamics(model.energies(parameters))
-    ask = jax.jit(jax.vmap(lambda *state: (*(plant.inverse_dynamics(*state) for plant in plants), flag(*state))))
-    truth, predicted, flags = ask(*away)
-    assert np.abs(predicted - truth).max() < 1e-8 * np.abs(truth).max()
-    assert not flags.any()
+    flag = jax.jit(jax.vmap(out_of_distribution(model, parameters, found.uncertainty)))
+    assert not flag(*away).any()
 
 
 def test_motions_that_differ_by_chance_alone_have_no_scatter():

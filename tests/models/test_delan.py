@@ -10,9 +10,9 @@ from dln_jax.models.lagrangian import make_delan
 from dln_jax.types import Needs
 
 
-def small(friction=False, gravity=True, prismatic=False):
-    joints = ("prismatic" if prismatic else "revolute",) * 2
-    return make_delan(Needs(joints, gravity=gravity, friction=friction), width=6, depth=2, dtype=jnp.float64)
+def small(friction=False, gravity=True):
+    needs = Needs(("revolute", "revolute"), gravity=gravity, friction=friction)
+    return make_delan(needs, width=6, depth=2, dtype=jnp.float64)
 
 
 def test_absent_terms_cost_nothing():

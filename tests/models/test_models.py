@@ -181,9 +181,7 @@ def test_wrong_use_raises_one_clear_line():
         (lambda: make_black_box_hamiltonian(MIXED, iterations=0), "iterations is 0"),
         (lambda: make_feed_forward(MIXED, tau_scale=(1.0, float("nan"))), "tau_scale is nan"),
         (lambda: make_feed_forward(MIXED, acceleration_scale=(1.0,)), "acceleration_scale has 1 sizes"),
-        (lambda: make_structured_hamiltonian(MIXED, width=0), "width is 0"),
         (lambda: make_delan(MIXED, width=-1), "width is -1"),
-        (lambda: make_black_box_lagrangian(MIXED, depth=0), "depth is 0"),
         (lambda: definiteness(of_mass(jnp.ones_like), *np.zeros((2, 0, 2))), "no states"),
         (lambda: definiteness(dynamics(make_feed_forward(MIXED).energies({})), *np.zeros((2, 1, 2))), "no mass"),
     ]:

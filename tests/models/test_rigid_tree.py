@@ -20,7 +20,7 @@ def test_a_fit_is_exact_and_knows_what_it_cannot_know():
     fit = fit_linear(model, train, negligible=1e-12)
     rows = jax.jit(jax.vmap(lambda *state: linearised(model, fit.parameters, *state)[0]))
     columns = np.asarray(rows(train.q, train.qd, train.qdd)).reshape(-1, 22 + 6)
-    columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     assert fit.rank == np.linalg.matrix_rank(columns, rtol=1e-10) < fit.parameter_count == 22 + 6
     predicted = torques(model, fit.parameters, test)
     assert np.abs(predicted - test.tau).max() < 1e-10 * np.abs(test.tau).max()

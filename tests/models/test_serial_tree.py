@@ -1,15 +1,14 @@
-"""A tree of learned frames is a model like any other, and what it calls gauges has no effect on torques."""
+"""Rotation vectors of a tree of learned frames, and what such a tree cannot have."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from calls import one_line
 
 from dln_jax.models.serial_tree import make_serial_tree, rotation, rotation_vector
-from dln_jax.types import InputError, Needs
+from dln_jax.types import Needs
 
-KINDS = ("revolute", "prismatic", "revolute")
-NEEDS = Needs(joints=KINDS, friction=True)
+NEEDS = Needs(joints=("revolute", "prismatic", "revolute"), friction=True)
 
 
 def test_rotation_vectors_and_matrices_are_inverse():
@@ -26,8 +25,10 @@ def test_rotations_are_differentiable_at_zero():
 
 
 def test_what_cannot_be_is_refused():
-    for keywords, word in [({"parents": (0, 1, 2)}, "parents"), ({"velocity_scale": 0.0}, "velocity_scale")]:
-        with pytest.raises(InputError, match=word):
-            make_serial_tree(NEEDS, **keywords)
-        with pytest.raises(InputError, match="actuation"):
-            make_serial_tree(NEEDS._replace(actuation=((1.0,), (0.0,), (0.0,))))
+    for needs, keywords, word in [
+        (NEEDS, {"parents": (0, 1, 2)}, "parents"),
+        (NEEDS, {"velocity_scale": 0.0}, "velocity_scale"),
+        (NEEDS._replace(actuation=((1.0,), (0.0,), (0.0,))), {}, "actuation"),
+    ]:
+        with one_line(word):
+            make_serial_tree(needs, **keywords)

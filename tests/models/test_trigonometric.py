@@ -23,7 +23,6 @@ from dln_jax.solvers.least_squares import solve, solve_chunks
 from dln_jax.types import Needs
 
 ARM = two_link_arm()
-STATE = ("q", "qd", "qdd", "tau")
 
 
 @functools.cache
@@ -33,10 +32,6 @@ def sampled(scene: Scene) -> tuple[Trajectories, Trajectories]:
     data = uniform(scene, samples=samples)
     order = np.arange(samples)
     return select(data, order[: samples // 2]), select(data, order[samples // 2 :])
-
-
-def relative_error(got, expected):
-    return float(np.max(np.abs(got - expected)) / np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize(
@@ -147,6 +142,8 @@ def test_rank_condition_and_the_shortest_solution():
     nothing = solve(np.zeros((3, 2)), np.ones(3))
     assert nothing.rank == 0 and not nothing.x.any() and nothing.condition == np.inf
     assert nothing.residual == pytest.approx(3**0.5)
+    shrunk = solve(q, q @ np.array([3.0, -2.0, 1.0]), ridge=0.5)
+    np.testing.assert_allclose(shrunk.x, np.array([3.0, -2.0, 1.0]) / 1.5, rtol=1e-13)
 
 
 @pytest.mark.slow

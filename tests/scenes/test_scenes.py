@@ -97,7 +97,6 @@ def test_inverse_kinematics_reaches_the_tip():
 def test_needs_say_what_a_scene_has_and_a_chain_has_links():
     assert cart_pole().needs.joints == ("prismatic", "revolute")
     np.testing.assert_array_equal(actuation_matrix(cart_pole().needs), [[1.0], [0.0]])
-    np.testing.assert_array_equal(actuation_matrix(chain(3).needs), np.eye(3))
     weightless = pendulum(acceleration=0.0)
     assert not weightless.needs.gravity and weightless.potential is None and weightless.gravity is None
     assert pendulum(friction=0.1).needs.friction and not pendulum().needs.friction

@@ -10,9 +10,6 @@ from calls import one_line
 
 from dln_jax.scenes.datasets.letters import LETTERS, letter_path, outline
 
-HEIGHT = 0.55
-CENTRE = np.array([1.05, 0.45])
-
 
 def motion(position, time):
     """Position, velocity and acceleration at one time."""
