@@ -21,11 +21,10 @@ LINK = trees.inertial_parameters(2.0, [0.05, 0.02, 0.1], np.diag([0.02, 0.03, 0.
 ARM = trees.serial(*trees.dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0.1, 0, 0]]), [LINK] * 2, armature=[0.1, 0.05])
 NOISE, SAMPLES = 0.02, 800
 LAWS = ("viscous", "coulomb")
-COEFFICIENTS = {"viscous": (0.4, 0.3), "coulomb": (0.5, 0.3), "stribeck": (0.4, 0.3), "sigmoid": (0.5, 0.4)}
+COEFFICIENTS = {"viscous": (0.4, 0.3), "coulomb": (0.5, 0.3), "stribeck": (0.4, 0.3)}
 SHAPES = {
     "nothing": {"friction": LAWS},
     "stribeck": {"friction": (*LAWS, "stribeck"), "stribeck_velocity": (0.2, 0.15)},
-    "sigmoid": {"friction": ("viscous", "sigmoid"), "sigmoid_slope": (20.0, 8.0), "sigmoid_shift": (0.05, -0.05)},
     "coupled": {"friction": LAWS, "coupled": ((0, 1),)},
     "load": {"friction": (*LAWS, "load"), "load": (0.2, 0.1)},
     "cooling": {"friction": LAWS, "cooling": (0.02, 0.01), "reference_temperature": 25.0},
@@ -69,7 +68,7 @@ def log_of(extra, seed=0, noise=NOISE):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["stribeck", "load", "sigmoid"])
+@pytest.mark.parametrize("case", ["stribeck", "load"])
 def test_shapes_and_coefficients_are_found_within_their_errors(case):
     true = {name: value for name, value in SHAPES[case].items() if name != "friction"}
     laws = SHAPES[case]["friction"]

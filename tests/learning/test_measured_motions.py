@@ -1,4 +1,4 @@
-"""A double pendulum with friction in its joints, from noisy angles and times, and one that is driven."""
+"""A double pendulum with friction in its joints, from noisy angles and times, driven and not."""
 
 import jax
 import jax.numpy as jnp

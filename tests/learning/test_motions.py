@@ -1,4 +1,4 @@
-"""Windows and gaps; a noisy oscillator and a damped one, recovered from their motions, the second from q alone."""
+"""Windows and gaps, and a damped oscillator that is recovered from its positions alone."""
 
 import functools
 

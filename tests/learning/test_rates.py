@@ -1,4 +1,4 @@
-"""Phase models: the energy law, the polynomial's exactness; derivative matching finds the field; mistakes are named."""
+"""Phase models: the energy law, the polynomial's exactness, the metrics of predicted motions."""
 
 import jax
 import jax.numpy as jnp

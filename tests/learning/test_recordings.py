@@ -1,4 +1,4 @@
-"""Encoders and late torques give the true plant, in weak form, by linear and by learned energies."""
+"""Encoders and late torques give the true plant by the weak form of linear models."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""The weak form of the equations of motion: exact without accelerations, and steadier than them under noise."""
+"""The weak form of the equations of motion is exact without accelerations."""
 
 import functools
 

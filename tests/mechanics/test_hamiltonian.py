@@ -1,4 +1,4 @@
-"""Hamiltonian mechanics against the textbook's Lagrangian one, the Legendre transform, and the solver below them."""
+"""Hamilton's equations against the textbook's Lagrangian ones, conjugate momenta, and the solver below them."""
 
 import jax
 import jax.numpy as jnp

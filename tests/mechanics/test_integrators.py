@@ -1,4 +1,4 @@
-"""Steps and rollouts against closed forms, another library and the laws of symplectic maps; roots of equations."""
+"""Steps against another library and the laws of symplectic maps; rollouts; roots of equations."""
 
 import jax
 import jax.numpy as jnp

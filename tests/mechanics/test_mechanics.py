@@ -1,4 +1,4 @@
-"""Generic mechanics against the textbook, the structured path against the generic one, and the laws of both."""
+"""Every record of a scene's energies against the textbook, and the accuracy of the solver."""
 
 import functools
 

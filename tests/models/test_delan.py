@@ -1,4 +1,4 @@
-"""The structured model: physics for random parameters, and no work for what a scene lacks."""
+"""The structured model does no work for terms that a scene lacks, and keeps its precision."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Fields of a phase space by their Helmholtz decomposition: what each part cannot be, and a damped spring learned."""
+"""Fields of a phase space by their Helmholtz decomposition: what each part cannot be."""
 
 import jax
 import jax.numpy as jnp

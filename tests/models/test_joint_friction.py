@@ -1,4 +1,4 @@
-"""Friction in the joints of any model: its force, its parametrisation, and what a linear model keeps."""
+"""Friction in the joints of any model: its force and its parametrisation."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""The Hamiltonian, black-box and feed-forward models: physics for random parameters, scales, absent terms, reports."""
+"""Models of every kind obey mechanics for random parameters; scales, types and reports of networks."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""Planar chains against the textbook double pendulum and cart-pole, and a tree of rigid bodies, in both coordinates."""
+"""Planar chains against the textbook double pendulum and cart-pole, in both coordinates."""
 
 import jax
 import jax.numpy as jnp

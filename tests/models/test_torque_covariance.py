@@ -1,4 +1,4 @@
-"""Covariances of torques: those of the energies' explicit features, and those that the model's energies have."""
+"""The covariance of torques is that of the model's energies."""
 
 import jax
 import jax.numpy as jnp

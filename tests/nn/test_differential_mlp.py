@@ -1,4 +1,4 @@
-"""The one pass against autodiff of a plain network, its cost, its ensembles and its Haiku front."""
+"""The one pass against autodiff of a plain network, its ensembles and its Haiku front."""
 
 from functools import partial
 from itertools import pairwise

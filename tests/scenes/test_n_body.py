@@ -1,4 +1,4 @@
-"""The pairwise and the separable Hamiltonian: symmetries and conservation for random parameters, absent terms."""
+"""The pairwise Hamiltonian: its symmetries, and Newton's gravity as one set of its parameters."""
 
 import functools
 

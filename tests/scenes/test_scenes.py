@@ -1,4 +1,4 @@
-"""Scenes against their own kinematics, and against each other."""
+"""Scenes against their own kinematics and published constants."""
 
 import jax
 import jax.numpy as jnp

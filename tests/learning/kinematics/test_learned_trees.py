@@ -1,4 +1,4 @@
-"""Arms of two and three joints are found from nothing but their motions and torques, down to the noise."""
+"""An arm of two joints is found from nothing but its motions and torques, down to the noise."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""With the linear parameters eliminated, slopes are those of finite differences, and only true frames leave nothing."""
+"""With the linear parameters eliminated, slopes are those of finite differences, and gauges change nothing."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""Motors that turn with several joints: their energy, forces and mass matrix agree, and files keep them."""
+"""Motors that turn with several joints: their energy, forces and mass matrix agree."""
 
 import jax
 import jax.numpy as jnp

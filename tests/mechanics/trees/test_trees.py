@@ -1,4 +1,4 @@
-"""Recursions over trees equal derivatives of their energies, closed forms of textbook scenes, and laws of mechanics."""
+"""Recursions over trees equal derivatives of their energies and the closed forms of a textbook scene."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Letters: smooth in time, true to the font, inside the arm's workspace, the same everywhere."""
+"""Letters: smooth in time, inside the arm's workspace, the same everywhere."""
 
 import jax
 import jax.numpy as jnp
