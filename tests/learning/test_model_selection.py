@@ -107,7 +107,9 @@ def test_the_smallest_sufficient_candidate_is_chosen():
         ((9.0, 1.0, 0.0), 2, 2.5, 1, 2),
     ]:
         errors = [errors_of(level) for level in levels]
-        trial, trials = grow(range(len(levels)), lambda n: (n, errors[n]), patience=patience, target=target)  # noqa: B023
+        trial, trials = grow(
+            range(len(levels)), lambda n, errors=errors: (n, errors[n]), patience=patience, target=target
+        )
         assert trial.candidate == trial.outcome == chosen and len(trials) == trained, levels
 
 
