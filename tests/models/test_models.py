@@ -178,7 +178,6 @@ def test_wrong_use_raises_one_clear_line():
     for call, message in [
         (lambda: make_black_box_lagrangian(MIXED, rate_scale=(1.0, 2.0, 3.0)), "rate_scale has 3 sizes"),
         (lambda: make_black_box_hamiltonian(MIXED, momentum_scale=0.0), "momentum_scale is 0.0"),
-        (lambda: make_black_box_hamiltonian(MIXED, iterations=0), "iterations is 0"),
         (lambda: make_feed_forward(MIXED, tau_scale=(1.0, float("nan"))), "tau_scale is nan"),
         (lambda: make_feed_forward(MIXED, acceleration_scale=(1.0,)), "acceleration_scale has 1 sizes"),
         (lambda: make_delan(MIXED, width=-1), "width is -1"),

@@ -59,6 +59,8 @@ def test_coordinates_do_not_matter():
             for each in ("absolute", "relative")
         )
         parameters = random_parameters(absolute)
+        M = absolute.energies(parameters).mass_matrix(STATE[0])
+        np.testing.assert_allclose(M, M.T, rtol=1e-14)
         turned = torque(relative.energies(parameters), [TO_RELATIVE @ each for each in STATE])
         np.testing.assert_allclose(torque(absolute.energies(parameters)), TO_RELATIVE.T @ turned, rtol=1e-12)
 

@@ -87,6 +87,11 @@ def test_an_indefinite_mass_matrix_is_used_and_a_singular_one_not_hidden():
     assert not jnp.isfinite(evaluate(0 * indefinite)[1]).all()
 
 
+def test_a_prismatic_joint_may_have_a_spring():
+    start = make_trigonometric(Needs(("prismatic",)), degree=1).init(jax.random.key(0))
+    assert start.mass.shape == (1, 2) and start.potential.shape == (2,)
+
+
 def test_precision_does_not_depend_on_the_caller():
     """Computed in float64 for a single-precision model in a single-precision program, and in chunks of any size."""
     train, _ = sampled(ARM)
