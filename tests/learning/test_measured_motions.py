@@ -59,7 +59,7 @@ def test_the_optimum_is_the_truth_as_well_as_noise_allows(driven):
     at = statistics(measured_motions.problem(CHAIN, TRUE, windows, windows, **known), TRUE)
     true = np.asarray(ravel_pytree(TRUE)[0])
     assert np.all(np.abs(at.step) < SURE * at.errors)
-    assert np.all(at.errors[:5] < 0.03 * true[:5])
+    assert np.all(at.errors[:5] < (0.03 if driven else 0.01) * true[:5])
     if not driven:
         assert np.linalg.norm(at.slope @ true) < 1e-6 * np.linalg.norm(at.slope * true)
 

@@ -52,8 +52,8 @@ def test_forces_are_those_of_the_sum_of_energies(record, terms):
     slow = dynamics(LagrangianSystem(energy, losses))
     q, qd, qdd = STATE
     tau = slow.inverse_dynamics(*STATE)
-    np.testing.assert_allclose(ours.inverse_dynamics(*STATE), tau, rtol=1e-11)
-    np.testing.assert_allclose(ours.forward_dynamics(q, qd, tau), qdd, rtol=1e-9)
+    np.testing.assert_allclose(ours.inverse_dynamics(*STATE), tau, rtol=1e-12)
+    np.testing.assert_allclose(ours.forward_dynamics(q, qd, tau), qdd, rtol=1e-10)
     np.testing.assert_allclose(ours.energy(q, qd), slow.energy(q, qd), rtol=1e-12)
     np.testing.assert_allclose(ours.friction(q, qd), jax.grad(losses, 1)(*map(jnp.asarray, (q, qd))), rtol=1e-12)
 

@@ -82,7 +82,7 @@ def test_the_arm_has_the_published_constants_from_either_zero():
     for arm, zero in ((two_link_arm(), 0.0), (two_link_arm(zero="hanging"), jnp.pi / 2)):
         shifted = q + jnp.array([zero, 0.0])
         got = closed_form.inverse_dynamics(arm.closed_form, shifted, qd, qdd)
-        np.testing.assert_allclose(got, [first, second], rtol=1e-12)
+        np.testing.assert_allclose(got, [first, second], rtol=1e-13)
         np.testing.assert_allclose(arm.tip(shifted), two_link_arm().tip(q), rtol=1e-12)
 
 
