@@ -5,21 +5,17 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
-from dln_jax.data.splits import Split, split
-from dln_jax.learning import BOTH_WAYS, FORWARD, TORQUE, objective_of
+from dln_jax.data.splits import split
+from dln_jax.learning import BOTH_WAYS, objective_of
 from dln_jax.learning.dynamics import problem
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import loss_of
-from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import STATED, arrays, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulums import pendulum
 from dln_jax.scenes.poles import cart_pole
-from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe_for
 
 ENERGIES = ("structured-delan", "black-box-hnn", "trigonometric")
@@ -48,67 +44,25 @@ def test_residuals_vanish_for_the_true_plant_as_lagrangian_and_as_hamiltonian(da
 
 
 @pytest.mark.parametrize("name", ENERGIES)
-def test_each_side_is_measured_in_its_standard_deviation_and_gradients_are_exact(data, name):
+def test_each_side_is_measured_in_its_standard_deviation(name, data):
     model, sets = model_of(name, data), split(data)
     posed, train = problem(model, sets, BOTH_WAYS), sets.train
-    flat, unravel = jax.flatten_util.ravel_pytree(posed.parameters)
 
     @jax.jit
-    def ask(flat):
-        plant = dynamics(model.energies(unravel(flat)))
+    def ask(parameters):
+        plant = dynamics(model.energies(parameters))
         sides = jax.vmap(lambda q, qd, x, tau: (plant.inverse_dynamics(q, qd, x), plant.forward_dynamics(q, qd, tau)))
-        loss = jax.value_and_grad(lambda vector: loss_of(posed)(unravel(vector), posed.arrays))(flat)
-        return *loss, *sides(train.q, train.qd, train.qdd, train.tau)
+        return loss_of(posed)(parameters, posed.arrays), *sides(train.q, train.qd, train.qdd, train.tau)
 
-    loss, _, torque, acceleration = ask(flat)
+    loss, torque, acceleration = ask(posed.parameters)
     # Only the cart is driven: the pole's torque, which is zero, counts in units of the cart's.
     expected = np.sum(((torque - train.tau) / train.tau[:, 0].std()) ** 2, axis=1).mean()
     expected += np.sum(((acceleration - train.qdd) / train.qdd.std(axis=0)) ** 2, axis=1).mean()
     np.testing.assert_allclose(loss, expected, rtol=1e-9)
 
-    flat = flat + 0.1 * np.random.default_rng(0).normal(size=flat.shape)
-    gradient = np.asarray(ask(flat)[1])
-    along, step = gradient / np.linalg.norm(gradient), 1e-6
-    difference = (ask(flat + step * along)[0] - ask(flat - step * along)[0]) / (2 * step)
-    np.testing.assert_allclose(difference, gradient @ along, rtol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("objective", STATED)
-def test_exact_data_have_the_same_optimum_by_every_objective(objective):
-    scene = pendulum(friction=0.2)
-    data = uniform(scene, samples=60, rate_bound=2.0, acceleration_bound=5.0)
-    model = model_of("trigonometric", data)
-    posed = problem(model, split(data), STATED[objective])
-    away = jax.tree.map(lambda leaf: leaf + 0.05, posed.parameters)
-    found = fit(posed._replace(parameters=away), GaussNewton(steps=40)).parameters
-    ours, plant = dynamics(model.energies(found)), dynamics(scene.energies)
-    for state in np.random.default_rng(1).normal(size=(5, 3, 1)):
-        np.testing.assert_allclose(ours.inverse_dynamics(*state), plant.inverse_dynamics(*state), atol=1e-7)
-
-
-@pytest.mark.slow
-def test_forward_errors_fall_where_they_are_asked_for(data):
-    """From the best torques of a model without friction, which the plant has: both errors cannot vanish."""
-    data = data._replace(needs=data.needs._replace(friction=False))
-    sets = Split(data, data, data)  # what is kept is the best of these samples
-    model = model_of("trigonometric", data)
-    start = fit_linear(model, data).parameters
-
-    def errors(parameters):
-        plant = model.energies(parameters)
-        sides = [
-            residuals(side, plant, arrays(side, data, jnp.float64)) / side.scale(data) for side in (TORQUE, FORWARD)
-        ]
-        return [float(jnp.mean(side**2)) for side in sides]
-
-    found = fit(problem(model, sets, FORWARD)._replace(parameters=start), GaussNewton(steps=10)).parameters
-    (inverse_before, forward_before), (inverse, forward) = errors(start), errors(found)
-    assert forward < 0.99 * forward_before and inverse > inverse_before
-
 
 def test_only_an_energy_can_be_fitted_by_one_of_two_sides(data):
     assert objective_of("structured-hnn", data, "both") is BOTH_WAYS
     assert objective_of("feed-forward", data, "both") is objective_of("feed-forward", data) is BOTH_WAYS
-    with pytest.raises(InputError, match="feed-forward model has no energy"):
+    with one_line("feed-forward model has no energy"):
         objective_of("feed-forward", data, "inverse")

@@ -1,34 +1,27 @@
-"""Phase models: the energy law, the polynomial's exactness; derivative matching finds the field; mistakes are named."""
+"""Phase models: the energy law, the polynomial's exactness, the metrics of predicted motions."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 from motions import quick_motion
 
 from dln_jax.data.splits import hold_out
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.rates import match_linear, problem
-from dln_jax.mechanics.dynamics import PlainFlow
-from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
 from dln_jax.models.baselines import make_phase_network
-from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_dissipative, make_separable_hamiltonian
+from dln_jax.models.hamiltonian import make_dissipative, make_separable_hamiltonian
+from dln_jax.models.model import Model
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
-from dln_jax.types import InputError, Needs
+from dln_jax.types import Needs
 
 NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)
-FREE = NEEDS._replace(friction=False)
 SMALL = {"width": 4, "depth": 1, "dtype": jnp.float64}
 FRICTION = {"friction_width": 4, "dtype": jnp.float64}
-
-
-def separable(needs):
-    """A separable model."""
-    return make_separable_hamiltonian(needs, **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -41,55 +34,24 @@ def swing():
 
 def test_friction_takes_energy_and_never_gives_it():
     """dH/dt = -qdᵀ dD/dqd = -2 D <= 0, for random parameters and states."""
-    model = make_dissipative(separable, NEEDS, **FRICTION)
-    q, p = 3 * jax.random.normal(jax.random.key(0), (2, 40, 2))
+    model = make_dissipative(lambda needs: make_separable_hamiltonian(needs, **SMALL), NEEDS, **FRICTION)
+    random = np.random.default_rng(0)
+    shapes = jax.eval_shape(model.init, jax.random.key(0))
+    energies = model.energies(jax.tree.map(lambda leaf: 2 * random.normal(size=leaf.shape), shapes))
 
     @jax.jit
-    def ask(key):
-        leaves, tree = jax.tree.flatten(model.init(key))
-        keys = jax.random.split(key, len(leaves))
-        drawn = [2 * jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
-        energies = model.energies(jax.tree.unflatten(tree, drawn))
-        field, dissipation = flow(energies), energies.dissipation
+    @jax.vmap
+    def ask(q, p):
+        field = flow(energies)
+        rates = field.rates(q, p)
+        friction = jax.grad(energies.dissipation, argnums=1)(q, rates[0])
+        rate = jax.jvp(field.energy, (q, p), rates)[1]
+        return rate, energies.dissipation(q, rates[0]), rates[0] @ friction
 
-        def one(q, p):
-            qd, pd = field.rates(q, p)
-            loss = dissipation(q, qd)
-            friction = jax.grad(dissipation, argnums=1)(q, qd)
-            return jax.jvp(field.energy, (q, p), (qd, pd))[1], loss, qd @ friction
-
-        return jax.vmap(one)(q, p)
-
-    rate, loss, power = ask(jax.random.key(1))
+    rate, loss, power = ask(*(3 * random.normal(size=(2, 40, 2))))
     assert (loss > 0).all() and float(loss.max()) > 1e-3
     np.testing.assert_allclose(rate, -2 * loss, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(power, 2 * loss, rtol=1e-9)
-
-
-def test_what_a_scene_lacks_is_not_built():
-    model = make_separable_hamiltonian(FREE, **SMALL)
-    parameters = jax.eval_shape(model.init, jax.random.key(0))
-    free = make_dissipative(separable, FREE, **FRICTION)
-    assert jax.tree.structure(jax.eval_shape(free.init, jax.random.key(0))) == jax.tree.structure(parameters)
-    baseline = make_phase_network(NEEDS, **SMALL)
-    assert isinstance(flow(baseline.energies(jax.jit(baseline.init)(jax.random.key(0)))), PlainFlow)
-
-
-def test_dynamics_with_friction_become_their_field():
-    """The viscous friction of a model for a scene with friction: pd = -dH/dq - b qd."""
-    model = make_black_box_hamiltonian(NEEDS, **SMALL)
-    q, p = jnp.array([0.3, -0.2]), jnp.array([1.0, 0.5])
-
-    @jax.jit
-    def ask(key):
-        energies = model.energies(model.init(key))
-        slope, qd = jax.grad(energies.hamiltonian, argnums=(0, 1))(q, p)
-        return flow(energies).rates(q, p), (qd, -slope - dynamics(energies).friction(q, qd)), -slope
-
-    got, expected, frictionless = ask(jax.random.key(0))
-    for one, other in zip(got, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12)
-    assert np.abs(got[1] - frictionless).max() > 1e-4
 
 
 def test_the_polynomial_recovers_the_pendulum(swing):
@@ -105,51 +67,24 @@ def test_the_polynomial_recovers_the_pendulum(swing):
     assert len(coefficients) == 2 + 2 + 1 + 1 + 2
 
 
-@pytest.mark.slow
-def test_networks_learn_the_field(swing):
-    model = make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL)
-    training = fit(problem(model, *hold_out(swing.train.data, 0.1, 0)), GaussNewton(20))
-    found = phase_metrics.field_errors(model, training.parameters, swing.test)
-    assert found["loss"] == pytest.approx(found["clean_field_mse"])
-    # A field of zero has an error of 5.
-    assert found["clean_field_mse"] < 1e-3
-    data = swing.test.data
-    predicted = phase_metrics.predict(model, training.parameters, data.q[:1], data.p[:1], swing.t)
-    truth = phase_metrics.Motions(swing.t, data.q[None, :45], data.p[None, :45])
-    errors = phase_metrics.motion_errors(
-        [predicted], [truth], swing.hamiltonian, published_energy=swing.published_energy
-    )
-    assert errors["energy_mse"] < 1e-3 and errors["rollout_mse"] < 1e-2
-    assert np.isnan(errors["energy_mse_standard_error"]) and errors["published_energy_mse"] > 0
-
-
 def test_metrics_by_hand_and_motions_that_end():
     """Energy q² + p² of given states; a field that reaches infinity in finite time has infinite errors."""
     truth = phase_metrics.Motions(np.array([0.0, 1.0]), np.zeros((2, 2, 1)), np.ones((2, 2, 1)))
     off = truth._replace(p=truth.p + np.array([[[0.0], [1.0]], [[0.0], [0.0]]]))
     found = phase_metrics.motion_errors([off], [truth], lambda q, p: jnp.sum(q**2 + p**2))
     # Energies are 1 and 4 against 1: errors 0, 9 and 0, 0.
-    assert found["energy_mse"] == pytest.approx(2.25) and found["energy_mse_median"] == pytest.approx(2.25)
-    assert found["energy_mse_standard_error"] == pytest.approx(4.5 / np.sqrt(2) / np.sqrt(2))
+    assert found["energy_mse"] == found["energy_mse_median"] == pytest.approx(2.25)
+    assert found["energy_mse_standard_error"] == pytest.approx(4.5 / 2)
     assert found["rollout_mse"] == pytest.approx(1 / 8)
-    explosive = HamiltonianSystem(lambda q, p: jnp.sum(q**2 * p))
-    model = make_phase_network(Needs(joints=("prismatic",)), **SMALL)._replace(energies=lambda parameters: explosive)
-    moved = phase_metrics.predict(model, 0.0, np.ones((1, 1)), np.zeros((1, 1)), np.array([0.0, 2.0]))
+    explosive = Model(None, lambda parameters: HamiltonianSystem(lambda q, p: jnp.sum(q**2 * p)))
+    moved = phase_metrics.predict(explosive, 0.0, np.ones((1, 1)), np.zeros((1, 1)), np.array([0.0, 2.0]))
     assert np.isinf(phase_metrics.state_errors(moved, phase_metrics.Motions(*(each[:1] for each in truth)))).all()
-
-
-def test_held_out_trajectories_are_the_seeds(swing):
-    train, validation = hold_out(swing.train.data, 0.4, 3)
-    kept, held_out = (set(part.trajectory.tolist()) for part in (train, validation))
-    assert not kept & held_out and kept | held_out == set(swing.train.data.trajectory.tolist())
-    again = hold_out(swing.train.data, 0.4, 3)[1]
-    np.testing.assert_array_equal(again.trajectory, validation.trajectory)
 
 
 def test_mistakes_are_named(swing):
     data, needs = swing.train.data, Needs(joints=("revolute",))
     model = make_phase_network(needs, **SMALL)
-    refused = [
+    for call, message in [
         (lambda: problem(model, data, data, most_samples=0), "most_samples is 0"),
         (lambda: problem(model, data, data, seed=-1), "seed is -1"),
         (lambda: problem(model, data._replace(p=None), data), "p and pd, which the data do not have"),
@@ -158,9 +93,7 @@ def test_mistakes_are_named(swing):
         (lambda: make_polynomial_hamiltonian(needs, degree=1), "degree is 1"),
         (lambda: make_polynomial_hamiltonian(NEEDS), "conserves energy"),
         (lambda: make_polynomial_hamiltonian(Needs(joints=("prismatic",) * 6), degree=9), "lower the degree"),
-        (lambda: make_dissipative(separable, NEEDS, friction_width=-1), "width is -1"),
         (lambda: make_phase_network(needs, depth=0), "depth is 0"),
-    ]
-    for call, message in refused:
-        with pytest.raises(InputError, match=message):
+    ]:
+        with one_line(message):
             call()

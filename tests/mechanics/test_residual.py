@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from planar_arm import ARM
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
@@ -11,11 +12,9 @@ from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.residual import Residual, with_residual
-from dln_jax.mechanics.trees import inertial_parameters, lagrangian, serial, tree_system
+from dln_jax.mechanics.trees import lagrangian, tree_system
 from dln_jax.scenes.pendulums import two_link_arm
 
-TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-ARM = serial([np.eye(3), TURN], [[0, 0, 0.1], [0.3, 0, 0]], [inertial_parameters(2, [0.1, 0.2, 0], np.eye(3))] * 2)
 STATE = tuple(np.random.default_rng(0).normal(size=(3, 2)))
 RESIDUAL = Residual(
     potential=lambda q: jnp.sin(3 * q[0]) * q[1],
@@ -24,13 +23,24 @@ RESIDUAL = Residual(
 )
 
 
-@pytest.mark.parametrize("terms", [("potential",), ("dissipation",), ("cholesky",), Residual._fields])
-def test_forces_are_those_of_the_sum_of_energies(terms):
+SCENE = two_link_arm()
+RECORDS = {
+    "tree": (tree_system(ARM), lagrangian(ARM)),
+    "closed-form": (SCENE.closed_form, SCENE.lagrangian),
+    "natural": (NaturalSystem(lambda q: jnp.linalg.cholesky(SCENE.mass_matrix(q)), SCENE.potential), SCENE.lagrangian),
+    "lagrangian": (SCENE.energies, SCENE.lagrangian),
+}
+TERMS = [("tree", (name,)) for name in Residual._fields] + [(record, Residual._fields) for record in RECORDS]
+
+
+@pytest.mark.parametrize(("record", "terms"), TERMS)
+def test_forces_are_those_of_the_sum_of_energies(record, terms):
+    known, L = RECORDS[record]
     residual = Residual(**{name: getattr(RESIDUAL, name) for name in terms})
     friction = joint_dissipation([0.3, 0.1], [0.2, 0.4])
 
     def energy(q, qd):
-        total = lagrangian(ARM)(q, qd)
+        total = L(q, qd)
         if residual.cholesky is not None:
             total += 0.5 * jnp.sum((residual.cholesky(q).T @ qd) ** 2)
         return total if residual.potential is None else total - residual.potential(q)
@@ -38,7 +48,7 @@ def test_forces_are_those_of_the_sum_of_energies(terms):
     def losses(q, qd):
         return friction(q, qd) + (0.0 if residual.dissipation is None else residual.dissipation(q, qd))
 
-    ours = dynamics(with_residual(tree_system(ARM, friction), residual))
+    ours = dynamics(with_residual(with_friction(known, friction), residual))
     slow = dynamics(LagrangianSystem(energy, losses))
     q, qd, qdd = STATE
     tau = slow.inverse_dynamics(*STATE)
@@ -46,31 +56,6 @@ def test_forces_are_those_of_the_sum_of_energies(terms):
     np.testing.assert_allclose(ours.forward_dynamics(q, qd, tau), qdd, rtol=1e-10)
     np.testing.assert_allclose(ours.energy(q, qd), slow.energy(q, qd), rtol=1e-12)
     np.testing.assert_allclose(ours.friction(q, qd), jax.grad(losses, 1)(*map(jnp.asarray, (q, qd))), rtol=1e-12)
-
-
-SCENE = two_link_arm()
-RECORDS = {
-    "closed-form": SCENE.closed_form,
-    "natural": NaturalSystem(lambda q: jnp.linalg.cholesky(SCENE.mass_matrix(q)), SCENE.potential),
-    "lagrangian": SCENE.energies,
-}
-
-
-@pytest.mark.parametrize("record", RECORDS)
-def test_any_record_of_energies_takes_a_residual(record):
-    friction = joint_dissipation([0.3, 0.1], [0.2, 0.4])
-    own = with_friction(RECORDS[record], friction)
-
-    def energy(q, qd):
-        return SCENE.lagrangian(q, qd) + 0.5 * jnp.sum((RESIDUAL.cholesky(q).T @ qd) ** 2) - RESIDUAL.potential(q)
-
-    slow = dynamics(LagrangianSystem(energy, lambda q, qd: friction(q, qd) + RESIDUAL.dissipation(q, qd)))
-    ours = dynamics(with_residual(own, RESIDUAL))
-    q, qd, qdd = STATE
-    tau = slow.inverse_dynamics(*STATE)
-    np.testing.assert_allclose(ours.inverse_dynamics(*STATE), tau, rtol=1e-11)
-    np.testing.assert_allclose(ours.forward_dynamics(q, qd, tau), qdd, rtol=1e-9)
-    np.testing.assert_allclose(ours.energy(q, qd), slow.energy(q, qd), rtol=1e-12)
 
 
 def test_transmissions_carry_the_residual_too():

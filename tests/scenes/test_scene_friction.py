@@ -3,17 +3,17 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.scenes.pendulums import two_link_pendulum
 from dln_jax.scenes.poles import cart_pole
 from dln_jax.scenes.scene import with_friction
-from dln_jax.types import InputError
 
 
-@pytest.mark.parametrize("scene", [cart_pole(friction=0.05), two_link_pendulum("elbow")], ids=lambda scene: scene.name)
-def test_forces_are_those_of_the_formulas(scene):
+def test_forces_are_those_of_the_formulas():
+    scene = two_link_pendulum("elbow")
     coefficients = FrictionCoefficients(viscous=(0.1, 0.2), coulomb=0.3, stribeck=(0.05, 0.0))
     rubbing = with_friction(scene, coefficients, FrictionShape(0.02, 0.1))
     q, qd = jnp.array([0.3, 0.7]), jnp.array([0.08, -1.5])
@@ -25,14 +25,11 @@ def test_forces_are_those_of_the_formulas(scene):
     assert float(after.energy(q, qd)) == pytest.approx(float(before.energy(q, qd)), rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("coefficients", "message"),
-    [
+def test_mistakes_are_one_line():
+    for coefficients, message in [
         (FrictionCoefficients(), "no friction to add"),
         (FrictionCoefficients(sigmoid=1.0), "no sigmoid friction"),
         (FrictionCoefficients(coulomb=-1.0), "coulomb is -1"),
-    ],
-)
-def test_mistakes_are_one_line(coefficients, message):
-    with pytest.raises(InputError, match=message):
-        with_friction(cart_pole(), coefficients)
+    ]:
+        with one_line(message):
+            with_friction(cart_pole(), coefficients)

@@ -1,4 +1,4 @@
-"""With the linear parameters eliminated, slopes are those of finite differences, and only true frames leave nothing."""
+"""With the linear parameters eliminated, slopes are those of finite differences, and gauges change nothing."""
 
 import functools
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions, random_frames
-from dln_jax.learning.kinematics.projection import Samples, Structure, design, inertias_of, project
+from dln_jax.learning.kinematics.projection import Samples, Structure, design, project
 from dln_jax.mechanics.trees import make_tree, newton_euler
 
 KINDS = ("revolute", "prismatic", "revolute")
@@ -56,25 +56,14 @@ def test_the_design_has_all_that_a_tree_shows():
 
 
 @pytest.mark.slow
-def test_true_frames_leave_nothing():
-    _, _, linear = problem()
-    at = projected(jnp.zeros(18))
-    assert at.loss < 1e-16
-    inertias = inertias_of(STRUCTURE, jnp.asarray(linear))
-    assert inertias.shape == (3, 10) and np.count_nonzero(inertias) == 18
-
-
-@pytest.mark.slow
 def test_slopes_are_those_of_finite_differences():
     places = free_directions(STRUCTURE.parents, KINDS)
-    start = np.zeros(18)
-    start[places] = 0.1 * np.random.default_rng(1).normal(size=len(places))
-    at = projected(jnp.asarray(start))
+    start = jnp.zeros(18).at[places].set(0.1 * np.random.default_rng(1).normal(size=len(places)))
+    at = projected(start)
     for place, slope in zip(places, at.slope, strict=True):
         step = jnp.zeros(18).at[place].set(1e-5)
-        higher, lower = (projected(jnp.asarray(start), sign * step).loss for sign in (1, -1))
-        estimate = (higher - lower) / 2e-5 * samples_count() / 2
-        np.testing.assert_allclose(-slope, estimate, rtol=1e-4, atol=1e-4)
+        higher, lower = (projected(start, sign * step).loss for sign in (1, -1))
+        np.testing.assert_allclose(-slope, (higher - lower) / 4e-5 * samples_count(), rtol=1e-4, atol=1e-4)
 
 
 def samples_count():
