@@ -16,9 +16,14 @@ from dln_jax.scenes.poles import cart_pole
 
 MODEL = dynamics(cart_pole(cart_mass=0.6, pole_mass=0.15, length=0.25, friction=0.002).closed_form)
 RAIL = layout(
-    ("prismatic", "revolute"), [0], goal=(0, 0), hanging=(0, np.pi), rate=100.0, control=8.0,
+    ("prismatic", "revolute"),
+    [0],
+    goal=(0, 0),
+    hanging=(0, np.pi),
+    rate=100.0,
+    control=8.0,
     position=[[-0.8, 0.8], [-np.inf, np.inf]],
-)  # fmt: skip
+)
 LOW = (-0.9, -0.9, -0.9, -0.9)
 """Surpluses of energy laws that stay far below the goal."""
 
@@ -28,13 +33,12 @@ def explored(surplus):
     return explore(plant, lambda _: MODEL, Exploration(seconds=15.0, surplus=surplus)).recording
 
 
-@pytest.mark.parametrize(("surplus", "expected"), [(LOW, 2), (Exploration().surplus, 0)])
-def test_a_plan_is_asked_for_only_where_no_episode_came_near_the_goal(monkeypatch, surplus, expected):
+def test_a_plan_is_asked_for_only_where_no_episode_came_near_the_goal(monkeypatch):
     asked = []
     monkeypatch.setattr(exploring, "_plan_law", lambda layout, upright, scales, seed: asked.append(upright))
-    q = explored(surplus).q
-    assert (distances(q, RAIL).min() < exploring.NEAR) == (expected == 0)
-    assert bool(asked) == bool(expected)
+    for surplus, planned in ((Exploration().surplus, False), (LOW, True)):
+        near = distances(explored(surplus).q, RAIL).min() < exploring.NEAR
+        assert (bool(asked), near) == (planned, not planned)
 
 
 @pytest.mark.slow
@@ -49,11 +53,10 @@ def test_a_lost_plan_starts_again_nearer_to_rest_or_after_a_while():
     upright = upright_of(MODEL, RAIL.actuation, RAIL.goal, postures=circle(RAIL))
     settings, goal = swing_up_numbers(upright, RAIL, scales_of(upright, RAIL), USUAL)
     rest, samples = jnp.array([0.0, np.pi, 0.0, 0.0]), 10
-    none = jnp.zeros((1, 4))
-    plan = Followed(
-        jnp.tile(rest, (samples, 1)), jnp.zeros((samples, 1)), jnp.zeros((samples, 1, 4)), jnp.eye(4), 0.09, goal,
-        Regulator(none, jnp.eye(4)),
-    )  # fmt: skip
+    zeros = jnp.zeros((samples, 1))
+    regulator = Regulator(jnp.zeros((1, 4)), jnp.eye(4))
+    gains = jnp.zeros((samples, 1, 4))
+    plan = Followed(jnp.tile(rest, (samples, 1)), zeros, gains, jnp.eye(4), 0.09, goal, regulator)
     act = follower(upright, RAIL, settings, plan).act
 
     def start(number, off):
