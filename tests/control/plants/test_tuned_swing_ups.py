@@ -36,7 +36,7 @@ def scaled(plant, **sizes):
 
 def test_scales_of_a_cart_pole_have_closed_forms():
     plant = rail()
-    upright, scales = scaled(plant)
+    _, scales = scaled(plant)
     m, l, g = SIZES["pole_mass"], SIZES["length"], 9.81
     assert scales.fall == pytest.approx(np.sqrt(g / l))
     assert scales.energy == pytest.approx(2 * m * g * l, rel=1e-6)
@@ -45,7 +45,7 @@ def test_scales_of_a_cart_pole_have_closed_forms():
     assert scales.acceleration == pytest.approx(8.0 / SIZES["cart_mass"])
     np.testing.assert_allclose(scales.sizes, [l, 1.0])
     with one_line("do not fall from the goal"):
-        scales_of(upright, plant._replace(goal=plant.hanging, hanging=plant.goal))
+        scaled(plant._replace(goal=plant.hanging, hanging=plant.goal))
 
 
 def test_similar_plants_get_the_same_law_in_their_own_units():
