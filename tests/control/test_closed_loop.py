@@ -86,13 +86,6 @@ def test_a_failure_lasts_until_the_end():
     assert np.isfinite(run.x[:6]).all() and not np.isfinite(run.x[6:]).any() and np.isnan(run.u[5:]).all()
 
 
-def test_many_runs_are_one_program():
-    law = stateless(lambda y: -4 * y[:1] - 2 * y[1:])
-    starts = np.random.default_rng(0).normal(size=(3, 2))
-    together = jax.jit(jax.vmap(lambda x: simulated(law, x).x))(starts)
-    np.testing.assert_allclose(together[2], simulated(law, starts[2]).x, rtol=1e-12)
-
-
 def test_feed_forward_of_the_exact_model_errs_by_the_hold_alone():
     """Torques held for a period lag by half of it: with the exact model the error is of first order in the period."""
     plant = dynamics(pendulum().closed_form)

@@ -21,7 +21,7 @@ def test_it_does_no_work_at_rest_and_is_friction_s_share_away_from_it():
     assert float(jnp.abs(forces(q, jnp.array([0.0, 3.0]))[0])) < 1e-15
     for rate in (-2.0, 2.0):
         qd = jnp.array([rate, 3.0])
-        assert float(forces(q, qd)[0]) == pytest.approx(0.9 * float(FRICTION(q, qd)[0]), rel=1e-3)
+        assert forces(q, qd)[0] == pytest.approx(0.9 * float(FRICTION(q, qd)[0]), rel=1e-3)
     # Never more than what friction takes, so that no joint is driven by it.
     rates = np.linspace(-0.3, 0.3, 61)
     given = np.array([forces(q, jnp.array([rate, 0.0]))[0] for rate in rates])

@@ -85,7 +85,7 @@ def laws():
 def test_no_law_answers_where_its_state_is_not_finite_in_jax_or_c(tmp_path):
     # One coordinate after another, and two states that are sound.
     bad = np.tile([0.01, 0.02, 0.03, 0.04], (10, 1))
-    bad[9] = 50
+    bad[9] = [0.7, -1.2, 0.9, 0.5]
     for place, number in enumerate([np.nan, np.inf]):
         bad[4 * place : 4 * place + 4][np.diag_indices(4)] = number
     every = laws()

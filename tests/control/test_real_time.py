@@ -5,11 +5,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from calls import one_line
 
 from dln_jax.control import TrajectoryProblem, feedback, first_plan, improve, mpc, prepare, shoot, worst_violation
-from dln_jax.control.real_time import BARRIER, _smooth
+from dln_jax.control.real_time import BARRIER
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.solvers.ending import Ending, reason
@@ -48,27 +47,6 @@ def test_iterations_approach_the_optimum_as_the_barrier_falls():
         gaps.append(float(cost - best.plan.cost))
         assert 0 < gaps[-1] < barrier * 3 * N
     assert gaps[1] < gaps[0] / 20
-
-
-def test_prices_have_their_closed_forms():
-    """Slopes of the minimum of w t - μ log t - μ log(t - c) over t, times (1 - d / D)²; no price beyond D = 0.1."""
-    limited = BLOCK._replace(cost=lambda x, u: 0 * x[0], soft=(2.0, 0.0), lower=-np.inf, upper=np.inf)
-    step, _ = _smooth(limited, 2, 1, 0.1)
-    expansion = jax.jit(step.expansion)
-
-    def price(c):
-        t = max(c, 0.0) + np.geomspace(1e-6, 10.0, 400_000)
-        return np.min(2.0 * t - 0.1 * np.log(t) - 0.1 * np.log(t - c))
-
-    for speed in (-3.0, 0.55, 0.6, 2.0):
-        c, y = speed - 0.6, jnp.array([0.0, speed, 0.0])
-        gradient, hessian = expansion(y)
-        fade = max(1 - (np.sqrt(c**2 + 0.1**2) - c) / 2 / 0.1, 0.0) ** 2
-        slope = (price(c + 1e-4) - price(c - 1e-4)) / 2e-4
-        assert float(gradient[1]) == pytest.approx(fade * slope, rel=1e-4, abs=1e-12)
-        assert (float(step.cost(y)[0]) > 0.0) == (fade > 0.0)
-        numeric = (expansion(y.at[1].add(1e-5))[0] - expansion(y.at[1].add(-1e-5))[0])[1] / 2e-5
-        assert float(hessian[1, 1]) == pytest.approx(float(numeric), rel=1e-5, abs=1e-8)
 
 
 def test_feedback_is_the_derivative_of_the_optimal_control():

@@ -44,7 +44,7 @@ def test_a_linear_problem_takes_one_iteration_to_the_recursion():
     known = time_varying_lqr(np.tile(F, (N, 1, 1)), np.tile(G, (N, 1, 1)), np.eye(3), 0.5 * np.eye(2), 2 * np.eye(3))
     for one in (found.plan, plan):
         np.testing.assert_allclose(one.K, -known.K, atol=1e-10)
-        assert float(one.cost) == pytest.approx(START @ np.asarray(known.S[0]) @ START, rel=1e-12)
+        assert one.cost == pytest.approx(START @ np.asarray(known.S[0]) @ START, rel=1e-12)
     # The cost to go is xᵀ S x.
     np.testing.assert_allclose(found.multipliers[0], 2 * known.S[1] @ found.plan.x[1], rtol=1e-9)
     assert found.defect < 1e-13
@@ -76,13 +76,8 @@ def test_limits_hold_and_the_rest_is_stationary():
 
 
 @pytest.mark.slow
-def test_plans_that_have_not_converged_say_so():
+def test_a_plan_that_used_up_its_iterations_says_so():
     assert reason(optimise(LINEAR, START, STILL, iterations=1).ending).startswith("used up its iterations")
-    # Every slope points uphill: gradients of the wrong sign.
-    uphill = LINEAR._replace(
-        cost=lambda x, u: u @ u, final_cost=lambda x: 2 * x @ x + 100 * (x @ x - 2 * jax.lax.stop_gradient(x @ x))
-    )
-    assert not optimise(uphill, START, 1 + STILL, iterations=30).converged
 
 
 @pytest.mark.slow
@@ -105,7 +100,7 @@ def test_swing_up_of_a_cart_pole_converges_quadratically_and_its_gains_are_deriv
     first = solve(down, found.plan.x, found.plan.u, limit)
     exact = solve(down, first.plan.x + 1e-2, first.plan.u, limit)
     assert exact.converged and exact.iterations <= 15
-    assert float(exact.plan.cost) == pytest.approx(float(first.plan.cost), rel=1e-9)
+    assert exact.plan.cost == pytest.approx(float(first.plan.cost), rel=1e-9)
     for axis, gain in zip(1e-3 * np.eye(4), exact.plan.K[0, 0], strict=True):
         ahead, behind = (solve(down + way, exact.plan.x, exact.plan.u, limit).plan.u[0, 0] for way in (axis, -axis))
         assert float(ahead - behind) / 2e-3 == pytest.approx(float(gain), rel=1e-3)

@@ -1,4 +1,4 @@
-"""Energy laws do the work that theory says, and swing up a plant from many starts within its limits."""
+"""Energy laws do the work that theory says, and a regulator has the region of attraction of its unstable mode."""
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +8,7 @@ from calls import one_line
 
 from dln_jax.control import (
     EnergyGains,
-    Hardware,
     energy_shaping,
-    error,
     field_of,
     holding_controls,
     linearise,
@@ -20,10 +18,6 @@ from dln_jax.control import (
     passive_energy,
     region_of_attraction,
     regulated,
-    simulate,
-    stateless,
-    switched,
-    value,
 )
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
@@ -49,29 +43,10 @@ def test_active_joints_get_the_acceleration_they_are_asked_for_and_do_its_work_o
             return qdd, jax.jvp(energy, (q, qd), (qd, qdd))[1], plant.mass_matrix(q)
 
         qdd, rate, M = accelerated(q, qd, a)
-        assert float(qdd[parts.active[0]]) == pytest.approx(3.0, rel=1e-10)
+        assert qdd[parts.active[0]] == pytest.approx(3.0, rel=1e-10)
         if conservative:
-            assert float(rate) == pytest.approx(float(-qd[1] * M[1, 0] * a[0]), rel=1e-10)
-            assert float(energy(jnp.array([5.0, 0.0]), jnp.zeros(2))) == pytest.approx(0.0, abs=1e-12)
-
-
-@pytest.mark.slow
-def test_a_cart_pole_swings_up_from_every_start_within_its_limits():
-    scene, goal = cart_pole(), jnp.zeros(4)
-    plant, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints
-    field = field_of(plant, B)
-    at = linearise(field, goal, holding_controls(plant, goal[:2], B))
-    regulator = lqr(at.A, at.B, np.diag([1, 1, 0.1, 0.1]), [[0.1]])
-    far = energy_shaping(plant, parts_of(B), goal[:2], EnergyGains(200.0, 2.0, 2.0))
-    near, cost = regulated(regulator, goal, at.u, joints), value(regulator, goal, joints)
-    law = stateless(switched(lambda x: far(*jnp.split(x, 2)), near, cost, 0.5))
-    settings = {"seconds": 10.0, "rate": 200.0, "controls": 1, "hardware": Hardware(-10.0, 10.0)}
-    starts = np.zeros((16, 4))
-    starts[:, :2] = [0.0, np.pi] + 0.1 * np.random.default_rng(0).normal(size=(16, 2))
-    run = jax.jit(jax.vmap(lambda x: simulate(field, law, x, **settings)))(starts)
-    assert np.abs(run.u).max() <= 10.0
-    off = jax.vmap(lambda x: error(x, goal, joints))(run.x[:, -1])
-    assert np.abs(off[:, 1]).max() < 1e-2
+            assert rate == pytest.approx(float(-qd[1] * M[1, 0] * a[0]), rel=1e-10)
+            assert energy(jnp.array([5.0, 0.0]), jnp.zeros(2)) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_region_of_attraction_is_that_of_the_unstable_mode():

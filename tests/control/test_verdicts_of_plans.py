@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import TrajectoryProblem, free_time, optimise, phases, shoot, worst_violation
+from dln_jax.control import TrajectoryProblem, free_time, optimise, shoot, worst_violation
 from dln_jax.solvers.ending import Ending, reason
 
 N, DT = 16, 0.1
@@ -51,8 +51,8 @@ def test_a_mass_that_passes_the_wall_across_its_way_has_not_converged():
     assert int(stopped.ending) == Ending.INFEASIBLE and not stopped.converged and np.isinf(stopped.objective)
     assert int(passed.ending) == Ending.EXCEEDED and not passed.converged
     excess = np.maximum(np.asarray(jax.vmap(depth)(passed.plan.x)), 0.0)
-    assert float(passed.objective - passed.plan.cost) == pytest.approx(excess.sum(), rel=1e-6)
-    assert float(passed.violation) == pytest.approx(excess.max()) and excess.max() > 0.03
+    assert passed.objective - passed.plan.cost == pytest.approx(excess.sum(), rel=1e-6)
+    assert passed.violation == pytest.approx(excess.max()) and excess.max() > 0.03
     assert reason(passed.ending).startswith("is optimal at its prices, but violates soft constraints")
     assert worst_violation(soft, passed.plan).startswith("constraint 0 on the states at knot")
 
@@ -94,14 +94,6 @@ def test_a_plan_leaves_the_top_of_a_hill_but_not_a_minimum():
         assert solution.converged and np.abs(solution.plan.x).max() < 1e-6
 
 
-@pytest.mark.slow
-def test_a_saddle_that_is_not_left_is_not_converged(monkeypatch):
-    monkeypatch.setattr(phases, "MOST_ESCAPES", 0)
-    plan = optimise(hill(0.5), np.zeros(1), np.zeros((STEPS, 1)))
-    assert int(plan.ending) == Ending.SADDLE and not plan.converged
-    assert reason(plan.ending).startswith("ended at a saddle") and np.abs(plan.x).max() < 1e-6
-
-
 def test_redundant_controls_are_no_saddle():
     """Two motors move one mass, and nothing decides between them."""
     problem = TrajectoryProblem(lambda x, u: x + u[:1] + u[1:], lambda x, u: x @ x, lambda x: x @ x, -0.3, 0.3)
@@ -134,27 +126,26 @@ def test_a_goal_within_reach_is_reached_and_one_beyond_is_infeasible_by_the_rest
         assert solution.converged and solution.violation < 1e-7
         np.testing.assert_allclose(solution.plan.x[-1], place, atol=1e-7)
     for distance in (2.5, 3.0):
-        solution = solve(np.array([distance, 0.0, 0.0]))
+        place = np.array([distance, 0.0, 0.0])
+        solution = solve(place)
         assert int(solution.ending) == Ending.INFEASIBLE and not solution.converged
-        assert float(solution.violation) == pytest.approx(distance - 2.0, abs=1e-5)
+        assert solution.violation == pytest.approx(distance - 2.0, abs=1e-5)
         assert max(solution.stationarity, solution.feasibility, solution.complementarity) <= 2e-6
+        text = worst_violation(problem._replace(end=lambda x, place=place: x - place), solution.plan)
+        assert text == f"equation 0 of the end is violated by {distance - 2:.3g}"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solve", ["shoot", "optimise"])
-def test_limits_of_controls_and_durations_hold_in_every_plan(solve):
+def test_limits_of_controls_and_durations_hold_in_every_plan():
     """Also where slacks are widened; moving sideways by 1 m by turning and driving takes at least 1 s."""
     settings = {"states": 3, "shortest": 1e-3, "longest": 0.5}
     problem = free_time(ridden, lambda x, u, dt: dt, FREE, **settings)._replace(lower=-MOST, upper=MOST)
     problem = problem._replace(end=lambda x: x[:3] - np.array([0.0, 1.0, 0.0]))
-    if solve == "shoot":
-        plan_of = jax.jit(lambda x, states, u: shoot(problem, x, states, u).plan)
-    else:
-        plan_of = jax.jit(lambda x, states, u: optimise(problem, x, u))
+    solve = jax.jit(lambda x, states, u: shoot(problem, x, states, u).plan)
     random, converged = np.random.default_rng(0), []
     for number in range(7):
         x, u = np.array([0.0, 0.0, 0.0, (0.1, 0.3, 0.02)[number % 3]]), random.uniform(-1, 1, (10, 2))
-        plan = plan_of(x, np.linspace(x, [0.0, 1.0, 0.0, x[3]], 11), u)
+        plan = solve(x, np.linspace(x, [0.0, 1.0, 0.0, x[3]], 11), u)
         assert (np.abs(plan.u) <= MOST + 1e-6).all()
         assert plan.x[:, 3].min() >= 1e-3 - 1e-6 and plan.x[:, 3].max() <= 0.5 + 1e-6
         assert not plan.converged or plan.cost > 1.0

@@ -7,11 +7,9 @@ import pytest
 from calls import one_line
 
 import dln_jax
-from dln_jax.control import Hardware, field_of, simulate, stateless
+from dln_jax.control import field_of, stateless
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.desktop_plants import desktop_rotary_pendulum, model_of_plant, try_starts
 from dln_jax.control.estimate import belief, extended, filtered, mechanical, unscented, with_estimate
-from dln_jax.control.plants.estimators import by_filter
 from dln_jax.control.state_space import integrated
 from dln_jax.export.c.interface import stated_costs
 from dln_jax.export.c.load import load_c
@@ -70,70 +68,41 @@ def test_late_and_rare_measurements_give_the_estimates_of_a_filter_that_knows_th
 
 
 def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effect():
-    delay = 2
-    # With exact measurements and an exact model the delayed loop repeats the prompt one from its first control on.
-    hardware = Hardware(delay=delay, sees_rates=False)
-    controller = estimating(ASKED, SHARP, EXACT, delay=delay)
-    settings = {"seconds": 0.5, "rate": 100.0, "controls": 1, "hardware": hardware}
-    run = jax.jit(lambda: simulate(FIELD, controller, EXACT.x, **settings))()
-    asked = jax.vmap(lambda x: ASKED.act((), jnp.zeros(()), x)[1])(run.x[:-1])
-    np.testing.assert_allclose(run.u[delay:], asked[delay:], rtol=0, atol=1e-5)
-
-
-def test_a_law_behind_half_a_sample_acts_on_the_state_half_a_sample_later():
-    controller = estimating(ASKED, SHARP, EXACT, delay=0.5)
+    """The plant takes every control one and a half samples late."""
+    controller = estimating(ASKED, SHARP, EXACT, delay=1.5)
     half, act = jax.jit(integrated(FIELD, 0.005)), jax.jit(controller.act)
-    memory, x, u = controller.start, np.asarray(EXACT.x), np.zeros(1)
-    errors = []
+    memory, x, errors = controller.start, np.asarray(EXACT.x), []
+    controls = [np.zeros(1), np.zeros(1)]
     for number in range(50):
-        memory, asked = act(memory, number / 100.0, x[:2])
-        x = half(x, u)  # the control of the sample before still acts
-        errors.append(asked[0] - ASKED.act((), jnp.zeros(()), x)[1][0])
-        x, u = half(x, asked), asked
+        memory, u = act(memory, number / 100.0, x[:2])
+        x = half(half(x, controls[-2]), controls[-1])
+        controls.append(u)
+        # Half a sample from now the control of the sample before gives way to this one.
+        errors.append(u[0] - ASKED.act((), jnp.zeros(()), half(x, controls[-2]))[1][0])
     # The plant knows when the control changes; the filter knows the mean over the sample.
     assert np.abs(errors).max() < 2e-3
 
 
-def swing(t, held, dt):
-    """States at the times t of the cart-pole under controls [N, 1] that are held for dt."""
-    step = integrated(FIELD, dt)
-    start = jnp.array([0.0, 1.0, 0.0, 0.0])
-    x = jax.jit(lambda: jax.lax.scan(lambda x, u: (step(x, u), x), start, jnp.asarray(held))[1])()
-    return np.asarray(x)[np.round(t / dt).astype(int)]
-
-
-def test_filters_use_the_times_of_samples():
-    """Samples of a free swing that are up to half a step late; its second channel comes at once or two samples late."""
-    t = np.round(np.arange(150) * 10 + np.random.default_rng(1).uniform(0, 5, 150)) / 1000.0
-    x = swing(t, np.zeros((1600, 1)), 1e-3)
-    start = belief([0.0, 1.0, 0.0, 0.0], [1e-3, 1e-3, 0.1, 0.1])
+def test_filters_use_the_times_of_samples_and_of_controls():
+    """Controls act 1.3 nominal steps after their samples, which are up to half a step late; so late is one channel."""
+    random = np.random.default_rng(2)
+    t = np.append(0.0, np.arange(1, 80) + random.uniform(0, 0.5, 79)) / 100.0
+    planned, delay, dt = random.choice([-6.0, 6.0], (80, 1)), 1.3, 1e-4
+    law = Controller(jnp.asarray(0), lambda number, t, x: (number + 1, jnp.asarray(planned)[number]))
+    arrived = np.searchsorted(t + delay / 100.0, dt * np.arange(8100) + dt / 2) - 1
+    held = np.where(arrived[:, None] >= 0, planned[arrived], 0.0)
+    step, start = integrated(FIELD, dt), belief([0.0, 1.0, 0.0, 0.0], 1e-4)
+    fine = jax.jit(lambda u: jax.lax.scan(lambda x, u: (step(x, u), x), start.x, u)[1])(held)
+    x = np.asarray(fine)[np.round(t / dt).astype(int)]
+    sharp = PROCESS._replace(noise=np.array([1e-5, 1e-5]), disturbance=np.array([0.2, 0.01]))
     for late in (0, 2):
         y = x[:, :2].copy()
         y[late:, 1] = y[: len(y) - late, 1]
-        known = replayed(estimating(IDLE, prior=start, late=(0, late), rate=100.0), y, t)[0]
-        ignored = replayed(estimating(IDLE, prior=start, late=(0, late)), y, t)[0]
-        assert np.abs(known - x)[20:, 2:].max() < 0.2 * np.abs(ignored - x)[20:, 2:].max()
-        nominal = replayed(estimating(IDLE, prior=start, late=(0, late), rate=100.0), y)[0]
-        np.testing.assert_allclose(nominal, ignored, rtol=0, atol=1e-9)
-
-
-def test_controls_act_when_they_arrive_though_samples_are_late():
-    """The plant takes every control 1.3 nominal steps after its sample; samples are up to half a step late."""
-    t = (np.arange(80) + np.random.default_rng(2).uniform(0, 0.5, 80)) / 100.0
-    t[0] = 0.0
-    delay = 1.3
-    planned = jnp.asarray(np.random.default_rng(3).choice([-6.0, 6.0], (80, 1)))
-    law = Controller(jnp.asarray(0), lambda number, t, x: (number + 1, planned[number]))
-    arrived = np.searchsorted(t + delay / 100.0, 1e-4 * np.arange(8100) + 5e-5) - 1
-    x = swing(t, np.where(arrived[:, None] >= 0, np.asarray(planned)[arrived], 0.0), 1e-4)
-    sharp = PROCESS._replace(noise=np.array([1e-5, 1e-5]), disturbance=np.array([0.2, 0.01]))
-    start = belief([0.0, 1.0, 0.0, 0.0], 1e-4)
-
-    def worst(**timed):
-        estimates, _ = replayed(estimating(law, sharp, start, delay=delay, **timed), x[:, :2], t)
-        return np.abs(estimates - x)[:, 2:].max(axis=0)
-
-    assert (worst(rate=100.0) < 0.25 * worst()).all()
+        settings = {"delay": delay, "late": (0, late)}
+        timed, untimed = (estimating(law, sharp, start, **settings, **more) for more in ({"rate": 100.0}, {}))
+        known, ignored = (np.abs(replayed(one, y, t)[0] - x)[:, 2:].max(axis=0) for one in (timed, untimed))
+        assert (known < 0.25 * ignored).all()
+        np.testing.assert_allclose(replayed(timed, y)[0], replayed(untimed, y)[0], rtol=0, atol=1e-9)
 
 
 def test_a_failed_measurement_is_not_hidden():
@@ -149,20 +118,6 @@ def test_wrong_numbers_of_samples_are_refused():
     ):
         with one_line(message):
             estimating(ASKED, **settings)
-
-
-@pytest.mark.slow
-def test_swing_ups_with_a_filter_succeed_and_hold_with_less_torque():
-    plant = desktop_rotary_pendulum()
-    model = model_of_plant(plant)
-    noise = {"band": [2.5e-4, 1e-5], "encoder_step": plant.hardware.encoder_step}  # the plant's own
-    process = mechanical(model, plant.scene.needs.actuation, rate=plant.rate, **noise)
-    different, filtering = (
-        try_starts(plant, model, starts=6, seconds=4.0, estimator=estimator)
-        for estimator in (None, by_filter(plant.layout, process, delay=1))
-    )
-    assert different.outcomes.share == filtering.outcomes.share == 1
-    assert np.median(filtering.effort) < 0.3 * np.median(different.effort)
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from calls import one_line
 
 import dln_jax
@@ -16,8 +15,6 @@ from dln_jax.control.estimate import (
     observed,
 )
 from dln_jax.control.estimate.external import block_maxima
-from dln_jax.export.c.load import load_c
-from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.mechanics.trees import frame_jacobian, serial, world_frames
 from dln_jax.scenes import two_link_pendulum
@@ -115,23 +112,6 @@ def test_the_jacobian_of_a_frame_is_the_derivative_of_its_place():
     np.testing.assert_allclose(J[:3], of_point, atol=1e-12)
     spin = jnp.einsum("abj,cb->acj", of_rotation, place(q)[1])
     np.testing.assert_allclose(J[3:], jnp.stack([spin[2, 1], spin[0, 2], spin[1, 0]]), atol=1e-12)
-
-
-@pytest.mark.slow
-def test_observer_and_wrench_are_the_same_in_c(tmp_path):
-    observer, jacobian = momentum_observer(MODEL, 2, rate=RATE, gain=25.0), frame_jacobian(arm(2), 1)
-
-    def update(q, qd, tau, r, p, beta, begun):
-        memory = observer.update(observer.start._replace(r=r, p=p, beta=beta, begun=begun > 0), q, qd, tau)
-        wrench = flange_wrench(jacobian(q), memory.r)
-        return {f"new_{name}": value for name, value in {**memory._asdict(), **wrench._asdict()}.items()}
-
-    random = np.random.default_rng(0)
-    draws = (*(random.normal(size=2) for _ in range(6)), np.asarray(1.0))
-    export_c({"update": (update, draws)}, tmp_path / "observer")
-    got, expected = load_c(tmp_path / "observer", flags=("-O1",)).update(*draws), jax.jit(update)(*draws)
-    for name in ("r", "p", "beta", "force", "moment", "residual"):
-        np.testing.assert_allclose(getattr(got, f"new_{name}"), expected[f"new_{name}"], rtol=1e-9, atol=1e-9)
 
 
 def test_observers_without_what_they_need_are_refused():

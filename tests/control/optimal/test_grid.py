@@ -1,7 +1,5 @@
 """The value on a grid is a linear-quadratic regulator's, and no policy costs less; convergence is stated."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,7 @@ from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.grid import extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import Grid, interpolated, linear, one_sided_slopes, read
-from dln_jax.control.optimal.problem import ControlProblem, from_field
+from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.solvers.ending import reason
 
 A, B = np.array([[0.0, 1.0], [1.0, -0.2]]), np.array([[0.0], [1.0]])
@@ -44,7 +42,9 @@ def test_the_value_of_a_linear_plant():
     assert errors[1] < errors[0] / 2.5  # h² halves twice; the goal's own cell converges more slowly
     u = -(x @ S @ B)[:, 0]
     # Held for a step, a control is best for the middle of it.
-    np.testing.assert_allclose(interpolated(found.grid, found.u, x), u, atol=0.05 * np.abs(u).max())
+    law = jax.vmap(lookahead(LINEAR, found, limit=8.0))
+    for control in (interpolated(found.grid, found.u, x), law(x)[:, 0]):
+        np.testing.assert_allclose(control, u, atol=0.05 * np.abs(u).max())
 
 
 GRID = Grid((-np.pi, 0.0), (2 * np.pi / 40, 0.25), (40, 9), (True, False))
@@ -72,57 +72,24 @@ def test_linear_interpolation_is_monotone_and_its_slopes_are_one_sided():
     assert before[0, 0] < 0 < after[19, 0]  # across the seam of the circle, and at the jump
 
 
-MASS, LENGTH, LIMIT = 0.6, 0.7, 0.9
-
-
-def weak_pendulum() -> ControlProblem:
-    """A driven rod whose motor cannot lift it: its value has ridges, where cubic interpolation did not converge."""
-
-    def field(x, u):
-        return jnp.stack([x[1], 3 / (MASS * LENGTH**2) * (u[0] + MASS * 9.81 * LENGTH / 2 * jnp.sin(x[0]))])
-
-    way = lambda x: math.pi * jnp.sin(x[0] / 2)  # noqa: E731
-    return ControlProblem(
-        *from_field(field, 1),
-        lambda x: way(x) ** 2 + 0.1 * x[1] ** 2,
-        limited_atan(LIMIT + 1e-3, 4 * LIMIT**2 * 0.15 / math.pi),
+@pytest.mark.slow
+def test_value_with_ridges_converges():
+    """Of a rod of 0.6 kg and 0.7 m whose motor cannot lift it; cubic interpolation did not converge."""
+    high, limit = np.array([np.pi, 8.0]), 0.9
+    inertia = 0.6 * 0.7**2 / 3
+    problem = ControlProblem(
+        lambda x: jnp.stack([x[1], 0.6 * 9.81 * 0.35 / inertia * jnp.sin(x[0])]),
+        lambda x: jnp.array([[0.0], [1 / inertia]]),
+        lambda x: (np.pi * jnp.sin(x[0] / 2)) ** 2 + 0.1 * x[1] ** 2,
+        limited_atan(limit + 1e-3, 0.155),
         0.086,
-        np.array([-math.pi, -8.0]),
-        np.array([math.pi, 8.0]),
+        -high,
+        high,
         ("revolute",),
         np.zeros(2),
     )
-
-
-def cost_of(problem, law, x, *, dt=0.02, seconds=20.0):
-    """Discounted cost of following a law from states [N, 2]."""
-    step = flow(problem, dt)
-
-    def follow(_, carry):
-        x, total, share = carry
-        x, cost = step(x, law(x))
-        return x, total + share * cost, share * jnp.exp(-problem.discount * dt)
-
-    def one(x):
-        return jax.lax.fori_loop(0, round(seconds / dt), follow, (x, jnp.zeros(()), jnp.ones(())))[1]
-
-    return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(x)))
-
-
-@pytest.mark.slow
-def test_value_with_ridges_converges_and_its_policy_costs_what_it_says_and_no_other_less():
-    problem = weak_pendulum()
-    found = solve_on_grid(problem, (51, 101), low=[-math.pi, -14], high=[math.pi, 14], limit=LIMIT)
+    found = solve_on_grid(problem, (51, 101), low=[-np.pi, -14], high=[np.pi, 14], limit=limit)
     assert found.converged and found.change <= 1e-7
-    value = lambda x: np.asarray(interpolated(found.grid, found.V, x))  # noqa: E731
-    x = np.random.default_rng(3).uniform([-0.35, -0.4], [0.35, 0.4], (40, 2))
-    x[0] = [-0.301, -0.17]
-    held = cost_of(problem, lambda x: jnp.clip(-(4 * x[:1] + 0.8 * x[1:]), -LIMIT, LIMIT), x)
-    # Linear interpolation raises V by O(h²/dt), which is absolute: it shows where V itself is small.
-    assert np.all(held + 5e-3 * np.max(found.V) >= value(x))
-    x = np.random.default_rng(4).uniform([-math.pi, -8], [math.pi, 8], (60, 2))
-    followed = cost_of(problem, lookahead(problem, found, limit=LIMIT), x)
-    assert np.median(np.abs(followed - value(x)) / followed) < 1e-2
 
 
 def test_too_few_improvements_are_not_converged():

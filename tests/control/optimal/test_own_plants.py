@@ -38,8 +38,6 @@ def of_rod(length=1.0, control=2.5, **options):
     return own_problem(rod(length), driven(control=control, **options))
 
 
-HELD = driven(0.3)
-"""Its goal takes torque."""
 POLE = cart_pole(cart_mass=0.57, pole_mass=0.127, length=0.16825)
 RAIL = layout(
     ["prismatic", "revolute"],
@@ -62,8 +60,8 @@ def test_rod_has_the_scales_of_its_closed_form():
     problem = own_plant(rod(), short).problem
     assert own_plant(rod(4.0), long).problem.discount == pytest.approx(problem.discount / 2)
     # Hanging costs π² / 2, half of the motor's limit a share of it.
-    assert float(problem.state_cost(jnp.array([np.pi, 0.0]))) == pytest.approx(0.5 * np.pi**2)  # driven
-    assert float(problem.action_cost.cost(jnp.array([1.25]))) == pytest.approx(0.25 * np.pi**2)
+    assert problem.state_cost(jnp.array([np.pi, 0.0])) == pytest.approx(0.5 * np.pi**2)  # driven
+    assert problem.action_cost.cost(jnp.array([1.25])) == pytest.approx(0.25 * np.pi**2)
     # A strong motor sets the pace.
     assert of_rod(control=1e4).scale == pytest.approx(np.sqrt(3e4 / np.pi))
 
@@ -90,19 +88,12 @@ def test_a_limited_joint_is_no_circle_and_a_run_beyond_its_limits_fails():
     assert inside.min() >= -0.4 and inside.max() <= 3.5
 
 
-def test_a_goal_that_takes_torque_costs_nothing_where_it_is_held():
-    problem = own_plant(rod(), own_problem(rod(), HELD)).problem
-    u = problem.action_cost.policy(jnp.zeros(1))
-    np.testing.assert_allclose(u, [-9.81 / 2 * np.sin(0.3)], rtol=1e-9)
-    assert abs(float(problem.action_cost.cost(u))) < 1e-12
-    with one_line("the limits are"):
-        own_problem(rod(), HELD._replace(goal=np.array([1.2])))
-
-
 def test_weights_and_efforts_out_of_range_are_refused():
     for wishes, message in (({"weights": [1.0]}, "expected 2 positive numbers"), ({"effort": -1.0}, "effort is -1")):
         with one_line(message):
-            own_problem(rod(), HELD, **wishes)
+            own_problem(rod(), driven(), **wishes)
+    with one_line("the limits are"):
+        own_problem(rod(), driven(1.2))  # the weight is more than the motor
 
 
 def test_numbers_rebuild_a_problem_from_json():

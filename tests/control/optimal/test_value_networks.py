@@ -13,6 +13,7 @@ from dln_jax.control.optimal.problem import (
     at_goal,
     checked,
     from_plant,
+    hjb_policy,
     hjb_residual,
     optimal_control,
     rates,
@@ -47,6 +48,18 @@ def test_values_are_zero_at_the_goal_periodic_and_have_the_gradient_of_autodiff(
         at_goal = known(jnp.zeros(4))[0]
         assert at_goal[0] == 0 and not np.any(at_goal[1])
         np.testing.assert_allclose(known(X.at[1].add(2 * np.pi))[0][1], slope, rtol=1e-9)
+
+
+def test_the_law_of_a_value_keeps_its_limits_and_has_no_control_where_the_state_is_not_finite():
+    problem = PROBLEM._replace(action_cost=scaled(tanh, 6.0))
+    network = value_network(problem, widths=(6, 6), members=2, scale=40.0)
+    parameters = network.init(jax.random.key(0))
+    law = jax.jit(hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem))
+    x = HIGH * np.random.default_rng(0).uniform(-1, 1, (50, 4))
+    assert 1.0 < np.abs(jax.vmap(law)(x)).max() < 6
+    np.testing.assert_allclose(law(jnp.zeros(4)), 0, atol=1e-12)
+    for bad in np.where(np.eye(4), np.array([np.nan, np.inf, np.nan, -np.inf]), 0.1):
+        assert np.isnan(law(bad)).all()
 
 
 def test_drift_and_actuation_are_those_of_the_plant():

@@ -28,25 +28,16 @@ LOW = (-0.9, -0.9, -0.9, -0.9)
 """Surpluses of energy laws that stay far below the goal."""
 
 
-def explored(surplus):
-    plant = plant_of(MODEL, RAIL, hardware=Hardware(encoder_step=1e-4))
-    return explore(plant, lambda _: MODEL, Exploration(seconds=15.0, surplus=surplus)).recording
-
-
-def test_a_plan_is_asked_for_only_where_no_episode_came_near_the_goal(monkeypatch):
-    asked = []
-    monkeypatch.setattr(exploring, "_plan_law", lambda layout, upright, scales, seed: asked.append(upright))
-    for surplus, planned in ((Exploration().surplus, False), (LOW, True)):
-        near = distances(explored(surplus).q, RAIL).min() < exploring.NEAR
-        assert (bool(asked), near) == (planned, not planned)
-
-
 @pytest.mark.slow
-def test_an_episode_along_a_plan_comes_near_the_goal_within_the_limits():
-    recording = explored(LOW)
+def test_episodes_follow_a_plan_where_none_came_near_the_goal():
+    plant, exploration = (
+        plant_of(MODEL, RAIL, hardware=Hardware(encoder_step=1e-4)),
+        Exploration(seconds=15.0, surplus=LOW),
+    )
+    recording = explore(plant, lambda _: MODEL, exploration).recording
     near = [distances(recording.q[recording.trajectory == k], RAIL).min() < exploring.NEAR for k in range(6)]
-    assert near[:4] == [False] * 4 and all(near[4:])
-    assert np.abs(recording.tau[:, 0]).max() <= Exploration().share * 8.0 + 1e-12
+    assert near == [False] * 4 + [True] * 2
+    assert np.abs(recording.tau[:, 0]).max() <= exploration.share * 8.0 + 1e-12
 
 
 def test_a_lost_plan_starts_again_nearer_to_rest_or_after_a_while():

@@ -52,29 +52,28 @@ def test_starts_outside_the_limits_or_far_from_hanging_are_refused():
 
 
 def test_wrong_answer_stops_the_plant_with_zero_controls_until_it_is_reset():
-    for q, t, reason in (
-        ([0.6, 0.0], 0.01, "'rail' is at 0.6, outside -0.5 to 0.5"),
-        ([0.1, np.nan], 0.01, "not finite"),
-        ([0.0, 0.0], 0.031, "an answer is 31 ms after the last"),
-        ([0.0, 0.0], np.nan, "not finite"),
-        ([0.0, 0.0], 0.0, "expected it to advance with every sample"),
+    for q, t, late, reason in (
+        ([0.6, 0.0], 0.01, 2, "'rail' is at 0.6, outside -0.5 to 0.5"),
+        ([0.1, np.nan], 0.01, 2, "not finite"),
+        ([0.0, 0.0], 0.021, 2, "an answer is 21 ms after the last, more than 2 samples"),
+        ([0.0, 0.0], 0.041, 4, "an answer is 41 ms after the last, more than 4 samples"),
+        ([0.0, 0.0], np.nan, 2, "not finite"),
+        ([0.0, 0.0], 0.0, 2, "expected it to advance with every sample"),
     ):
-        puppet = Puppet()
+        puppet = Puppet(late=late)
         safe = puppet.guarded()
         safe.act([1.0])
-        puppet.q = np.array(q)
-        puppet.t = t
-        with pytest.raises(Stopped, match=reason):
-            safe.read()
-        np.testing.assert_array_equal(puppet.commands[-1], [0.0])
-        with pytest.raises(Stopped, match=reason):
-            safe.act([1.0])
-        assert len(puppet.commands) == 2
-        puppet.q = np.zeros(2)
-        puppet.t = 0.0
+        puppet.q, puppet.t = np.array(q), t
+        for again in (safe.read, lambda safe=safe: safe.act([1.0])):
+            with pytest.raises(Stopped, match=reason):
+                again()
+        np.testing.assert_array_equal(np.ravel(puppet.commands), [1.0, 0.0])
+        puppet.q, puppet.t = np.zeros(2), 0.0
         safe.reset()
         safe.act([1.0])
         assert len(puppet.commands) == 3
+        puppet.t = 0.01 * late - 1e-3
+        safe.read()
 
 
 def test_rate_and_distance_to_stop_count_as_limits():
@@ -87,16 +86,6 @@ def test_rate_and_distance_to_stop_count_as_limits():
                 puppet.t += 0.01
                 safe.read()
         assert puppet.q[0] < 0.1
-
-
-def test_layout_states_how_late_an_answer_may_be():
-    puppet = Puppet(late=4.0)
-    safe = puppet.guarded()
-    puppet.t = 0.039
-    safe.read()
-    puppet.t += 0.041
-    with pytest.raises(Stopped, match="41 ms after the last, more than 4 samples"):
-        safe.read()
 
 
 def test_controls_beyond_the_motor_stop_the_plant():
@@ -195,16 +184,15 @@ def test_compilation_does_not_count_as_a_late_answer():
     assert not result.stopped and len(result.t) == 10
 
 
-@pytest.mark.parametrize("failure", [KeyboardInterrupt, ValueError])
-def test_interrupt_or_failure_of_the_law_leaves_the_motors_at_zero(failure):
+def test_an_interrupt_leaves_the_motors_at_zero():
     puppet = Puppet()
 
     def act(memory, t, y):
         if len(puppet.commands) == 3:
-            raise failure
+            raise KeyboardInterrupt
         return memory, np.ones((1, 1))
 
-    with pytest.raises(failure):
+    with pytest.raises(KeyboardInterrupt):
         run([puppet.bare()], act, np.zeros(1), seconds=1.0)
     np.testing.assert_array_equal(np.ravel(puppet.commands), [1.0, 1.0, 1.0, 0.0])
 
