@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control import (
     Controller,
@@ -33,21 +34,21 @@ def simulated(controller, start=(0.0, 0.0), field=FIELD, **settings):
 
 def test_controls_are_held_and_integrated_exactly():
     run = simulated(COUNTING)
-    np.testing.assert_allclose(run.u[:, 0], np.arange(1, 21))
-    np.testing.assert_allclose(run.x[1:, 1], 0.01 * np.cumsum(np.arange(1, 21)), rtol=1e-12)
-    np.testing.assert_allclose(run.t, 0.01 * np.arange(21))
+    assert_allclose(run.u[:, 0], np.arange(1, 21))
+    assert_allclose(run.x[1:, 1], 0.01 * np.cumsum(np.arange(1, 21)), rtol=1e-12)
+    assert_allclose(run.t, 0.01 * np.arange(21))
 
 
 def test_a_push_adds_to_the_rates_once():
     run = simulated(STILL, [0.0, 0.5], push=Push(0.1, [2.0]))
-    np.testing.assert_allclose(run.x[:, 1], np.where(run.t <= 0.1 + 1e-9, 0.5, 2.5))
-    np.testing.assert_allclose(run.x[-1, 0], 0.1 * 0.5 + 0.1 * 2.5)
-    np.testing.assert_array_equal(run.y[9:11, 1], [0.5, 2.5])  # it is measured at its own sample
+    assert_allclose(run.x[:, 1], np.where(run.t <= 0.1 + 1e-9, 0.5, 2.5))
+    assert_allclose(run.x[-1, 0], 0.1 * 0.5 + 0.1 * 2.5)
+    assert_array_equal(run.y[9:11, 1], [0.5, 2.5])  # it is measured at its own sample
 
 
 def test_controls_are_limited_and_delayed():
     run = simulated(COUNTING, hardware=Hardware(upper=5.0, delay=3))
-    np.testing.assert_array_equal(run.u[:, 0], np.clip(np.arange(20) - 2, 0, 5))
+    assert_array_equal(run.u[:, 0], np.clip(np.arange(20) - 2, 0, 5))
 
 
 def test_encoders_round_and_rates_come_from_differences():
@@ -55,7 +56,7 @@ def test_encoders_round_and_rates_come_from_differences():
     lab = Hardware(encoder_step=1e-3, sees_rates=False)
     coasting = simulated(seen, [0.0, 0.37], lambda x, u: jnp.array([x[1], 0.0]), hardware=lab)
     assert coasting.y.shape == (20, 1)
-    np.testing.assert_allclose(coasting.y / 1e-3, np.round(coasting.y / 1e-3), atol=1e-9)
+    assert_allclose(coasting.y / 1e-3, np.round(coasting.y / 1e-3), atol=1e-9)
     assert coasting.u[0, 0] == 0 and np.abs(coasting.u[1:, 0] - 0.37).max() <= 0.1 + 1e-9
 
 
@@ -66,7 +67,7 @@ def test_noise_has_its_size_and_its_seed():
         for seed in (0, 0, 1)
     )
     assert first.y[:, 0].std() == pytest.approx(0.1, rel=0.05) and first.u.std() == pytest.approx(0.5, rel=0.05)
-    np.testing.assert_array_equal(first.u, again.u)
+    assert_array_equal(first.u, again.u)
     assert not np.array_equal(first.u, other.u)
 
 
@@ -95,4 +96,4 @@ def test_feed_forward_of_the_exact_model_errs_by_the_hold_alone():
         wanted = Reference(np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t))
         run = simulated(following(law, wanted, rate=rate), [0.0, 3.0], field_of(plant), seconds=0.5, rate=rate)
         errors.append(np.abs(np.asarray(run.x[:, 0]) - wanted.q[:, 0]).max())
-    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.05)
+    assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.05)

@@ -1,4 +1,4 @@
-"""Plans with constraints against closed forms, IPOPT and their own conditions."""
+"""Plans with constraints against closed forms and the conditions of an optimum."""
 
 import functools
 from types import SimpleNamespace
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control import TrajectoryProblem, free_time, optimise, shoot, with_limits_of, worst_violation
 from dln_jax.solvers.ending import Ending
@@ -40,7 +41,7 @@ def test_shortest_time_of_a_mass_is_twice_the_root_of_distance_over_acceleration
         solution = solve(distance)
         assert solution.converged
         assert solution.plan.cost == pytest.approx(2 * np.sqrt(distance / 2.0), rel=1e-6)
-        np.testing.assert_allclose(solution.plan.u[:, 0], np.where(np.arange(N) < N // 2, 2.0, -2.0), atol=1e-4)
+        assert_allclose(solution.plan.u[:, 0], np.where(np.arange(N) < N // 2, 2.0, -2.0), atol=1e-4)
 
 
 @functools.cache
@@ -54,40 +55,27 @@ def test_limits_hard_and_soft_constraints_and_single_shooting_give_the_same_plan
     limited = TO_ONE._replace(upper_x=np.array([np.inf, 0.6]))
     single = optimise(limited, np.zeros(2), STILL[1])
     assert single.converged and worst_violation(limited, single) == "all constraints hold within 1e-06"
-    np.testing.assert_allclose(single.u, at_most().plan.u, atol=1e-5)
+    assert_allclose(single.u, at_most().plan.u, atol=1e-5)
     for solution in (shoot(limited, np.zeros(2), *STILL), at_most((1e2, 0.0))):
         assert solution.converged and solution.violation < 1e-7
-        np.testing.assert_allclose(solution.plan.u, at_most().plan.u, atol=1e-5)
+        assert_allclose(solution.plan.u, at_most().plan.u, atol=1e-5)
 
 
 def test_active_constraints_are_met_and_their_pressures_close_the_lagrangian():
+    """The problem is convex, so that these conditions prove the optimum."""
     solution = at_most()
     x, u, prices = solution.plan.x, solution.plan.u, np.asarray(solution.multipliers)
     speed = np.asarray(x[1:, 1])
     assert solution.converged and speed.max() == pytest.approx(0.6, abs=1e-7) and (speed > 0.6 - 1e-6).sum() > 3
     pressure = np.asarray(solution.pressures)[1:]  # of x_1 to x_N
     assert (pressure >= 0).all()
-    np.testing.assert_allclose(pressure * (speed - 0.6), 0.0, atol=1e-7)
+    assert_allclose(pressure * (speed - 0.6), 0.0, atol=1e-7)
     # Derivatives of the Lagrangian by hand, from the dynamics' constant matrices.
     A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([DT**2 / 2, DT])
-    np.testing.assert_allclose(2 * DT * u[:, 0] + prices @ B, 0.0, atol=1e-6)
+    assert_allclose(2 * DT * u[:, 0] + prices @ B, 0.0, atol=1e-6)
     between = prices[1:] @ A - prices[:-1]
     between[:, 1] += pressure[:-1]
-    np.testing.assert_allclose(between, 0.0, atol=1e-6)
-
-
-def test_ipopt_reaches_the_same_plan():
-    ca = pytest.importorskip("casadi", reason="the reference is IPOPT by CasADi, of the extra [test]")
-    X, U = ca.SX.sym("x", 2, N + 1), ca.SX.sym("u", N)
-    after = ca.vertcat(X[0, :-1] + DT * X[1, :-1] + DT**2 / 2 * U.T, X[1, :-1] + DT * U.T)
-    g = ca.vertcat(ca.vec(after - X[:, 1:]), X[:, 0], X[:, N] - ca.DM([1, 0]), X[1, :].T - 0.6)
-    equal = 2 * N + 4
-    low = np.append(np.zeros(equal), np.full(N + 1, -np.inf))
-    quiet = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-    solver = ca.nlpsol("s", "ipopt", {"x": ca.vertcat(ca.vec(X), U), "f": DT * ca.sumsqr(U), "g": g}, quiet)
-    rival = solver(x0=0, lbg=low, ubg=np.zeros(equal + N + 1))
-    assert at_most().plan.cost == pytest.approx(float(rival["f"]), rel=1e-7)
-    np.testing.assert_allclose(np.asarray(rival["x"]).ravel()[-N:], at_most().plan.u[:, 0], atol=1e-4)
+    assert_allclose(between, 0.0, atol=1e-6)
 
 
 def test_a_soft_constraint_gives_way_where_its_price_is_low():
@@ -109,7 +97,7 @@ def test_limits_come_from_a_robot():
     problem = with_limits_of(BLOCK, SimpleNamespace(**limits))
     expected = {"lower": [-5.0], "upper": [6.0], "lower_x": [-1.0, -3.0], "upper_x": [2.0, 3.0]}
     for name, values in expected.items():
-        np.testing.assert_array_equal(getattr(problem, name), values)
+        assert_array_equal(getattr(problem, name), values)
 
 
 def test_a_start_outside_limits_and_crossed_limits_are_refused():

@@ -42,13 +42,12 @@ def test_ends_that_can_be_met_or_are_not_linear_are_not_refused():
 
 
 def test_contradictions_are_found_while_a_caller_traces():
-    def traced(start, place):
-        problem = BLOCK._replace(end=lambda x: x[:1] - place)
-        return lambda x=start: shoot(problem, x, np.zeros((3, 2)), np.zeros((2, 1)))
+    def traced(x, place):
+        return shoot(BLOCK._replace(end=lambda x: x[:1] - place), x, np.zeros((3, 2)), np.zeros((2, 1)))
 
     with one_line(r"misses zero by 0\.4"):
-        jax.eval_shape(traced(None, 1.0), np.zeros(2))
+        jax.eval_shape(lambda x: traced(x, 1.0), np.zeros(2))
     with one_line("state 0 starts at 1, above its upper limit"):
-        jax.eval_shape(traced(np.array([1.0, 0.0]), 0.0))
+        jax.eval_shape(lambda: traced(np.array([1.0, 0.0]), 0.0))
     # What is traced cannot be judged.
-    jax.eval_shape(lambda place: traced(np.zeros(2), place)(), 1.0)
+    jax.eval_shape(lambda place: traced(np.zeros(2), place), 1.0)

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from numpy.testing import assert_allclose
 
 from dln_jax.control import field_of, linearise
 from dln_jax.mechanics import closed_form
@@ -17,7 +18,7 @@ def test_forces_by_hand_are_those_of_the_energies():
     q, qd, qdd = jax.random.normal(jax.random.key(0), (3, 3))
     by_hand = closed_form.inverse_dynamics(SCENE.closed_form, q, qd, qdd)
     inverse = jax.jit(dynamics(SCENE.energies).inverse_dynamics)
-    np.testing.assert_allclose(inverse(q, qd, qdd), by_hand, rtol=1e-11)
+    assert_allclose(inverse(q, qd, qdd), by_hand, rtol=1e-11)
 
 
 def test_the_linearisation_is_that_of_the_paper():
@@ -28,5 +29,5 @@ def test_the_linearisation_is_that_of_the_paper():
     third = [0, k / (carried * l), g * (carried + pole) / (carried * l), *(2 * [b2 / (carried * l)]), -hinge]
     expected = [[0, k / m, 0, -b1 / m, 0, 0], second, third]
     found = linearise(FIELD, np.zeros(6), np.zeros(1))
-    np.testing.assert_allclose(found.A, np.vstack([np.eye(3, 6, 3), expected]), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(found.B[:, 0], [0, 0, 0, 1 / m, -1 / m, 0], rtol=1e-10, atol=1e-12)
+    assert_allclose(found.A, np.vstack([np.eye(3, 6, 3), expected]), rtol=1e-10, atol=1e-10)
+    assert_allclose(found.B[:, 0], [0, 0, 0, 1 / m, -1 / m, 0], rtol=1e-10, atol=1e-12)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from calls import one_line
+from numpy.testing import assert_allclose
 
 from dln_jax.control import TrajectoryProblem, feedback, first_plan, improve, mpc, prepare, shoot, worst_violation
 from dln_jax.control.real_time import BARRIER
@@ -55,7 +56,7 @@ def test_feedback_is_the_derivative_of_the_optimal_control():
     for axis in step * np.eye(2):
         ahead, behind = (improved(start + way, 1e-2).u[0] for way in (axis, -axis))
         moved = feedback(BLOCK, plan, start + axis) - feedback(BLOCK, plan, start - axis)
-        np.testing.assert_allclose(moved, ahead - behind, rtol=2e-2)
+        assert_allclose(moved, ahead - behind, rtol=2e-2)
 
 
 def test_a_loop_settles_within_its_constraints_in_spite_of_pushes():
@@ -121,7 +122,7 @@ def test_one_reading_that_is_not_finite_costs_one_command_in_c_too(tmp_path):
     for reading in (START / 2, START * np.nan, START / 2.2):
         got, expected = in_c(reading, *memory_in_c)._asdict(), in_jax(reading, *memory)
         for name, value in expected.items():
-            np.testing.assert_allclose(got[name], value, rtol=1e-9, atol=1e-12)
+            assert_allclose(got[name], value, rtol=1e-9, atol=1e-12)
             assert np.isfinite(value).all() == (name != "force" or np.isfinite(reading).all())
         memory, memory_in_c = (
             [answer[f"new_{name}"] for name in ("u", "x", "K", "damping")] for answer in (expected, got)
@@ -146,7 +147,7 @@ def test_knots_move_a_reference_and_constraints_that_depend_on_time():
     again = jax.jit(functools.partial(improve, first))
     for _ in range(25):
         plan = again(plan)
-    np.testing.assert_allclose(plan.x, solved.plan.x, atol=5e-2)
+    assert_allclose(plan.x, solved.plan.x, atol=5e-2)
     for k in range(40):
         assert k * DT >= 1.0 or x[0] < -0.49
         u, plan = act(x, plan, t[k : k + N + 2])

@@ -19,6 +19,7 @@ def rates(x, u):
 def controller():
     """For a pendulum of 1 kg m² whose motor holds it up to 0.42 rad from upright; the parameter is its strength."""
     regulator = lqr([[0, 1], [9.81, 0]], [[0], [1]], np.diag([10.0, 1.0]), np.eye(1))
+    K, S = np.asarray(regulator.K)[0], np.asarray(regulator.S)
     dt = EVERY / RATE
     step = integrated(rates, dt)
     cost = lambda x, u: dt * (2 * (1 - jnp.cos(x[0])) + 0.01 * x[1] ** 2 + 0.02 * u @ u)  # noqa: E731
@@ -31,7 +32,7 @@ def controller():
         jax.jit(jax.vmap(lambda u: first_plan(problem, UPRIGHT, u)))(guesses),
         lambda x, strength: near(x) / strength,
         lambda x, strength: to_go(x),
-        float(LIMIT**2 / (regulator.K @ np.linalg.solve(regulator.S, regulator.K.T)).item()),
+        LIMIT**2 / (K @ np.linalg.solve(S, K)),
         rate=RATE,
         every=EVERY,
         parameters=jnp.asarray(1.0),

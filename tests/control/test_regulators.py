@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control import lqr, sampled_lqr, time_varying_lqr
 from dln_jax.control.regulators import held
@@ -15,8 +16,8 @@ Q, R = np.eye(2), np.eye(1)
 
 def test_the_double_integrator_has_its_closed_form():
     found = lqr(A, B, Q, R)
-    np.testing.assert_allclose(found.K, [[1.0, np.sqrt(3)]], rtol=1e-12)
-    np.testing.assert_allclose(found.S, [[np.sqrt(3), 1.0], [1.0, np.sqrt(3)]], rtol=1e-12)
+    assert_allclose(found.K, [[1.0, np.sqrt(3)]], rtol=1e-12)
+    assert_allclose(found.S, [[np.sqrt(3), 1.0], [1.0, np.sqrt(3)]], rtol=1e-12)
 
 
 def test_a_long_recursion_comes_to_the_constant_regulator_and_fast_sampling_to_continuous_time():
@@ -24,9 +25,9 @@ def test_a_long_recursion_comes_to_the_constant_regulator_and_fast_sampling_to_c
     F, G = held(A, B, dt)
     found = time_varying_lqr(np.tile(F, (400, 1, 1)), np.tile(G, (400, 1, 1)), dt * Q, dt * R, np.zeros((2, 2)))
     constant = sampled_lqr(A, B, Q, R, dt)
-    np.testing.assert_allclose(found.K[0], constant.K, rtol=1e-10)
-    np.testing.assert_allclose(found.S[0], constant.S, rtol=1e-10)
-    np.testing.assert_allclose(sampled_lqr(A, B, Q, R, 1e-4).S, lqr(A, B, Q, R).S, rtol=1e-3)
+    assert_allclose(found.K[0], constant.K, rtol=1e-10)
+    assert_allclose(found.S[0], constant.S, rtol=1e-10)
+    assert_allclose(sampled_lqr(A, B, Q, R, 1e-4).S, lqr(A, B, Q, R).S, rtol=1e-3)
 
 
 def test_problems_without_a_regulator_are_refused():
@@ -77,9 +78,9 @@ def test_the_recursion_meets_the_conditions_of_an_optimum():
         unknowns = solution.dx, solution.du, solution.multipliers
         of_x, *others = jax.grad(lagrangian, argnums=(1, 2, 3))(program, *unknowns)
         fixed = np.ones(n, bool) if free is None else ~free
-        np.testing.assert_array_equal(solution.dx[0][fixed], 0.0)
+        assert_array_equal(solution.dx[0][fixed], 0.0)
         for slope in (of_x[0][~fixed], of_x[1:], *others):
-            np.testing.assert_allclose(slope, 0.0, atol=1e-8)
+            assert_allclose(slope, 0.0, atol=1e-8)
         assert solution.convex and not least_cost(horizon(-1.0), free).convex
 
 
@@ -89,4 +90,4 @@ def test_a_regulator_that_varies_in_time_has_the_gains_of_the_recursion():
     weights = np.tile(np.diag([1.0] * n + [0.5] * m), (N, 1, 1))
     program = Horizon(slopes, *still, weights, np.zeros(n), end)
     found = time_varying_lqr(slopes[..., :n], slopes[..., n:], np.eye(n), 0.5 * np.eye(m), end)
-    np.testing.assert_allclose(found.K, -least_cost(program).K, rtol=1e-10, atol=1e-12)
+    assert_allclose(found.K, -least_cost(program).K, rtol=1e-10, atol=1e-12)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control.closed_loop import outcomes
 from dln_jax.control.desktop_plants import desktop_plant, law_of, model_of_plant, nominal_model, try_starts
@@ -38,7 +39,7 @@ def test_the_model_s_own_equilibrium_is_found():
     tilted = with_potential(lambda q: 1e-3 * q[1])
     weight = PLANT.sizes["pole_mass"] * 9.81 * PLANT.sizes["pole_length"] / 2
     home = nearest_equilibrium(tilted, np.zeros(2), (1,))
-    np.testing.assert_allclose(home, [0.0, np.arcsin(1e-3 / weight)], atol=1e-10)
+    assert_allclose(home, [0.0, np.arcsin(1e-3 / weight)], atol=1e-10)
 
 
 def test_models_that_cannot_be_used_are_refused():
@@ -59,7 +60,7 @@ def test_models_that_cannot_be_used_are_refused():
 def test_runs_that_are_not_finite_are_failures_and_counted():
     angle = np.array([[3.1, 0.2, 0.05, 0.05], [3.1, 0.05, np.nan, np.nan], [0.0, 0.0, 0.0, 0.0], [3.1, 0.0, 0.0, 0.3]])
     found = outcomes(angle, rate=10.0)
-    np.testing.assert_allclose(found.seconds, [0.2, np.inf, 0.0, np.inf])
-    np.testing.assert_array_equal(found.failed, [False, True, False, False])
+    assert_allclose(found.seconds, [0.2, np.inf, 0.0, np.inf])
+    assert_array_equal(found.failed, [False, True, False, False])
     assert found.share == 0.5 and found.worst == 0.2
     assert outcomes(angle + 2 * np.pi, rate=10.0).share == 0.5

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.testing import assert_allclose
 
 from dln_jax.control import (
     Gains,
@@ -41,14 +42,14 @@ def test_computed_torque_makes_errors_decay_linearly_and_feed_forward_stays_on_t
     # Both joints are critically damped: e = (1 + w t) exp(-w t) e0.
     off, w = np.array([0.3, -0.2]), np.sqrt(P)
     expected = off * (1 + w * T[:, None]) * np.exp(-w * T[:, None])
-    np.testing.assert_allclose(errors(computed_torque(ARM, Gains(P, D)), off), expected, atol=1e-8)
+    assert_allclose(errors(computed_torque(ARM, Gains(P, D)), off), expected, atol=1e-8)
     assert np.abs(errors(feed_forward(ARM, Gains(np.diag(P), np.diag(D))), 0.0)).max() < 1e-8
 
 
 def test_gravity_is_held_at_rest():
     rest = jnp.zeros(2)
     tau = gravity_compensation(ARM, Gains(P, D))(Q, rest, Reference(Q, rest, rest))
-    np.testing.assert_allclose(ARM.forward_dynamics(Q, rest, tau), 0.0, atol=1e-12)
+    assert_allclose(ARM.forward_dynamics(Q, rest, tau), 0.0, atol=1e-12)
 
 
 def test_an_indefinite_or_unknown_state_falls_back():
@@ -58,7 +59,7 @@ def test_an_indefinite_or_unknown_state_falls_back():
     for plant, outside, expected in ((ARM, False, first), (ARM, True, other), (bad, False, other)):
         unknown = lambda q, qd, qdd, flag=outside: jnp.asarray(flag)  # noqa: E731
         tau, usable = jax.jit(trusted(plant, first, other, out_of_distribution=unknown))(Q, wanted.qd, wanted)
-        np.testing.assert_allclose(tau, expected(Q, wanted.qd, wanted), rtol=1e-12)
+        assert_allclose(tau, expected(Q, wanted.qd, wanted), rtol=1e-12)
         assert bool(usable) == (expected is first)
     assert not trusted(ARM, first, other, usable=False)(Q, wanted.qd, wanted)[1]
 
@@ -79,7 +80,7 @@ def test_a_model_is_judged_by_motions_that_it_has_not_seen():
     )
     assert good.usable and np.all(good.nmse < 1e-20) and good.definite == 1 and good.line.endswith("the model is used")
     share = 0.25 * np.mean(tau**2, axis=0) / np.var(tau, axis=0)
-    np.testing.assert_allclose(heavy.nmse, share, rtol=1e-10)
+    assert_allclose(heavy.nmse, share, rtol=1e-10)
     assert not heavy.usable and f"joint {np.argmax(share) + 1}'s" in heavy.line
     assert not lost.usable
     assert not hollow.usable and "not positive definite in 100.0%" in hollow.line

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose
 
 import dln_jax
 from dln_jax.control import field_of, stateless
@@ -60,11 +61,11 @@ def test_late_and_rare_measurements_give_the_estimates_of_a_filter_that_knows_th
         seen = every.copy()
         seen[k] = False
         seen[k - 2 : k, 1] = False
-        np.testing.assert_allclose(delayed[k], direct(seen)[k], rtol=0, atol=1e-12)
+        assert_allclose(delayed[k], direct(seen)[k], rtol=0, atol=1e-12)
     assert np.abs(delayed - direct(every)).max() > 1e-4
     rare, _ = replayed(estimating(IDLE, every=(1, 4)), y)
     every[:, 1] = np.arange(len(y)) % 4 == 0
-    np.testing.assert_allclose(rare, direct(every), rtol=0, atol=1e-12)
+    assert_allclose(rare, direct(every), rtol=0, atol=1e-12)
 
 
 def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effect():
@@ -102,7 +103,7 @@ def test_filters_use_the_times_of_samples_and_of_controls():
         timed, untimed = (estimating(law, sharp, start, **settings, **more) for more in ({"rate": 100.0}, {}))
         known, ignored = (np.abs(replayed(one, y, t)[0] - x)[:, 2:].max(axis=0) for one in (timed, untimed))
         assert (known < 0.25 * ignored).all()
-        np.testing.assert_allclose(replayed(timed, y)[0], replayed(untimed, y)[0], rtol=0, atol=1e-9)
+        assert_allclose(replayed(timed, y)[0], replayed(untimed, y)[0], rtol=0, atol=1e-9)
 
 
 def test_a_failed_measurement_is_not_hidden():
@@ -130,14 +131,14 @@ def test_a_controller_with_an_unscented_filter_and_late_measurements_is_the_same
         memory, u = controller.act(jax.tree.unflatten(tree, memory), t, y)
         return {"u": u, **{f"after_{number}": leaf for number, leaf in enumerate(jax.tree.leaves(memory))}}
 
-    examples = (np.zeros(()), np.zeros(2), *map(np.asarray, leaves))
-    export_c({"act": (act, examples)}, tmp_path, finite=True, loop_bound=30)
-    assert stated_costs(tmp_path)["act"].unbounded_loops == 0
-    in_c, in_jax = load_c(tmp_path, flags=("-O1",)), jax.jit(act)
     memory = memory_in_c = [np.asarray(leaf) for leaf in leaves]
+    export_c({"act": (act, (np.zeros(()), np.zeros(2), *memory))}, tmp_path, finite=True, loop_bound=30)
+    assert stated_costs(tmp_path)["act"].unbounded_loops == 0
+    in_c, in_jax = load_c(tmp_path, flags=("-O1",)).act, jax.jit(act)
     for number, y in enumerate(np.asarray(measurements(12))):
         t = np.asarray(0.01 * number + 0.002 * (number % 3))
-        expected, got = in_jax(t, y, *memory), in_c.act(t, y, *memory_in_c)
-        np.testing.assert_allclose(got.u, expected["u"], rtol=1e-9, atol=1e-12)
-        memory = [np.asarray(expected[f"after_{number}"]) for number in range(len(leaves))]
-        memory_in_c = [np.asarray(getattr(got, f"after_{number}")) for number in range(len(leaves))]
+        expected, got = in_jax(t, y, *memory), in_c(t, y, *memory_in_c)._asdict()
+        assert_allclose(got["u"], expected["u"], rtol=1e-9, atol=1e-12)
+        memory, memory_in_c = (
+            [np.asarray(answer[f"after_{number}"]) for number in range(len(leaves))] for answer in (expected, got)
+        )

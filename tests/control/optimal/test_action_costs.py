@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose
 
 from dln_jax.control.optimal.action_costs import (
     atan,
@@ -54,10 +55,10 @@ def test_conjugate_is_the_most_that_any_control_gains_and_the_policy_is_its_slop
             gains = W[:, None] * u - costs
             best = u[np.arange(len(W)), np.argmax(gains, axis=1)]
             u = best[:, None] + (u[:, 1:2] - u[:, :1]) * np.linspace(-1, 1, 2001)
-        np.testing.assert_allclose(conjugate, np.max(gains, axis=1), rtol=1e-6, atol=1e-6, err_msg=name)
+        assert_allclose(conjugate, np.max(gains, axis=1), rtol=1e-6, atol=1e-6, err_msg=name)
         gained = W * policy[:, 0] - known(W, np.tile(policy, 2001))[3][:, 0]
-        np.testing.assert_allclose(gained, conjugate, rtol=1e-12, atol=1e-12, err_msg=name)
-        np.testing.assert_allclose(slope, policy, rtol=1e-12, err_msg=name)
+        assert_allclose(gained, conjugate, rtol=1e-12, atol=1e-12, err_msg=name)
+        assert_allclose(slope, policy, rtol=1e-12, err_msg=name)
         beyond = np.resize([least - 0.1, most + 0.1, np.nan], u.shape)
         *of_nan, costs = known(W * np.nan, beyond)
         assert all(np.isnan(values).all() for values in of_nan) and np.isnan(costs[:, 2]).all(), name
@@ -66,13 +67,13 @@ def test_conjugate_is_the_most_that_any_control_gains_and_the_policy_is_its_slop
 
 def test_several_controls_and_a_matrix():
     R, w = np.array([[2.0, 0.5], [0.5, 1.0]]), jnp.array([0.7, -40.0])
-    np.testing.assert_allclose(R @ quadratic(R).policy(w), w, rtol=1e-14)
+    assert_allclose(R @ quadratic(R).policy(w), w, rtol=1e-14)
     # Motors of different strength have a conjugate each.
     for cost in (quadratic(R), tanh, stretched(limited_atan(1.0, 3.0), [2.0, 0.1])):
         u = cost.policy(w)
         assert cost.cost(u) + cost.conjugate(w) == pytest.approx(float(w @ u), rel=1e-9)
     assert abs(float(u[0])) < 2 and abs(float(u[1])) < 0.1
-    np.testing.assert_allclose(jax.grad(cost.cost)(u), w, rtol=1e-6)
+    assert_allclose(jax.grad(cost.cost)(u), w, rtol=1e-6)
 
 
 def test_the_curvature_of_the_limited_atan():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
@@ -56,8 +56,8 @@ def test_targets_are_weighted_returns_and_their_slopes():
     for memory in (0.05, 1e9):
         assert found(memory).V[0] == pytest.approx(float(expected(x, memory)[0]), rel=1e-12)
     # With all of the memory the slope is that of the return.
-    np.testing.assert_allclose(found(1e9).slope[0], expected(x, 1e9)[1], rtol=1e-7)
-    np.testing.assert_allclose(found(0.05).x[0], x)
+    assert_allclose(found(1e9).slope[0], expected(x, 1e9)[1], rtol=1e-7)
+    assert_allclose(found(0.05).x[0], x)
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_seeds_are_what_each_is_alone_also_after_an_interruption():
     both = fit_values(LINE, network, (0, 1), numbers=numbers, store=lambda seed, state: stored.append((seed, state)))
     first = next(state for seed, state in stored if seed == 1)
     (alone,) = fit_values(LINE, network, (1,), numbers=numbers, restore=lambda seed, state: first)
-    jax.tree.map(np.testing.assert_array_equal, both[1].parameters, alone.parameters)
+    jax.tree.map(assert_array_equal, both[1].parameters, alone.parameters)
     assert [at.validation for at in both[1].history] == [at.validation for at in alone.history]
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(alone.parameters))
 
@@ -91,8 +91,3 @@ def test_states_are_drawn_from_the_wide_box():
     wide = widened(PENDULUM, 1.25)
     x = drawn(wide, jax.random.key(0), 500)
     assert wide.high.tolist() == [np.pi, 10.0] and np.abs(x[:, 1]).max() > 9 and np.abs(x[:, 0]).max() <= np.pi
-
-
-def test_time_step_of_zero_is_refused():
-    with one_line("dt"):
-        fit_value(LINE, value_network(LINE, widths=()), numbers=Iteration(dt=0.0))

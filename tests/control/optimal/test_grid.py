@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose
 
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
@@ -37,14 +38,14 @@ def test_the_value_of_a_linear_plant():
     assert coarse.converged and found.converged
     x = np.random.default_rng(0).uniform(-1, 1, (50, 2))
     exact = np.einsum("ni,ij,nj->n", x, S, x)
-    np.testing.assert_allclose(extrapolated(coarse, found, x), exact, atol=5e-3 * exact.max())
+    assert_allclose(extrapolated(coarse, found, x), exact, atol=5e-3 * exact.max())
     errors = [np.max(np.abs(interpolated(each.grid, each.V, x) - exact)) for each in (coarse, found)]
     assert errors[1] < errors[0] / 2.5  # h² halves twice; the goal's own cell converges more slowly
     u = -(x @ S @ B)[:, 0]
     # Held for a step, a control is best for the middle of it.
     law = jax.vmap(lookahead(LINEAR, found, limit=8.0))
     for control in (interpolated(found.grid, found.u, x), law(x)[:, 0]):
-        np.testing.assert_allclose(control, u, atol=0.05 * np.abs(u).max())
+        assert_allclose(control, u, atol=0.05 * np.abs(u).max())
 
 
 GRID = Grid((-np.pi, 0.0), (2 * np.pi / 40, 0.25), (40, 9), (True, False))
@@ -54,7 +55,7 @@ def test_interpolation_is_cubic_goes_round_and_does_not_overshoot():
     nodes = GRID.nodes
     x = np.random.default_rng(1).uniform([-9, 0], [9, 2], (200, 2))
     smooth = lambda x: np.cos(x[..., 0]) + x[..., 1] ** 3 + 10 * x[..., 1]  # noqa: E731
-    np.testing.assert_allclose(interpolated(GRID, jnp.asarray(smooth(nodes)), x), smooth(x), atol=5e-3)
+    assert_allclose(interpolated(GRID, jnp.asarray(smooth(nodes)), x), smooth(x), atol=5e-3)
     values = interpolated(GRID, jnp.asarray((nodes[..., 1] > 0.9).astype(float)), x)
     assert values.min() >= 0 and values.max() <= 1
 
@@ -63,10 +64,10 @@ def test_linear_interpolation_is_monotone_and_its_slopes_are_one_sided():
     at = linear(GRID, jnp.asarray(np.random.default_rng(2).uniform([-9, -1], [9, 3], (200, 2))))
     for weights in (at.row_weights, at.column_weights):
         assert weights.min() >= 0
-        np.testing.assert_allclose(weights.sum(axis=0), 1, rtol=1e-12)
+        assert_allclose(weights.sum(axis=0), 1, rtol=1e-12)
     plane = jnp.asarray(3 * GRID.nodes[..., 1])
-    np.testing.assert_allclose(one_sided_slopes(GRID, plane, 1), 3, rtol=1e-12)
-    np.testing.assert_allclose(read(plane, linear(GRID, jnp.array([[2 * np.pi + 0.1, 0.6]]))), [1.8], rtol=1e-12)
+    assert_allclose(one_sided_slopes(GRID, plane, 1), 3, rtol=1e-12)
+    assert_allclose(read(plane, linear(GRID, jnp.array([[2 * np.pi + 0.1, 0.6]]))), [1.8], rtol=1e-12)
     jump = jnp.asarray(np.where(np.arange(40) < 20, 0.0, 1.0))[:, None] * jnp.ones(9)
     before, after = one_sided_slopes(GRID, jump, 0)
     assert before[0, 0] < 0 < after[19, 0]  # across the seam of the circle, and at the jump
@@ -103,7 +104,7 @@ def test_a_step_and_its_cost():
     after, cost = flow(LINEAR, 0.1, substeps=2)(x, u)
     half, first = flow(LINEAR, 0.05)(x, u)
     again, second = flow(LINEAR, 0.05)(half, u)
-    np.testing.assert_allclose(after, again, rtol=1e-12)
+    assert_allclose(after, again, rtol=1e-12)
     assert cost == pytest.approx(float(first + np.exp(-0.3 * 0.05) * second), rel=1e-8)
     held, _ = flow(LINEAR, 0.1, clipped=True)(jnp.array([0.999, 1.0]), u)
     assert held[0] == 1.0

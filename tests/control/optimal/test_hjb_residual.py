@@ -47,11 +47,6 @@ def test_a_network_has_the_value_of_limited_controls():
         assert found[0] == pytest.approx(slope(x), rel=5e-3)
 
 
-def test_discounts_come_down():
-    found = discounts_down_to(0.2, first=8.0, ratio=0.5, last=1.0)
-    np.testing.assert_allclose(found, [8.2, 4.2, 2.2, 1.2, 0.2])
-
-
 def test_problems_that_cannot_be_fitted_are_refused():
     for change, message in (
         ({"discounts": [3.0]}, "ends with the problem's, 0.0"),

@@ -1,17 +1,13 @@
 """The problem of one's own plant has the plant's scales, and its iterations go on as if they had never stopped."""
 
-import dataclasses
-import json
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.control.optimal.own_plants import OwnProblem, own_plant, own_problem, own_settings
+from dln_jax.control.optimal.own_plants import own_plant, own_problem, own_settings
 from dln_jax.control.optimal.plants import evaluate, starts
 from dln_jax.control.plants import layout
-from dln_jax.files import as_type
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole
@@ -94,9 +90,3 @@ def test_weights_and_efforts_out_of_range_are_refused():
             own_problem(rod(), driven(), **wishes)
     with one_line("the limits are"):
         own_problem(rod(), driven(1.2))  # the weight is more than the motor
-
-
-def test_numbers_rebuild_a_problem_from_json():
-    numbers = own_problem(dynamics(POLE.closed_form), RAIL)
-    again = as_type(json.loads(json.dumps(dataclasses.asdict(numbers))), OwnProblem, name="value.json", remedy="")
-    assert again == numbers

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose
 
 from dln_jax.control import field_of
 from dln_jax.control.optimal.action_costs import quadratic, scaled, tanh
@@ -43,11 +44,11 @@ def test_values_are_zero_at_the_goal_periodic_and_have_the_gradient_of_autodiff(
 
         (value, slope), expected, each = known(X)
         assert value > 0
-        np.testing.assert_allclose(slope, expected, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(np.mean(each[1], axis=0), slope, rtol=1e-12)
+        assert_allclose(slope, expected, rtol=1e-12, atol=1e-12)
+        assert_allclose(np.mean(each[1], axis=0), slope, rtol=1e-12)
         at_goal = known(jnp.zeros(4))[0]
         assert at_goal[0] == 0 and not np.any(at_goal[1])
-        np.testing.assert_allclose(known(X.at[1].add(2 * np.pi))[0][1], slope, rtol=1e-9)
+        assert_allclose(known(X.at[1].add(2 * np.pi))[0][1], slope, rtol=1e-9)
 
 
 def test_the_law_of_a_value_keeps_its_limits_and_has_no_control_where_the_state_is_not_finite():
@@ -57,7 +58,7 @@ def test_the_law_of_a_value_keeps_its_limits_and_has_no_control_where_the_state_
     law = jax.jit(hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem))
     x = HIGH * np.random.default_rng(0).uniform(-1, 1, (50, 4))
     assert 1.0 < np.abs(jax.vmap(law)(x)).max() < 6
-    np.testing.assert_allclose(law(jnp.zeros(4)), 0, atol=1e-12)
+    assert_allclose(law(jnp.zeros(4)), 0, atol=1e-12)
     for bad in np.where(np.eye(4), np.array([np.nan, np.inf, np.nan, -np.inf]), 0.1):
         assert np.isnan(law(bad)).all()
 
@@ -66,7 +67,7 @@ def test_drift_and_actuation_are_those_of_the_plant():
     plant, B, x, u = dynamics(pendulum(friction=0.1).energies), np.array([[2.0]]), X[1:3], jnp.array([2.0])
     a, of = from_plant(plant, B)
     ours, theirs = jax.jit(lambda x, u: (a(x) + of(x) @ u, field_of(plant, B)(x, u)))(x, u)
-    np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+    assert_allclose(ours, theirs, rtol=1e-12)
 
 
 def test_the_equation_is_the_least_over_controls():
@@ -78,7 +79,7 @@ def test_the_equation_is_the_least_over_controls():
 
     u = optimal_control(PROBLEM, X, slope)
     assert hamiltonian(u) == pytest.approx(float(hjb_residual(PROBLEM, X, value, slope)))
-    np.testing.assert_allclose(jax.grad(hamiltonian)(u), 0, atol=1e-12)
+    assert_allclose(jax.grad(hamiltonian)(u), 0, atol=1e-12)
 
 
 def test_another_goal_is_held_by_a_control():
@@ -89,7 +90,7 @@ def test_another_goal_is_held_by_a_control():
     rod = ControlProblem(drift, actuation, lambda x: x @ x, push, 0.0, *box, ("revolute",), np.zeros(2))
     aside = at_goal(rod, [0.4, 0.0])
     held = optimal_control(aside, jnp.asarray(aside.goal), jnp.zeros(2))
-    np.testing.assert_allclose(held, -weight * np.sin(0.4), rtol=1e-12)
+    assert_allclose(held, -weight * np.sin(0.4), rtol=1e-12)
     for problem, goal, message in (
         (rod._replace(action_cost=scaled(tanh, 0.5)), [0.4, 0.0], "limits cannot hold the goal"),
         (rod, [0.4, 1.0], "not an equilibrium"),

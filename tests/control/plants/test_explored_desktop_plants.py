@@ -59,5 +59,3 @@ def test_noise_has_unit_variance_below_its_bandwidth():
 def test_settings_out_of_range_are_refused():
     with one_line("seconds is -1"):
         explore(simulated_plant(PLANT), unused, BLIND._replace(seconds=-1.0))
-    with one_line("choose from cart-pole, rotary-pendulum, furuta"):
-        desktop_plant("dance")

@@ -5,6 +5,7 @@ import gc
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control import Controller, Push
 from dln_jax.control.plants import Plant, Stopped, guarded, hardware_plant, layout
@@ -67,7 +68,7 @@ def test_wrong_answer_stops_the_plant_with_zero_controls_until_it_is_reset():
         for again in (safe.read, lambda safe=safe: safe.act([1.0])):
             with pytest.raises(Stopped, match=reason):
                 again()
-        np.testing.assert_array_equal(np.ravel(puppet.commands), [1.0, 0.0])
+        assert_array_equal(np.ravel(puppet.commands), [1.0, 0.0])
         puppet.q, puppet.t = np.zeros(2), 0.0
         safe.reset()
         safe.act([1.0])
@@ -93,7 +94,7 @@ def test_controls_beyond_the_motor_stop_the_plant():
         puppet = Puppet()
         with pytest.raises(Stopped, match=reason):
             puppet.guarded().act(u)
-        np.testing.assert_array_equal(puppet.commands, [[0.0]])
+        assert_array_equal(puppet.commands, [[0.0]])
 
 
 def test_wrapped_angles_become_continuous():
@@ -154,7 +155,7 @@ def test_run_is_up_if_it_is_near_the_goal_for_the_last_second_without_a_stop():
     late = np.where(t[:, None] < 4.5, 0.0, y)
     runs = [PlantRun(t, y, t), PlantRun(t, y, t, "rail"), PlantRun(t, late, t), PlantRun(t, np.nan * y, t)]
     trials = judged_runs(runs, described(), seconds=5.0)
-    np.testing.assert_array_equal(trials.up, [True, False, False, False])
+    assert_array_equal(trials.up, [True, False, False, False])
     assert trials.seconds[0] == pytest.approx(2.0) and trials.stopped == ("rail",)
 
 
@@ -167,7 +168,7 @@ def test_push_reaches_the_plant_at_its_sample():
     run([kicked], act, start_of(still, 1), **settings)
     ((t, rates),) = kicks
     assert t == pytest.approx(0.05)
-    np.testing.assert_array_equal(rates, [0.0, 3.0])
+    assert_array_equal(rates, [0.0, 3.0])
     with one_line("no kick"):
         run([puppet.bare()], act, start_of(still, 1), **settings)
 
@@ -194,7 +195,7 @@ def test_an_interrupt_leaves_the_motors_at_zero():
 
     with pytest.raises(KeyboardInterrupt):
         run([puppet.bare()], act, np.zeros(1), seconds=1.0)
-    np.testing.assert_array_equal(np.ravel(puppet.commands), [1.0, 1.0, 1.0, 0.0])
+    assert_array_equal(np.ravel(puppet.commands), [1.0, 1.0, 1.0, 0.0])
 
 
 def test_run_states_the_times_of_the_answers_and_restores_garbage_collection():
@@ -208,5 +209,5 @@ def test_run_states_the_times_of_the_answers_and_restores_garbage_collection():
 
     zero = lambda memory, t, y: (memory, np.zeros((1, 1)))  # noqa: E731
     (result,) = run([puppet.bare()._replace(act=act)], zero, np.zeros(1), seconds=0.05)
-    np.testing.assert_allclose(result.t, 0.01 * np.arange(5) + late, atol=1e-12)
+    assert_allclose(result.t, 0.01 * np.arange(5) + late, atol=1e-12)
     assert gc.get_freeze_count() == 0

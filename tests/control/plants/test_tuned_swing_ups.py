@@ -5,9 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose
 
 from dln_jax.control.closed_loop import Hardware, Push, stateless
-from dln_jax.control.plants import compiled, judged_runs, layout, plant_of, run, start_of, tune
+from dln_jax.control.plants import Exploration, compiled, explore, judged_runs, layout, plant_of, run, start_of, tune
+from dln_jax.control.plants.exploring import NEAR
+from dln_jax.control.plants.runs import distances
 from dln_jax.control.plants.scales import USUAL, circle, scales_of, swing_up_numbers
 from dln_jax.control.plants.tuning import trial_of
 from dln_jax.control.swing_up import upright_of
@@ -41,7 +44,7 @@ def test_scales_of_a_cart_pole_have_closed_forms():
     assert scales.speed == pytest.approx(2 * np.sqrt(g / l), rel=1e-6)
     assert scales.coupling == pytest.approx(m * l)
     assert scales.acceleration == pytest.approx(8.0 / SIZES["cart_mass"])
-    np.testing.assert_allclose(scales.sizes, [l, 1.0])
+    assert_allclose(scales.sizes, [l, 1.0])
     with one_line("do not fall from the goal"):
         scaled(plant._replace(goal=plant.hanging, hanging=plant.goal))
 
@@ -52,11 +55,11 @@ def test_similar_plants_get_the_same_law_in_their_own_units():
     one, first = swing_up_numbers(scaled(rail())[0], rail(), scaled(rail())[1], USUAL)
     upright, scales = scaled(large, cart_mass=1.8, pole_mass=0.45)
     other, second = swing_up_numbers(upright, large, scales, USUAL)
-    np.testing.assert_allclose(second.K, 3 * np.asarray(first.K), rtol=1e-6)
+    assert_allclose(second.K, 3 * np.asarray(first.K), rtol=1e-6)
     assert other.level == pytest.approx(one.level, rel=1e-6) and other.kick == pytest.approx(3 * one.kick)
     # k E M_ap qd_p is an acceleration, where E and M_ap grow by 3 each.
     assert other.gains.energy == pytest.approx(one.gains.energy / 9, rel=1e-6)
-    np.testing.assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
+    assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
 
 
 def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_limit():
@@ -79,6 +82,15 @@ def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up_again_after_a_p
     runs = run(plants, act, start_of(tuned.controller, 4), seconds=12.0, push=Push(6.0, [0.0, 12.0]))
     trials = judged_runs(runs, plant, seconds=12.0)
     assert trials.up.all() and not trials.stopped and trials.seconds.min() > 6.0
+
+
+@pytest.mark.slow
+def test_episodes_of_an_exploration_follow_a_plan_where_none_came_near_the_goal():
+    plant, low = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4)), (-0.9, -0.9, -0.9, -0.9)
+    recording = explore(plant, lambda _: model(), Exploration(seconds=15.0, surplus=low)).recording
+    near = [distances(recording.q[recording.trajectory == k], rail()).min() < NEAR for k in range(6)]
+    assert near == [False] * 4 + [True] * 2
+    assert np.abs(recording.tau[:, 0]).max() <= Exploration().share * 8.0 + 1e-12
 
 
 def trial(law, plant, hardware, late=0.0):
