@@ -72,16 +72,17 @@ def lagrangian(program, dx, du, multipliers):
 
 
 def test_the_recursion_meets_the_conditions_of_an_optimum():
-    program = horizon()
+    program, slopes = horizon(), jax.jit(jax.grad(lagrangian, argnums=(1, 2, 3)))
     for free in (None, FREE):
-        solution = jax.jit(lambda program, free=free: least_cost(program, free))(program)
+        solve = jax.jit(lambda program, free=free: least_cost(program, free))
+        solution = solve(program)
         unknowns = solution.dx, solution.du, solution.multipliers
-        of_x, *others = jax.grad(lagrangian, argnums=(1, 2, 3))(program, *unknowns)
+        of_x, *others = slopes(program, *unknowns)
         fixed = np.ones(n, bool) if free is None else ~free
         assert_array_equal(solution.dx[0][fixed], 0.0)
         for slope in (of_x[0][~fixed], of_x[1:], *others):
             assert_allclose(slope, 0.0, atol=1e-8)
-        assert solution.convex and not least_cost(horizon(-1.0), free).convex
+        assert solution.convex and not solve(horizon(-1.0)).convex
 
 
 def test_a_regulator_that_varies_in_time_has_the_gains_of_the_recursion():
@@ -90,4 +91,4 @@ def test_a_regulator_that_varies_in_time_has_the_gains_of_the_recursion():
     weights = np.tile(np.diag([1.0] * n + [0.5] * m), (N, 1, 1))
     program = Horizon(slopes, *still, weights, np.zeros(n), end)
     found = time_varying_lqr(slopes[..., :n], slopes[..., n:], np.eye(n), 0.5 * np.eye(m), end)
-    assert_allclose(found.K, -least_cost(program).K, rtol=1e-10, atol=1e-12)
+    assert_allclose(found.K, -jax.jit(least_cost)(program).K, rtol=1e-10, atol=1e-12)

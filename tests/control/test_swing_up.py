@@ -32,7 +32,7 @@ def test_active_joints_get_the_acceleration_they_are_asked_for_and_do_its_work_o
         (cart_pole(friction=0.05), False),
         (two_link_pendulum("elbow"), False),
     ):
-        plant, B = dynamics(scene.energies), np.asarray(scene.needs.actuation)
+        plant, B = dynamics(scene.closed_form), np.asarray(scene.needs.actuation)
         parts = parts_of(B)
         energy = passive_energy(plant, parts, jnp.zeros(2))
         q, qd, a = jnp.array([0.4, 1.1]), jnp.array([0.0, 2.0]), jnp.array([3.0])
@@ -63,7 +63,7 @@ def test_the_region_of_attraction_is_that_of_the_unstable_mode():
 
 def test_postures_that_cannot_be_held_and_plants_without_energy_are_refused():
     scene = cart_pole()
-    plant, B = dynamics(scene.energies), scene.needs.actuation
+    plant, B = dynamics(scene.closed_form), scene.needs.actuation
     plain = PlainDynamics(plant.inverse_dynamics, plant.forward_dynamics, plant.decompose)
     for make, message in (
         (lambda: holding_controls(plant, [0.0, 0.3], B), "no controls hold the posture"),

@@ -34,7 +34,7 @@ def errors(law, off):
     """Errors of the coordinates along the closed loop, from a start that deviates by `off`."""
     field = second_order(lambda t, q, qd: ARM.forward_dynamics(q, qd, law(q, qd, reference(t))))
     start = reference(0.0)
-    q, _ = rollout(runge_kutta(CLASSICAL, field), (start.q + off, start.qd), T)
+    q, _ = jax.jit(lambda start: rollout(runge_kutta(CLASSICAL, field), start, T))((start.q + off, start.qd))
     return q - jax.vmap(lambda t: reference(t).q)(T)
 
 
@@ -66,7 +66,7 @@ def test_an_indefinite_or_unknown_state_falls_back():
 
 def test_a_model_is_judged_by_motions_that_it_has_not_seen():
     x = np.random.default_rng(0).normal(size=(3, 50, 2))
-    tau = np.asarray(jax.vmap(ARM.inverse_dynamics)(*map(jnp.asarray, x)))
+    tau = np.asarray(jax.jit(jax.vmap(ARM.inverse_dynamics))(*map(jnp.asarray, x)))
     columns = {"q": x[0], "qd": x[1], "qdd": x[2], "tau": tau}
     unseen = from_arrays({"t": 0.01 * np.arange(50), **columns, "trajectory": np.zeros(50, int)})
     good, heavy, lost, hollow = (

@@ -60,8 +60,8 @@ def test_conjugate_is_the_most_that_any_control_gains_and_the_policy_is_its_slop
         assert_allclose(gained, conjugate, rtol=1e-12, atol=1e-12, err_msg=name)
         assert_allclose(slope, policy, rtol=1e-12, err_msg=name)
         beyond = np.resize([least - 0.1, most + 0.1, np.nan], u.shape)
-        *of_nan, costs = known(W * np.nan, beyond)
-        assert all(np.isnan(values).all() for values in of_nan) and np.isnan(costs[:, 2]).all(), name
+        conjugate, policy, _, costs = known(W * np.nan, beyond)
+        assert np.isnan(conjugate).all() and np.isnan(policy).all() and np.isnan(costs[:, 2]).all(), name
         assert name == "quadratic" or (np.isinf(costs[:, 0]).all() and np.isinf(costs[:, 1]).all()), name
 
 

@@ -57,7 +57,7 @@ def test_the_law_of_a_value_keeps_its_limits_and_has_no_control_where_the_state_
     parameters = network.init(jax.random.key(0))
     law = jax.jit(hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem))
     x = HIGH * np.random.default_rng(0).uniform(-1, 1, (50, 4))
-    assert 1.0 < np.abs(jax.vmap(law)(x)).max() < 6
+    assert 1.0 < np.abs(jax.vmap(law)(x)).max() <= 6
     assert_allclose(law(jnp.zeros(4)), 0, atol=1e-12)
     for bad in np.where(np.eye(4), np.array([np.nan, np.inf, np.nan, -np.inf]), 0.1):
         assert np.isnan(law(bad)).all()
