@@ -18,7 +18,6 @@ from dln_jax.control import (
     following,
     simulate,
     stateless,
-    with_differences,
 )
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import pendulum
@@ -49,15 +48,6 @@ def test_a_push_adds_to_the_rates_once():
 def test_controls_are_limited_and_delayed():
     run = simulated(COUNTING, hardware=Hardware(upper=5.0, delay=3))
     assert_array_equal(run.u[:, 0], np.clip(np.arange(20) - 2, 0, 5))
-
-
-def test_encoders_round_and_rates_come_from_differences():
-    seen = with_differences(lambda x: x[1:], 1, rate=100.0, cutoff=1e6)
-    lab = Hardware(encoder_step=1e-3, sees_rates=False)
-    coasting = simulated(seen, [0.0, 0.37], lambda x, u: jnp.array([x[1], 0.0]), hardware=lab)
-    assert coasting.y.shape == (20, 1)
-    assert_allclose(coasting.y / 1e-3, np.round(coasting.y / 1e-3), atol=1e-9)
-    assert coasting.u[0, 0] == 0 and np.abs(coasting.u[1:, 0] - 0.37).max() <= 0.1 + 1e-9
 
 
 def test_noise_has_its_size_and_its_seed():

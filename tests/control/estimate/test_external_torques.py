@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from calls import one_line
 from numpy.testing import assert_allclose
+from planar_arm import LINKS
 
 import dln_jax
 from dln_jax.control import field_of, integrated
@@ -29,10 +30,7 @@ def arm(d):
     random = np.random.default_rng(0)
     rotations = [np.linalg.qr(random.normal(size=(3, 3)))[0] for _ in range(d)]
     rotations = np.stack([R * np.sign(np.linalg.det(R)) for R in rotations])
-    mass, centre, box = 2.0, np.array([0.1, 0.02, 0.05]), np.array([0.03, 0.02, 0.025])
-    about = np.diag(box) + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    inertia = np.array([mass, *(mass * centre), *about[np.triu_indices(3)]])
-    return serial(rotations, 0.3 * random.normal(size=(d, 3)), np.tile(inertia, (d, 1)))
+    return serial(rotations, 0.3 * random.normal(size=(d, 3)), np.tile(LINKS[0], (d, 1)))
 
 
 SCENE = with_friction(two_link_pendulum("elbow"), FrictionCoefficients(viscous=(0.05, 0.02)), FrictionShape())

@@ -72,7 +72,6 @@ def test_several_controls_and_a_matrix():
     for cost in (quadratic(R), tanh, stretched(limited_atan(1.0, 3.0), [2.0, 0.1])):
         u = cost.policy(w)
         assert cost.cost(u) + cost.conjugate(w) == pytest.approx(float(w @ u), rel=1e-9)
-    assert abs(float(u[0])) < 2 and abs(float(u[1])) < 0.1
     assert_allclose(jax.grad(cost.cost)(u), w, rtol=1e-6)
 
 
