@@ -33,15 +33,15 @@ def estimating(law, process=PROCESS, prior=PRIOR, **settings):
     return with_estimate(law, extended(process), prior, controls=1, measurements=2, **settings)
 
 
-def replayed(controller, y, t=None):
-    """Estimates and controls of a controller along measurements, by default at 100 Hz."""
+def replay(controller):
+    """(measurements, times, by default at 100 Hz) -> estimates and controls of a controller."""
 
     def sample(memory, row):
         memory, u = controller.act(memory, *row)
         return memory, (memory.x, u)
 
-    rows = (jnp.arange(len(y)) / 100.0 if t is None else jnp.asarray(t), jnp.asarray(y))
-    return jax.jit(lambda rows: jax.lax.scan(sample, controller.start, rows)[1])(rows)
+    run = jax.jit(lambda t, y: jax.lax.scan(sample, controller.start, (t, y))[1])
+    return lambda y, t=None: run(np.arange(len(y)) / 100.0 if t is None else t, y)
 
 
 def measurements(samples=60):
@@ -54,7 +54,7 @@ def test_late_and_rare_measurements_give_the_estimates_of_a_filter_that_knows_th
     y = measurements()
     direct = jax.jit(lambda seen: filtered(extended(PROCESS), PRIOR, y, jnp.zeros((len(y), 1)), seen)[0])
     shifted = jnp.stack([jnp.roll(y[:, 0], 1), jnp.roll(y[:, 1], 3)], axis=1)
-    delayed, _ = replayed(estimating(IDLE, late=(1, 3)), shifted)
+    delayed, _ = replay(estimating(IDLE, late=(1, 3)))(shifted)
     # At sample k the late loop knows channel 0 up to k - 1 and channel 1 up to k - 3: filter that log directly.
     every = np.ones((len(y), 2), bool)
     for k in (10, 40):
@@ -63,9 +63,12 @@ def test_late_and_rare_measurements_give_the_estimates_of_a_filter_that_knows_th
         seen[k - 2 : k, 1] = False
         assert_allclose(delayed[k], direct(seen)[k], rtol=0, atol=1e-12)
     assert np.abs(delayed - direct(every)).max() > 1e-4
-    rare, _ = replayed(estimating(IDLE, every=(1, 4)), y)
+    rare = replay(estimating(IDLE, every=(1, 4)))
     every[:, 1] = np.arange(len(y)) % 4 == 0
-    assert_allclose(rare, direct(every), rtol=0, atol=1e-12)
+    assert_allclose(rare(y)[0], direct(every), rtol=0, atol=1e-12)
+    # A failed measurement is not hidden.
+    _, u = rare(y.at[30, 0].set(jnp.nan))
+    assert np.isfinite(u[:30]).all() and np.isnan(u[30:]).all()
 
 
 def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effect():
@@ -100,15 +103,10 @@ def test_filters_use_the_times_of_samples_and_of_controls():
         y = x[:, :2].copy()
         y[late:, 1] = y[: len(y) - late, 1]
         settings = {"delay": delay, "late": (0, late)}
-        timed, untimed = (estimating(law, sharp, start, **settings, **more) for more in ({"rate": 100.0}, {}))
-        known, ignored = (np.abs(replayed(one, y, t)[0] - x)[:, 2:].max(axis=0) for one in (timed, untimed))
+        timed, untimed = (replay(estimating(law, sharp, start, **settings, **more)) for more in ({"rate": 100.0}, {}))
+        known, ignored = (np.abs(one(y, t)[0] - x)[:, 2:].max(axis=0) for one in (timed, untimed))
         assert (known < 0.25 * ignored).all()
-        assert_allclose(replayed(timed, y)[0], replayed(untimed, y)[0], rtol=0, atol=1e-9)
-
-
-def test_a_failed_measurement_is_not_hidden():
-    _, u = replayed(estimating(ASKED), measurements(6).at[3, 1].set(jnp.nan))
-    assert np.isfinite(u[:3]).all() and np.isnan(u[3:]).all()
+        assert_allclose(timed(y)[0], untimed(y)[0], rtol=0, atol=1e-9)
 
 
 def test_wrong_numbers_of_samples_are_refused():
