@@ -80,7 +80,8 @@ def test_a_failure_lasts_until_the_end():
 def test_feed_forward_of_the_exact_model_errs_by_the_hold_alone():
     """Torques held for a period lag by half of it: with the exact model the error is of first order in the period."""
     plant = dynamics(pendulum().closed_form)
-    law, errors = feed_forward(plant, Gains(np.zeros(1), np.zeros(1))), []
+    law = feed_forward(plant, Gains(np.zeros(1), np.zeros(1)))
+    errors = []
     for rate in (100.0, 200.0, 400.0):
         t = np.arange(round(0.5 * rate) + 1)[:, None] / rate
         wanted = Reference(np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t))

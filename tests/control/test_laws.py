@@ -38,7 +38,8 @@ from dln_jax.scenes.poles import rotary_pendulum
 
 SCENE = rotary_pendulum(friction=1e-5)
 PLANT, B, JOINTS = dynamics(SCENE.closed_form), np.asarray(SCENE.needs.actuation), SCENE.needs.joints
-FIELD, GOAL = field_of(PLANT, B), np.zeros(4)
+FIELD = field_of(PLANT, B)
+GOAL = np.zeros(4)
 IN_C = "regulated", "switched", "computed_torque", "feed_forward"
 
 
@@ -60,7 +61,8 @@ def laws():
     problem = TrajectoryProblem(
         lambda x, u: x + 0.01 * FIELD(x, u), lambda x, u: x @ x + u @ u, lambda x: x @ x, *limits
     )
-    plan, act = first_plan(problem, GOAL, np.zeros((3, 1))), mpc(problem)
+    plan = first_plan(problem, GOAL, np.zeros((3, 1)))
+    act = mpc(problem)
     differences = with_differences(far, 2, rate=500.0, cutoff=50.0)
     settings = {"seconds": 0.002, "rate": 500.0, "controls": 1, "hardware": Hardware(*limits)}
 

@@ -41,7 +41,8 @@ def test_differences_of_second_order_are_exact_for_parabolas():
 
 def test_differences_continue_after_a_measurement_that_is_not_finite():
     controller = with_differences(stateless(lambda x: x[1:]), 1, rate=50.0, cutoff=1e6)
-    memory, rates = controller.start, []
+    memory = controller.start
+    rates = []
     for number, y in enumerate([0.0, 0.02, 0.04, np.nan, 0.08, 0.1]):
         memory, u = controller.act(memory, jnp.asarray(number / 50), jnp.array([y]))
         rates.append(float(u[0]))

@@ -51,7 +51,8 @@ def test_iterations_approach_the_optimum_as_the_barrier_falls():
 
 
 def test_feedback_is_the_derivative_of_the_optimal_control():
-    start, step = np.array([-0.2, 0.1]), 1e-4  # near enough for a force within the limits
+    start = np.array([-0.2, 0.1])
+    step = 1e-4  # near enough for a force within the limits
     plan = improved(start, 1e-2)
     for axis in step * np.eye(2):
         ahead, behind = (improved(start + way, 1e-2).u[0] for way in (axis, -axis))
@@ -60,8 +61,11 @@ def test_feedback_is_the_derivative_of_the_optimal_control():
 
 
 def test_a_loop_settles_within_its_constraints_in_spite_of_pushes():
-    act, plan, x = jax.jit(mpc(BLOCK)), improved(START), jnp.asarray(START)
-    random, controls = np.random.default_rng(0), []
+    act = jax.jit(mpc(BLOCK))
+    plan = improved(START)
+    x = jnp.asarray(START)
+    random = np.random.default_rng(0)
+    controls = []
     for _ in range(60):
         u, plan = act(x, plan)
         controls.append(float(u[0]))
@@ -83,7 +87,9 @@ STEEP = BLOCK._replace(
 
 
 def test_plans_recover_from_gains_that_diverge_and_from_a_reading_that_is_not_finite():
-    act, plan, x = jax.jit(mpc(STEEP)), first_plan(STEEP, START / 2, IDLE), jnp.asarray(START) / 2
+    act = jax.jit(mpc(STEEP))
+    plan = first_plan(STEEP, START / 2, IDLE)
+    x = jnp.asarray(START) / 2
     for sample in range(50):
         if sample == 10:  # throws the prediction to infinity
             plan = plan._replace(K=plan.K + 1e200)
@@ -98,7 +104,9 @@ def test_plans_recover_from_gains_that_diverge_and_from_a_reading_that_is_not_fi
 def test_a_far_obstacle_and_unequal_limits_leave_the_mass_at_its_goal():
     """Before, an obstacle 1.5 m away moved the mass by millimetres."""
     obstacle = BLOCK._replace(upper_x=np.inf, lower=-2.0, states=lambda x: x[:1] - 1.5)
-    act, plan, x = jax.jit(mpc(obstacle)), first_plan(obstacle, START, IDLE), jnp.asarray(START)
+    act = jax.jit(mpc(obstacle))
+    plan = first_plan(obstacle, START, IDLE)
+    x = jnp.asarray(START)
     for _ in range(120):
         u, plan = act(x, plan)
         x = obstacle.step(x, u)
@@ -143,7 +151,9 @@ def test_knots_move_a_reference_and_constraints_that_depend_on_time():
     first = timed._replace(knots=t[: N + 1])
     solved = jax.jit(lambda: shoot(first, START, ALONG, IDLE))()
     assert solved.converged and solved.plan.x[9, 0] <= -0.5 + 1e-6 < solved.plan.x[12, 0]
-    plan, x, act = first_plan(first, START, IDLE), jnp.asarray(START), jax.jit(mpc(timed))
+    plan = first_plan(first, START, IDLE)
+    x = jnp.asarray(START)
+    act = jax.jit(mpc(timed))
     again = jax.jit(functools.partial(improve, first))
     for _ in range(25):
         plan = again(plan)

@@ -72,7 +72,8 @@ def lagrangian(program, dx, du, multipliers):
 
 
 def test_the_recursion_meets_the_conditions_of_an_optimum():
-    program, slopes = horizon(), jax.jit(jax.grad(lagrangian, argnums=(1, 2, 3)))
+    program = horizon()
+    slopes = jax.jit(jax.grad(lagrangian, argnums=(1, 2, 3)))
     for free in (None, FREE):
         solve = jax.jit(lambda program, free=free: least_cost(program, free))
         solution = solve(program)
@@ -86,7 +87,8 @@ def test_the_recursion_meets_the_conditions_of_an_optimum():
 
 
 def test_a_regulator_that_varies_in_time_has_the_gains_of_the_recursion():
-    slopes, end = horizon().slopes, 2 * np.eye(n)
+    slopes = horizon().slopes
+    end = 2 * np.eye(n)
     still = np.zeros((N, n)), np.zeros((N, n + m))
     weights = np.tile(np.diag([1.0] * n + [0.5] * m), (N, 1, 1))
     program = Horizon(slopes, *still, weights, np.zeros(n), end)

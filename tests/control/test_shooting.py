@@ -20,7 +20,7 @@ from dln_jax.control import (
     time_varying_lqr,
 )
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.integrators import MIDPOINT
+from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
 from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
 from dln_jax.solvers.ending import reason
 
@@ -57,7 +57,8 @@ def test_limits_hold_and_the_rest_is_stationary():
     solve = jax.jit(lambda limit, x, u: optimise(LINEAR._replace(lower=-limit, upper=limit), x, u, tolerance=1e-9))
 
     def total(controls):
-        x, cost = START, 0.0
+        x = START
+        cost = 0.0
         for u in controls:
             cost += LINEAR.cost(x, u)
             x = LINEAR.step(x, u)
@@ -78,7 +79,9 @@ def test_limits_hold_and_the_rest_is_stationary():
 
 @pytest.mark.slow
 def test_swing_up_of_a_cart_pole_converges_quadratically_and_its_gains_are_derivatives_of_the_optimum():
-    scene, steps, dt = cart_pole(), 50, 0.04
+    scene = cart_pole()
+    steps = 50
+    dt = 0.04
     field = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
     off = lambda x: x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * (x[2] ** 2 + x[3] ** 2)  # noqa: E731
     cost = lambda x, u: dt * (off(x) + 0.01 * u[0] ** 2)  # noqa: E731
@@ -107,11 +110,24 @@ def test_implicit_steps_have_the_derivatives_of_finite_differences():
     field = field_of(dynamics(scene.closed_form), np.asarray(scene.needs.actuation))
     stiff = integrated(field, 0.02, method=MIDPOINT)
     step = jax.jit(stiff)
-    x, u = 0.01 * jnp.arange(1.0, 7.0).at[1].set(1e-4), jnp.array([2.0])
+    x = 0.01 * jnp.arange(1.0, 7.0).at[1].set(1e-4)
+    u = jnp.array([2.0])
     slopes = jax.jit(jax.jacfwd(stiff, argnums=(0, 1)))(x, u)
     for slope, by, size in ((slopes[0], lambda e: step(x + e, u), 6), (slopes[1], lambda e: step(x, u + e), 1)):
         numeric = np.stack([(by(1e-6 * each) - by(-1e-6 * each)) / 2e-6 for each in np.eye(size)], axis=1)
         assert_allclose(slope, numeric, rtol=1e-5, atol=1e-6)
+
+
+def test_radau_is_of_order_three_and_forgets_what_decays_fast():
+    field = lambda x, u: -u * x  # noqa: E731
+    one = jnp.ones(1)
+    ends = []
+    for method, order in ((RADAU_3, 3), (GAUSS_LEGENDRE_4, 4)):
+        steps = [integrated(field, 1.0, method=method, substeps=n) for n in (4, 8)]
+        errors = [abs(step(one, one)[0] - np.exp(-1)) for step in steps]
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
+        ends.append(abs(integrated(field, 1.0, method=method)(one, 1e6 * one)[0]))
+    assert ends[0] < 1e-5 and ends[1] > 0.99
 
 
 def test_other_shapes_are_refused():

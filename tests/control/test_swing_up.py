@@ -52,7 +52,8 @@ def test_active_joints_get_the_acceleration_they_are_asked_for_and_do_its_work_o
 def test_the_region_of_attraction_is_that_of_the_unstable_mode():
     """x'' = x + u with |u| <= 1 comes back from |x + x'| < 1 and from nowhere else."""
     field = lambda x, u: jnp.stack([x[1], x[0] + u[0]])  # noqa: E731
-    goal, joints = jnp.zeros(2), ("prismatic",)
+    goal = jnp.zeros(2)
+    joints = ("prismatic",)
     at = linearise(field, goal, jnp.zeros(1))
     regulator = lqr(at.A, at.B, np.eye(2), np.eye(1))
     law = regulated(regulator, goal, at.u, joints)

@@ -28,7 +28,8 @@ def with_potential(extra):
 
 @pytest.mark.slow
 def test_dry_friction_holds_no_pole_down():
-    model, settings = model_of_plant(PLANT), {"starts": 8, "seed": 5, "seconds": 3.0}
+    model = model_of_plant(PLANT)
+    settings = {"starts": 8, "seed": 5, "seconds": 3.0}
     tried = try_starts(PLANT, model, **settings)
     assert tried.outcomes.share == 1 and tried.outcomes.worst < 3.0
     # A filter that knows the plant's own noise holds it with less torque.

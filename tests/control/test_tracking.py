@@ -40,7 +40,8 @@ def errors(law, off):
 
 def test_computed_torque_makes_errors_decay_linearly_and_feed_forward_stays_on_the_reference():
     # Both joints are critically damped: e = (1 + w t) exp(-w t) e0.
-    off, w = np.array([0.3, -0.2]), np.sqrt(P)
+    off = np.array([0.3, -0.2])
+    w = np.sqrt(P)
     expected = off * (1 + w * T[:, None]) * np.exp(-w * T[:, None])
     assert_allclose(errors(computed_torque(ARM, Gains(P, D)), off), expected, atol=1e-8)
     assert np.abs(errors(feed_forward(ARM, Gains(np.diag(P), np.diag(D))), 0.0)).max() < 1e-8

@@ -41,7 +41,8 @@ def test_the_best_of_several_guesses_has_the_least_objective(solve):
     problem = TrajectoryProblem(
         lambda x, u: x + u, lambda x, u: 0.0 * u[0], final, states=lambda x: -x, soft=(5.0, 0.0)
     )
-    start, ends = np.array([0.05]), np.array([1.0, -1.0])
+    start = np.array([0.05])
+    ends = np.array([1.0, -1.0])
     u = (ends - start)[:, None, None]
     states = np.stack([np.full(2, start), ends], axis=1)[:, :, None]
     if solve == "shoot":

@@ -74,8 +74,11 @@ def test_late_and_rare_measurements_give_the_estimates_of_a_filter_that_knows_th
 def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effect():
     """The plant takes every control one and a half samples late."""
     controller = estimating(ASKED, SHARP, EXACT, delay=1.5)
-    half, act = jax.jit(integrated(FIELD, 0.005)), jax.jit(controller.act)
-    memory, x, errors = controller.start, np.asarray(EXACT.x), []
+    half = jax.jit(integrated(FIELD, 0.005))
+    act = jax.jit(controller.act)
+    memory = controller.start
+    x = np.asarray(EXACT.x)
+    errors = []
     controls = [np.zeros(1), np.zeros(1)]
     for number in range(50):
         memory, u = act(memory, number / 100.0, x[:2])
@@ -91,11 +94,14 @@ def test_filters_use_the_times_of_samples_and_of_controls():
     """Controls act 1.3 nominal steps after their samples, which are up to half a step late; so late is one channel."""
     random = np.random.default_rng(2)
     t = np.append(0.0, np.arange(1, 80) + random.uniform(0, 0.5, 79)) / 100.0
-    planned, delay, dt = random.choice([-6.0, 6.0], (80, 1)), 1.3, 1e-4
+    planned = random.choice([-6.0, 6.0], (80, 1))
+    delay = 1.3
+    dt = 1e-4
     law = Controller(jnp.asarray(0), lambda number, t, x: (number + 1, jnp.asarray(planned)[number]))
     arrived = np.searchsorted(t + delay / 100.0, dt * np.arange(8100) + dt / 2) - 1
     held = np.where(arrived[:, None] >= 0, planned[arrived], 0.0)
-    step, start = integrated(FIELD, dt), belief([0.0, 1.0, 0.0, 0.0], 1e-4)
+    step = integrated(FIELD, dt)
+    start = belief([0.0, 1.0, 0.0, 0.0], 1e-4)
     fine = jax.jit(lambda u: jax.lax.scan(lambda x, u: (step(x, u), x), start.x, u)[1])(held)
     x = np.asarray(fine)[np.round(t / dt).astype(int)]
     sharp = PROCESS._replace(noise=np.array([1e-5, 1e-5]), disturbance=np.array([0.2, 0.01]))

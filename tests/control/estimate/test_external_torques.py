@@ -54,7 +54,9 @@ def motion(external, noise, key):
 
 
 def test_the_residual_approaches_a_constant_push_at_the_observers_rate():
-    push, samples, gain = np.array([0.3, -0.2]), 200, 25.0
+    push = np.array([0.3, -0.2])
+    samples = 200
+    gain = 25.0
     external = np.where(np.arange(samples)[:, None] >= 50, push, 0.0)
     observer = momentum_observer(MODEL, 2, rate=RATE, gain=gain)
     r = jax.jit(lambda: observed(observer, *motion(external, np.zeros((samples, 2)), jax.random.key(0))))()
@@ -99,7 +101,8 @@ def test_the_wrench_at_a_flange_is_found_where_the_joints_determine_it():
 
 
 def test_the_jacobian_of_a_frame_is_the_derivative_of_its_place():
-    tree, q = arm(4), jnp.asarray([0.3, -1.0, 0.5, 0.2])
+    tree = arm(4)
+    q = jnp.asarray([0.3, -1.0, 0.5, 0.2])
     J = frame_jacobian(tree, 3, (0.1, 0.2, 0.0))(q)
 
     def place(q):

@@ -34,7 +34,9 @@ PRIOR = belief([0.3, -0.2, 0.1], [1.0, 2.0, 0.5])
 
 def linear_log(samples, seed=0):
     random = np.random.default_rng(seed)
-    x, y, u = np.array([0.5, 1.0, 0.0]), [], random.normal(size=(samples, 1))
+    x = np.array([0.5, 1.0, 0.0])
+    y = []
+    u = random.normal(size=(samples, 1))
     for number in range(samples):
         y.append(H @ x + random.normal(size=2) * LINEAR.noise)
         x = F @ x + B @ u[number] + G @ (random.normal(size=2) * LINEAR.disturbance)
@@ -44,7 +46,9 @@ def linear_log(samples, seed=0):
 def textbook(y, u, seen):
     """Means of the Kalman filter in its plain form."""
     x, P = np.asarray(PRIOR.x), np.asarray(PRIOR.covariance)
-    Q, R, means = G * LINEAR.disturbance**2 @ G.T, np.diag(LINEAR.noise**2), []
+    Q = G * LINEAR.disturbance**2 @ G.T
+    R = np.diag(LINEAR.noise**2)
+    means = []
     y, u = np.asarray(y), np.asarray(u)
     for number in range(len(y)):
         rows = np.flatnonzero(seen[number])
@@ -78,7 +82,8 @@ def test_the_covariance_stays_positive_with_encoders_a_million_times_better_than
 
 def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
     """Along 60 motions near hanging with random torques, from draws of the belief."""
-    scene, samples = cart_pole(), 80
+    scene = cart_pole()
+    samples = 80
     model, actuation = dln_jax.dynamics(scene.closed_form), np.array(scene.needs.actuation)
     process = mechanical(model, actuation, rate=200.0, band=[0.5, 0.02], encoder_noise=[1e-3, 2e-3])
     prior = belief([0.0, np.pi, 0.0, 0.0], [0.02, 0.1, 0.1, 0.3])
@@ -113,15 +118,20 @@ def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
 
 def test_late_samples_do_not_look_like_noise_if_the_log_has_their_times():
     """A log at 200 Hz with a band of 0.1 N m and an encoder of 1 mrad, whose resolution is the noise."""
-    model, resolution = dln_jax.dynamics(pendulum().closed_form), 1e-3
+    model = dln_jax.dynamics(pendulum().closed_form)
+    resolution = 1e-3
     process = mechanical(model, rate=200.0, band=[0.1], encoder_step=resolution)
-    random, x, q = np.random.default_rng(0), jnp.array([2.5, 0.0]), []
+    random = np.random.default_rng(0)
+    x = jnp.array([2.5, 0.0])
+    q = []
     late = np.random.default_rng(1).uniform(0, 4e-3, 400)
-    tau, step = 0.5 * np.sin(0.07 * np.arange(400))[:, None], jax.jit(process.step)
+    tau = 0.5 * np.sin(0.07 * np.arange(400))[:, None]
+    step = jax.jit(process.step)
     for number in range(400):
         q.append(resolution * np.round((x[:1] + late[number] * x[1:]) / resolution))
         x = step(x, tau[number], 0.1 * random.normal(size=1))
-    absent, even = np.full((400, 1), np.nan), np.arange(400) / 200.0
+    absent = np.full((400, 1), np.nan)
+    even = np.arange(400) / 200.0
     log = Trajectories(even + late, np.stack(q), absent, absent, tau, np.zeros(400, int), np.array(["a"]))
     of_times, of_even_times = (from_log(model, one).process for one in (log, log._replace(t=even)))
     assert resolution / np.sqrt(12) * 0.999 < of_times.noise[0] < 5e-4 and of_even_times.noise[0] > 2e-3

@@ -35,8 +35,11 @@ NETWORK = value_network(PENDULUM, widths=(8,), scale=10.0)
 def test_targets_are_weighted_returns_and_their_slopes():
     parameters = NETWORK.init(jax.random.key(0))
     value = lambda x: NETWORK.value_and_gradient(parameters, x)  # noqa: E731
-    x, steps, dt = jnp.array([2.0, 1.0]), 4, 0.02
-    step, discount = flow(PENDULUM, dt, clipped=True), np.exp(-0.1 * dt)
+    x = jnp.array([2.0, 1.0])
+    steps = 4
+    dt = 0.02
+    step = flow(PENDULUM, dt, clipped=True)
+    discount = np.exp(-0.1 * dt)
 
     def weighted_returns(x, memory):
         """The sum over n of weights times the return of n steps, as it is printed."""

@@ -76,7 +76,8 @@ def test_linear_interpolation_is_monotone_and_its_slopes_are_one_sided():
 @pytest.mark.slow
 def test_value_with_ridges_converges():
     """Of a rod of 0.6 kg and 0.7 m whose motor cannot lift it; cubic interpolation did not converge."""
-    high, limit = np.array([np.pi, 8.0]), 0.9
+    high = np.array([np.pi, 8.0])
+    limit = 0.9
     inertia = 0.6 * 0.7**2 / 3
     problem = ControlProblem(
         lambda x: jnp.stack([x[1], 0.6 * 9.81 * 0.35 / inertia * jnp.sin(x[0])]),

@@ -64,14 +64,18 @@ def test_the_law_of_a_value_keeps_its_limits_and_has_no_control_where_the_state_
 
 
 def test_drift_and_actuation_are_those_of_the_plant():
-    plant, B, x, u = dynamics(pendulum(friction=0.1).energies), np.array([[2.0]]), X[1:3], jnp.array([2.0])
+    plant = dynamics(pendulum(friction=0.1).energies)
+    B = np.array([[2.0]])
+    x = X[1:3]
+    u = jnp.array([2.0])
     a, of = from_plant(plant, B)
     ours, theirs = jax.jit(lambda x, u: (a(x) + of(x) @ u, field_of(plant, B)(x, u)))(x, u)
     assert_allclose(ours, theirs, rtol=1e-12)
 
 
 def test_the_equation_is_the_least_over_controls():
-    slope, value = jnp.array([1.0, -2.0, 0.3, 0.7]), jnp.asarray(3.0)
+    slope = jnp.array([1.0, -2.0, 0.3, 0.7])
+    value = jnp.asarray(3.0)
 
     def hamiltonian(u):
         now = PROBLEM.state_cost(X) + PROBLEM.action_cost.cost(u)
@@ -83,7 +87,8 @@ def test_the_equation_is_the_least_over_controls():
 
 
 def test_another_goal_is_held_by_a_control():
-    weight, push = 2.0, scaled(tanh, 5.0)  # of a rod that stands at 0
+    weight = 2.0
+    push = scaled(tanh, 5.0)  # of a rod that stands at 0
     drift = lambda x: jnp.stack([x[1], weight * jnp.sin(x[0])])  # noqa: E731
     actuation = lambda x: jnp.array([[0.0], [1.0]])  # noqa: E731
     box = -HIGH[1:3], HIGH[1:3]

@@ -29,7 +29,8 @@ def test_recording_stays_within_the_limits_and_is_a_file_of_encoder_readings(tmp
 
 def test_the_rest_of_a_stopped_episode_is_tried_once_more_with_half_of_the_noise():
     """The plant answers NaN 0.5 s after its first reset, and is sound after the second."""
-    plant, resets = simulated_plant(PLANT, seed=1), []
+    plant = simulated_plant(PLANT, seed=1)
+    resets = []
 
     def read():
         broken = len(resets) == 1 and plant.time() > resets[0] + 0.5

@@ -22,7 +22,10 @@ class Puppet:
     """A plant that goes where the test says."""
 
     def __init__(self, **changed):
-        self.q, self.t, self.commands, self.layout = np.zeros(2), 0.0, [], described(**changed)
+        self.q = np.zeros(2)
+        self.t = 0.0
+        self.commands = []
+        self.layout = described(**changed)
 
     def act(self, u):
         self.commands.append(np.asarray(u))
@@ -127,7 +130,8 @@ def test_layouts_that_contradict_themselves_are_refused():
 
 
 def test_hardware_waits_for_the_next_sample_and_does_not_catch_up():
-    now, slept = [0.0], []
+    now = [0.0]
+    slept = []
 
     def sleep(seconds):
         slept.append(seconds)
@@ -160,7 +164,8 @@ def test_run_is_up_if_it_is_near_the_goal_for_the_last_second_without_a_stop():
 
 
 def test_push_reaches_the_plant_at_its_sample():
-    puppet, kicks = Puppet(), []
+    puppet = Puppet()
+    kicks = []
     still = Controller(np.zeros(()), lambda memory, t, y: (memory, np.zeros(1)))
     kicked = puppet.bare()._replace(kick=lambda rates: kicks.append((puppet.t, rates)))
     settings = {"seconds": 0.1, "push": Push(0.05, [0.0, 3.0])}
@@ -174,7 +179,8 @@ def test_push_reaches_the_plant_at_its_sample():
 
 
 def test_compilation_does_not_count_as_a_late_answer():
-    puppet, calls = Puppet(), []
+    puppet = Puppet()
+    calls = []
 
     def act(memory, t, y):
         calls.append(t)
@@ -199,7 +205,8 @@ def test_an_interrupt_leaves_the_motors_at_zero():
 
 
 def test_run_states_the_times_of_the_answers_and_restores_garbage_collection():
-    puppet, late = Puppet(), np.array([0.0, 2e-3, 0.0, 5e-3, 1e-3])
+    puppet = Puppet()
+    late = np.array([0.0, 2e-3, 0.0, 5e-3, 1e-3])
     puppet.t = 7.0
 
     def act(u):

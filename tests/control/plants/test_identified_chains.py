@@ -29,7 +29,8 @@ def test_noise_does_not_shrink_the_inertias_of_a_plant_with_a_weak_motor():
     found = identified_chain(ready, plant.layout.needs)
     assert found.description["name"] == "planar-chain"
     model = mujoco.MjModel.from_xml_string(WEAK)
-    data, truth = mujoco.MjData(model), np.zeros((2, 2))
+    data = mujoco.MjData(model)
+    truth = np.zeros((2, 2))
     mujoco.mj_forward(model, data)
     for column, unit in zip(truth, np.eye(2), strict=True):
         mujoco.mj_mulM(model, data, column, unit)

@@ -74,7 +74,8 @@ def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_li
 @pytest.mark.slow
 @pytest.mark.parametrize("recover", ["swing-up", "plans"])
 def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up_again_after_a_push(recover):
-    plant, lab = rail(), Hardware(encoder_step=1e-4, delay=1)
+    plant = rail()
+    lab = Hardware(encoder_step=1e-4, delay=1)
     tuned = tune(model(), plant, lab, sets=32, seconds=6.0, recover=recover)
     assert 0 < tuned.worked <= 1 and tuned.margin >= 0 and tuned.trials >= 64
     plants = [plant_of(model(), plant, hardware=lab, seed=seed) for seed in range(4)]
@@ -86,7 +87,8 @@ def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up_again_after_a_p
 
 @pytest.mark.slow
 def test_episodes_of_an_exploration_follow_a_plan_where_none_came_near_the_goal():
-    plant, low = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4)), (-0.9, -0.9, -0.9, -0.9)
+    plant = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4))
+    low = (-0.9, -0.9, -0.9, -0.9)
     recording = explore(plant, lambda _: model(), Exploration(seconds=15.0, surplus=low)).recording
     near = [distances(recording.q[recording.trajectory == k], rail()).min() < NEAR for k in range(6)]
     assert near == [False] * 4 + [True] * 2
