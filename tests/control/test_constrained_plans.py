@@ -64,14 +64,17 @@ def test_limits_hard_and_soft_constraints_and_single_shooting_give_the_same_plan
 def test_active_constraints_are_met_and_their_pressures_close_the_lagrangian():
     """The problem is convex, so that these conditions prove the optimum."""
     solution = at_most()
-    x, u, prices = solution.plan.x, solution.plan.u, np.asarray(solution.multipliers)
+    x = solution.plan.x
+    u = solution.plan.u
+    prices = np.asarray(solution.multipliers)
     speed = np.asarray(x[1:, 1])
     assert solution.converged and speed.max() == pytest.approx(0.6, abs=1e-7) and (speed > 0.6 - 1e-6).sum() > 3
     pressure = np.asarray(solution.pressures)[1:]  # of x_1 to x_N
     assert (pressure >= 0).all()
     assert_allclose(pressure * (speed - 0.6), 0.0, atol=1e-7)
     # Derivatives of the Lagrangian by hand, from the dynamics' constant matrices.
-    A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([DT**2 / 2, DT])
+    A = np.array([[1.0, DT], [0.0, 1.0]])
+    B = np.array([DT**2 / 2, DT])
     assert_allclose(2 * DT * u[:, 0] + prices @ B, 0.0, atol=1e-6)
     between = prices[1:] @ A - prices[:-1]
     between[:, 1] += pressure[:-1]

@@ -37,7 +37,9 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import rotary_pendulum
 
 SCENE = rotary_pendulum(friction=1e-5)
-PLANT, B, JOINTS = dynamics(SCENE.closed_form), np.asarray(SCENE.needs.actuation), SCENE.needs.joints
+PLANT = dynamics(SCENE.closed_form)
+B = np.asarray(SCENE.needs.actuation)
+JOINTS = SCENE.needs.joints
 FIELD = field_of(PLANT, B)
 GOAL = np.zeros(4)
 IN_C = "regulated", "switched", "computed_torque", "feed_forward"
@@ -47,7 +49,8 @@ def laws():
     """All laws under test, as functions of x [4]."""
     at = linearise(FIELD, GOAL, np.zeros(1))
     regulator = lqr(at.A, at.B, np.eye(4), np.eye(1))
-    near, cost = regulated(regulator, GOAL, at.u, JOINTS), value(regulator, GOAL, JOINTS)
+    near = regulated(regulator, GOAL, at.u, JOINTS)
+    cost = value(regulator, GOAL, JOINTS)
     swing = energy_shaping(PLANT, parts_of(B), [0.0, 0.0], EnergyGains(2e7, 0.0, 0.0))
     far = lambda x: swing(x[:2], x[2:])  # noqa: E731
     one = lambda x: jnp.ones(1)  # noqa: E731

@@ -19,14 +19,16 @@ def rates(x, u):
 def controller():
     """For a pendulum of 1 kg m² whose motor holds it up to 0.42 rad from upright; the parameter is its strength."""
     regulator = lqr([[0, 1], [9.81, 0]], [[0], [1]], np.diag([10.0, 1.0]), np.eye(1))
-    K, S = np.asarray(regulator.K)[0], np.asarray(regulator.S)
+    K = np.asarray(regulator.K)[0]
+    S = np.asarray(regulator.S)
     dt = EVERY / RATE
     step = integrated(rates, dt)
     cost = lambda x, u: dt * (2 * (1 - jnp.cos(x[0])) + 0.01 * x[1] ** 2 + 0.02 * u @ u)  # noqa: E731
     final = lambda x: 40 * (1 - jnp.cos(x[0])) + 2 * x[1] ** 2  # noqa: E731
     problem = TrajectoryProblem(step, cost, final, -LIMIT, LIMIT)
     guesses = np.array([0.0, 3.0, -3.0])[:, None, None] * np.sin(3 * dt * np.arange(STEPS))[:, None]
-    near, to_go = regulated(regulator, UPRIGHT, np.zeros(1), JOINTS), value(regulator, UPRIGHT, JOINTS)
+    near = regulated(regulator, UPRIGHT, np.zeros(1), JOINTS)
+    to_go = value(regulator, UPRIGHT, JOINTS)
     return recovery_by_plans(
         lambda strength: problem._replace(step=lambda x, u: step(x, strength * u)),
         jax.jit(jax.vmap(lambda u: first_plan(problem, UPRIGHT, u)))(guesses),

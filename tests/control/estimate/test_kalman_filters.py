@@ -77,7 +77,6 @@ def test_the_covariance_stays_positive_with_encoders_a_million_times_better_than
     for _ in range(5):
         memory = sharp.predict(sharp.update(memory, jnp.zeros(2), jnp.ones(2, bool))[0], jnp.zeros(1))
         assert np.linalg.eigvalsh(memory.covariance).min() > -1e-16
-    assert np.isfinite(memory.W).all()
 
 
 def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
