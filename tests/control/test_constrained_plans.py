@@ -1,179 +1,113 @@
-"""Plans with constraints against closed forms, IPOPT and their own conditions."""
+"""Plans with constraints against closed forms and the conditions of an optimum."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control import TrajectoryProblem, free_time, optimise, shoot, with_limits_of, worst_violation
-from dln_jax.solvers.ending import Ending, reason
-from dln_jax.types import InputError
+from dln_jax.solvers.ending import Ending
 
 N, DT = 20, 0.1
-BLOCK = TrajectoryProblem(
-    lambda x, u: jnp.stack([x[0] + DT * x[1] + DT**2 / 2 * u[0], x[1] + DT * u[0]]),
-    lambda x, u: DT * u @ u,
-    lambda x: 0.0 * x[0],
-)
-"""A mass of 1 kg on a rail."""
-STILL = np.zeros((N + 1, 2)), np.zeros((N, 1))
 
 
-def exact_step(x, u, dt):
+def moved(x, u, dt):
+    """A mass of 1 kg on a rail, after dt."""
     return jnp.stack([x[0] + dt * x[1] + dt**2 / 2 * u[0], x[1] + dt * u[0]])
 
 
-@pytest.mark.parametrize("distance", [1.0, 3.0])
-def test_shortest_time_of_a_mass_is_twice_the_root_of_distance_over_acceleration(distance):
-    solution = by_time()(distance)
-    assert solution.converged
-    assert float(solution.plan.cost) == pytest.approx(2 * np.sqrt(distance / 2.0), rel=1e-6)
-    np.testing.assert_allclose(solution.plan.u[:, 0], np.where(np.arange(N) < N // 2, 2.0, -2.0), atol=1e-4)
+BLOCK = TrajectoryProblem(lambda x, u: moved(x, u, DT), lambda x, u: DT * u @ u, lambda x: 0.0 * x[0])
+STILL = np.zeros((N + 1, 2)), np.zeros((N, 1))
+TO_ONE = BLOCK._replace(end=lambda x: jnp.stack([x[0] - 1.0, x[1]]))
+"""From rest to rest over one metre."""
 
 
-@functools.cache
-def by_time():
-    free = free_time(
-        exact_step, lambda x, u, dt: dt, lambda x: 0.0 * x[0], states=2, shortest=1e-3, longest=1.0
-    )._replace(lower=-2.0, upper=2.0)
+def test_shortest_time_of_a_mass_is_twice_the_root_of_distance_over_acceleration():
+    settings = {"states": 2, "shortest": 1e-3, "longest": 1.0}
+    free = free_time(moved, lambda x, u, dt: dt, lambda x: 0.0 * x[0], **settings)._replace(lower=-2.0, upper=2.0)
+    start = np.array([0.0, 0.0, 0.1])
 
+    @jax.jit
     def solve(distance):
         problem = free._replace(end=lambda x: jnp.stack([x[0] - distance, x[1]]))
-        return shoot(problem, np.array([0.0, 0.0, 0.1]), np.tile([0.0, 0.0, 0.1], (N + 1, 1)), np.zeros((N, 1)))
+        return shoot(problem, start, np.tile(start, (N + 1, 1)), np.zeros((N, 1)))
 
-    return jax.jit(solve)
-
-
-def to_one(x):
-    return jnp.stack([x[0] - 1.0, x[1]])
+    for distance in (1.0, 3.0):
+        solution = solve(distance)
+        assert solution.converged
+        assert solution.plan.cost == pytest.approx(2 * np.sqrt(distance / 2.0), rel=1e-6)
+        assert_allclose(solution.plan.u[:, 0], np.where(np.arange(N) < N // 2, 2.0, -2.0), atol=1e-4)
 
 
 @functools.cache
-def with_a_speed_limit(kind):
-    """From rest to rest over one metre, at most 0.6 m/s: by a limit, a hard or a soft constraint."""
-    problem = BLOCK._replace(end=to_one)
-    by_constraint = problem._replace(states=lambda x: x[1:] - 0.6, soft=None)
-    kinds = {
-        "limit": problem._replace(upper_x=np.array([np.inf, 0.6])),
-        "constraint": by_constraint,
-        "price": by_constraint._replace(soft=(1e2, 0.0)),
-    }
-    return shoot(kinds[kind], np.zeros(2), *STILL)
+def at_most(soft=None):
+    """Solves for at most 0.6 m/s by a constraint."""
+    return shoot(TO_ONE._replace(states=lambda x: x[1:] - 0.6, soft=soft), np.zeros(2), *STILL)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["limit", "constraint", "price"])
-def test_active_constraints_are_met_exactly_by_limits_constraints_and_prices_alike(kind):
-    solution = with_a_speed_limit(kind)
-    assert solution.converged and solution.violation < 1e-7
-    speed = np.asarray(solution.plan.x[1:, 1])
-    assert speed.max() == pytest.approx(0.6, abs=1e-7) and (speed > 0.6 - 1e-6).sum() > 3
-    np.testing.assert_allclose(solution.plan.u, with_a_speed_limit("constraint").plan.u, atol=1e-5)
+def test_limits_hard_and_soft_constraints_and_single_shooting_give_the_same_plan():
+    limited = TO_ONE._replace(upper_x=np.array([np.inf, 0.6]))
+    single = optimise(limited, np.zeros(2), STILL[1])
+    assert single.converged and worst_violation(limited, single) == "all constraints hold within 1e-06"
+    assert_allclose(single.u, at_most().plan.u, atol=1e-5)
+    for solution in (shoot(limited, np.zeros(2), *STILL), at_most((1e2, 0.0))):
+        assert solution.converged and solution.violation < 1e-7
+        assert_allclose(solution.plan.u, at_most().plan.u, atol=1e-5)
 
 
-def test_pressures_are_complementary_and_close_the_lagrangian():
-    solution = with_a_speed_limit("constraint")
-    x, u, prices = solution.plan.x, solution.plan.u, np.asarray(solution.multipliers)
+def test_active_constraints_are_met_and_their_pressures_close_the_lagrangian():
+    """The problem is convex, so that these conditions prove the optimum."""
+    solution = at_most()
+    x = solution.plan.x
+    u = solution.plan.u
+    prices = np.asarray(solution.multipliers)
+    speed = np.asarray(x[1:, 1])
+    assert solution.converged and speed.max() == pytest.approx(0.6, abs=1e-7) and (speed > 0.6 - 1e-6).sum() > 3
     pressure = np.asarray(solution.pressures)[1:]  # of x_1 to x_N
     assert (pressure >= 0).all()
-    np.testing.assert_allclose(pressure * (np.asarray(x[1:, 1]) - 0.6), 0.0, atol=1e-7)
+    assert_allclose(pressure * (speed - 0.6), 0.0, atol=1e-7)
     # Derivatives of the Lagrangian by hand, from the dynamics' constant matrices.
-    A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([DT**2 / 2, DT])
-    np.testing.assert_allclose(2 * DT * u[:, 0] + prices @ B, 0.0, atol=1e-6)
+    A = np.array([[1.0, DT], [0.0, 1.0]])
+    B = np.array([DT**2 / 2, DT])
+    assert_allclose(2 * DT * u[:, 0] + prices @ B, 0.0, atol=1e-6)
     between = prices[1:] @ A - prices[:-1]
     between[:, 1] += pressure[:-1]
-    np.testing.assert_allclose(between, 0.0, atol=1e-6)
-
-
-def test_ipopt_reaches_the_same_plan():
-    ca = pytest.importorskip("casadi", reason="the reference is IPOPT by CasADi, of the extra [test]")
-    X, U = ca.SX.sym("x", 2, N + 1), ca.SX.sym("u", N)
-    after = ca.vertcat(X[0, :-1] + DT * X[1, :-1] + DT**2 / 2 * U.T, X[1, :-1] + DT * U.T)
-    g = ca.vertcat(ca.vec(after - X[:, 1:]), X[:, 0], X[:, N] - ca.DM([1, 0]), X[1, :].T - 0.6)
-    equal = 2 * N + 4
-    low = np.append(np.zeros(equal), np.full(N + 1, -np.inf))
-    quiet = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-    solver = ca.nlpsol("s", "ipopt", {"x": ca.vertcat(ca.vec(X), U), "f": DT * ca.sumsqr(U), "g": g}, quiet)
-    rival = solver(x0=0, lbg=low, ubg=np.zeros(equal + N + 1))
-    solution = with_a_speed_limit("constraint")
-    assert float(solution.plan.cost) == pytest.approx(float(rival["f"]), rel=1e-7)
-    np.testing.assert_allclose(np.asarray(rival["x"]).ravel()[-N:], solution.plan.u[:, 0], atol=1e-4)
+    assert_allclose(between, 0.0, atol=1e-6)
 
 
 def test_a_soft_constraint_gives_way_where_its_price_is_low():
     """A mass that should not pass 0.5 m but is drawn to 1 m: w_1 + w_2 t is the marginal cost of the excess t."""
-    problem = BLOCK._replace(
-        cost=lambda x, u: 1e-9 * u @ u, final_cost=lambda x: 10 * (x[0] - 1.0) ** 2, end=lambda x: x[1:],
-        end_below=lambda x: x[:1] - 0.5, soft=(2.0, 4.0),
-    )  # fmt: skip
+    drawn = BLOCK._replace(cost=lambda x, u: 1e-9 * u @ u, final_cost=lambda x: 10 * (x[0] - 1.0) ** 2)
+    problem = drawn._replace(end=lambda x: x[1:], end_below=lambda x: x[:1] - 0.5, soft=(2.0, 4.0))
     solution = shoot(problem, np.zeros(2), *STILL)
     # 20 (1 - x) = 2 + 4 (x - 1/2)
-    assert int(solution.ending) == Ending.EXCEEDED and float(solution.plan.x[-1, 0]) == pytest.approx(20 / 24, abs=1e-5)
-    assert float(solution.violation) == pytest.approx(20 / 24 - 0.5, abs=1e-5)
+    assert int(solution.ending) == Ending.EXCEEDED and solution.plan.x[-1, 0] == pytest.approx(20 / 24, abs=1e-5)
+    assert solution.violation == pytest.approx(20 / 24 - 0.5, abs=1e-5)
 
 
-@pytest.mark.slow
-def test_an_infeasible_problem_says_which_constraint_and_by_how_much():
-    """With 0.1 m/s² the mass gets 0.2 m far in 2 s."""
-    problem = BLOCK._replace(lower=-0.1, upper=0.1, end=lambda x: x[:1] - 1.0)
-    solution = shoot(problem, np.zeros(2), *STILL)
-    assert not solution.converged and float(solution.violation) == pytest.approx(0.8, abs=1e-5)
-    assert reason(solution.ending).startswith("is locally infeasible")
-    assert worst_violation(problem, solution.plan) == "equation 0 of the end is violated by 0.8"
-    soft = problem._replace(end=None, end_below=lambda x: 1.0 - x[:1], soft=(1e3, 1e3))
-    solution = shoot(soft, np.zeros(2), *STILL)
-    assert int(solution.ending) == Ending.EXCEEDED and float(solution.violation) == pytest.approx(0.8, abs=1e-6)
-    assert worst_violation(soft, solution.plan) == "inequality 0 of the end is violated by 0.8"
+def test_limits_come_from_a_robot():
+    limits = {
+        "position_limits": np.array([[-1.0, 2.0]]),
+        "velocity_limits": 3.0,
+        "force_limits": np.array([[-5.0, 6.0]]),
+    }
+    problem = with_limits_of(BLOCK, SimpleNamespace(**limits))
+    expected = {"lower": [-5.0], "upper": [6.0], "lower_x": [-1.0, -3.0], "upper_x": [2.0, 3.0]}
+    for name, values in expected.items():
+        assert_array_equal(getattr(problem, name), values)
 
 
-@pytest.mark.slow
-def test_single_shooting_meets_constraints_of_states_too():
-    problem = BLOCK._replace(end=to_one, upper_x=np.array([np.inf, 0.6]))
-    plan = optimise(problem, np.zeros(2), np.zeros((N, 1)))
-    assert plan.converged
-    np.testing.assert_allclose(plan.u, with_a_speed_limit("constraint").plan.u, atol=1e-5)
-    assert worst_violation(problem, plan) == "all constraints hold within 1e-06"
-
-
-@pytest.mark.slow
-def test_more_guesses_keep_the_best():
-    """A well of depth one at -1 and of depth two at 2, whose hill holds what starts on its left."""
-    well = lambda x: (x[0] + 1) ** 2 * (x[0] - 2) ** 2 - x[0]  # noqa: E731
-    problem = BLOCK._replace(cost=lambda x, u: 1e-3 * u @ u, final_cost=well)
-    left, right = (np.tile([end, 0.0], (N + 1, 1)) for end in (-1.0, 2.0))
-    alone = shoot(problem, np.array([-1.0, 0.0]), left, STILL[1])
-    both = shoot(problem, np.array([-1.0, 0.0]), left, STILL[1], starts=(right[None], STILL[1][None]))
-    assert both.converged and alone.converged and both.plan.x[-1, 0] > 1.0 > alone.plan.x[-1, 0]
-    assert both.plan.cost < alone.plan.cost
-
-
-def test_limits_come_from_the_file_of_a_robot(tmp_path):
-    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
-    from dln_jax.data.robots import read_robot
-
-    file = tmp_path / "arm.urdf"
-    file.write_text(
-        '<robot name="arm"><link name="base"/><link name="rod"><inertial><mass value="1"/><origin xyz="0 0 0.5"/>'
-        '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" '
-        'type="revolute"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>'
-        '<limit lower="-1" upper="2" velocity="3" effort="5"/></joint></robot>'
-    )
-    problem = with_limits_of(BLOCK, read_robot(file))
-    limits = problem.lower, problem.upper, problem.lower_x, problem.upper_x
-    for limit, expected in zip(limits, ([-5.0], [5.0], [-1.0, -3.0], [2.0, 3.0]), strict=True):
-        np.testing.assert_allclose(limit, expected)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_a_start_outside_limits_and_crossed_limits_are_refused():
+    for change, message in (
         ({"upper_x": np.array([0.5, np.inf])}, "state 0 starts at 1, above its upper limit of 0.5"),
         ({"states": lambda x: x[:1] - 0.25}, "constraint 0 on the states is 0.75 at the start"),
         ({"lower": 1.0, "upper": -1.0}, r"limits \[0\] of the controls are not in order; expected lower < upper"),
-    ],
-)
-def test_a_start_outside_limits_and_crossed_limits_are_one_line(change, message):
-    with pytest.raises(InputError, match=message):
-        shoot(BLOCK._replace(**change), np.array([1.0, 0.0]), *STILL)
+    ):
+        with one_line(message):
+            shoot(BLOCK._replace(**change), np.array([1.0, 0.0]), *STILL)

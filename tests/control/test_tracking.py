@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
 
 from dln_jax.control import (
     Gains,
@@ -12,7 +12,6 @@ from dln_jax.control import (
     feed_forward,
     gravity_compensation,
     judged,
-    saturated,
     trusted,
 )
 from dln_jax.data.schema import from_arrays
@@ -22,77 +21,67 @@ from dln_jax.scenes.pendulums import two_link_arm
 
 ARM = dynamics(two_link_arm().energies)
 P, D = np.array([36.0, 16.0]), np.array([12.0, 8.0])
+Q = jnp.array([0.4, -1.1])
+T = jnp.linspace(0, 1, 401)
 
 
 def reference(t):
-    return Reference(
-        *(each * jnp.array([0.7, -0.4]) for each in (jnp.sin(2 * t), 2 * jnp.cos(2 * t), -4 * jnp.sin(2 * t)))
-    )
+    sizes = jnp.array([0.7, -0.4])
+    return Reference(sizes * jnp.sin(2 * t), 2 * sizes * jnp.cos(2 * t), -4 * sizes * jnp.sin(2 * t))
 
 
-def errors(law, t, off):
+def errors(law, off):
     """Errors of the coordinates along the closed loop, from a start that deviates by `off`."""
     field = second_order(lambda t, q, qd: ARM.forward_dynamics(q, qd, law(q, qd, reference(t))))
     start = reference(0.0)
-    q, _ = rollout(runge_kutta(CLASSICAL, field), (start.q + off, start.qd), t)
-    return q - jax.vmap(lambda t: reference(t).q)(t)
+    q, _ = jax.jit(lambda start: rollout(runge_kutta(CLASSICAL, field), start, T))((start.q + off, start.qd))
+    return q - jax.vmap(lambda t: reference(t).q)(T)
 
 
-def test_computed_torque_makes_errors_decay_linearly():
+def test_computed_torque_makes_errors_decay_linearly_and_feed_forward_stays_on_the_reference():
     # Both joints are critically damped: e = (1 + w t) exp(-w t) e0.
-    t, off = jnp.linspace(0, 1, 401), np.array([0.3, -0.2])
+    off = np.array([0.3, -0.2])
     w = np.sqrt(P)
-    expected = off * (1 + w * t[:, None]) * np.exp(-w * t[:, None])
-    np.testing.assert_allclose(errors(computed_torque(ARM, Gains(P, D)), t, off), expected, atol=1e-8)
-
-
-@pytest.mark.parametrize("make", [feed_forward, computed_torque])
-def test_an_exact_model_stays_on_the_reference(make):
-    t = jnp.linspace(0, 1, 401)
-    assert np.abs(errors(make(ARM, Gains(np.diag(P), np.diag(D))), t, 0.0)).max() < 1e-8
+    expected = off * (1 + w * T[:, None]) * np.exp(-w * T[:, None])
+    assert_allclose(errors(computed_torque(ARM, Gains(P, D)), off), expected, atol=1e-8)
+    assert np.abs(errors(feed_forward(ARM, Gains(np.diag(P), np.diag(D))), 0.0)).max() < 1e-8
 
 
 def test_gravity_is_held_at_rest():
-    q = jnp.array([0.4, -1.1])
     rest = jnp.zeros(2)
-    tau = gravity_compensation(ARM, Gains(P, D))(q, rest, Reference(q, rest, rest))
-    np.testing.assert_allclose(ARM.forward_dynamics(q, rest, tau), 0.0, atol=1e-12)
+    tau = gravity_compensation(ARM, Gains(P, D))(Q, rest, Reference(Q, rest, rest))
+    assert_allclose(ARM.forward_dynamics(Q, rest, tau), 0.0, atol=1e-12)
 
 
 def test_an_indefinite_or_unknown_state_falls_back():
     bad = ARM._replace(mass_matrix=lambda q, qd=None: -jnp.eye(2))
-    q, wanted = jnp.array([0.4, -1.1]), reference(0.3)
+    wanted = reference(0.3)
     first, other = computed_torque(ARM, Gains(P, D)), feed_forward(ARM, Gains(P, D))
     for plant, outside, expected in ((ARM, False, first), (ARM, True, other), (bad, False, other)):
-        law = jax.jit(
-            trusted(plant, first, other, out_of_distribution=lambda q, qd, qdd, flag=outside: jnp.asarray(flag))
-        )
-        tau, usable = law(q, wanted.qd, wanted)
-        np.testing.assert_allclose(tau, expected(q, wanted.qd, wanted), rtol=1e-12)
+        unknown = lambda q, qd, qdd, flag=outside: jnp.asarray(flag)  # noqa: E731
+        tau, usable = jax.jit(trusted(plant, first, other, out_of_distribution=unknown))(Q, wanted.qd, wanted)
+        assert_allclose(tau, expected(Q, wanted.qd, wanted), rtol=1e-12)
         assert bool(usable) == (expected is first)
+    assert not trusted(ARM, first, other, usable=False)(Q, wanted.qd, wanted)[1]
 
 
 def test_a_model_is_judged_by_motions_that_it_has_not_seen():
     x = np.random.default_rng(0).normal(size=(3, 50, 2))
-    tau = np.asarray(jax.vmap(ARM.inverse_dynamics)(*map(jnp.asarray, x)))
-    unseen = from_arrays(
-        {"t": 0.01 * np.arange(50), "q": x[0], "qd": x[1], "qdd": x[2], "tau": tau, "trajectory": np.zeros(50, int)}
+    tau = np.asarray(jax.jit(jax.vmap(ARM.inverse_dynamics))(*map(jnp.asarray, x)))
+    columns = {"q": x[0], "qd": x[1], "qdd": x[2], "tau": tau}
+    unseen = from_arrays({"t": 0.01 * np.arange(50), **columns, "trajectory": np.zeros(50, int)})
+    good, heavy, lost, hollow = (
+        judged(ARM._replace(**changed), unseen)
+        for changed in (
+            {},
+            {"inverse_dynamics": lambda q, qd, qdd: 1.5 * ARM.inverse_dynamics(q, qd, qdd)},
+            {"inverse_dynamics": lambda q, qd, qdd: jnp.full(2, jnp.nan)},
+            {"mass_matrix": lambda q: -ARM.mass_matrix(q)},
+        )
     )
-    good = judged(ARM, unseen)
     assert good.usable and np.all(good.nmse < 1e-20) and good.definite == 1 and good.line.endswith("the model is used")
-    heavy = ARM._replace(inverse_dynamics=lambda q, qd, qdd: 1.5 * ARM.inverse_dynamics(q, qd, qdd))
-    bad = judged(heavy, unseen)
     share = 0.25 * np.mean(tau**2, axis=0) / np.var(tau, axis=0)
-    np.testing.assert_allclose(bad.nmse, share, rtol=1e-10)
-    assert not bad.usable and f"joint {np.argmax(share) + 1}'s" in bad.line
-    none = judged(ARM._replace(inverse_dynamics=lambda q, qd, qdd: jnp.full(2, jnp.nan)), unseen)
-    assert not none.usable
-    hollow = judged(ARM._replace(mass_matrix=lambda q: -ARM.mass_matrix(q)), unseen)
+    assert_allclose(heavy.nmse, share, rtol=1e-10)
+    assert not heavy.usable and f"joint {np.argmax(share) + 1}'s" in heavy.line
+    assert not lost.usable
     assert not hollow.usable and "not positive definite in 100.0%" in hollow.line
-    law = trusted(ARM, computed_torque(ARM, Gains(P, D)), feed_forward(ARM, Gains(P, D)), usable=bad.usable)
-    assert not law(jnp.zeros(2), jnp.zeros(2), reference(0.3))[1]
-
-
-def test_limits_leave_what_is_no_number():
-    found = saturated(jnp.array([5.0, -5.0, jnp.nan]), -1.0, 2.0)
-    np.testing.assert_array_equal(found, [2.0, -1.0, np.nan])

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
@@ -12,7 +13,6 @@ from dln_jax.control.optimal.flow import drawn, flow, targets, widened
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
-from dln_jax.types import InputError
 
 PENDULUM = ControlProblem(
     lambda x: jnp.stack([x[1], 10 * jnp.sin(x[0])]),
@@ -31,15 +31,15 @@ LINE = ControlProblem(
 NETWORK = value_network(PENDULUM, widths=(8,), scale=10.0)
 
 
-def value_of(network, seed=0):
-    parameters = network.init(jax.random.key(seed))
-    return lambda x: network.value_and_gradient(parameters, x)
-
-
 @pytest.mark.slow
 def test_targets_are_weighted_returns_and_their_slopes():
-    value, x, steps, dt = value_of(NETWORK), jnp.array([2.0, 1.0]), 4, 0.02
-    step, discount = flow(PENDULUM, dt, clipped=True), np.exp(-0.1 * dt)
+    parameters = NETWORK.init(jax.random.key(0))
+    value = lambda x: NETWORK.value_and_gradient(parameters, x)  # noqa: E731
+    x = jnp.array([2.0, 1.0])
+    steps = 4
+    dt = 0.02
+    step = flow(PENDULUM, dt, clipped=True)
+    discount = np.exp(-0.1 * dt)
 
     def weighted_returns(x, memory):
         """The sum over n of weights times the return of n steps, as it is printed."""
@@ -59,36 +59,38 @@ def test_targets_are_weighted_returns_and_their_slopes():
     for memory in (0.05, 1e9):
         assert found(memory).V[0] == pytest.approx(float(expected(x, memory)[0]), rel=1e-12)
     # With all of the memory the slope is that of the return.
-    np.testing.assert_allclose(found(1e9).slope[0], expected(x, 1e9)[1], rtol=1e-7)
-    np.testing.assert_allclose(found(0.05).x[0], x)
+    assert_allclose(found(1e9).slope[0], expected(x, 1e9)[1], rtol=1e-7)
+    assert_allclose(found(0.05).x[0], x)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.0, 0.2])
-def test_the_value_of_a_line_and_of_the_worst_of_lines(share):
+def test_values_of_a_line_and_of_the_worst_of_lines_are_those_of_the_regulator():
     """dx/dt = p x + u with p off by a share: the worst is always the larger p."""
     numbers = Iteration(iterations=25, starts=64, seconds=0.5, dt=0.025, steps=40, batch=64, kept=2, learning_rate=0.05)
     network = value_network(LINE, widths=())
-    worst = worst_disturbance(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=share))
-    found = fit_value(LINE, network, numbers=numbers, double=True, disturbance=worst if share else None)
-    S = lqr([[0.9 + share]], [[1.0]], [[0.5]], [[0.5]]).S[0, 0]
-    V, slope = network.value_and_gradient(found.parameters, jnp.array([1.5]))
-    assert pytest.approx(float(S) * 1.5**2, rel=5e-3) == V and slope[0] == pytest.approx(3.0 * float(S), rel=5e-3)
-    assert found.history[-1].validation <= 1.01 * min(at.validation for at in found.history)
+    for share in (0.0, 0.2):
+        worst = worst_disturbance(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=share)) if share else None
+        found = fit_value(LINE, network, numbers=numbers, double=True, disturbance=worst)
+        S = lqr([[0.9 + share]], [[1.0]], [[0.5]], [[0.5]]).S[0, 0]
+        V, slope = network.value_and_gradient(found.parameters, jnp.array([1.5]))
+        assert pytest.approx(float(S) * 1.5**2, rel=5e-3) == V and slope[0] == pytest.approx(3.0 * float(S), rel=5e-3)
+        assert found.history[-1].validation <= 1.01 * min(at.validation for at in found.history)
 
 
 @pytest.mark.slow
-def test_seeds_are_what_each_is_alone_and_states_are_of_the_wide_box():
-    numbers = Iteration(iterations=1, starts=8, seconds=0.1, steps=2, batch=8, kept=2)
-    both, again = (fit_values(LINE, value_network(LINE, widths=()), seeds, numbers=numbers) for seeds in ((0, 1), (1,)))
-    alone = again[0]
-    jax.tree.map(np.testing.assert_array_equal, both[1].parameters, alone.parameters)
+def test_seeds_are_what_each_is_alone_also_after_an_interruption():
+    network = value_network(LINE, widths=())
+    numbers = Iteration(iterations=3, starts=8, seconds=0.1, steps=2, batch=8, kept=2)
+    stored = []
+    both = fit_values(LINE, network, (0, 1), numbers=numbers, store=lambda seed, state: stored.append((seed, state)))
+    first = next(state for seed, state in stored if seed == 1)
+    (alone,) = fit_values(LINE, network, (1,), numbers=numbers, restore=lambda seed, state: first)
+    jax.tree.map(assert_array_equal, both[1].parameters, alone.parameters)
+    assert [at.validation for at in both[1].history] == [at.validation for at in alone.history]
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(alone.parameters))
+
+
+def test_states_are_drawn_from_the_wide_box():
     wide = widened(PENDULUM, 1.25)
     x = drawn(wide, jax.random.key(0), 500)
     assert wide.high.tolist() == [np.pi, 10.0] and np.abs(x[:, 1]).max() > 9 and np.abs(x[:, 0]).max() <= np.pi
-
-
-def test_numbers_out_of_range():
-    with pytest.raises(InputError, match="dt"):
-        fit_value(LINE, value_network(LINE, widths=()), numbers=Iteration(dt=0.0))

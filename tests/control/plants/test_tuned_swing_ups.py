@@ -4,97 +4,77 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
+from numpy.testing import assert_allclose
 
 from dln_jax.control.closed_loop import Hardware, stateless
-from dln_jax.control.plants import (
-    Exploration,
-    compiled,
-    explore,
-    judged_runs,
-    layout,
-    plant_of,
-    run,
-    start_of,
-    tune,
-)
-from dln_jax.control.plants.scales import USUAL, circle, gains_of, scales_of, swing_up_numbers
+from dln_jax.control.plants import Exploration, compiled, explore, judged_runs, layout, plant_of, run, start_of, tune
+from dln_jax.control.plants.exploring import NEAR
+from dln_jax.control.plants.runs import distances
+from dln_jax.control.plants.scales import USUAL, circle, scales_of, swing_up_numbers
 from dln_jax.control.plants.tuning import trial_of
-from dln_jax.control.plants.ways import by_energy
 from dln_jax.control.swing_up import upright_of
-from dln_jax.learning.recordings import identified_chain, prepare
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole
-from dln_jax.types import InputError
 
 SIZES = {"cart_mass": 0.6, "pole_mass": 0.15, "length": 0.25}
 
 
-def rail(control=8.0, half=0.8, rate=100.0):
-    limits = [[-half, half], [-np.inf, np.inf]]
+def rail(control=8.0):
+    limits = [[-0.8, 0.8], [-np.inf, np.inf]]
     postures = {"goal": (0, 0), "hanging": (0, np.pi)}
-    return layout(("prismatic", "revolute"), [0], **postures, rate=rate, control=control, position=limits)
+    return layout(("prismatic", "revolute"), [0], **postures, rate=100.0, control=control, position=limits)
 
 
 def model(**sizes):
     return dynamics(cart_pole(**{**SIZES, **sizes}, friction=0.002).closed_form)
 
 
-def upright(plant, model):
-    return upright_of(model, plant.actuation, plant.goal, postures=circle(plant))
+def scaled(plant, **sizes):
+    upright = upright_of(model(**sizes), plant.actuation, plant.goal, postures=circle(plant))
+    return upright, scales_of(upright, plant)
 
 
 def test_scales_of_a_cart_pole_have_closed_forms():
-    scales = scales_of(upright(rail(), model()), rail())
+    plant = rail()
+    _, scales = scaled(plant)
     m, l, g = SIZES["pole_mass"], SIZES["length"], 9.81
     assert scales.fall == pytest.approx(np.sqrt(g / l))
     assert scales.energy == pytest.approx(2 * m * g * l, rel=1e-6)
     assert scales.speed == pytest.approx(2 * np.sqrt(g / l), rel=1e-6)
     assert scales.coupling == pytest.approx(m * l)
     assert scales.acceleration == pytest.approx(8.0 / SIZES["cart_mass"])
-    np.testing.assert_allclose(scales.sizes, [l, 1.0])
+    assert_allclose(scales.sizes, [l, 1.0])
+    with one_line("do not fall from the goal"):
+        scaled(plant._replace(goal=plant.hanging, hanging=plant.goal))
 
 
-def test_plants_of_one_shape_get_the_same_law_in_their_own_units():
-    """Masses and forces c times as large leave accelerations, and the regulator's feedback grows as the force."""
-    small, large = upright(rail(), model()), upright(rail(24.0), model(cart_mass=1.8, pole_mass=0.45))
-    (one, first), (other, second) = (
-        swing_up_numbers(at, plant, scales_of(at, plant), USUAL) for at, plant in ((small, rail()), (large, rail(24.0)))
-    )
-    np.testing.assert_allclose(second.K, 3 * np.asarray(first.K), rtol=1e-6)
+def test_similar_plants_get_the_same_law_in_their_own_units():
+    """Masses and forces 3 times as large leave accelerations, and the regulator's feedback grows as the force."""
+    large = rail(24.0)
+    one, first = swing_up_numbers(scaled(rail())[0], rail(), scaled(rail())[1], USUAL)
+    upright, scales = scaled(large, cart_mass=1.8, pole_mass=0.45)
+    other, second = swing_up_numbers(upright, large, scales, USUAL)
+    assert_allclose(second.K, 3 * np.asarray(first.K), rtol=1e-6)
     assert other.level == pytest.approx(one.level, rel=1e-6) and other.kick == pytest.approx(3 * one.kick)
-    # k E M_ap qd_p is an acceleration, where E and M_ap grow by c each.
+    # k E M_ap qd_p is an acceleration, where E and M_ap grow by 3 each.
     assert other.gains.energy == pytest.approx(one.gains.energy / 9, rel=1e-6)
-    np.testing.assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
+    assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
 
 
 def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_limit():
-    plant = rail()
-    at = upright(plant, model())
-    numbers, regulator = swing_up_numbers(at, plant, scales_of(at, plant), {**USUAL, "catch": 1.0})
+    upright, scales = scaled(rail())
+    numbers, regulator = swing_up_numbers(upright, rail(), scales, {**USUAL, "catch": 1.0})
     directions = np.random.default_rng(0).normal(size=(20000, 4)) @ np.linalg.inv(np.linalg.cholesky(regulator.S))
     sizes = np.sqrt(np.einsum("ni,ij,nj->n", directions, regulator.S, directions))
     asked = np.abs((np.sqrt(numbers.level) * directions / sizes[:, None]) @ np.asarray(regulator.K).T).max()
     assert 0.97 * 8.0 < asked <= 8.0 + 1e-9
 
 
-def test_a_goal_from_which_nothing_falls_is_refused():
-    plant = rail()
-    down = plant._replace(goal=plant.hanging, hanging=plant.goal)
-    with pytest.raises(InputError, match="do not fall from the goal"):
-        scales_of(upright(down, model()), down)
-
-
-def test_gains_are_those_of_the_module_s_equations():
-    scales = scales_of(upright(rail(), model()), rail())
-    gains = gains_of(scales, {"energy": 2.0, "stiffness": 0.5, "damping": 1.0})
-    at_most = gains.energy * scales.energy * scales.coupling * scales.speed
-    assert at_most == pytest.approx(2 * scales.acceleration)
-    assert gains.derivative == pytest.approx(2 * np.sqrt(gains.proportional))
-
-
 @pytest.mark.slow
 def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
-    plant, lab = rail(), Hardware(encoder_step=1e-4, delay=1)
+    plant = rail()
+    lab = Hardware(encoder_step=1e-4, delay=1)
     tuned = tune(model(), plant, lab, sets=32, seconds=6.0)
     assert 0 < tuned.worked <= 1 and tuned.margin >= 0 and tuned.trials >= 64
     plants = [plant_of(model(), plant, hardware=lab, seed=seed) for seed in range(4)]
@@ -103,86 +83,36 @@ def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
     assert trials.up.all() and not trials.stopped
 
 
-def test_trials_with_motors_a_whole_sample_late_are_those_of_hardware_with_that_delay():
-    plant = rail()
-    asked = stateless(lambda x: 3.0 * jnp.cos(5 * x[:1] + x[1:2]))
-
-    def trial(delay, late):
-        made = trial_of(
-            lambda _: asked,
-            model(),
-            plant,
-            Hardware(delay=delay, encoder_noise=1e-4),
-            seconds=2.0,
-            substeps=1,
-            late=late,
-        )
-        return made((), jnp.array([0.0, 0.1]), jnp.array(0.0), jax.random.key(0))
-
-    changes, of_late_motors, between = (float(trial(*late)[1]) for late in ((1, 0.0), (0, 1.0), (0, 0.5)))
-    assert of_late_motors == pytest.approx(changes, rel=1e-9)
-    assert abs(between / changes - 1) > 1e-6
+@pytest.mark.slow
+def test_episodes_of_an_exploration_follow_a_plan_where_none_came_near_the_goal():
+    plant = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4))
+    low = (-0.9, -0.9, -0.9, -0.9)
+    recording = explore(plant, lambda _: model(), Exploration(seconds=15.0, surplus=low)).recording
+    near = [distances(recording.q[recording.trajectory == k], rail()).min() < NEAR for k in range(6)]
+    assert near == [False] * 4 + [True] * 2
+    assert np.abs(recording.tau[:, 0]).max() <= Exploration().share * 8.0 + 1e-12
 
 
-@pytest.mark.parametrize(("noise", "fine"), [(1e-3, True), (1e-2, False)])
-def test_a_trial_fails_where_noise_makes_a_plant_look_faster_than_its_limit(noise, fine):
+def trial(law, plant, hardware, late=0.0):
+    return trial_of(lambda _: stateless(law), model(), plant, hardware, seconds=2.0, substeps=1, late=late)
+
+
+def test_motors_a_whole_sample_late_are_hardware_with_that_delay():
+    def margin(delay, late):
+        law = lambda x: 3.0 * jnp.cos(5 * x[:1] + x[1:2])  # noqa: E731
+        made = trial(law, rail(), Hardware(delay=delay, encoder_noise=1e-4), late)
+        return float(made((), jnp.array([0.0, 0.1]), jnp.array(0.0), jax.random.key(0))[1])
+
+    delayed = margin(1, 0.0)
+    assert margin(0, 1.0) == pytest.approx(delayed, rel=1e-9)
+    assert abs(margin(0, 0.5) / delayed - 1) > 1e-6
+
+
+def test_trial_fails_where_noise_makes_a_plant_look_faster_than_its_limit():
     """A plant at rest at its goal, for which rates over five samples have the standard deviation 28 noise."""
     still = rail()
     still = still._replace(limits=still.limits._replace(rate=np.array([0.2, 0.2])))
-    trial = trial_of(
-        lambda _: stateless(lambda x: jnp.zeros(1)),
-        model(),
-        still,
-        Hardware(encoder_noise=noise),
-        seconds=2.0,
-        substeps=1,
-        late=0.0,
-    )
-    seconds, _ = trial((), jnp.asarray(still.goal), jnp.array(0.0), jax.random.key(0))
-    assert np.isfinite(seconds) == fine
-
-
-def test_trials_of_a_plant_that_falls_slowly_last_longer(monkeypatch):
-    """With a pole of 36 times the length everything takes six times as long."""
-    durations = []
-
-    def refuse(*_, seconds=None, **__):
-        durations.append(seconds)
-        raise InputError("no trial")
-
-    monkeypatch.setattr("dln_jax.control.plants.tuning.trial_of", refuse)
-    monkeypatch.setattr("dln_jax.control.plants.tuning.RECOVERIES", {"swing-up": (by_energy,)})
-    for length in (0.25, 36 * 0.25):
-        with pytest.raises(InputError, match="no trial"):
-            tune(model(length=length), rail())
-    assert durations == [6.0, pytest.approx(26 / np.sqrt(9.81 / 9.0))]
-
-
-@pytest.mark.slow
-def test_a_motor_that_is_too_weak_is_refused_with_the_number_of_trials(monkeypatch):
-    def refuse(*_, **__):
-        raise InputError("no plan arrives")
-
-    monkeypatch.setattr("dln_jax.control.plants.ways.plans_of", refuse)
-    with pytest.raises(InputError, match=r"no plan arrives; none of 16 sets .* in 32 trials, of which 0% came up"):
-        tune(model(), rail(control=0.01), sets=4, seconds=2.0)
-
-
-@pytest.mark.slow
-def test_a_plant_is_identified_from_motions_that_no_model_planned():
-    plant = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4, delay=1))
-
-    def fit(recording):
-        return identified_chain(prepare(recording, chain=True), plant.layout.needs).dynamics
-
-    explored = explore(plant, fit, Exploration(seconds=12.0))
-    recording = explored.recording
-    assert np.abs(recording.tau[:, 0]).max() <= 0.8 * 8.0 and (recording.tau[:, 1] == 0).all()
-    assert np.abs(recording.q[:, 0]).max() <= 0.8
-    truth = model().mass_matrix(jnp.zeros(2))
-    np.testing.assert_allclose(fit(recording).mass_matrix(jnp.zeros(2)), truth, rtol=0.05)
-
-
-def test_an_unknown_recovery_is_refused():
-    with pytest.raises(InputError, match="choose from swing-up, plans"):
-        tune(model(), rail(), recover="never")
+    for noise, fine in ((1e-3, True), (1e-2, False)):
+        made = trial(lambda x: jnp.zeros(1), still, Hardware(encoder_noise=noise))
+        seconds, _ = made((), jnp.asarray(still.goal), jnp.array(0.0), jax.random.key(0))
+        assert np.isfinite(seconds) == fine
