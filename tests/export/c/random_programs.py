@@ -23,27 +23,18 @@ LARGEST = 300
 Arrays = list[Any]
 
 
-def program(seed: int) -> tuple[Callable[..., Any], tuple[np.ndarray, ...]]:
-    """A function of one to four arrays that gives a list of arrays, and examples of its arguments."""
+def program(seed: int, count: int) -> tuple[Callable[..., Any], list[tuple[np.ndarray, ...]]]:
+    """A function of one to four arrays that gives a list of arrays, and some states of its arguments."""
     random = np.random.default_rng([seed, 0])
-    shapes = [_of_one(random, SHAPES) for _ in range(random.integers(1, 5))]
-    examples = tuple(_of(random, shape, _of_one(random, TYPES)) for shape in shapes)
+    like = [(_of_one(random, SHAPES), _of_one(random, TYPES)) for _ in range(random.integers(1, 5))]
 
-    def function(arrays: Arrays) -> Arrays:
+    def function(*arguments: Any) -> Arrays:
         random = np.random.default_rng([seed, 1])
-        known = _computed(random, [*arrays], steps=int(random.integers(4, 12)), depth=2)
-        chosen = random.choice(len(known), size=min(len(known), int(random.integers(1, 5))), replace=False)
+        known = _computed(random, [*arguments], steps=int(random.integers(4, 12)), depth=2)
         # The last is there, so that long chains are.
-        return [known[k] for k in {*chosen.tolist(), len(known) - 1}]
+        return [*(_of_one(random, known) for _ in range(3)), known[-1]]
 
-    return lambda *arrays: function(arrays), examples
-
-
-def states(seed: int, examples: tuple[np.ndarray, ...], count: int) -> list[tuple[np.ndarray, ...]]:
-    """The examples, and others of the same shapes and types."""
-    random = np.random.default_rng([seed, 2])
-    others = (tuple(_of(random, array.shape, array.dtype) for array in examples) for _ in range(count - 1))
-    return [examples, *others]
+    return function, [tuple(_of(random, *one) for one in like) for _ in range(count)]
 
 
 def _of_one(random: np.random.Generator, choices: Any) -> Any:
@@ -183,28 +174,31 @@ def _reduced(random, known, depth):
 
 def _product(random, known, depth):
     a = _chosen(random, known, rank=1)
-    b = jnp.asarray(_of(random, (a.shape[-1], *_of_one(random, ((), (3,), (9,)))), a.dtype))
-    same = [array for array in known if array.dtype == a.dtype and array.ndim and array.shape[0] == a.shape[-1]]
-    return [jnp.tensordot(a, _of_one(random, [b, *same]), ([a.ndim - 1], [0]))]
+    fitting = [array for array in known if array.dtype == a.dtype and array.ndim and array.shape[0] == a.shape[-1]]
+    made = jnp.asarray(_of(random, (a.shape[-1], 9), a.dtype))
+    return [jnp.tensordot(a, _of_one(random, [made, *fitting]), ([a.ndim - 1], [0]))]
 
 
 def _moved(random, known, depth):
     x = _chosen(random, known, rank=1)
     axis = int(random.integers(x.ndim))
-    moves = [
-        lambda: jnp.flip(x, axis),
-        lambda: x.T,
-        lambda: jnp.roll(x, 1 + int(random.integers(3)), axis),
-        lambda: jnp.concatenate([lax.slice_in_dim(x, 0, 1, axis=axis), x], axis),
-        lambda: x.reshape(-1)[::2],
-        lambda: x[-1],
-        lambda: jnp.pad(x, [(1, 0)] * x.ndim),
-        lambda: jnp.repeat(x, 2, axis),
-        lambda: jnp.broadcast_to(x, (2, *x.shape)),
-        lambda: jnp.tril(x) if x.ndim > 1 else jnp.diag(x[:6]),
-        lambda: lax.slice_in_dim(x, 0, 0, axis=axis),
-    ]
-    return [_of_one(random, moves)()]
+    move = _of_one(random, MOVES)
+    return [move(x, axis)]
+
+
+MOVES = (
+    jnp.flip,
+    lambda x, axis: x.T,
+    lambda x, axis: jnp.roll(x, 2, axis),
+    lambda x, axis: jnp.concatenate([lax.slice_in_dim(x, 0, 1, axis=axis), x], axis),
+    lambda x, axis: x.reshape(-1)[::2],
+    lambda x, axis: x[-1],
+    lambda x, axis: jnp.pad(x, [(1, 0)] * x.ndim),
+    lambda x, axis: jnp.repeat(x, 2, axis),
+    lambda x, axis: jnp.broadcast_to(x, (2, *x.shape)),
+    lambda x, axis: jnp.tril(x) if x.ndim > 1 else jnp.diag(x[:6]),
+    lambda x, axis: lax.slice_in_dim(x, 0, 0, axis=axis),
+)
 
 
 def _indexed(random, known, depth):
@@ -212,16 +206,14 @@ def _indexed(random, known, depth):
     # JAX narrows indices to 32 bits in some modes, and jitted and not it clamps large unsigned ones differently.
     index = index % 23 if _kind(index) == "u" else jnp.clip(index, -23, 23)
     index = index if index.size * (x.size // x.shape[0]) <= LARGEST else index.reshape(-1)[0]
-    near, mode = index % x.shape[0], _of_one(random, ("clip", "drop"))
+    mode, first = _of_one(random, ("clip", "drop")), index.reshape(-1)[0]
     ways = [
-        lambda: x[near],
-        lambda: jnp.take(x, index, axis=0, mode="clip"),
+        lambda: x[index % x.shape[0]],
         lambda: x.at[index].get(mode="fill", fill_value=1),
-        lambda: lax.dynamic_slice_in_dim(x, index.reshape(-1)[0], max(1, x.shape[0] // 2)),
-        lambda: lax.dynamic_update_slice_in_dim(x, x[:1], index.reshape(-1)[0], 0),
-        lambda: x.at[near].set(x[0]),
+        lambda: lax.dynamic_slice_in_dim(x, first, max(1, x.shape[0] // 2)),
+        lambda: lax.dynamic_update_slice_in_dim(x, x[:1], first, 0),
+        lambda: x.at[index].set(x[0], mode=mode),
         lambda: x.at[index].add(x[0], mode=mode) if x.dtype != bool else ~x,
-        lambda: x.at[near].min(x[0], mode="promise_in_bounds") if x.dtype != bool else x,
         lambda: x.at[index].apply(lambda v: ~v if v.dtype == bool else v * v, mode=mode),
     ]
     return [_of_one(random, ways)()]

@@ -12,11 +12,10 @@ from comparison import BOUND, TYPES, in_c, in_jax, needs_compiler
 from conftest import slow_among
 from jax import lax
 from planar_arm import ARM
-from test_families import MODELS, run_of
+from test_families import MODELS, run_of, states_of
 
 from dln_jax.export.c.families import functions_of_run, functions_of_system
 from dln_jax.export.c.load import FLAGS
-from dln_jax.mechanics.equations import Canonical, flow
 from dln_jax.mechanics.friction import LAWS, coefficients_of, joint_dissipation
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -33,17 +32,6 @@ def furuta_pendulum(q, qd):
     mass = mass.at[0, 1].set(0.3 * cos).at[1, 0].set(0.3 * cos)
     factor = jnp.linalg.cholesky(mass)
     return 0.5 * jnp.sum((factor.T @ qd) ** 2) - 0.2 * 9.81 * cos
-
-
-def elastic_beam(q, qd):
-    """Masses in a row whose bending energy is summed by a scan."""
-    padded = jnp.concatenate([jnp.zeros(2), q])
-
-    def bent(energy, three):
-        return energy + 30 * (three[0] - 2 * three[1] + three[2]) ** 2, None
-
-    energy, _ = lax.scan(bent, 0.0, jnp.stack([padded[:-2], padded[1:-1], padded[2:]], axis=1))
-    return 0.5 * qd @ qd - energy - 9.81 * jnp.sum(q)
 
 
 def ball_in_a_bowl(q, qd):
@@ -63,7 +51,6 @@ def with_every_friction():
 
 BY_HAND = {
     "furuta_pendulum": (LagrangianSystem(furuta_pendulum), 2),
-    "elastic_beam": (LagrangianSystem(elastic_beam), 4),
     "ball_in_a_bowl": (LagrangianSystem(ball_in_a_bowl), 2),
     "every_friction": (with_every_friction(), 2),
 }
@@ -86,48 +73,33 @@ def pytest_generate_tests(metafunc):
 
 
 def system_of(case, precision):
-    """Functions, and the system that they are of, if it is one of mechanics.
+    """Functions, the system that they are of, and its degrees of freedom.
 
     A run's parameters are numbers that both precisions have.
     """
-    dtype = TYPES[precision]
     if case in MODELS:
         run = run_of(case)
         rounded = jax.tree.map(lambda leaf: leaf.astype(np.float32).astype(float), run.parameters)
-        run = Run(run.model, rounded, run.description)
-        return functions_of_run(run, precision=precision), run.energies if "needs" in MODELS[case] else None
+        functions = functions_of_run(Run(run.model, rounded, run.description), precision=precision)
+        needs = MODELS[case].get("needs")
+        return functions, needs and run.energies, needs.degrees_of_freedom if needs else 1
     if case in BY_HAND:
-        system, d = BY_HAND[case]
-        return functions_of_system(system, d, dtype=dtype), system
-    scene = SCENES[case]()
-    d = len(scene.needs.joints)
-    return functions_of_system(scene.closed_form, d, dtype=dtype, actuation=scene.needs.actuation), scene.closed_form
+        system, d, actuation = (*BY_HAND[case], None)
+    else:
+        scene = SCENES[case]()
+        system, d, actuation = scene.closed_form, len(scene.needs.joints), scene.needs.actuation
+    return functions_of_system(system, d, dtype=TYPES[precision], actuation=actuation), system, d
 
 
-def states_of(functions, system):
-    """Returns a thousand states of each function, and the first with each of its numbers in turn not finite."""
-    random = np.random.default_rng(1)
-    drawn, states = {}, {}
-    names = {name: list(inspect.signature(function).parameters) for name, (function, _) in functions.items()}
-    for name, (_, examples) in functions.items():
-        for key, example in zip(names[name], examples, strict=True):
-            values = random.uniform(-1, 1, (STATES, *np.shape(example)))
-            drawn.setdefault(key, (0.02 + 0 * values if key == "dt" else values).astype(np.float32).astype(float))
-    if isinstance(system, Canonical):  # velocities that have momenta
-        rates = jax.jit(jax.vmap(lambda q, p: flow(system).rates(q, p)[0]))
-        drawn["qd"] = np.asarray(rates(drawn["q"], 0.5 * drawn["p"])).astype(np.float32).astype(float)
-        drawn["x"] = np.concatenate([drawn["q"], drawn["qd"]], axis=1)
-    for name, keys in names.items():
-        every = list(zip(*(drawn[key] for key in keys), strict=True))
-        first = every[0]
-        for place, leaf in enumerate(first):
-            for k in range(np.size(leaf)):
-                for value in (np.nan, np.inf, -np.inf):
-                    changed = np.array(leaf)
-                    changed.reshape(-1)[k] = value
-                    every.append((*first[:place], changed, *first[place + 1 :]))
-        states[name] = every
-    return states
+def with_holes(rows):
+    """The states, and the first with each of its numbers in turn not finite."""
+    first, changed = rows[0], []
+    for place, leaf in enumerate(first):
+        for k in range(np.size(leaf)):
+            for value in (np.nan, np.inf, -np.inf):
+                hole = np.where(np.arange(np.size(leaf)).reshape(np.shape(leaf)) == k, value, leaf)
+                changed.append((*first[:place], hole, *first[place + 1 :]))
+    return [*rows, *changed]
 
 
 def differences(got, expected):
@@ -151,14 +123,23 @@ def test_c_equals_jax(case, tmp_path, pytestconfig):
     every = pytestconfig.getoption("--every-export")
 
     def chosen(precision):
-        functions, system = system_of(case, precision)
+        functions, system, d = system_of(case, precision)
         names = functions if every or case in WHOLE else ("forward_dynamics",) if case in BY_HAND else BRIEFLY
         if case == "black-box-hnn" and not every:  # derivatives through its iterations take long to compile
             names = ("inverse_dynamics", "forward_dynamics", "rates", "hamiltonian")
-        return {name: functions[name] for name in functions if name in names}, system
+        return {name: functions[name] for name in functions if name in names}, system, d
 
-    functions, system = chosen("f64")
-    states = states_of(functions, system)
+    functions, system, d = chosen("f64")
+    controls = len(functions["step_rk4"][1][1]) if "step_rk4" in functions else d
+    drawn = states_of(system, d, controls, count=STATES)
+    states = {}
+    for name, (function, examples) in functions.items():
+        keys = inspect.signature(function).parameters
+        if system is None:  # networks alone
+            random = np.random.default_rng(1)
+            drawn = {key: random.uniform(-1, 1, (STATES, *one.shape)) for key, one in zip(keys, examples, strict=True)}
+            drawn = {key: values.astype(np.float32).astype(float) for key, values in drawn.items()}
+        states[name] = with_holes(list(zip(*(drawn[key] for key in keys), strict=True)))
     expected = in_jax(functions, states)
     for precision in BOUND if every or case in SINGLE else ("f64",):
         ours = functions if precision == "f64" else chosen(precision)[0]

@@ -56,6 +56,7 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
     assert f"C format {interface.FORMAT}" in header
     assert "void arm_step(const float x[4], const float u[1], float x_next[4]);" in header
     assert "float arm_energy(const float x[3], float k);" in header
+    assert "const int64_t i[2]" in source_files(FUNCTIONS, name="arm")["arm.h"].decode()
     assert re.findall(r"#include (\S+)", source) == ["<float.h>", "<math.h>", "<stdint.h>", '"arm.h"']
     assert not re.search(r"\b(malloc|static (?!const|inline|void)|double)\b", source)
     stated = json.loads(once["arm.json"])["functions"]
@@ -262,16 +263,6 @@ def test_library_functions_bear_extended_precision(tmp_path):
     export_c({"f": (jnp.exp, (np.zeros(9),))}, tmp_path, libm=True)
     x = np.linspace(-3, 3, 9)
     np.testing.assert_allclose(load_c(tmp_path, compiler="gcc", flags=("-mfpmath=387",)).f(x), np.exp(x), rtol=1e-14)
-
-
-def test_integers_have_the_types_of_stdint(tmp_path):
-    types = (np.int32, np.int64, np.uint32, np.uint64)
-    export_c({"f": (lambda *arrays: arrays[0][0] + 1, tuple(np.zeros(2, kind) for kind in types))}, tmp_path)
-    header = (tmp_path / "model.h").read_text()
-    assert "#include <stdint.h>" in header
-    for kind in types:
-        assert f"const {np.dtype(kind).name}_t " in header
-    assert not re.search(r"\bunsigned |long long", (tmp_path / "model.c").read_text())
 
 
 def test_an_export_never_takes_the_place_of_a_runs_file(tmp_path):

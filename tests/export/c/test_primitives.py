@@ -43,8 +43,7 @@ UNARY = {
     "round_away": lambda x: lax.round(x, lax.RoundingMethod.AWAY_FROM_ZERO),
     "integer_pow": lambda x: [lax.integer_pow(x, n) for n in (0, 2, 3, 7, -1, -3)],
     "clamp": lambda x: lax.clamp(x.dtype.type(-0.7), x, x.dtype.type(0.9)),
-    "to_int": lambda x: jnp.where(jnp.abs(x) < 100, x, 0).astype(int),
-    "to_bool": lambda x: x.astype(bool),
+    "converted": lambda x: (jnp.where(jnp.abs(x) < 100, x, 0).astype(int), x.astype(bool)),
     "saturating_conversions": lambda x: [(1e17 * x).astype(kind) for kind in KINDS],
     "reduce_precision": lambda x: [
         lax.reduce_precision(x, *bits) for bits in ((5, 10), (8, 7), (8, 23), (11, 52), (8, 52), (11, 3), (5, 23))
@@ -97,10 +96,6 @@ ON_INTEGERS = {
     "bits_that_differ": lambda a, b: (
         *((a[:3] | -2) != 0, (b[:3] & 3) == 4, (a[:3].astype(jnp.uint32) | 3) == 4, ((a | -2).astype(bool) & (b > 0))),
     ),
-    "bitwise_reductions": lambda a, b: (
-        *(jnp.bitwise_or.reduce(a), jnp.bitwise_and.reduce(b[1:4]), jnp.bitwise_xor.reduce(a)),
-        jnp.bitwise_xor.reduce(b[:2]),
-    ),
     "products": lambda a, b: (
         *(a @ b, jnp.dot(a.astype(jnp.uint32), b.astype(jnp.uint32)), a[(b @ b) % 3]),
         *((jnp.outer(a, b) @ jnp.outer(b, a)) % 3, (a * 30370005) @ (b * wide(4611686018427))),
@@ -143,7 +138,6 @@ MOVES = {
     "unstack": lambda x: [3 * column for column in jnp.unstack(x, axis=1)[:3]] + list(jnp.split(x, [2, 3])),
     "tile": lambda x: (jnp.tile(x, (2, 3)), jnp.roll(x, 2, axis=1)),
     "triangles": lambda x: (jnp.triu(x, 1), jnp.diag(x[:, 0]), jnp.diagonal(x)),
-    "iota": lambda x: x * jnp.arange(7) + lax.broadcasted_iota(float, (5, 7), 0),
     "reductions": lambda x: (
         *(x.sum(0), x.sum(1), x.sum(), x.prod(1), x.max(0), x.min((0, 1)), x.var(1), x[:, :2].sum(1)),
         *((x > 0).all(1), (x > 1).any(0), (x[..., None] * x[0]).max((0, 1))),
@@ -153,15 +147,12 @@ MOVES = {
         *(jnp.cumsum(x, 0), lax.cumsum(x, 1, reverse=True), jnp.cumprod(x, 1)),
         *(lax.cummax(x, 1), lax.cummin(x, 0, reverse=True)),
     ),
-    "gradient_of_max": lambda x: jax.grad(lambda x: x.max() * jnp.prod(x.min(1)))(x),
-    "gradient_of_sort": jax.grad(lambda x: jnp.sort(x, 1)[:, 0] @ jnp.sort(x, 0)[2, :5] + jnp.median(x)),
 }
 INDEXED = {
     "gather": lambda x, i: (x[i], x[0, i], x[i, i[::-1]], x[:, i]),
     "gather_outside": lambda x, i: (
         [x.at[i].get(mode=mode) for mode in ("clip", "fill")] + [x.at[0, i].get(mode="fill", fill_value=-3.0)]
     ),
-    "gather_promise": lambda x, i: x.at[jnp.clip(i, 0, 4)].get(mode="promise_in_bounds"),
     "gather_batched": lambda x, i: jax.vmap(lambda row, k: row[k])(x, i[:5]),
     "gather_known": lambda x, i: (x[np.array([0, 4, 4])], x[np.array([True, False, True, False, True])]),
     "scatter": lambda x, i: [
@@ -177,8 +168,6 @@ INDEXED = {
     "scatter_triangles": lambda x, i: jax.vmap(  # a loop cannot follow its places
         lambda row: jnp.zeros((4, 4), x.dtype).at[np.tril_indices(4)].add(jnp.tile(row, 2)[:10]).at[1].mul(row[1])
     )(x),
-    "lower_triangles": lambda x, i: jnp.tril(jnp.broadcast_to(x[:, None], (5, 7, 7))) * 2.0,
-    "scatter_whole": lambda x, i: x.at[:].set(x[0, i[0] % 5]),
     "scatter_batched": lambda x, i: jax.vmap(lambda row, k: row.at[k].add(2.0))(x, i[:5]),
     "dynamic_slice": lambda x, i: (
         lax.dynamic_slice(x, (i[0], i[1]), (2, 3)),
@@ -188,7 +177,6 @@ INDEXED = {
     "changed": lambda x, i: (x.at[i].apply(lambda v: v * v), x.at[1].apply(jnp.sin), x.at[:, i[:2]].apply(jnp.cos)),
     "changed_by_mode": lambda x, i: [x.at[i, 0].apply(jnp.tanh, mode=mode) for mode in ("clip", "drop")],
     "changed_at_known": lambda x, i: (x.at[np.array([1, 1, 2])].apply(lambda v: 2 * v), x.at[2:, ::3].apply(jnp.exp)),
-    "changed_in_rows": lambda x, i: jax.vmap(lambda row, k: row.at[k].apply(lambda v: v - 1))(x, i[:5]),
     "changed_integers": lambda x, i: (i.at[i].apply(lambda v: 3 * v), (i > 0).at[i].apply(jnp.logical_not)),
 }
 
@@ -229,7 +217,6 @@ CONTROL = {
     "while_without_turn": lambda x, n: lax.while_loop(lambda y: jnp.all(y != y), lambda y: y + 1, 0 * x + 1),
     "scan": lambda x, n: lax.scan(lambda c, y: (c + y, c * y), 0.0, x),
     "scan_reverse": lambda x, n: lax.scan(lambda c, y: (c + y, jnp.stack([c, y])), 0.0, x, reverse=True),
-    "scan_of_length": lambda x, n: lax.scan(lambda c, _: (jnp.cos(c), c[:2]), x, None, length=4),
     "scan_of_rows": lambda x, n: lax.scan(
         lambda c, y: ((c[0] + y["a"], c[1] @ y["b"]), (y["a"] * 2, c[1])),
         (x, jnp.eye(2)),
@@ -239,8 +226,6 @@ CONTROL = {
     "nested_loops": lambda x, n: lax.fori_loop(
         0, 3, lambda k, y: lax.scan(lambda c, z: (c + z * k, c), y, y[:, None] * x)[0] / 10, x
     ),
-    "loop_of_what_is_outside": lambda x, n: lax.fori_loop(0, 4, lambda k, y: y + jnp.tanh(x) @ jnp.outer(x, x), x),
-    "associative_scan": lambda x, n: lax.associative_scan(jnp.multiply, x),
     "cond": lambda x, n: lax.cond(x[0] > 0, lambda: (x, x[0]), lambda: (-x, x[1])),
     "switch": lambda x, n: lax.switch(n - 2, [jnp.sin, jnp.cos, lambda y: y[::-1]], x),
     "select_n": lambda x, n: lax.select_n(jnp.clip(n, 0, 2), x, 2 * x, x + 1),
@@ -253,14 +238,9 @@ CONTROL = {
         lambda: lax.cond(x[0] > 0, lambda: jnp.exp(x), lambda: lax.scan(lambda c, y: (c, c * y), x[0], x)[1]),
     ),
     "shared_by_branches": lambda x, n: lax.cond(n > 2, lambda: jnp.tanh(x) + 1, lambda: jnp.tanh(x) * 2),
-    "gradient_of_scan": lambda x, n: jax.grad(lambda x: lax.scan(lambda c, y: (jnp.sin(c + y), c), 0.0, x)[0])(x),
-    "checkpoint": lambda x, n: jax.grad(jax.checkpoint(lambda x: jnp.sum(jnp.sin(x) ** 3)))(x),
     "own_derivatives": lambda x, n: (
         *(of_own_slope(x[0]), jax.grad(of_own_slope)(x[0]), of_own_pullback(x), jax.grad(of_own_pullback)(x)),
-        *(root(x[0]), jax.grad(root)(x[0])),
-    ),
-    "newton": lambda x, n: lax.while_loop(
-        lambda s: (jnp.abs(s**3 - 2) > 1e-5) & (s < 10), lambda s: s - (s**3 - 2) / (3 * s**2), 1 + 0.0 * n
+        *(root(x[0]), jax.grad(root)(x[0]), jax.checkpoint(jnp.sin)(x)),
     ),
     "mapped_while": lambda x, n: jax.vmap(jax.vmap(lambda y: counted(y, n)))(x[:, None] + x[:3]),
     "mapped_while_of_rows": lambda x, n: jax.vmap(
@@ -270,7 +250,6 @@ CONTROL = {
         lambda c, y: (c + 1, jax.vmap(lambda z: counted(z, n))(c * y)[0]), x, x
     ),
     "mapped_cond": lambda x, n: jax.vmap(lambda y: lax.cond(y > 0, jnp.sin, lambda y: counted(1 + y * y, n)[0], y))(x),
-    "mapped_gradient": lambda x, n: jax.vmap(lambda y: jax.jvp(lambda y: counted(y, n)[0], (y,), (2.0,))[1])(x),
 }
 EMPTY = {
     "reductions": lambda z, x: (
@@ -341,7 +320,6 @@ FACTORED = {
     "triangular_solves": triangular_solves,
     "lu": lambda a, b: (lax.linalg.lu(a), scipy_linalg.lu_factor(jnp.hstack([a, b]))[0]),
     "solve": lambda a, b: (jnp.linalg.solve(jnp.stack([a, a.T]), jnp.stack([b, 2 * b])), jnp.linalg.det(a)),
-    "gradient_of_solve": lambda a, b: jax.grad(lambda a: jnp.sum(jnp.linalg.solve(definite(a), b)))(a),
     "custom_linear_solve": lambda a, b: (matrix_free(a, b[:, 0]), jax.jacobian(matrix_free, 1)(a, b[:, 0])),
     "qr": lambda a, b: (jnp.linalg.qr(jnp.stack([a, 2 * a.T])), jnp.linalg.qr(a, mode="r")),
     "qr_of_tall": lambda a, b: (jnp.linalg.qr(jnp.vstack([a, b.T])), jnp.linalg.qr(b, "complete")),
@@ -371,10 +349,6 @@ PRODUCTS = {
     "contraction": (
         lambda a, b: (jnp.einsum("bij,bjk->bik", a, b), jnp.einsum("bij,bjk->i", a, b), jnp.tensordot(a, b, 0)),
         (normal(2, 3, 4), normal(2, 4, 5)),
-    ),
-    "several_axes": (
-        lambda a, b: (jnp.tensordot(a, b, ((0, 2), (2, 0))), jnp.einsum("ijk,kli->jl", a, b)),
-        (normal(3, 4, 2), normal(2, 5, 3)),
     ),
     "large_batch": (lambda a, b: jnp.einsum("bij,bkj->bki", a, b), (normal(5, 9, 17), normal(5, 20, 17))),
     "many_rows": (lambda a, b: a @ b, (normal(40, 33), normal(33, 70))),
@@ -423,15 +397,10 @@ TYPES = {
     ),
     "signs_of_zero": (lambda x: (1 / (0 - x), 1 / -x), (np.array([0.0, -0.0, 2.0]),)),
     "results_read_by_others": (lambda xs: [(2 * x, 2 * x + 1) for x in xs], ([normal(n) for n in (1, 8, 65)],)),
-    "result_read_in_a_loop": (
-        lambda x: (2 * x, lax.fori_loop(0, 3, lambda k, y: y + 2 * x, x), (2 * x)[::-1], (2 * x).sum()),
-        (normal(12),),
-    ),
     "unused": (
         lambda x: lax.scan(lambda c, y: ((c[0] + y, c[1] * 2, y), (c[1], c[2] + x[0])), (x[0], x, x[1]), x)[0][0],
         (normal(9),),
     ),
-    "broadcast_add": (jnp.add, (normal(1), normal(9))),
 }
 INTERFACES = {
     "arrays": (
@@ -442,8 +411,6 @@ INTERFACES = {
         lambda a, k, flag, x: {"y": a * x, "z": jnp.where(flag, k, -k)},
         (normal(), np.int64(4), np.bool_(True), normal(3)),
     ),
-    "small_integers": (lambda i, u: (i * 2, u // 3), (np.arange(4, dtype=np.int32), np.arange(4, dtype=np.uint32))),
-    "returned": (lambda x: x @ x, (normal(3),)),
     "returned_integer": (lambda x: jnp.argmax(x), (normal(3),)),
     "returned_bool": (lambda x: jnp.all(x > 0), (normal(3),)),
     "trees": (
@@ -451,7 +418,6 @@ INTERFACES = {
         ({"q": normal(2), "qd": normal(2)}, [(normal(2, 2), normal(2))]),
     ),
     "empty": (lambda x, y: (x, y.sum(), jnp.concatenate([x, y]), y @ x), (normal(0), normal(0))),
-    "of_constants": (lambda x: (jnp.ones(3), jnp.zeros(()), jnp.arange(4.0)), (normal(2),)),
     "unchanged": (lambda x, y: (y, x, x), (normal(3), normal(3))),
 }
 SORTED = {
@@ -468,9 +434,6 @@ SORTED = {
         for whole in [(jnp.nan_to_num(x, posinf=9, neginf=-9) * 3).astype(int)]
         for k in map(whole.astype, KINDS)
     ],
-    "sort_of_known": lambda x: x[jnp.argsort(jnp.array([3, 1, 5, 1, 2, 0]))],
-    "search": lambda x: (jnp.unique(x, size=20, fill_value=0), jnp.searchsorted(jnp.sort(x[0]), x)),
-    "sort_in_a_loop": lambda x: lax.scan(lambda c, row: (jnp.sort(c + row), jnp.argsort(row)), x[0], x),
     "sort_of_many": lambda x: jnp.sort((x[:, :, None] * jnp.cos(jnp.arange(80.0) ** 2)).reshape(6, 480), 1),
 }
 
@@ -509,9 +472,9 @@ def drawn(leaf, random):
     return random.permutation(leaf.ravel()).reshape(leaf.shape)
 
 
-NOT_FINITE = {"factored": (), "cholesky": (np.nan,), "moved_gradient_of_max": ()}
+NOT_FINITE = {"factored": (), "cholesky": (np.nan,)}
 """Inputs of some cases by how their names begin; the others get NaN and infinities. LAPACK makes finite numbers of
-infinities, and of NaN by LU, and XLA of 0 times NaN where 0 is a truth value that is false: C does not."""
+infinities, and of NaN by LU: C does not."""
 
 
 def states_of(name, examples):
@@ -544,19 +507,13 @@ def test_a_primitive_gives_what_it_gives_in_jax(precision, pytestconfig, tmp_pat
     cases = {name: pair for name, pair in CASES.items() if every or name in SINGLE}
     got = in_c(cases, STATES, tmp_path, precision=precision, flags=("-O0",))
     expected = in_jax(cases, STATES, precision=precision)
-    wrong = {}
+    wrong = []
     for name in cases:
         for place, (ours, theirs) in enumerate(zip(got[name], expected[name], strict=True)):
+            bound = BOUND[precision] if theirs.dtype.kind == "f" else 0
             try:
-                assert_equal(ours, theirs, BOUND[precision])
+                assert ours.shape == theirs.shape
+                np.testing.assert_allclose(ours, theirs, rtol=bound, atol=bound)
             except AssertionError as error:
-                wrong[f"{name}, result {place}"] = str(error)
-    assert not wrong, "\n".join(f"{name}: {error}" for name, error in wrong.items())
-
-
-def assert_equal(ours, theirs, bound):
-    assert ours.shape == theirs.shape
-    if theirs.dtype.kind == "f":
-        np.testing.assert_allclose(ours, theirs, rtol=bound, atol=bound)
-    else:
-        np.testing.assert_array_equal(ours, theirs)
+                wrong.append(f"{name}, result {place}: {error}")
+    assert not wrong, "\n".join(wrong)

@@ -11,7 +11,6 @@ from jax import lax
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c, source_files
-from dln_jax.mechanics import integrators
 from dln_jax.scenes import two_link_arm
 
 BOUND = 1e-12
@@ -21,15 +20,6 @@ SPARSE = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 
 def operations(function, *examples, finite=True):
     stated = json.loads(source_files({"f": (function, examples)}, name="m", finite=finite)["m.json"])
     return stated["functions"]["f"]["operations"]
-
-
-def rk4_jacobian(x, dt):
-    step = integrators.rk4(lambda t, y: jnp.stack([y[1], -jnp.sin(y[0]) - 0.1 * y[1] * jnp.abs(y[1])]))
-    return jax.jacfwd(lambda x: step(0.0, x, dt))(x)
-
-
-def hessian(x):
-    return jax.hessian(lambda x: jnp.sum(jnp.sin(x) * x[::-1] ** 2) + x[0] * x[1] * x[2])(x)
 
 
 def tangents_in_a_scan(x, u):
@@ -57,11 +47,6 @@ def a_loop_after_a_loop_whose_output_is_moved(x):
     return [lax.scan(lambda v, y: (v * y + y[::-1], v), every[0], part) for part in (shifted, numbered, masked)]
 
 
-def batched_products(a, b):
-    placed = jnp.zeros((3, 4, 4)).at[:, 0, 1].set(a).at[:, 2, 2].set(1.0)
-    return jax.vmap(lambda m, c: m @ (SPARSE + jnp.diag(c)) @ m.T)(placed, b), jnp.einsum("bij,jk->bik", placed, SPARSE)
-
-
 def solved(q):
     def solve(q):
         m = jnp.array([[2.0 + q[0], 0.0, 0.0], [0.0, 3.0, q[1]], [0.0, q[1], 4.0]])
@@ -78,12 +63,9 @@ def branches(x):
 
 ARM = functions_of_system(two_link_arm().closed_form, 2, dtype=np.float64)
 PROGRAMS = {
-    "rk4_jacobian": (rk4_jacobian, (np.zeros(2), np.zeros(()))),
-    "hessian": (hessian, (np.zeros(5),)),
     "tangents_in_a_scan": (tangents_in_a_scan, (np.zeros(3), np.zeros(4))),
     "powers_of_a_triangle": (powers_of_a_triangle, (np.zeros(()),)),
     "moved_output": (a_loop_after_a_loop_whose_output_is_moved, (np.zeros(()),)),
-    "batched_products": (batched_products, (np.zeros(3), np.zeros((3, 4)))),
     "solved": (solved, (np.zeros(2),)),
     "branches": (branches, (np.zeros(3),)),
     "step_rk4_jacobian": ARM["step_rk4_jacobian"],
