@@ -1,4 +1,4 @@
-"""Random JAX programs: real, whole and truth arrays, moves, reductions, products, control flow and nested functions.
+"""Random JAX programs: real, whole and truth arrays, moves, reductions, products, and control flow.
 
 Control flow and indexing are also mapped over the rows of arrays, and arrays may have no elements.
 
@@ -109,52 +109,48 @@ def _divided(divide):
     return lambda a, b: divide(a | (b == 0).astype(a.dtype), b)
 
 
-ON_ONE = {
+NAMES = {
     "f": (
-        *(jnp.sin, jnp.cos, jnp.tanh, jnp.abs, jnp.negative, jnp.floor, jnp.sign, lax.erf, jnp.square),
-        *(lambda x: jnp.exp(-jnp.abs(x)), lambda x: jnp.sqrt(1 + x * x), lambda x: 1 / (1 + x * x), lambda x: 0 - x),
-        jax.grad(lambda x: jnp.sum(jnp.sin(x) * jnp.flip(x)) if x.ndim else jnp.tanh(x)),
+        "sin cos tanh abs negative floor sign square",
+        "add subtract multiply maximum minimum hypot",
+        "mean sum max min argmax argmin sort",
     ),
     # Without squares, which XLA takes for positive though they wrap around.
-    "i": (jnp.negative, jnp.abs, jnp.sign, jnp.bitwise_not, lambda x: x**3, lambda x: x & 1),
-    "b": (jnp.logical_not,),
+    "i": (
+        "negative abs sign bitwise_not",
+        "add subtract multiply maximum minimum bitwise_and bitwise_or left_shift right_shift",
+        "sum prod max argmin argsort",
+    ),
+    "b": ("logical_not", "logical_and logical_or logical_xor equal less less_equal maximum", "any all sum max min"),
 }
-ON_TWO = {
+"""Functions of one array, of two, and over an axis, by the kind of number."""
+MORE = {
     "f": (
-        *(jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, lambda a, b: a / (2 + jnp.abs(b))),
-        *(lambda a, b: (1 + a * a) ** jnp.tanh(b), lambda a, b: jnp.fmod(a, 1.5 + jnp.abs(b))),
+        (lax.erf, lambda x: 1 / (1 + x * x), lambda x: jnp.exp(-jnp.abs(x)), lambda x: 0 - x),
+        (lambda a, b: a / (2 + jnp.abs(b)), lambda a, b: (1 + a * a) ** jnp.tanh(b)),
+        (lambda x, axis: jnp.prod(jnp.cos(x), axis), lambda x, axis: jnp.cumsum(x, axis or 0)),
     ),
     "i": (
-        *(jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, lax.rem, jnp.bitwise_and, jnp.bitwise_or),
-        *(_divided(lax.div), _divided(jnp.floor_divide), lax.shift_left, lax.shift_right_arithmetic),
+        (lambda x: x**3, lambda x: x & 1),
+        (lax.rem, _divided(lax.div), _divided(jnp.floor_divide)),
+        (lambda x, axis: jnp.bitwise_or.reduce(x, axis or 0), lambda x, axis: lax.cummax(x, axis or 0)),
     ),
-    "b": (jnp.logical_and, jnp.logical_or, jnp.logical_xor, jnp.equal, jnp.less, jnp.less_equal, jnp.maximum),
+    "b": ((), (), ()),
 }
 COMPARED = (jnp.equal, jnp.not_equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
-OVER = {
-    "f": (
-        *(jnp.mean, jnp.sum, jnp.max, jnp.min, jnp.argmax, jnp.argmin, jnp.sort),
-        *(lambda x, axis: jnp.prod(jnp.cos(x), axis), lambda x, axis: jnp.cumsum(x, axis or 0)),
-    ),
-    "i": (
-        *(jnp.sum, jnp.prod, jnp.max, jnp.argmin, jnp.argsort, lambda x, axis: jnp.cumsum(x, axis or 0)),
-        *(lambda x, axis: jnp.bitwise_or.reduce(x, axis or 0), lambda x, axis: lax.cummax(x, axis or 0)),
-        lambda x, axis: lax.sort((x & 3, x), axis or 0, num_keys=2)[1],
-    ),
-    "b": (jnp.any, jnp.all, jnp.sum, jnp.max, jnp.min),
-}
 
 
-def _functions(table: dict[str, Any], x: Any) -> Any:
-    return table.get(_kind(x), table["i"])
+def _function(random: np.random.Generator, x: Any, place: int) -> Any:
+    kind = _kind(x) if _kind(x) in NAMES else "i"
+    return _of_one(random, [*(getattr(jnp, name) for name in NAMES[kind][place].split()), *MORE[kind][place]])
 
 
 def _elementwise(random, known, depth):
     a = _chosen(random, known)
     b = jnp.broadcast_to(_partner(random, known, a), a.shape)
     results = [
-        lambda: _of_one(random, _functions(ON_ONE, a))(a),
-        lambda: _of_one(random, _functions(ON_TWO, a))(a, b),
+        lambda: _function(random, a, 0)(a),
+        lambda: _function(random, a, 1)(a, b),
         lambda: _of_one(random, COMPARED)(a, b),
         lambda: jnp.where(jnp.resize(_chosen(random, known, "b", 1), a.shape), a, b),
     ]
@@ -169,7 +165,7 @@ def _converted(random, known, depth):
 def _reduced(random, known, depth):
     x = _chosen(random, known, rank=1)
     axis = (None, int(random.integers(x.ndim)))[random.integers(2)]
-    return [jnp.asarray(_of_one(random, _functions(OVER, x))(x, axis))]
+    return [jnp.asarray(_function(random, x, 2)(x, axis))]
 
 
 def _product(random, known, depth):
@@ -269,21 +265,11 @@ def _mapped(random, known, depth):
     return jax.vmap(lambda *rows: step(np.random.default_rng(seed), [*rows], depth))(*rows, order)
 
 
-def _nested(random, known, depth):
-    """A jitted function with constants of its own, called twice; another differs in its constants alone."""
-    x, y, inside = _chosen(random, known), _chosen(random, known, "f"), _drawn_inside(random, 3, depth)
-    constants = [jnp.asarray(_of(random, y.shape, y.dtype)) for _ in range(2)]
-    first, second = (
-        jax.jit(lambda x, y, constant=constant: (inside([x, y * constant])[-1], y + constant)) for constant in constants
-    )
-    return [*first(x, y), *second(x, y), first(x, y + 1)[1]]
-
-
-DEEP = (_scanned, _branched, _looped, _mapped, _nested)
+DEEP = (_scanned, _branched, _looped, _mapped)
 """Steps that draw programs inside."""
 CHANCES = {
     **{_elementwise: 8, _converted: 2, _reduced: 3, _product: 2, _moved: 4, _indexed: 3},
-    **{_scanned: 1, _branched: 1, _looped: 1, _mapped: 4, _nested: 1},
+    **{_scanned: 1, _branched: 1, _looped: 1, _mapped: 4},
 }
 STEPS = tuple(CHANCES)
 WEIGHTS = np.array(list(CHANCES.values())) / sum(CHANCES.values())

@@ -26,14 +26,6 @@ from dln_jax.zoo.run import Run
 STATES = 1000
 
 
-def furuta_pendulum(q, qd):
-    sin, cos = jnp.sin(q[1]), jnp.cos(q[1])
-    mass = jnp.array([[1.0, 0.0], [0.0, 0.2]]) + jnp.array([[0.2, 0.0], [0.0, 0.0]]) * sin**2
-    mass = mass.at[0, 1].set(0.3 * cos).at[1, 0].set(0.3 * cos)
-    factor = jnp.linalg.cholesky(mass)
-    return 0.5 * jnp.sum((factor.T @ qd) ** 2) - 0.2 * 9.81 * cos
-
-
 def ball_in_a_bowl(q, qd):
     """The bowl's height is a series, and its slope is solved for with the bowl's metric."""
     height = lax.fori_loop(0, 4, lambda k, total: 0.3 * total * (q @ q) + 0.5 * q @ q, 0.0)
@@ -50,7 +42,6 @@ def with_every_friction():
 
 
 BY_HAND = {
-    "furuta_pendulum": (LagrangianSystem(furuta_pendulum), 2),
     "ball_in_a_bowl": (LagrangianSystem(ball_in_a_bowl), 2),
     "every_friction": (with_every_friction(), 2),
 }
@@ -60,7 +51,7 @@ DEFAULT = ("trigonometric", "differential-network", "pendulum", *BY_HAND, *SLOW[
 """The other cases repeat what is in these."""
 BRIEFLY = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian", "mass_matrix", "rates", "hamiltonian")
 WHOLE = ("pendulum", "differential-network")
-SINGLE = ("structured-delan", "differential-network", "furuta_pendulum")
+SINGLE = ("structured-delan", "differential-network", "ball_in_a_bowl")
 AS_USERS_DO = {"trigonometric": FLAGS}
 TOO_LARGE = {f"chain-{links}" for links in range(7, 13)}
 """Their C takes minutes to compile."""

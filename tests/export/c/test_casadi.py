@@ -97,30 +97,6 @@ def test_values_and_derivatives_equal_jax(name, library):
 
 
 @needs_compiler
-def test_signatures_are_those_that_casadi_gives_its_own_functions(library):
-    ours = casadi.external("casadi_model_products", str(library))
-    A, b, scale = casadi.MX.sym("A", 3, 2), casadi.MX.sym("b", 2), casadi.MX.sym("scale")
-    results = [scale * b @ casadi.sin(A[:, 0]).T, A @ b * scale]
-    theirs = casadi.Function("casadi_model_products", [A, b, scale], results, ["A", "b", "scale"], ["Z", "y"])
-
-    def signature(function):
-        inputs = [(function.size_in(k), function.nnz_in(k)) for k in range(function.n_in())]
-        outputs = [function.size_out(k) for k in range(function.n_out())]
-        return function.name(), function.name_in(), inputs, function.name_out(), outputs
-
-    ways = {
-        "jac": casadi.Function.jacobian,
-        "fwd1": lambda function: function.forward(1),
-        "adj1": lambda function: function.reverse(1),
-        "jac_adj1": lambda function: function.reverse(1).jacobian(),
-    }
-    for prefix, derivative in ways.items():
-        made = derivative(ours)
-        assert made.class_name() == "External" and made.name() == f"{prefix}_casadi_model_products"
-        assert signature(made) == signature(derivative(theirs))
-
-
-@needs_compiler
 def test_null_pointers_are_zeros_and_what_nobody_wants(library):
     call = ctypes.CDLL(str(library)).jac_casadi_model_products
     Block = ctypes.POINTER(ctypes.c_double)

@@ -68,27 +68,25 @@ def evaluate(tmp_path_factory):
 
 
 def points(name: str, precision: str) -> np.ndarray:
-    """Random numbers of every binade where the function is defined and not constant, and the hard ones."""
-    numpy_type, random = TYPES[precision][0], np.random.default_rng(VECTORISED.index(name))
-    limits, half_pi = np.finfo(numpy_type), np.pi / 2
-    exponents = np.concatenate(
-        [np.arange(limits.minexp - limits.nmant, limits.maxexp, 3), np.arange(-6, 18).repeat(30)]
-    )
-    x = np.ldexp(random.uniform(1, 2, exponents.size), exponents)
+    """Random numbers of every third binade where the function is defined and not constant, and the hard ones."""
+    real, random = TYPES[precision][0], np.random.default_rng(VECTORISED.index(name))
+    limits, bound = np.finfo(real), BOUNDS.get(name, {}).get(precision, 1000)
+    exponents = [*range(limits.minexp - limits.nmant, limits.maxexp, 3), *np.arange(-6, 18).repeat(30)]
     # Thresholds: of the overflow of exp and the smallest normal number, and where tanh and expm1 become constant.
-    x = np.concatenate([x, np.log([limits.max, 1 / limits.tiny]), [0.55, 20.0, 40.0, 0.5, 1.0, 2.0, np.sqrt(0.5)]])
+    hard = [*np.log([limits.max, 1 / limits.tiny]), 0.55, 20.0, 40.0, 0.5, 1.0, 2.0, np.sqrt(0.5)]
     if name in BOUNDS:
-        bound = BOUNDS[name][precision]
         # 161 pi/2 and 29 pi/2 are the multiples nearest to a float and a double within the bounds.
-        hardest = np.outer([29, 161], 2 ** np.arange(12)).ravel()
-        multiples = np.concatenate([np.arange(1, 30), hardest, random.integers(1, int(bound / half_pi), 200)])
-        x = np.concatenate([x, half_pi * multiples])
-        x = np.append(x[x < bound], bound)
-    near = x.astype(numpy_type)[-300:]
-    x = np.concatenate([x.astype(numpy_type), np.nextafter(near, numpy_type(np.inf)), np.nextafter(near, near * 0)])
+        multiples = [
+            *range(1, 30),
+            *np.outer([29, 161], 2 ** np.arange(12)).flat,
+            *random.integers(1, int(bound / 2), 200),
+        ]
+        hard += [*np.pi / 2 * np.array(multiples), bound]
+    near = np.array(hard, real)
+    x = np.ldexp(random.uniform(1, 2, len(exponents)), exponents).astype(real)
+    x = np.concatenate([x, near, np.nextafter(near, real(np.inf)), np.nextafter(near, real(0))])
     x = np.concatenate([x, -x])
-    inside = {"exp": abs(x) < 1000, "expm1": abs(x) < 1000, "tanh": abs(x) < 1000, "log": x > 0, "log1p": x > -1}
-    return x[inside.get(name, abs(x) <= BOUNDS.get(name, {}).get(precision, 0))]
+    return x[(x > {"log": 0, "log1p": -1}.get(name, -np.inf)) & ((abs(x) <= bound) | (name in ("log", "log1p")))]
 
 
 def units_in_the_last_place(y, x, name: str) -> np.ndarray:

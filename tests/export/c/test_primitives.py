@@ -215,18 +215,15 @@ CONTROL = {
         lambda s: s[2] < 3, lambda s: (s[1], s[0] + 1, s[2] + 1), (x, 2 * x, 0)
     ),
     "while_without_turn": lambda x, n: lax.while_loop(lambda y: jnp.all(y != y), lambda y: y + 1, 0 * x + 1),
-    "scan": lambda x, n: lax.scan(lambda c, y: (c + y, c * y), 0.0, x),
     "scan_reverse": lambda x, n: lax.scan(lambda c, y: (c + y, jnp.stack([c, y])), 0.0, x, reverse=True),
     "scan_of_rows": lambda x, n: lax.scan(
         lambda c, y: ((c[0] + y["a"], c[1] @ y["b"]), (y["a"] * 2, c[1])),
         (x, jnp.eye(2)),
         {"a": jnp.outer(x[:3], x), "b": jnp.ones((3, 2, 2)) * x[:2]},
     ),
-    "scan_of_nothing": lambda x, n: lax.scan(lambda c, y: (c + y, y), x[0], x[:0])[0],
     "nested_loops": lambda x, n: lax.fori_loop(
         0, 3, lambda k, y: lax.scan(lambda c, z: (c + z * k, c), y, y[:, None] * x)[0] / 10, x
     ),
-    "cond": lambda x, n: lax.cond(x[0] > 0, lambda: (x, x[0]), lambda: (-x, x[1])),
     "switch": lambda x, n: lax.switch(n - 2, [jnp.sin, jnp.cos, lambda y: y[::-1]], x),
     "select_n": lambda x, n: lax.select_n(jnp.clip(n, 0, 2), x, 2 * x, x + 1),
     "cond_in_scan": lambda x, n: lax.scan(
@@ -252,28 +249,24 @@ CONTROL = {
     "mapped_cond": lambda x, n: jax.vmap(lambda y: lax.cond(y > 0, jnp.sin, lambda y: counted(1 + y * y, n)[0], y))(x),
 }
 EMPTY = {
-    "reductions": lambda z, x: (
-        *(z.sum(), z.sum(0), z.prod(1), jnp.all(z > 0, 0), jnp.any(z > 0), z.max(1), z.max(0, initial=2)),
-    ),
+    "reductions": lambda z, x: (z.sum(), z.prod(1), jnp.all(z > 0, 0), z.max(1), z.max(0, initial=2), jnp.argmin(z, 1)),
     "products": lambda z, x: (z.T @ z + x, z @ x, z @ z.T),
     "moves": lambda z, x: (
-        *(jnp.pad(z, ((1, 2), (0, 1))), jnp.concatenate([z, x, z]), jnp.tile(z, (2, 2)), z.T.reshape(0, 3)),
-        *(jnp.flip(z, 0), z[:, :1], jnp.stack([z, z], 1).sum((0, 1)), jnp.repeat(z, 3, axis=0)),
+        *(jnp.pad(z, ((1, 2), (0, 1))), jnp.concatenate([z, x, z]), z.T.reshape(0, 3), jnp.sort(z, 0), jnp.sort(z, 1)),
+        *(jnp.cumsum(z, 0), lax.cummax(z, 1), z.astype(int) // 3, jnp.nonzero(z > 0, size=2)[0]),
     ),
     "indices": lambda z, x: (
         *(x[z[:, 0].astype(int)], x.at[z[:, 0].astype(int)].set(z), x.at[:0].add(1.0), x.at[:0].apply(jnp.sin)),
         *(z[:, x[0].astype(int)], lax.dynamic_update_slice(x, z, (1, 2)), lax.dynamic_slice(z, (1, 2), (0, 2))),
     ),
-    "order": lambda z, x: (jnp.sort(z, 0), jnp.sort(z, 1), jnp.cumsum(z, 0), jnp.argmin(z, 1), lax.cummax(z, 1)),
     "loops": lambda z, x: (
         lax.while_loop(lambda s: jnp.abs(s[1].sum()) < 9, lambda s: (2 * s[0], s[1] + 1), (z, x)),
         lax.scan(lambda c, row: (c + row, c * row), x[0], z),
         lax.scan(lambda c, row: (c + row, row[:0]), x[0], x),
-        lax.switch(jnp.sum(x > 0) % 3, [lambda: z.sum() + x, lambda: 2 * x, lambda: x]),
+        lax.cond(x[0, 0] > 0, lambda: (z, x), lambda: (2 * z, 2 * x)),
         jax.vmap(lambda y: counted(y, 3.0))(z[:, 0]),
     ),
     "factors": lambda z, x: (jnp.linalg.cholesky(z[:, :0]), jnp.linalg.inv(z[:, :0]), jnp.linalg.solve(x, x[:, :0])),
-    "integers": lambda z, x: (z.astype(int).sum(), z.astype(int) // 3, ~(z > 0), jnp.nonzero(z > 0, size=2)[0]),
 }
 
 
@@ -417,7 +410,6 @@ INTERFACES = {
         lambda state, layers: {"next": {"qd": -state["qd"], "q": state["q"]}, "y": layers[0][0] @ state["q"]},
         ({"q": normal(2), "qd": normal(2)}, [(normal(2, 2), normal(2))]),
     ),
-    "empty": (lambda x, y: (x, y.sum(), jnp.concatenate([x, y]), y @ x), (normal(0), normal(0))),
     "unchanged": (lambda x, y: (y, x, x), (normal(3), normal(3))),
 }
 SORTED = {
