@@ -270,9 +270,8 @@ def test_pictures_have_their_networks_and_the_rates_of_their_latent_phase():
     @jax.jit
     def both(frames):
         q, p = run.images.encode(frames)
-        ours = [
-            functions[name][0](*state).values() for name, state in zip(names, ((frames,), (q, p), (q, p)), strict=True)
-        ]
+        states = ((frames,), (q, p), (q, p))
+        ours = [[*functions[name][0](*state).values()] for name, state in zip(names, states, strict=True)]
         return ours, ((q, p), (run.images.decode(q, p),), run.images.field.rates(q, p))
 
     ours, by_hand = both(jnp.linspace(0, 1, 12))

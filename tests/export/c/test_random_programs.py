@@ -18,7 +18,7 @@ from sanitized import in_sanitized_c
 from dln_jax.export.c import jaxprs
 from dln_jax.export.c.source import source_files
 
-BATCHES = [range(4), range(4, 20), range(20, 40), range(40, 60)]
+BATCHES = [range(2), range(2, 20), range(20, 40), range(40, 60)]
 """Seeds of programs that are compiled together; the slow tests have all but the first."""
 BOUND = 1e-12
 
