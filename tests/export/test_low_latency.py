@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
 from dln_jax.export.low_latency import low_latency
 from dln_jax.mechanics.dynamics import Decomposition
-from dln_jax.types import InputError
 
 EARLY = """
 import dln_jax
@@ -53,23 +53,18 @@ def test_numpy_in_and_out():
     # The buffer of the second call leaves the first result as it was.
     np.testing.assert_array_equal(first, [3.5, 7.5])
     np.testing.assert_array_equal(second, [2.0, 4.0])
-    for x in (np.zeros(3), np.zeros(1), 0.0, [0.0], np.zeros((1, 2)), "x"):
-        with pytest.raises(InputError, match=r"^argument 1 has .*expected.*\(2,\)"):
+    for x in (np.zeros(3), 0.0, np.zeros((1, 2)), "x"):
+        with one_line(r"^argument 1 has .*expected.*\(2,\)"):
             function(x, A, 0.0)
-    with pytest.raises(InputError, match=r"^argument 3 has shape \(2,\); expected \(\)"):
-        function(np.zeros(2), A, np.zeros(2))
-    with pytest.raises(InputError, match="got 2 arguments; expected 3"):
+    with one_line("got 2 arguments; expected 3"):
         function(np.zeros(2), A)
 
 
-def test_an_identity_does_not_hand_out_its_buffer():
+def test_results_are_copies_in_the_structure_of_the_function():
     same = low_latency(lambda x: x, np.zeros(64), numpy=True)
     first = same(np.ones(64))
-    same(np.zeros(64))
+    same(np.zeros(64))  # the buffer is not handed out
     np.testing.assert_array_equal(first, np.ones(64))
-
-
-def test_results_of_several_arrays_and_device_arrays():
     decompose = low_latency(lambda x: Decomposition(x, 2 * x, 3 * x), np.zeros(2), numpy=True)
     parts = decompose([1.0, 2.0])
     assert isinstance(parts, Decomposition) and type(parts.gravity) is np.ndarray
@@ -81,7 +76,7 @@ def test_results_of_several_arrays_and_device_arrays():
 
 
 def test_examples_are_needed_and_of_one_type():
-    with pytest.raises(InputError, match="no example"):
+    with one_line("no example"):
         low_latency(lambda: 0)
-    with pytest.raises(InputError, match="types float32, float64"):
+    with one_line("types float32, float64"):
         low_latency(lambda x, y: x + y, np.zeros(2, np.float32), np.zeros(2), numpy=True)

@@ -6,21 +6,12 @@ import pkgutil
 import jax
 import jax.numpy as jnp
 import numpy as np
+from calls import one_line
 
 from dln_jax.cli import commands
 from dln_jax.scale.devices import backend_started
 from dln_jax.scale.mesh import batch_mesh, on_devices, replicate, shard, shares, spread, total
 from dln_jax.scale.processes import host_devices
-from dln_jax.types import InputError
-
-
-def refused(function, *arguments):
-    """The line of an `InputError`."""
-    try:
-        function(*arguments)
-    except InputError as error:
-        return str(error)
-    raise AssertionError("not refused")
 
 
 def energies(scale, batch):
@@ -42,25 +33,22 @@ host_devices(4)
 assert batch_mesh(1) is None
 mesh = batch_mesh()
 assert mesh is not None and mesh.size == 4 and batch_mesh(2).size == 2
-assert "--devices is 5; JAX sees 4 here" in refused(batch_mesh, 5)
-assert "--devices is 0" in refused(host_devices, 0)
+with one_line("--devices is 5; JAX sees 4 here"):
+    batch_mesh(5)
+with one_line("--devices is 0"):
+    host_devices(0)
 host_devices(4)  # too late, and so many
 
 for count in (8, 5, 3):  # divided, and filled up, by less than a share and by more
     batch = (np.random.default_rng(count).normal(size=(count, 3)), np.arange(count))
-    alone = jax.jit(spread(energies, None))(2.0, batch)
-    together = jax.jit(spread(energies, mesh))(2.0, batch)
+    alone, together = (jax.jit(spread(energies, on))(2.0, batch) for on in (None, mesh))
     jax.tree.map(lambda one, all: np.testing.assert_allclose(one, all, rtol=1e-14, atol=1e-15), alone, together)
-    slope = lambda scale, on: spread(energies, on)(scale, batch)["sine"]  # noqa: B023, E731
-    one, all_ = (jax.jit(jax.jacfwd(slope), static_argnums=1)(2.0, on) for on in (None, mesh))
-    np.testing.assert_allclose(one, all_, rtol=1e-14, atol=1e-15)
+    slopes = [jax.jit(jax.jacfwd(lambda scale: spread(energies, on)(scale, batch)["sine"]))(2.0) for on in (None, mesh)]  # noqa: B023
+    np.testing.assert_allclose(*slopes, rtol=1e-14, atol=1e-15)
 
 batch = (np.random.default_rng(0).normal(size=(8, 3)), np.arange(8))
-jax.tree.map(
-    lambda one, all: np.testing.assert_allclose(one, all, rtol=1e-14),
-    jax.jit(sums)(2.0, batch),
-    jax.jit(on_devices(lambda scale, batch: total(sums(scale, batch), mesh), mesh))(2.0, batch),
-)
+together = jax.jit(on_devices(lambda scale, batch: total(sums(scale, batch), mesh), mesh))(2.0, batch)
+jax.tree.map(lambda one, all: np.testing.assert_allclose(one, all, rtol=1e-14), sums(2.0, batch), together)
 
 
 @jax.jit
@@ -86,6 +74,8 @@ assert [part.data.shape for part in split[0].addressable_shards] == [(2, 3)] * 4
 jax.tree.map(np.testing.assert_array_equal, split, batch)
 assert backend_started()
 assert replicate(batch, mesh)[0].is_fully_replicated and shares(mesh, 8, "rows") == 2
-assert "6 seeds cannot be split over 4 devices; give a multiple of 4" in refused(shares, mesh, 6, "seeds")
-assert "cannot be split over 4 devices" in refused(shard, np.zeros((6, 2)), mesh)
+with one_line("6 seeds cannot be split over 4 devices; give a multiple of 4"):
+    shares(mesh, 6, "seeds")
+with one_line("cannot be split over 4 devices"):
+    shard(np.zeros((6, 2)), mesh)
 assert shard(batch, None) is batch and spread(energies, None) is energies

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from calls import one_line
 from interpreters import Program, interpreters
 from safetensors.numpy import load_file
 
 from dln_jax.scale.processes import Membership, membership
-from dln_jax.types import InputError
 
 TINY = '''
 """A command that iterates a map; every step needs all devices, and a process may be lost."""
@@ -78,8 +78,6 @@ sys.stdout.flush()
 os._exit(code)  # a second sooner
 '''
 
-MESH = Path(__file__).with_name("on_four_devices.py")
-
 
 class Ended(NamedTuple):
     """Results of processes that were started together."""
@@ -88,10 +86,6 @@ class Ended(NamedTuple):
     out: list[str]
     err: list[str]
     folder: Path
-
-    @property
-    def result(self):
-        return load_file(self.folder / "run" / "result.safetensors")
 
 
 @pytest.fixture(scope="module")
@@ -103,26 +97,29 @@ def run_programs():
 
 @pytest.fixture(scope="module")
 def run_tiny(run_programs, tmp_path_factory):
-    """A function that runs the command once for each list of processes, all beside each other."""
+    """A function that runs the command once for each list of processes, all beside each other.
+
+    A run is a list of (options, environment), an environment of all of them, and maybe the folder of an earlier one.
+    """
     path = tmp_path_factory.mktemp("tiny") / "tiny.py"
     path.write_text(TINY)
+    own = {key: value for key, value in os.environ.items() if not key.startswith("SLURM_")}
 
-    def run(*runs):
-        programs, folders = [], []
-        for processes, shared, folder in runs:
-            folder = folder or tmp_path_factory.mktemp("run")
-            folders.append(folder)
-            for options, more in processes:
-                environment = {key: value for key, value in os.environ.items() if not key.startswith("SLURM_")}
-                programs.append(Program(path, folder, {**environment, **shared, **more}, ("--out", "run", *options)))
+    def run(runs):
+        runs = [
+            (processes, shared, *(folder or [tmp_path_factory.mktemp("run")])) for processes, shared, *folder in runs
+        ]
+        programs = [
+            Program(path, folder, {**own, **shared, **more}, ("--out", "run", *options))
+            for processes, shared, folder in runs
+            for options, more in processes
+        ]
         results = iter(run_programs(path.parent, *programs))
-        ended_runs = []
-        for (processes, _, _), folder in zip(runs, folders, strict=True):
-            ended = [next(results) for _ in processes]
-            codes = tuple(result.returncode for result in ended)
-            texts = ([getattr(result, name) for result in ended] for name in ("stdout", "stderr"))
-            ended_runs.append(Ended(codes, *texts, folder))
-        return ended_runs
+        ended = []
+        for processes, _, folder in runs:
+            codes, out, err = zip(*(next(results) for _ in processes), strict=True)
+            ended.append(Ended(codes, list(out), list(err), folder))
+        return ended
 
     return run
 
@@ -139,57 +136,45 @@ def pair(*more, first=(), second=(), host="127.0.0.1", port=None):
     return [((*both, "--process-id", "0", *first), {}), ((*both, "--process-id", "1", *second), {})]
 
 
-def slurm_pair(*more):
+def slurm_pair():
     """Environments that Slurm gives two tasks of a step, on this host."""
     step = {"SLURM_JOB_ID": str(free_port()), "SLURM_STEP_NUM_TASKS": "2", "SLURM_NTASKS": "2"}
     step |= {"SLURM_STEP_NODELIST": "localhost"}
-    return [(more, {**step, "SLURM_PROCID": str(k), "SLURM_LOCALID": str(k)}) for k in range(2)]
+    return [(("--devices", "2"), {**step, "SLURM_PROCID": str(k), "SLURM_LOCALID": str(k)}) for k in range(2)]
 
 
-RUNS = {"alone": lambda: [((), {})], "two": pair, "1 SIGKILL": pair}
-LOST = ("1 SIGSTOP", "0 SIGKILL", "1 error")
-MORE_RUNS = {"slurm": lambda: slurm_pair("--devices", "2"), **dict.fromkeys(LOST, pair)}
-"""Processes by how they are started, or by how one of them is lost."""
-
-
-def started(run_tiny, runs):
-    losses = {how: {"LOST": how} if how[0].isdigit() else {} for how in runs}
-    return dict(zip(runs, run_tiny(*((runs[how](), losses[how], None) for how in runs)), strict=True))
+LOSSES = {"1 SIGKILL": (3, -9), "0 SIGKILL": (-9, 3), "1 error": (3, 2), "1 SIGSTOP": (-signal.SIGABRT, -9)}
+"""Statuses of two processes by how one of them is lost."""
 
 
 @pytest.fixture(scope="module")
 def trained(run_tiny):
-    """One process, two, and two with one that is lost."""
-    return started(run_tiny, RUNS)
+    """One process, and two with one that is killed."""
+    return dict(zip(("alone", "1 SIGKILL"), run_tiny([([((), {})], {}), (pair(), {"LOST": "1 SIGKILL"})]), strict=True))
 
 
 @pytest.fixture(scope="module")
-def trained_more(run_tiny):
-    """Two processes by Slurm, and two with one that is lost in other ways."""
-    return started(run_tiny, MORE_RUNS)
+def trained_more(run_tiny, trained):
+    """Two processes, two by Slurm, and two with one that is lost in other ways."""
+    ways = [how for how in LOSSES if how not in trained]
+    runs = [(pair(), {}), (slurm_pair(), {}), *((pair(), {"LOST": how}) for how in ways)]
+    return {**trained, **dict(zip(("two", "slurm", *ways), run_tiny(runs), strict=True))}
 
 
-def assert_same_result(started, alone):
-    np.testing.assert_array_equal(started.result["places"], alone.result["places"])
-    assert started.result["done"] == 8
+def assert_same_result(started, alone, devices=1):
+    """All that ran to its end is bit for bit what one process on one device gives."""
+    assert set(started.codes) == {0} and not any(started.err)
+    ours, theirs = (load_file(ended.folder / "run" / "result.safetensors") for ended in (started, alone))
+    np.testing.assert_array_equal(ours["places"], theirs["places"])
+    assert (ours["done"], ours["devices"], theirs["devices"]) == (8, devices, 1)
 
 
-def assert_is_one_program(result, alone, devices):
-    assert (result.codes, result.err) == ((0, 0), ["", ""])
-    assert_same_result(result, alone)
-    assert (result.result["devices"], alone.result["devices"]) == (devices, 1)
-    first, second = result.out
+@pytest.mark.slow
+@pytest.mark.parametrize("how, devices", [("two", 2), ("slurm", 4)])
+def test_two_processes_give_what_one_gives_and_the_first_alone_prints(trained_more, how, devices):
+    assert_same_result(trained_more[how], trained_more["alone"], devices)
+    first, second = trained_more[how].out
     assert first.startswith("2 processes, ") and "I am the first" in first and "Gloo" not in first and not second
-
-
-@pytest.mark.slow
-def test_two_processes_give_what_one_gives_and_the_first_alone_prints(trained):
-    assert_is_one_program(trained["two"], trained["alone"], devices=2)
-
-
-@pytest.mark.slow
-def test_tasks_of_slurm_give_what_one_process_gives(trained, trained_more):
-    assert_is_one_program(trained_more["slurm"], trained["alone"], devices=4)
 
 
 def assert_ended_by_loss(result, how):
@@ -205,89 +190,71 @@ def assert_ended_by_loss(result, how):
         assert code in (3, -signal.SIGABRT) and "another" in err
 
 
-LOSSES = {"1 SIGKILL": (3, -9), "0 SIGKILL": (-9, 3), "1 error": (3, 2), "1 SIGSTOP": (-signal.SIGABRT, -9)}
-
-
-def test_a_killed_process_ends_the_other(trained):
-    assert_ended_by_loss(trained["1 SIGKILL"], "1 SIGKILL")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("how", LOST)
-def test_a_lost_process_ends_the_other(trained_more, how):
-    assert_ended_by_loss(trained_more[how], how)
-
-
-def assert_continued(result, alone):
-    assert set(result.codes) == {0} and not any(result.err)
-    assert_same_result(result, alone)
-    assert "process" not in (result.folder / "run" / "config.json").read_text()
-
-
-def test_a_broken_run_continues_as_if_unbroken(run_tiny, trained):
-    broken = trained["1 SIGKILL"].folder
-    assert not (broken / "run" / "result.json").exists()
-    for result in run_tiny((pair("--resume"), {}, broken)):
-        assert_continued(result, trained["alone"])
+def test_a_killed_process_ends_the_other_and_the_run_continues_as_if_unbroken(run_tiny, trained):
+    broken = trained["1 SIGKILL"]
+    assert_ended_by_loss(broken, "1 SIGKILL")
+    assert not (broken.folder / "run" / "result.json").exists()
+    (result,) = run_tiny([(pair("--resume"), {}, broken.folder)])
+    assert_same_result(result, trained["alone"], devices=2)
+    assert "process" not in (broken.folder / "run" / "config.json").read_text()
 
 
 @pytest.mark.slow
-def test_a_broken_run_continues_in_one_process_or_without_its_first(run_tiny, trained, trained_more):
-    ways = [("0 SIGKILL", pair("--resume")), ("1 SIGSTOP", [(("--resume",), {})])]
-    for result in run_tiny(*((processes, {}, trained_more[how].folder) for how, processes in ways)):
-        assert_continued(result, trained["alone"])
+def test_a_lost_process_ends_the_other_and_the_run_continues_in_one_process_or_without_its_first(
+    run_tiny, trained_more
+):
+    for how in LOSSES:
+        assert_ended_by_loss(trained_more[how], how)
+    ways = {"0 SIGKILL": pair("--resume"), "1 SIGSTOP": [(("--resume",), {})]}
+    results = run_tiny([(processes, {}, trained_more[how].folder) for how, processes in ways.items()])
+    for result, processes in zip(results, ways.values(), strict=True):
+        assert_same_result(result, trained_more["alone"], devices=len(processes))
 
 
-REFUSED = {
-    "arguments": ("--seed differs between process 0 and process 1; it is 1", "it is 2 in this one"),
-    "devices": ("--devices: process 0 has 1, process 1 has 3",) * 2,
-    "twice": ("the 2 processes did not meet at 127.0.0.1:", "of --coordinator is not free"),
-    "absent": ("the 2 processes did not meet at 127.0.0.1:",),
-    "port": ("of --coordinator is not free", "did not meet at localhost"),
-    "address": ("did not meet at no-such-host.invalid", "cannot reach no-such-host.invalid"),
-}
-
-
-def assert_refused(run_tiny, *reasons):
-    """Pairs that cannot be one program, all beside each other, end with one line each."""
-    taken = socket.socket()
-    taken.bind(("", 0))
-    taken.listen()
+@pytest.mark.slow
+def test_processes_that_cannot_be_one_program_end_with_one_line_each(run_tiny):
     hurried = {"JOINING": "5"}
-    runs = {
-        "arguments": (pair(first=("--seed", "1"), second=("--seed", "2")), {}, None),
-        "devices": (pair(second=("--devices", "3")), {}, None),
-        "twice": ([pair()[0]] * 2, hurried, None),
-        "absent": (pair()[:1], hurried, None),
-        "port": (pair(host="localhost", port=taken.getsockname()[1]), hurried, None),
-        "address": (pair(host="no-such-host.invalid"), hurried, None),
-    }
-    with taken:
-        results = run_tiny(*(runs[reason] for reason in reasons))
-    for reason, result in zip(reasons, results, strict=True):
+    with socket.socket() as taken:
+        taken.bind(("", 0))
+        taken.listen()
+        refused = [
+            (pair(first=("--seed", "1"), second=("--seed", "2")), {}, "--seed differs between process 0 and process 1"),
+            (pair(second=("--devices", "3")), {}, "--devices: process 0 has 1, process 1 has 3"),
+            ([pair()[0]] * 2, hurried, "of --coordinator is not free"),
+            (pair()[:1], hurried, "the 2 processes did not meet at 127.0.0.1:"),
+            (pair(host="localhost", port=taken.getsockname()[1]), hurried, "of --coordinator is not free"),
+            (pair(host="no-such-host.invalid"), hurried, "cannot reach no-such-host.invalid"),
+        ]
+        results = run_tiny([(processes, shared) for processes, shared, _ in refused])
+    for (*_, message), result in zip(refused, results, strict=True):
         lines = [err.splitlines() for err in result.err]
-        assert set(result.codes) == {2}, reason
-        assert all(len(text) == 1 and text[0].startswith("error: ") for text in lines), reason
-        assert all(any(message in err for err in result.err) for message in REFUSED[reason]), reason
-        assert not list(result.folder.iterdir()), f"{reason}: something is left"
-
-
-@pytest.mark.slow
-def test_different_options_and_absent_processes_are_one_line(run_tiny):
-    assert_refused(run_tiny, "arguments", "absent")
-
-
-@pytest.mark.slow
-def test_other_processes_that_do_not_fit_are_one_line(run_tiny):
-    assert_refused(run_tiny, "devices", "twice", "port", "address")
+        assert set(result.codes) == {2}, message
+        assert all(len(text) == 1 and text[0].startswith("error: ") for text in lines), message
+        assert any(message in err for err in result.err), message
+        assert not list(result.folder.iterdir()), f"{message}: something is left"
 
 
 def test_devices_of_one_process_share_batches(run_programs, tmp_path):
-    (result,) = run_programs(tmp_path, Program(MESH, tmp_path, dict(os.environ)))
+    path = Path(__file__).with_name("on_four_devices.py")
+    (result,) = run_programs(tmp_path, Program(path, tmp_path, dict(os.environ)))
     assert (result.returncode, result.stderr) == (0, "")
 
 
 TASK = {"SLURM_STEP_NUM_TASKS": "4"}
+REFUSED = [
+    (2, "node1:\uff15\uff10\uff10\uff10", 0, "expected host:port, such as node1:61440"),
+    (2, "n\u00f6de:5000", 0, "expected host:port, such as node1:61440"),
+    (2, None, None, "--coordinator and --process-id missing beside --processes"),
+    (None, "node1:5000", None, "--processes and --process-id missing beside --coordinator"),
+    (2, "node1:5000", None, "--process-id missing beside --processes and --coordinator"),
+    (None, None, 0, "missing beside --process-id"),
+    (1, "node1:5000", 0, "leave them out"),
+    (0, None, None, "expected a positive whole number"),
+    (2, "node1:5000", 2, "expected 0 to 1"),
+    (2, "node1:5000", -1, "expected 0 to 1"),
+    *((2, address, 0, "expected host:port") for address in ("node1", "node1:70000", "node1:0", "::1:5000")),
+    (2, "http://node1:5000", 0, "expected host:port"),
+]
 
 
 def test_options_are_a_membership_and_go_before_a_cluster():
@@ -297,28 +264,6 @@ def test_options_are_a_membership_and_go_before_a_cluster():
     assert membership(None, None, None, {}) is None
     assert membership(1, None, None, TASK) is None
     assert membership(None, None, None, {"SLURM_STEP_NUM_TASKS": "1"}) is None
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ((2, "node1:\uff15\uff10\uff10\uff10", 0), "expected host:port, such as node1:61440"),
-        ((2, "n\u00f6de:5000", 0), "expected host:port, such as node1:61440"),
-        ((2, None, None), "--coordinator and --process-id missing beside --processes"),
-        ((None, "node1:5000", None), "--processes and --process-id missing beside --coordinator"),
-        ((2, "node1:5000", None), "--process-id missing beside --processes and --coordinator"),
-        ((None, None, 0), "missing beside --process-id"),
-        ((1, "node1:5000", 0), "leave them out"),
-        ((0, None, None), "expected a positive whole number"),
-        ((2, "node1:5000", 2), "expected 0 to 1"),
-        ((2, "node1:5000", -1), "expected 0 to 1"),
-        ((2, "node1", 0), "expected host:port"),
-        ((2, "node1:70000", 0), "expected host:port"),
-        ((2, "node1:0", 0), "expected host:port"),
-        ((2, "http://node1:5000", 0), "expected host:port"),
-        ((2, "::1:5000", 0), "expected host:port"),
-    ],
-)
-def test_half_a_membership_is_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        membership(*options, {})
+    for *options, message in REFUSED:
+        with one_line(message):
+            membership(*options, {})

@@ -1,11 +1,14 @@
 """Exported C beside the JAX functions that it is of: both called on the same states."""
 
+import shutil
+import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import pytest
 
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
@@ -14,6 +17,12 @@ STRICT = ("-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wshadow", "-Wdouble-p
 """Warnings, which fail."""
 BOUND = {"f64": 1e-12, "f32": 1e-5}
 TYPES = {"f64": np.float64, "f32": np.float32}
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
+)
+needs_gcc = pytest.mark.skipif(
+    not shutil.which("gcc") or "Free Software" not in subprocess.getoutput("gcc --version"), reason="there is no gcc"
+)
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
 
 

@@ -1,94 +1,29 @@
 """Exported C equals jitted JAX on a thousand random states: of models of each kind, scenes, and Lagrangians by hand.
 
-By default a few functions of each are tried, and of a few systems all and single precision; `--every-export` tries all
-of everything, which takes minutes.
+By default a few functions of a few systems are tried; `--every-export` tries all of everything, which takes minutes.
 """
 
 import inspect
-import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from comparison import BOUND, in_c, in_jax
+from comparison import BOUND, TYPES, in_c, in_jax, needs_compiler
 from conftest import slow_among
 from jax import lax
-from test_families import MODELS, run_of
+from planar_arm import ARM
+from test_families import MODELS, run_of, states_of
 
 from dln_jax.export.c.families import functions_of_run, functions_of_system
 from dln_jax.export.c.load import FLAGS
-from dln_jax.mechanics.equations import Canonical, flow
+from dln_jax.mechanics.friction import LAWS, coefficients_of, joint_dissipation
+from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.trees import tree_system
 from dln_jax.scenes.registry import SCENES
 from dln_jax.zoo.run import Run
 
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
-)
 STATES = 1000
-
-
-def double_pendulum(q, qd):
-    """From Cartesian positions of the masses as a function of the angles, and their velocities by a jvp."""
-
-    def positions(q):
-        steps = jnp.stack([jnp.sin(q), -jnp.cos(q)], axis=1) * jnp.array([[1.0], [0.7]], q.dtype)
-        return jnp.cumsum(steps, axis=0)
-
-    x, v = jax.jvp(positions, (q,), (qd,))
-    return jnp.sum(jnp.array([[1.2], [0.8]], q.dtype) * (0.5 * v**2)) - 9.81 * jnp.sum(x[:, 1] * jnp.array([1.2, 0.8]))
-
-
-def spherical_pendulum(q, qd):
-    return 0.5 * (qd[0] ** 2 + jnp.sin(q[0] + 1.5) ** 2 * qd[1] ** 2) + 9.81 * jnp.cos(q[0] + 1.5)
-
-
-def bead_on_a_hoop(q, qd):
-    """On one that turns at a given rate; friction-free stops are a potential on one side."""
-    stop = jnp.where(jnp.abs(q[0]) > 0.5, 40 * (jnp.abs(q[0]) - 0.5) ** 2, 0.0)
-    return 0.5 * (qd[0] ** 2 + (1.7 * jnp.sin(q[0])) ** 2) + 9.81 * jnp.cos(q[0]) - stop
-
-
-def spring_pendulum(q, qd):
-    length, rate = 1.5 + q[0], qd[0]
-    kinetic = 0.5 * (rate**2 + (length * qd[1]) ** 2)
-    return kinetic + 9.81 * length * jnp.cos(q[1]) - 20 * q[0] ** 2 * lax.cond(q[0] > 0, lambda: 1.0, lambda: 2.0)
-
-
-def relativistic_particle(q, qd):
-    return -jnp.sqrt(1 - 0.1 * qd @ qd) / 0.1 - 0.5 * jnp.sum(q**2 * jnp.arange(1.0, 4.0))
-
-
-def kepler(q, qd):
-    r = 2 + q[0]
-    return 0.5 * (qd[0] ** 2 + r**2 * qd[1] ** 2) + 1 / r
-
-
-def charged_particle(q, qd):
-    """In a magnetic field that grows with z, a potential that depends on the velocity."""
-    vector = jnp.cross(jnp.array([0.0, 0.0, 1.0]) * (1 + q[2] ** 2), q) / 2
-    return 0.5 * qd @ qd + qd @ vector - jnp.exp(-q @ q)
-
-
-def furuta_pendulum(q, qd):
-    sin, cos = jnp.sin(q[1]), jnp.cos(q[1])
-    mass = jnp.array([[1.0, 0.0], [0.0, 0.2]]) + jnp.array([[0.2, 0.0], [0.0, 0.0]]) * sin**2
-    mass = mass.at[0, 1].set(0.3 * cos).at[1, 0].set(0.3 * cos)
-    factor = jnp.linalg.cholesky(mass)
-    return 0.5 * jnp.sum((factor.T @ qd) ** 2) - 0.2 * 9.81 * cos
-
-
-def elastic_beam(q, qd):
-    """Masses in a row whose bending energy is summed by a scan."""
-    padded = jnp.concatenate([jnp.zeros(2), q])
-
-    def bent(energy, three):
-        return energy + 30 * (three[0] - 2 * three[1] + three[2]) ** 2, None
-
-    threes = jnp.stack([padded[:-2], padded[1:-1], padded[2:]], axis=1)
-    energy, _ = lax.scan(bent, 0.0, threes)
-    return 0.5 * qd @ qd - energy - 9.81 * jnp.sum(q)
 
 
 def ball_in_a_bowl(q, qd):
@@ -99,83 +34,63 @@ def ball_in_a_bowl(q, qd):
     return 0.5 * qd @ metric @ qd - 9.81 * height - 0.1 * slope @ jnp.linalg.solve(metric, slope)
 
 
-LAGRANGIANS = {
-    double_pendulum: 2,
-    spherical_pendulum: 2,
-    bead_on_a_hoop: 1,
-    spring_pendulum: 2,
-    relativistic_particle: 3,
-    kepler: 2,
-    charged_particle: 3,
-    furuta_pendulum: 2,
-    elastic_beam: 5,
-    ball_in_a_bowl: 2,
+def with_every_friction():
+    """An arm with all laws of friction in its joints, also that of the force which a transmission carries."""
+    coefficients = {name: np.array([0.2, 0.1]) for name in coefficients_of(LAWS)}
+    dissipation = joint_dissipation(**coefficients, velocity_scale=0.02)
+    return with_friction(tree_system(ARM), dissipation, Load(np.array([0.2, 0.1]), 0.02))
+
+
+BY_HAND = {
+    "ball_in_a_bowl": (LagrangianSystem(ball_in_a_bowl), 2),
+    "every_friction": (with_every_friction(), 2),
 }
 """With their degrees of freedom."""
-BY_HAND = {lagrangian.__name__: (lagrangian, d) for lagrangian, d in LAGRANGIANS.items()}
-CASES = [*MODELS, *SCENES, *BY_HAND]
-DEFAULT = {"structured-delan", "black-box-hnn", "trigonometric", "feed-forward", "differential-network", "latent-phase"}
-DEFAULT |= {*BY_HAND, "pendulum", "three-body"}
+SLOW = ("structured-delan", "black-box-hnn", "every_friction")
+DEFAULT = ("trigonometric", "differential-network", "pendulum", *BY_HAND, *SLOW[:2])
 """The other cases repeat what is in these."""
-SLOW = {"black-box-hnn", "latent-phase", "three-body", "spherical_pendulum", "relativistic_particle", "kepler"}
-SLOW |= {"structured-delan", "double_pendulum"}
-"""Cases of `DEFAULT` whose primitives occur in another case, too."""
-BRIEFLY = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian", "mass_matrix")
-BRIEFLY += ("rates", "hamiltonian", "encode", "decode")
-HAMILTONIANS = ("black-box-hnn",)
-"""Their Newton iterations take long to compile: derivatives through them are tried with `--every-export`."""
+BRIEFLY = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian", "mass_matrix", "rates", "hamiltonian")
 WHOLE = ("pendulum", "differential-network")
-SINGLE = ("structured-delan", "differential-network", "double_pendulum")
+SINGLE = ("structured-delan", "differential-network", "ball_in_a_bowl")
 AS_USERS_DO = {"trigonometric": FLAGS}
-LARGEST_CHAIN = 6
+TOO_LARGE = {f"chain-{links}" for links in range(7, 13)}
+"""Their C takes minutes to compile."""
+
+
+def pytest_generate_tests(metafunc):
+    every = [case for case in (*MODELS, *SCENES, *BY_HAND) if case not in TOO_LARGE]
+    chosen = every if metafunc.config.getoption("--every-export") else DEFAULT
+    metafunc.parametrize("case", slow_among(chosen, SLOW.__contains__))
 
 
 def system_of(case, precision):
-    """Functions, and the system that they are of, if it is one of mechanics.
+    """Functions, the system that they are of, and its degrees of freedom.
 
     A run's parameters are numbers that both precisions have.
     """
-    dtype = {"f64": np.float64, "f32": np.float32}[precision]
     if case in MODELS:
         run = run_of(case)
         rounded = jax.tree.map(lambda leaf: leaf.astype(np.float32).astype(float), run.parameters)
-        run = Run(run.model, rounded, run.description)
-        return functions_of_run(run, precision=precision), run.energies if "needs" in MODELS[case] else None
+        functions = functions_of_run(Run(run.model, rounded, run.description), precision=precision)
+        needs = MODELS[case].get("needs")
+        return functions, needs and run.energies, needs.degrees_of_freedom if needs else 1
     if case in BY_HAND:
-        lagrangian, d = BY_HAND[case]
-        system = LagrangianSystem(lagrangian)
-        return functions_of_system(system, d, dtype=dtype), system
-    scene = SCENES[case]()
-    d = len(scene.needs.joints)
-    return functions_of_system(scene.closed_form, d, dtype=dtype, actuation=scene.needs.actuation), scene.closed_form
+        system, d, actuation = (*BY_HAND[case], None)
+    else:
+        scene = SCENES[case]()
+        system, d, actuation = scene.closed_form, len(scene.needs.joints), scene.needs.actuation
+    return functions_of_system(system, d, dtype=TYPES[precision], actuation=actuation), system, d
 
 
-def states_of(functions, system):
-    """Returns a thousand states of each function, and the first with each of its numbers in turn not finite."""
-    random = np.random.default_rng(1)
-    drawn: dict[str, np.ndarray] = {}
-    states = {}
-    for function, examples in functions.values():
-        arguments = list(inspect.signature(function).parameters)
-        for key, example in zip(arguments, examples, strict=True):
-            values = random.uniform(-1, 1, (STATES, *np.shape(example)))
-            drawn.setdefault(key, (0.02 + 0 * values if key == "dt" else values).astype(np.float32).astype(float))
-    if isinstance(system, Canonical):  # velocities that have momenta
-        rates = jax.jit(jax.vmap(lambda q, p: flow(system).rates(q, p)[0]))
-        drawn["qd"] = np.asarray(rates(drawn["q"], 0.5 * drawn["p"])).astype(np.float32).astype(float)
-        drawn["x"] = np.concatenate([drawn["q"], drawn["qd"]], axis=1)
-    for name, (function, _) in functions.items():
-        columns = [drawn[key] for key in inspect.signature(function).parameters]
-        every = list(zip(*columns, strict=True))
-        first = every[0]
-        for place, leaf in enumerate(first):
-            for k in range(np.size(leaf)):
-                for value in (np.nan, np.inf, -np.inf):
-                    changed = np.array(leaf, copy=True)
-                    changed.reshape(-1)[k] = value
-                    every.append((*first[:place], changed, *first[place + 1 :]))
-        states[name] = every
-    return states
+def with_holes(rows):
+    """The states, and the first with each of its numbers in turn not finite."""
+    first, changed = rows[0], []
+    for place, leaf in enumerate(first):
+        for k in range(np.size(leaf)):
+            for value in (np.nan, np.inf, -np.inf):
+                hole = np.where(np.arange(np.size(leaf)).reshape(np.shape(leaf)) == k, value, leaf)
+                changed.append((*first[:place], hole, *first[place + 1 :]))
+    return [*rows, *changed]
 
 
 def differences(got, expected):
@@ -194,45 +109,40 @@ def differences(got, expected):
     return worst
 
 
-def differently_finite(got, expected):
-    """States where only one of the two results is finite, by result."""
-    return {
-        (name, place): np.unique(np.argwhere(np.isfinite(ours) != np.isfinite(theirs))[:, 0])
-        for name, results in expected.items()
-        for place, (ours, theirs) in enumerate(zip(got[name], results, strict=True))
-    }
-
-
 @needs_compiler
-@pytest.mark.parametrize("case", slow_among(CASES, SLOW.__contains__))
 def test_c_equals_jax(case, tmp_path, pytestconfig):
     every = pytestconfig.getoption("--every-export")
-    if not every and case not in DEFAULT:
-        pytest.skip("compared only with --every-export, which takes minutes")
-    if case.startswith("chain") and int(case.removeprefix("chain-")) > LARGEST_CHAIN:
-        pytest.skip("this export takes minutes to compile")
 
     def chosen(precision):
-        functions, system = system_of(case, precision)
+        functions, system, d = system_of(case, precision)
         names = functions if every or case in WHOLE else ("forward_dynamics",) if case in BY_HAND else BRIEFLY
-        if case in HAMILTONIANS and not every:
-            names = [name for name in names if name not in ("inverse_dynamics_jacobian", "mass_matrix")]
-        return {key: function for key, function in functions.items() if key in names}, system
+        if case == "black-box-hnn" and not every:  # derivatives through its iterations take long to compile
+            names = ("inverse_dynamics", "forward_dynamics", "rates", "hamiltonian")
+        return {name: functions[name] for name in functions if name in names}, system, d
 
-    functions, system = chosen("f64")
-    states = states_of(functions, system)
+    functions, system, d = chosen("f64")
+    controls = len(functions["step_rk4"][1][1]) if "step_rk4" in functions else d
+    drawn = states_of(system, d, controls, count=STATES)
+    states = {}
+    for name, (function, examples) in functions.items():
+        keys = inspect.signature(function).parameters
+        if system is None:  # networks alone
+            random = np.random.default_rng(1)
+            drawn = {key: random.uniform(-1, 1, (STATES, *one.shape)) for key, one in zip(keys, examples, strict=True)}
+            drawn = {key: values.astype(np.float32).astype(float) for key, values in drawn.items()}
+        states[name] = with_holes(list(zip(*(drawn[key] for key in keys), strict=True)))
     expected = in_jax(functions, states)
-    for precision, bound in BOUND.items():
-        if precision == "f32" and not (every or case in SINGLE):
-            continue
+    for precision in BOUND if every or case in SINGLE else ("f64",):
         ours = functions if precision == "f64" else chosen(precision)[0]
         got = in_c(ours, states, tmp_path / precision, precision=precision, flags=AS_USERS_DO.get(case, ("-O0",)))
         alike = expected if precision == "f64" else in_jax(ours, states, precision=precision)
         # Badly conditioned functions lose more digits, in JAX as well.
         rounding = differences(alike, expected)
         for name, apart in differences(got, expected).items():
-            assert apart < max(bound, 2 * rounding[name]), (precision, name, apart, rounding[name])
-        for name, other in differently_finite(got, alike).items():
-            if precision == "f32" and "implicit" in name[0] and (other < STATES).sum() < 0.02 * STATES:
-                other = other[other >= STATES]  # whether iterations suffice is a matter of rounding there
-            assert not other.size, (precision, name, [states[name[0]][k] for k in other[:3]])
+            assert apart < max(BOUND[precision], 2 * rounding[name]), (precision, name, apart, rounding[name])
+        for name, results in alike.items():
+            for mine, theirs in zip(got[name], results, strict=True):
+                other = np.unique(np.argwhere(np.isfinite(mine) != np.isfinite(theirs))[:, 0])
+                if precision == "f32" and "implicit" in name and (other < STATES).sum() < 0.02 * STATES:
+                    other = other[other >= STATES]  # whether iterations suffice is a matter of rounding there
+                assert not other.size, (precision, name, [states[name][k] for k in other[:3]])

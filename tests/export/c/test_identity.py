@@ -1,21 +1,18 @@
 """Which functions of a source are one function, and what an export leaves behind in the process."""
 
-import shutil
+import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from comparison import needs_compiler
 
 from dln_jax.export.c import jaxprs
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c, source_files
 from dln_jax.scenes.pendulums import chain
-
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
-)
 
 
 @pytest.fixture(autouse=True)
@@ -51,27 +48,39 @@ def parts(files):
 
 
 @needs_compiler
-def test_two_models_in_one_export_keep_their_own_weights(tmp_path):
+def test_models_in_one_export_keep_their_own_weights(tmp_path):
+    """Before and after training, and as members of an ensemble."""
     old, retrained = model(W), model(1.1 * W)
-    functions = {"old": (lambda x: old(old(x)), (STATE,)), "retrained": (lambda x: retrained(retrained(x)), (STATE,))}
-    export_c(functions, tmp_path)
-    loaded = load_c(tmp_path)
-    for name, (function, _) in functions.items():
+    functions = {"old": lambda x: old(old(x)), "retrained": lambda x: retrained(retrained(x))}
+    functions["both"] = of_two(old, retrained)
+    export_c({name: (function, (STATE,)) for name, function in functions.items()}, tmp_path)
+    loaded = load_c(tmp_path, flags=("-O1",))
+    for name, function in functions.items():
         np.testing.assert_allclose(getattr(loaded, name)(STATE), function(STATE), rtol=1e-12)
-
-
-@needs_compiler
-def test_members_of_an_ensemble_keep_their_own_weights(tmp_path):
-    function = of_two(model(W), model(1.1 * W))
-    export_c({"both": (function, (STATE,))}, tmp_path)
-    for ours, theirs in zip(load_c(tmp_path).both(STATE), function(STATE), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
 def test_functions_of_equal_programs_are_one_however_they_came_about():
     alike, differing = of_two(model(W), model(W.copy())), of_two(model(W), model(np.nextafter(W, 1)))
     assert parts(source_files({"f": (alike, (STATE,))}, name="model")) == 1
     assert parts(source_files({"f": (differing, (STATE,))}, name="model")) == 2
+
+
+def test_what_is_called_counts_with_what_calls_it():
+    """Functions that call another, or one that calls it, need its stack; each is written once."""
+    inner = model(W)
+    outer = jax.jit(lambda x: inner(x) + inner(inner(x)))
+    callers = {
+        "alone": lambda x: inner(x),
+        "once": lambda x: inner(inner(x)),
+        "of_outer": lambda x: 2 * outer(outer(x)),
+        "of_both": lambda x: outer(outer(x)) + inner(x),
+    }
+    files = source_files({name: (call, (STATE,)) for name, call in callers.items()}, name="model")
+    stated = json.loads(files["model.json"])["functions"].values()
+    operations, stack = ([facts[key] for facts in stated] for key in ("operations", "stack_bytes"))
+    inside = operations[0]
+    assert operations == [inside, 2 * inside, 4 * inside + 9, 5 * inside + 9]
+    assert stack[0] < stack[1] < stack[2] - 512 and parts(files) == 2
 
 
 def test_what_is_left_out_leaves_nothing_behind():
