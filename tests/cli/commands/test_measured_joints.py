@@ -81,14 +81,9 @@ def test_tests_and_noise_may_be_stated(double):
             problem_of(MEASURED, data=data, stated=stated)
 
 
-@pytest.mark.slow
-def test_mistakes_are_one_line(double, capsys):
+def test_options_of_measured_tasks_are_refused_elsewhere(double, capsys):
     rows = [
-        (MEASURE, "--noise small", "--noise is 'small'"),
-        (MEASURE, "--noise 0", "finite positive numbers"),
-        (MEASURE, "--coordinates absolute", "--coordinates is an option of --model planar-chain"),
         (MEASURE, "--model trigonometric --width 3", "--width is an option of networks"),
         ("--task spring --test a", "--test is an option of --task measured"),
-        ("--task spring --model trigonometric", "is of no phase space"),
     ]
     assert_refused(capsys, train_hnn_task, rows, out=double / "no")
