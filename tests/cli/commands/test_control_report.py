@@ -1,17 +1,15 @@
 """The report of control: its cases, and what it refuses."""
 
 import pytest
-from calls import refused
+from calls import assert_refused
 
 from dln_jax.control.closed_loop import hanging_starts
 from scripts.reports.commands import control_report
 from scripts.reports.control.swing_ups import SWING_UPS, tried
 
 
-def test_an_unknown_subject_is_one_line(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert "'dance' is unknown; choose from" in refused(capsys, control_report, "--only dance --out run")
-    assert not (tmp_path / "run").exists()
+def test_an_unknown_subject_is_one_line(capsys, tmp_path):
+    assert_refused(capsys, control_report, [("--only dance", "'dance' is unknown; choose from")], out=tmp_path / "run")
 
 
 def test_every_subject_has_cases():

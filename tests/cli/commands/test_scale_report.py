@@ -1,9 +1,6 @@
 """Work on one device and on several takes turns, and its report says how much several gain."""
 
-import json
-
-import pytest
-from calls import command, refused
+from calls import assert_refused
 
 from scripts.reports import scale
 from scripts.reports.commands import scale_report
@@ -24,25 +21,11 @@ def test_gains_are_ratios_of_seconds(monkeypatch):
     assert rows["crawlers/8/2-devices", "speed_up"] == 1.5 and rows["crawlers/8", "share"] == 1.0
 
 
-@pytest.mark.slow
-def test_the_report_measures_one_device(tmp_path):
-    command(scale_report, "--quick", "--lanes", "2", "--sharing", "1", "--out", tmp_path / "out")
-    rows = json.loads((tmp_path / "out/report.json").read_text())["rows"]
-    values = {(row["case"], row["quantity"]): row["value"] for row in rows}
-    assert values["training/adam", "parameters"] == 260 and 0 < values["crawlers/2", "useful_iterations_share"] <= 1
-    assert all(value > 0 for value in values.values())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--lanes", "8,x"), "--lanes is '8,x'"),
-        (("--lanes", "0"), "--lanes is '0'"),
-        (("--sharing", "0"), "sharing is 0"),
-        (("--only", "teapots"), "teapots"),
-    ],
-)
-def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    assert message in refused(capsys, scale_report, *arguments)
-    assert not (tmp_path / "runs").exists()
+def test_mistakes_are_one_line(capsys, tmp_path):
+    rows = {
+        "--lanes 8,x": "--lanes is '8,x'",
+        "--lanes 0": "--lanes is '0'",
+        "--sharing 0": "sharing is 0",
+        "--only teapots": "teapots",
+    }
+    assert_refused(capsys, scale_report, rows.items(), out=tmp_path / "run")

@@ -1,12 +1,9 @@
 """Cases of soft bodies that do not depend on the machine, and the command line."""
 
-import json
-
 import pytest
-from calls import command, refused
+from calls import assert_refused, command, json_of
 from conftest import slow_among
 
-from dln_jax.types import InputError
 from scripts.reports.case import Case, Findings, named
 from scripts.reports.commands import softbody_report
 from scripts.reports.commands.softbody_report import cases
@@ -34,17 +31,9 @@ def test_soft_bodies_meet_their_bounds(name):
 def test_the_script_writes_its_report(tmp_path, capsys, monkeypatch):
     row = expect("locking", "error", "of a test", 0.1, 0.2)
     monkeypatch.setattr(softbody_report, "cases", lambda quick: [Case("references/one", lambda: Findings([row]))])
-    command(softbody_report, "--only", "references", "--quick", "--out", tmp_path / "run")
-    report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert len(report["rows"]) == len(report["conditions"]["expected"]) == 1
+    command(softbody_report, "--only references --quick --out", tmp_path / "run")
+    report = json_of(tmp_path / "run" / "report.json")
     assert {"case", "quantity", "value", "unit", "reference", "bound", "pass"} == set(report["rows"][0])
     assert report["conditions"]["quick"] is True and "1 of 1 pass" in capsys.readouterr().out
-
-
-def test_refuses_bad_input(tmp_path, capsys):
-    out = tmp_path / "a"
-    assert "'nonsense' is unknown; choose from" in refused(capsys, softbody_report, "--only", "nonsense", "--out", out)
-    assert "names nothing" in refused(capsys, softbody_report, "--only", ",", "--out", out)
-    assert not out.exists()
-    with pytest.raises(InputError, match="'hard/nonsense' is unknown; choose from references/locking"):
-        named(cases(), "hard/nonsense")
+    rows = {"--only nonsense": "'nonsense' is unknown; choose from", "--only ,": "names nothing"}
+    assert_refused(capsys, softbody_report, rows.items(), out=tmp_path / "none")

@@ -22,7 +22,6 @@ from dln_jax.cli.sweeps.executors import here
 from dln_jax.cli.sweeps.job import Job, Status, run_job, status_of
 from dln_jax.cli.sweeps.table import compared, write_tables
 from dln_jax.data import schema
-from dln_jax.figures.sweeps import Point, error_against_seconds
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.registry import scene_named
 from dln_jax.types import InputError
@@ -106,10 +105,6 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
     # The job with the best validation error has the worst test error.
     (best,) = [job["values"] for job in results["jobs"] if job["best"]]
     assert best == {"width": "4", "seed": "0"}
-    with (out / "table.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 9 and float(rows[3]["validation_error"]) == 1e-4 and rows[7]["validation_error"] == ""
-    assert max(rows, key=lambda row: float(row["torque_mse"] or 0))["best"] == "1"
     # Medians over seeds, by hand.
     groups = {group["values"]["width"]: group for group in results["groups"]}
     assert groups["4"]["medians"]["validation_error"] == pytest.approx(2e-4)
@@ -238,16 +233,18 @@ def test_jobs_get_the_gpus_that_the_user_has_made_visible(monkeypatch, tmp_path)
     jobs = [Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
     together = threading.Barrier(2, timeout=60)
 
-    def device_beside_another(job, environment, interrupt):
+    def wait_for_the_other(job, environment, interrupt):
+        devices.add(environment["CUDA_VISIBLE_DEVICES"])
         together.wait()  # both run at once, each with a GPU of its own
-        return environment["CUDA_VISIBLE_DEVICES"]
 
     for visible, expected in ((None, {"0", "1"}), ("2,5,7", {"2", "5"})):
+        devices = set()
         if visible is not None:
             monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
         with here(2, 2) as (submit, _):
-            futures = [submit(device_beside_another, job) for job in jobs]
-            assert {future.result() for future in futures} == expected
+            for future in [submit(wait_for_the_other, job) for job in jobs]:
+                future.result()
+        assert devices == expected
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     with pytest.raises(InputError, match="names 1 of them: 3"), here(2, 2):
         pass
@@ -280,16 +277,6 @@ def test_another_grid_is_refused(tmp_path, executor, capsys):
     command(sweep, "--grid", "width=2 seed=0", "--out", tmp_path / "s")
     line = refused(capsys, sweep, "--grid", "width=4 seed=0", "--out", tmp_path / "s", "--resume")
     assert "was started with grid = width=2 seed=0" in line
-
-
-def test_the_figure_shows_every_run_and_rings_the_best():
-    points = [Point(1.0, 1e-3, "4"), Point(2.0, 1e-5, "8", best=True), Point(1.5, 1e-4, median=True)]
-    drawn = error_against_seconds(points, x="training, s", y="torque", colour="width", note="3 jobs: 1 failed")
-    (axis,) = drawn.axes
-    assert [line.get_xydata()[0].tolist() for line in axis.lines].count([2.0, 1e-5]) == 2
-    assert len(axis.lines) == 4 and axis.get_yscale() == "log"
-    (legend,) = drawn.legends
-    assert legend.get_title().get_text() == "3 jobs: 1 failed"
 
 
 def kill_as_it_begins(job):
