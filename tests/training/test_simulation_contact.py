@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from calls import command, json_of, refused
+from calls import assert_refused, command, json_of
 
 from dln_jax.cli.commands import simulate
 from dln_jax.softbody.mesh import beam
@@ -19,16 +19,17 @@ def two_blocks(tmp_path):
 
 
 def test_contact_is_refused_where_it_cannot_hold(capsys, two_blocks, tmp_path):
-    mine = ("--scene", "drop", "--mesh", str(two_blocks), "--contact", "--out", str(tmp_path / "run"))
-    assert "use BACKWARD_EULER, BDF2" in refused(capsys, simulate, *mine, "--integrator midpoint")
-    assert "has no --contact" in refused(capsys, simulate, "--scene slope --contact")
-    assert not (tmp_path / "run").exists()
+    rows = [
+        ("--scene drop --integrator midpoint --mesh", two_blocks, "use BACKWARD_EULER, BDF2"),
+        ("--scene slope", "has no --contact"),
+    ]
+    assert_refused(capsys, simulate, rows, "--contact", out=tmp_path / "run")
 
 
 @pytest.mark.slow
 def test_blocks_that_fall_on_each_other_stay_apart(two_blocks, tmp_path):
-    mine = ("--scene", "drop", "--mesh", str(two_blocks), "--youngs-modulus", "1e5", "--seconds", "0.5", "--no-figures")
-    command(simulate, *mine, "--contact --out", str(tmp_path / "run"))
+    options = "--scene drop --contact --youngs-modulus 1e5 --seconds 0.5 --no-figures"
+    command(simulate, options, "--mesh", two_blocks, "--out", tmp_path / "run")
     numbers = json_of(tmp_path / "run" / "metrics.json")
     # Their surfaces act on each other within 15 mm, a tenth of the shortest edge.
     assert numbers["steps_not_converged"] == 0 and 0 < numbers["least_distance_of_surfaces"] < 0.0149

@@ -1,5 +1,6 @@
 """Stored trees come back bit for bit."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -26,9 +27,7 @@ def test_arrays_come_back_however_they_lie_in_memory(tmp_path):
     numbers = np.arange(24.0).reshape(4, 6)
     tree = {"transposed": numbers.T, "columns": numbers.T[:, [True, False, True, False]], "strided": numbers[::2, ::3]}
     save_tree(tmp_path, "state", tree, {})
-    found = load_tree(tmp_path, "state", tree)
-    for name, expected in tree.items():
-        np.testing.assert_array_equal(found[name], expected)
+    jax.tree.map(np.testing.assert_array_equal, load_tree(tmp_path, "state", tree), tree)
 
 
 def test_a_tree_comes_back_bit_for_bit_and_old_states_are_removed(tmp_path):
@@ -38,8 +37,4 @@ def test_a_tree_comes_back_bit_for_bit_and_old_states_are_removed(tmp_path):
     manifest = load_manifest(tmp_path, "checkpoint")
     assert manifest["note"] == 2 and set(manifest["versions"]) >= {"jax", "dln-jax"}
     assert manifest["tensors"]["count"] == {"shape": [], "dtype": "int32"}
-    again = load_tree(tmp_path, "checkpoint", TREE)
-    assert isinstance(again, State)
-    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(TREE), strict=True):
-        assert one.dtype == other.dtype
-        np.testing.assert_array_equal(one, other)
+    jax.tree.map(partial(np.testing.assert_array_equal, strict=True), load_tree(tmp_path, "checkpoint", TREE), TREE)
