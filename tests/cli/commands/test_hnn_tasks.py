@@ -14,20 +14,13 @@ from dln_jax.data import schema
 from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.scenes.datasets import phase_samples
 from dln_jax.training.hamiltonian import measurements, predictions, stages
 from dln_jax.training.hamiltonian import model_selection as choice
 from dln_jax.training.hamiltonian import tasks as hnn_tasks
 from dln_jax.training.hamiltonian import training as hnn_models
-from dln_jax.training.hamiltonian.tasks import pieces, problem_of
+from dln_jax.training.hamiltonian.tasks import problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.zoo.run import load
-from scripts.reports.case import Findings, rows_of
-from scripts.reports.commands import hnn_table
-from scripts.reports.hamiltonian import table
-from scripts.reports.hamiltonian.table import BOUNDS, TASKS, models_of, table_rows
-from scripts.reports.published import HAMILTONIAN
-from scripts.reports.rows import markdown
 
 
 def quick_prediction(model, parameters, q, p, t):
@@ -52,78 +45,17 @@ def workplace(tmp_path_factory):
             patch.setattr(module, "RECIPES", small)
         for module in (hnn_tasks, measurements):
             patch.setattr(module, "WINDOW", window)
-        for module in (phase_samples, hnn_tasks):
-            patch.setattr(module, "reference_motion", quick_motion)
         patch.setattr(predictions, "predict", quick_prediction)
-        patch.setattr(table, "models_of", {"spring": ["polynomial-hamiltonian"]}.get)
-        patch.setattr(choice, "DEGREES", (2, 3))
         yield folder
-
-
-@pytest.mark.slow
-def test_a_task_runs_and_reports_and_a_finished_table_measures_nothing_twice(workplace, monkeypatch):
-    command(hnn_table, "--seeds 1 --steps 1 --trajectories 10 --tasks spring --out all")
-    jobs = workplace / "all" / "jobs.json"
-    before = jobs.read_bytes()
-    rows = {row["quantity"]: row for row in json_of(workplace / "all" / "report.json")["rows"]}
-    quantities = "rollout_mse train_seconds compile_seconds parameters test_loss train_loss energy_mse_standard_error"
-    assert set(quantities.split()) <= set(rows)
-    published = HAMILTONIAN.values["spring/black-box-hnn"]
-    assert rows["energy_mse"]["reference"] == published["energy_mse"]
-    # The polynomial holds the oscillator.
-    assert rows["clean_field_mse"]["value"] < 0.1
-    assert (workplace / "all" / "spring.png").read_bytes().startswith(b"\x89PNG")
-    monkeypatch.setattr(table, "problem_of", lambda *a, **k: pytest.fail("measured again"))
-    command(hnn_table, "--out all --resume")
-    assert jobs.read_bytes() == before
-
-
-def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypatch):
-    measured = Findings(rows_of("spring/separable-hnn", {"energy_mse": 1e-6}))
-    monkeypatch.setattr(table, "phase_task", lambda name, **given: measured)
-    command(hnn_table, "--tasks spring,real-pendulum --no-figures --out part")
-    assert "real-pendulum is left out" in capsys.readouterr().out
-    assert not (workplace / "part" / "spring.png").exists()
-    assert "needs its data" in refused(capsys, hnn_table, "--tasks real-pendulum --out no")
-
-
-def test_bounds_decide():
-    measured = {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7, "train_seconds": 6.0}
-    rows = table_rows(rows_of("spring/separable-hnn", measured))
-    assert "| 1e-06 / 0.00038 | 2e-07 |" in markdown(rows)
-    passed = {row.quantity: row.passed for row in rows}
-    assert passed["energy_mse"] is True and passed["train_seconds"] is False
-    assert all(row.bound is None for row in table_rows(rows_of("spring/phase-network", {"energy_mse": 1e-6})))
-    suited = {task: RECIPES[task].suits for task in TASKS if task in RECIPES} | {"pixels": "black-box-hnn"}
-    assert {f"{task}/{name}" for task, name in suited.items()} == set(BOUNDS)
-    rivals = ("black-box-hnn", "phase-network")
-    assert {f"{task}/{name}" for task in TASKS for name in rivals} == set(HAMILTONIAN.values)
 
 
 def test_measured_motions_are_cut_at_gaps(workplace):
     problem = problem_of(hnn_tasks.REAL, data=workplace / "swing.npz")
     fitted = problem.fitted
-    steps = np.diff(fitted.t)[np.diff(fitted.trajectory) == 0]
-    assert steps.max() < 0.2 and len(np.unique(fitted.trajectory)) > 2
+    assert np.diff(fitted.t)[np.diff(fitted.trajectory) == 0].max() < 0.2 and len(np.unique(fitted.trajectory)) > 2
     # A fifth of the samples is the test, predicted from its first state.
     assert problem.truth[0].q.shape == (1, 32, 1) and len(fitted.t) == 128 and problem.truth[0].t[0] == 0
     np.testing.assert_array_equal(fitted.p, fitted.qd)
-    assert len(np.unique(pieces(fitted, 100).trajectory)) == len(np.unique(fitted.trajectory))
-
-
-def test_mistakes_are_one_line(workplace, capsys):
-    two = schema.load("swing.npz")
-    schema.save("double.npz", two._replace(q=np.hstack([two.q, two.q]), estimated=("qd", "qdd", "tau")))
-    rows = {
-        "--tasks spring,pixel": "--tasks: 'pixel' is unknown",
-        "--seeds 0": "seeds is 0",
-        "--steps 0": "steps is 0",
-        "--real-pendulum missing.npz": "no such file",
-        "--real-pendulum double.npz": "has 2 coordinates",
-        "--tasks two-body --trajectories 3": "trajectories is 3",
-    }
-    assert_refused(capsys, hnn_table, rows.items(), out=workplace / "no")
-    assert models_of("spring") == ("separable-hnn", "black-box-hnn", "phase-network", "polynomial-hamiltonian")
 
 
 @pytest.fixture(scope="module")

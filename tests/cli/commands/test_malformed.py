@@ -154,15 +154,6 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
         schema.load("data.npz")
 
 
-def test_columns_and_bytes_in_either_order_are_read(here):
-    q = np.arange(24.0).reshape(12, 2)
-    order = {"q": np.asfortranarray(q), "qd": q.astype(">f4")}
-    np.savez("data.npz", t=np.arange(12.0), trajectory=np.zeros(12, np.uint8), **order)
-    data = schema.load("data.npz")
-    np.testing.assert_array_equal(data.q, q)
-    np.testing.assert_array_equal(data.qd, q)
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=4))
 def test_an_archive_with_any_bytes_changed_is_read_or_refused(tmp_path_factory, changes):
@@ -283,18 +274,16 @@ def test_damaged_configs_are_refused(here, capsys):
 def test_a_damaged_table_of_what_was_measured_is_refused(here, capsys):
     Path("run").mkdir()
     Path("run", LOCK).touch()
+    write_json(Path("run", CONFIG), {**stored_arguments(diffnet_table.Arguments()), "samples": 50})
     for stored in (
         "{",
         '{"teapot": {}}',
         '{"sin/type1/cos/gauss-newton": 3}',
         '{"sin/type1/cos/gauss-newton": {"value_mse": "small"}}',
         '{"sin/type1/cos/gauss-newton": {"value_mse": 1.0}}',
-        '{"sin/type1/cos/gauss-newton": {"value_mse": [1.0]}}',
     ):
         Path("run", "jobs.json").write_text(stored)
-        for script, arguments in ((diffnet_table, {"samples": 50}), (hnn_table, {"tasks": "spring"})):
-            write_json(Path("run", CONFIG), {**stored_arguments(script.Arguments()), **arguments})
-            assert "jobs.json" in refuse(capsys, script, "--out run --resume")
+        assert "jobs.json" in refuse(capsys, diffnet_table, "--out run --resume")
 
 
 # checkpoints

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from calls import assert_refused, command, json_of
 from motions import quick_motion
-from PIL import Image
 
 from dln_jax.cli.commands import train_hnn_pixels
 from dln_jax.figures import animations
@@ -73,30 +72,27 @@ def pictures64(q):
 
 def test_renderer_draws_the_rod():
     """Bounded, mirrored for -q, moving where its derivative says, and bright exactly on the rod."""
-    angles = jnp.array([0.0, 0.35, -0.35, 1.3])
+    angles, h = jnp.array([0.35, -0.35, 1.3]), 1e-6
     image, slope = jax.jit(jax.vmap(lambda q: jax.jvp(render, (q,), (jnp.ones_like(q),))))(angles)
-    assert image.shape == (4, SIDE, SIDE) and image.min() >= 0 and image.max() <= 1
-    np.testing.assert_allclose(image[2], image[1][:, ::-1], atol=1e-13)
-    h = 1e-6
+    assert image.shape == (3, SIDE, SIDE) and image.min() >= 0 and image.max() <= 1
+    np.testing.assert_allclose(image[1], image[0][:, ::-1], atol=1e-13)
     difference = (pictures64(angles + h) - pictures64(angles - h)) / (2 * h)
-    np.testing.assert_allclose(slope.reshape(4, -1), difference, atol=1e-8)
+    np.testing.assert_allclose(slope.reshape(3, -1), difference, atol=1e-8)
     # The tip of a rod of 1 m at q = 1.3 is at (0.96, -0.27), outside; half way down it is bright, elsewhere dark.
-    column, row = ((0.5 * np.sin(1.3) + 0.8) / 1.6 * SIDE, (0.4 + 0.5 * np.cos(1.3)) / 1.6 * SIDE)
-    assert image[3, int(row), int(column)] > 0.9 and image[3, int(row), SIDE - 1 - int(column)] < 1e-6
+    row, column = (SIDE * np.array([0.4 + 0.5 * np.cos(1.3), 0.8 + 0.5 * np.sin(1.3)]) / 1.6).astype(int)
+    assert image[2, row, column] > 0.9 and image[2, row, SIDE - 1 - column] < 1e-6
 
 
 def test_data_are_repeatable_and_conserve_energy(data):
     np.testing.assert_array_equal(data.frames, swinging_rod(0, trajectories=6, frames=13).frames)
     assert data.frames.dtype == np.float32 and data.frames.shape == (6, 13, PIXELS)
-    assert np.abs(swinging_rod(1, trajectories=6, frames=13).q - data.q).max() > 1e-2
     levels = np.asarray(energy(jnp.asarray(data.q), jnp.asarray(data.qd)))
     assert np.ptp(levels, axis=1).max() < 1e-8 and levels.std() > 0.05
-    assert np.abs(data.q[:, 0]).max() < np.pi / 6 and np.abs(data.qd[:, 0]).max() < 1
     np.testing.assert_allclose(data.frames[3, 5], pictures64(data.q[3, 5:6])[0], atol=1e-7)
-    np.testing.assert_array_equal(data.pairs[2, 4], np.concatenate([data.frames[2, 4], data.frames[2, 5]]))
+    np.testing.assert_array_equal(data.pairs[2, 4], data.frames[2, 4:6].ravel())
     parts = split(data, seed=3)
     assert [len(part.q) for part in parts] == [4, 1, 1]
-    np.testing.assert_array_equal(np.unique(np.concatenate([part.q[:, 0] for part in parts])), np.unique(data.q[:, 0]))
+    assert len(set(np.concatenate([part.q[:, 0] for part in parts]))) == 6
 
 
 def test_the_point_pendulum_is_gyms_rod():
@@ -137,23 +133,22 @@ def test_loss_by_hand():
     """Sums over samples in numpy, with the oscillator's motion in closed form."""
     frames = np.random.default_rng(0).normal(size=(4, 5, 1))
     factor, scale = 0.9, 2.0
-    model, parameters = oscillator(scale), jnp.array([factor])
     x, following = frames[:, :-1, 0], frames[:, 1:, 0]
     q, p = scale * x, scale * factor * (following - x)
-    image = ((q + 1.5 * p) / scale - following) ** 2 / 2
-    angle = 0.2 * np.arange(4)
-    moved = q[:, :1] * np.cos(angle) + p[:, :1] * np.sin(angle) / 0.2
-    pushed = p[:, :1] * np.cos(angle) - 0.2 * q[:, :1] * np.sin(angle)
-    change = p[:, :-1] - np.diff(q, axis=1)
-    for relative in (True, False):
-        found = terms(model, parameters, jnp.asarray(frames), relative)
-        sizes = (np.mean([x.var(), following.var()]), q.var(), p.var()) if relative else (1.0, 1.0, 1.0)
-        np.testing.assert_allclose(found.autoencoder, image.mean() / sizes[0], rtol=1e-9)
-        np.testing.assert_allclose(found.coordinate, np.mean(change**2) / sizes[2], rtol=1e-9)
-        by_hand = np.mean((moved - q)[:, 1:] ** 2) / sizes[1] + np.mean((pushed - p)[:, 1:] ** 2) / sizes[2]
-        np.testing.assert_allclose(found.field, by_hand / 2, rtol=1e-4)
+    c, s = np.cos(0.2 * np.arange(1, 4)), np.sin(0.2 * np.arange(1, 4))
+    image = np.mean(((q + 1.5 * p) / scale - following) ** 2) / 2
+    change = np.mean((p[:, :-1] - np.diff(q, axis=1)) ** 2)
+    moved = np.mean((q[:, :1] * c + p[:, :1] * s / 0.2 - q[:, 1:]) ** 2)
+    pushed = np.mean((p[:, :1] * c - 0.2 * q[:, :1] * s - p[:, 1:]) ** 2)
+    sizes = np.mean([x.var(), following.var()]), q.var(), p.var()
+    for relative, (of_image, of_q, of_p) in ((True, sizes), (False, (1.0, 1.0, 1.0))):
+        given = oscillator(scale), jnp.array([factor]), jnp.asarray(frames)
+        found = terms(*given, relative)
+        np.testing.assert_allclose(found.autoencoder, image / of_image, rtol=1e-9)
+        np.testing.assert_allclose(found.coordinate, change / of_p, rtol=1e-9)
+        np.testing.assert_allclose(found.field, (moved / of_q + pushed / of_p) / 2, rtol=1e-4)
     matching = Matching(weights=TermWeights(2.0, 3.0, 5.0), relative=False)
-    total = learning_frames.loss(model, matching, parameters, jnp.asarray(frames))
+    total = learning_frames.loss(given[0], matching, *given[1:])
     np.testing.assert_allclose(total, 2 * found[0] + 3 * found[1] + 5 * found[2], rtol=1e-9)
 
 
@@ -162,29 +157,16 @@ def test_windows_are_segments_of_one_trajectory():
     np.testing.assert_array_equal(windows(frames, 3)[..., 0], [[0, 1, 2], [3, 4, 5], [7, 8, 9], [10, 11, 12]])
 
 
-@pytest.fixture(scope="module")
-def untrained():
-    """A small network for images of the data, and its parameters."""
-    model = make_latent_phase(latent_field("black-box-hnn", width=6, depth=1), PIXELS, width=6)
-    return model, jax.jit(model.init)(jax.random.key(0))
-
-
 def test_autoencoders_read_two_frames(data):
     """The momentum is the change of the coordinate, for any parameters."""
     model = make_latent_phase(latent_field("phase-network", width=3), PIXELS, width=5)
-    x, other = data.pairs[0, 0], data.pairs[3, 2]
-
-    @jax.jit
-    def ask(key):
-        system = model.apply(model.init(key))
-        moved = jnp.concatenate([jnp.asarray(x[:PIXELS]), jnp.asarray(other[PIXELS:])])
-        q, p = system.encode(jnp.asarray(x))
-        return (q, p), system.encode(moved), system.encode(jnp.roll(jnp.asarray(x), PIXELS)), system.decode(q, p)
-
-    (q, p), (q_moved, p_moved), (q_swapped, _), decoded = ask(jax.random.key(0))
-    assert decoded.shape == (2 * PIXELS,) and abs(p_moved - p) > 1e-6
-    np.testing.assert_allclose(q_swapped, q + p, rtol=1e-5)
-    np.testing.assert_array_equal(q_moved, q)
+    system = model.apply(jax.jit(model.init)(jax.random.key(0)))
+    first, second, other = data.frames[0, 0], data.frames[0, 1], data.frames[3, 2]
+    pairs = jnp.asarray([[first, second], [first, other], [second, first]]).reshape(3, -1)
+    q, p = jax.jit(jax.vmap(system.encode))(pairs)
+    assert system.decode(q[0], p[0]).shape == (2 * PIXELS,) and abs(p[1] - p[0]) > 1e-6
+    np.testing.assert_allclose(q[2], q[0] + p[0], rtol=1e-5)
+    np.testing.assert_array_equal(q[1], q[0])
 
 
 def test_components_keep_the_images(data):
@@ -204,8 +186,9 @@ def test_components_keep_the_images(data):
     np.testing.assert_allclose(there, data.frames[0, :2] - missed[0, :2], atol=1e-6)
 
 
-def test_latent_motions_keep_the_energy(untrained, data):
-    model, parameters = untrained
+def test_latent_motions_keep_the_energy(data):
+    model = make_latent_phase(latent_field("black-box-hnn", width=6, depth=1), PIXELS, width=6)
+    parameters = jax.jit(model.init)(jax.random.key(0))
     moved = frame_metrics.predict_frames(model, parameters, data.pairs[:2, 0], 30)
     assert moved.pairs.shape == (2, 30, 2 * PIXELS) and moved.frames.shape == (2, 30, PIXELS)
     H = flow(model.field.energies(with_float64(parameters["field"]))).energy
@@ -219,22 +202,6 @@ def test_injection_raises_the_energy_to_what_was_asked():
     q, p = raise_energy(lambda q, p: jnp.sum(q**2 + p**2 / 2), jnp.array([3.0]), jnp.array([4.0]), 60.0)
     np.testing.assert_allclose(q**2 + p**2 / 2, 60.0, rtol=1e-9)
     np.testing.assert_allclose(q / 3, (p / 4) ** 2, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_motion_goes_on_with_the_injected_energy(untrained, data):
-    model, parameters = untrained
-    found = frame_metrics.inject_energy(model, parameters, data.pairs[0, 0], factor=2.5, times=6)
-    np.testing.assert_allclose(found.level, np.repeat([1.0, 2.5], 6), rtol=1e-6)
-    assert found.pairs.shape == (12, 2 * PIXELS) and found.latent.t[5] == found.latent.t[6] == 5
-
-
-def test_animation_of_a_motion_that_ends_has_every_frame(tmp_path):
-    orbit = Motions(np.arange(4.0), np.random.default_rng(0).normal(size=(1, 4, 4)), np.zeros((1, 4, 4)))
-    ended = orbit._replace(q=np.where(np.arange(4)[:, None] > 2, np.inf, orbit.q))
-    animations.write_motion_gif(tmp_path / "orbits.gif", {"truth": orbit, "baseline": ended}, stride=2)
-    with Image.open(tmp_path / "orbits.gif") as image:
-        assert image.n_frames == 2 and image.size[0] > 100
 
 
 def test_films_are_judged_by_the_motion_in_them(data):
@@ -266,31 +233,23 @@ def test_a_run_is_judged_resumes_and_loads(tmp_path, monkeypatch, capsys):
     assert np.isfinite(system.field.rates(q, p)).all()
 
 
-def test_mistakes_of_the_command_are_one_line(tmp_path, capsys):
+def test_mistakes_are_named(data, tmp_path, capsys):
     rows = {
         "--width 8": "unrecognised option: --width",
         "--model pairwise": "--model is 'pairwise'",
         "--steps 0": "steps is 0",
     }
     assert_refused(capsys, train_hnn_pixels, rows.items(), out=tmp_path / "no")
-
-
-def test_mistakes_are_named(data, untrained, tmp_path):
-    model, parameters = untrained
     frames, gif = data.frames, tmp_path / "a.gif"
     for message, call in {
         "trajectories is 0": lambda: swinging_rod(trajectories=0),
         "frames is 2; expected at least 3": lambda: swinging_rod(frames=2),
         "leave none for training": lambda: split(data, test_share=0.9),
         "field is 'lnn'; expected one of black-box-hnn, phase-network": lambda: latent_field("lnn"),
-        "width is 0": lambda: make_latent_phase(latent_field("black-box-hnn"), 2, width=0),
         "components is 0": lambda: principal_components(frames, 0),
-        "window is 1": lambda: problem(model, frames, frames, Matching(window=1)),
-        "at least the 21 of a window": lambda: problem(model, frames, frames, Matching(window=20)),
-        "factor is 0": lambda: frame_metrics.inject_energy(model, parameters, np.zeros(4), factor=0.0),
+        "at least the 21 of a window": lambda: problem(oscillator(1.0), frames, frames, Matching(window=20)),
         "no motion to show": lambda: animations.write_frame_gif(gif, {}, np.zeros(2)),
         "hnn has 13 samples for 2 times": lambda: animations.write_frame_gif(gif, {"hnn": frames[0]}, np.zeros(2)),
-        "5 pixels": lambda: animations.write_frame_gif(gif, {"hnn": frames[0, :2, :5]}, np.zeros(2)),
     }.items():
         with pytest.raises(InputError, match=message):
             call()

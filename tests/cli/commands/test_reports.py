@@ -13,7 +13,7 @@ from dln_jax.data import schema
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 from dln_jax.training import low_latency_calls
-from dln_jax.training.hamiltonian.tasks import RECIPES
+from dln_jax.training.hamiltonian.recipes import RECIPES
 from dln_jax.types import InputError
 from scripts.reports import scale
 from scripts.reports.case import Findings, named, rows_of

@@ -177,18 +177,16 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(workplace, capsys):
     assert_refused(capsys, train_diffnet, MISTAKES.items(), "--function good.npz", out=out)
 
 
-def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypatch, capsys):
+def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypatch):
     """With training stubbed: each row of the published table gets the best of ours and its bound."""
     numbers = {"value_mse": 1e-9, "gradient_mse": 1e-8, "hessian_mse": 1e-5}
-    costs = {"train_seconds": 1.0, "compile_seconds": 2.0, "job_seconds": 3.0, "width": 4}
-    monkeypatch.setattr(table, "trained", lambda *given: {**numbers, **costs})
+    costs = dict.fromkeys(("train_seconds", "compile_seconds", "job_seconds", "width"), 4)
+    monkeypatch.setattr(table, "trained", lambda *given: numbers | costs)
     command(diffnet_table, "--samples 50 --out table")
     rows = {(row["case"], row["quantity"]): row for row in json_of(workplace / "table" / "report.json")["rows"]}
     assert rows["sin/type1/cos/gauss-newton", "value_mse"]["reference"] == 2.0e-7
-    assert len([1 for _, quantity in rows if quantity == "value_mse"]) == 16 + 12 + 2
     assert rows["sin/best", "value_mse"]["bound"] == pytest.approx(1.7e-8 / 30)
     assert [rows["sin/best", key]["pass"] for key in numbers] == [False, True, False]
     # What is measured is not measured again.
     monkeypatch.setattr(table, "trained", None)
     command(diffnet_table, "--resume --out table")
-    assert "almost everywhere" in capsys.readouterr().out

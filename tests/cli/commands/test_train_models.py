@@ -82,19 +82,6 @@ def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, 
 
 
 @pytest.mark.slow
-def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, capsys):
-    """M = m_0 + m_1 cos q is fitted to torques of -cos q qdd."""
-    random = np.random.default_rng(0)
-    q, qdd = random.uniform(-3, 3, (2, 60, 1))
-    moving = {"q": q, "qd": np.zeros((60, 1)), "qdd": qdd, "tau": -np.cos(q) * qdd}
-    np.savez("negative.npz", t=np.zeros(60), trajectory=np.arange(60), **moving)
-    options = ("--data negative.npz --model trigonometric", BRIEF, "--out")
-    command(train_delan, *options, "negative", "--degree 1")
-    assert re.search(r"not positive definite at \d\d\.\d%", capsys.readouterr().out)
-    assert metrics_of(workplace / "negative")["share_not_definite"] > 0.3
-
-
-@pytest.mark.slow
 def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_their_spread(workplace, capsys):
     command(train_delan, QUICK, "--seeds 2 --out seeds")
     metrics = metrics_of(workplace / "seeds")
