@@ -17,7 +17,7 @@ from typing import Annotated, ClassVar, Literal
 import pytest
 from rich.console import Console
 
-from dln_jax.__main__ import REPORTS, command, main, report_names
+from dln_jax.__main__ import REPORTS, main, report_names
 from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.progress import progress
@@ -76,18 +76,6 @@ def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsy
     text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
     assert "--kind {this,that} Which. (default: this)" in text and "--names {one,two}[,...] Some" in text
     assert "--steps INT How many (default: 7)." in text and "None" not in text
-
-
-def test_every_command_says_its_choices_and_defaults(monkeypatch, capsys):
-    for name in PACKAGES:
-        monkeypatch.setattr(sys, "argv", [name, "--help"])
-        monkeypatch.setenv("COLUMNS", "100")
-        with pytest.raises(SystemExit) as stop:
-            command(name, name, package=PACKAGES[name])
-        text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
-        assert stop.value.code == 0
-        assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
-        assert "--gif" not in text and "--no-compilation-cache" in text
 
 
 def test_only_a_command_that_continues_says_so(tmp_path):

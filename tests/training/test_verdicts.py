@@ -2,17 +2,9 @@
 
 import numpy as np
 
-from dln_jax.data import schema
-from dln_jax.data.splits import Split
-from dln_jax.learning.objectives import CANONICAL
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.verdict import HeldOut
-from dln_jax.scenes import two_link_arm
-from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.task import Task
-from dln_jax.training.dynamics.verdict import judge_fit, searched
+from dln_jax.training.dynamics.verdict import searched
 from dln_jax.training.identification.verdict import friction_verdict, spikes, weight_verdict
-from dln_jax.types import Needs
 
 
 def test_learned_tree_says_how_its_frames_were_found():
@@ -68,15 +60,3 @@ def test_spikes_are_single_samples_and_dry_friction_has_none():
     assert not spikes(torque).any()
     torque[[300, 700], [0, 1]] += 60
     assert np.argwhere(spikes(torque)).tolist() == [[300, 0], [700, 1]]
-
-
-def test_hamiltonian_of_momenta_is_judged_by_torques():
-    t = np.arange(0, 10, 0.01)
-    q = np.stack([np.sin(t), np.cos(2 * t)], axis=1)
-    data = schema.from_arrays({"t": t, "q": q, "tau": -q, "p": q, "trajectory": np.zeros(len(t), int)})
-    needs, sets = Needs(joints=("revolute", "revolute")), Split(data, data, data)
-    recorded = Recorded("", sets, None, needs, "", (), None, None, None, None, "", np.zeros(2))
-    task = Task(recorded, "structured-hnn", {}, CANONICAL, None, 0, 0.0)
-    for sign, level in ((-1, "good"), (1, "refused")):
-        answers = {"tau": sign * np.tile(q, (2, 1)), "qdd": np.tile(data.qdd, (2, 1))}
-        assert judge_fit(task, dynamics(two_link_arm().energies), answers, [])[0].level == level

@@ -5,13 +5,11 @@ import json
 import struct
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
 from calls import json_of, one_line
 
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import load, save
@@ -25,18 +23,6 @@ DIFFNET = describe("differential-network", sizes=[1, 3, 1], activation="cos", me
 def run_folder(tmp_path):
     save(tmp_path, DELAN, build(DELAN).init(jax.random.key(0)))
     return tmp_path
-
-
-@pytest.mark.slow
-def test_a_loaded_run_answers_as_the_model_does(run_folder):
-    model = build(DELAN)
-    system, loaded = dynamics(model.energies(model.init(jax.random.key(0)))), load(run_folder).dynamics
-    state = np.array([[0.1, 0.2], [0.3, -1.0], [2.0, 0.5]])
-    tau = loaded.inverse_dynamics(*state)
-    assert tau.dtype == jnp.float32 and loaded.energy(state[0], state[1]).shape == ()
-    np.testing.assert_allclose(tau, system.inverse_dynamics(*jnp.asarray(state, jnp.float32)), rtol=1e-5)
-    np.testing.assert_allclose(loaded.forward_dynamics(state[0], state[1], tau), state[2], rtol=1e-3)
-    np.testing.assert_allclose(loaded.mass_matrix(state[0]), loaded.mass_matrix(state[0], state[1]))
 
 
 ALTERED = "truncated or altered"

@@ -99,25 +99,6 @@ def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, capsys):
     assert "warning: q of joint 1 goes to" in said and "error:" not in said
 
 
-ROBOT = """<robot name="robot"><link name="ground"/>
-<link name="arm"><inertial><origin xyz="0 0 -0.3"/><mass value="1"/>
-<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="finger"><inertial><origin xyz="0 0 -0.3"/><mass value="1"/>
-<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="arm_joint" type="continuous"><parent link="ground"/><child link="arm"/><axis xyz="0 1 0"/></joint>
-<joint name="finger_joint" type="continuous"><parent link="arm"/><child link="finger"/><axis xyz="0 1 0"/></joint>
-</robot>"""
-
-
-def test_joints_of_a_gripper_are_held(log, capsys):
-    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
-    Path("robot.urdf").write_text(ROBOT)
-    rows = {"--robot robot.urdf": "--lock NAME,NAME", "--lock finger": "--lock is for joints of --robot"}
-    assert_refused(capsys, check_data, rows.items(), "--data log.npz", out=Path("none"))
-    command(check_data, "--data log.npz --robot robot.urdf --no-figures --lock *finger* --out held")
-    assert "robot: the motions determine" in capsys.readouterr().out
-
-
 def test_options_that_make_no_filter_are_refused(log, capsys):
     rows = {
         "--cutoff fast": "expected Hz, a positive number, or auto",

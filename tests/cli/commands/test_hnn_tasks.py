@@ -1,15 +1,11 @@
 """Hamiltonian tasks: hnn_table and train_hnn_task end to end on tiny budgets, and what they refuse."""
 
-import json
-
 import numpy as np
 import pytest
-from calls import assert_refused, command, json_of, refused
+from calls import assert_refused, command, json_of
 from motions import quick_motion
 
-from dln_jax.cli.arguments import arguments_of
-from dln_jax.cli.commands import train_hnn, train_hnn_task
-from dln_jax.cli.stored_arguments import stored_arguments
+from dln_jax.cli.commands import train_hnn_task
 from dln_jax.data import schema
 from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import hamiltonian_of
@@ -104,6 +100,7 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         ("--task measured --data marked.npz", "q has numbers of up to 1.0e+308"),
         ("--task measured --data points.npz", "no trajectory has two samples"),
         ("--task spring --data positions.npz", "--data is an option of --task measured"),
+        ("--task spring --test a", "--test is an option of --task measured"),
         ("--task spring", *SLIDING, "--needs is an option of --task measured"),
         ("--task spring --model trigonometric", "is of no phase space"),
         (OWN, "--needs", '{"joints": ["revolute", "revolute"]}', "have 2 joints"),
@@ -127,15 +124,6 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         "--trajectories 3": "--trajectories is an option of tasks that generate their data",
     }
     assert_refused(capsys, train_hnn_task, rows.items(), OWN, *SLIDING, out=positions / "none")
-
-
-def test_options_and_models_of_other_commands_are_refused(workplace, capsys):
-    rows = {"--model baseline": "--model is 'baseline'", "--trajectories 5": "unrecognised option: --trajectories"}
-    assert_refused(capsys, train_hnn, rows.items(), out=workplace / "none")
-    (workplace / "old").mkdir()
-    stored = {**stored_arguments(arguments_of(train_hnn.Arguments)), "task": "spring"}
-    (workplace / "old" / "config.json").write_text(json.dumps(stored))
-    assert "'task' is not an argument of this release" in refused(capsys, train_hnn, "--out old --resume")
 
 
 @pytest.mark.slow

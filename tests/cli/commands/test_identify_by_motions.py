@@ -50,7 +50,7 @@ def moved(system, seconds):
     return t, tau, np.asarray(states)
 
 
-def test_the_slope_of_windows_is_that_of_finite_differences_and_a_fit_descends_it(place):
+def test_the_slope_of_windows_is_that_of_finite_differences(place):
     """Where all samples are noise-free, residuals vanish, so that Kaufman's derivative is exact."""
     model = make_rigid_tree(read_robot("rod.urdf").tree, friction=("viscous",))
     known = model.init(jax.random.key(0))
@@ -69,14 +69,10 @@ def test_the_slope_of_windows_is_that_of_finite_differences_and_a_fit_descends_i
         above, below = (at(theta + sign * change, 0.0, *scales, windows)[0] for sign in (1, -1))
         difference = (above - below) / 2e-5
         np.testing.assert_allclose(slopes[:, :, column], difference, atol=1e-4 * max(1.0, np.abs(difference).max()))
-    options = {"noise_q": scales[0], "noise_tau": scales[1], "delay": False}
-    wrong, stiff = (np.concatenate([theta[:-1], [viscous]]) for viscous in (0.3, 100.0))
-    fit = fit_motions(model, columns_of(known), wrong, wrong, windows, **options)
-    assert fit.converged and fit.after < 0.1 * fit.before
-    assert fit.theta[-1] == pytest.approx(0.1, abs=0.01)
+    stiff = np.concatenate([theta[:-1], [100.0]])
     # It decays at 100 / 0.06 1/s, and a Runge-Kutta step of 10 ms is stable up to 278.5 1/s.
     with one_line(r"friction acts up to 5\.98 times faster than the log's step of 0\.01 s resolves"):
-        fit_motions(model, columns_of(known), stiff, stiff, windows, **options)
+        fit_motions(model, columns_of(known), stiff, stiff, windows, noise_tau=scales[1])
 
 
 @pytest.mark.slow

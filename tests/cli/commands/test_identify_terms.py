@@ -11,11 +11,8 @@ from dln_jax.data.robots import read_robot
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import tree_to_json
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.types import InputError
-from dln_jax.zoo.descriptions import build, describe
-from dln_jax.zoo.run import load, save
+from dln_jax.zoo.run import load
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 MJCF = """<mujoco><worldbody>
@@ -96,14 +93,3 @@ def test_terms_that_are_none_are_refused(place, capsys):
         ("--temperature", "friction is to depend on temperature, which the data do not have"),
     ]
     assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=place / "none")
-
-
-def test_a_run_without_temperature_is_not_exported_for_one(place, tmp_path):
-    tree = read_robot("arm.xml").tree
-    description = describe("rigid-tree", precision="f64", needs=tree.needs, tree=tree_to_json(tree))
-    # Files of releases without these terms.
-    older = {key: value for key, value in description.items() if key not in ("motors", "coupled", "cooling")}
-    with jax.enable_x64(True):
-        save(tmp_path, description, build(older).init(jax.random.key(0)))
-        with pytest.raises(InputError, match="does not depend on temperature"):
-            export_run(tmp_path, tmp_path / "c", temperature=40.0)

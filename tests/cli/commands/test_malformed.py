@@ -60,14 +60,6 @@ def refuse(capsys, script, *arguments):
     return line
 
 
-def assert_one_line_at_most(function, *given):
-    """Asserts that the function takes what it is given, or refuses it in one line."""
-    try:
-        return function(*given)
-    except InputError as error:
-        assert "\n" not in str(error)
-
-
 # npz archives
 
 
@@ -154,18 +146,6 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
         schema.load("data.npz")
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=4))
-def test_an_archive_with_any_bytes_changed_is_read_or_refused(tmp_path_factory, changes):
-    path = tmp_path_factory.mktemp("changed") / "mesh.npz"
-    np.savez_compressed(path, **MESH)
-    data = bytearray(path.read_bytes())
-    for place, value in changes:
-        data[place % len(data)] = value
-    path.write_bytes(bytes(data))
-    assert_one_line_at_most(meshes.load, path)
-
-
 # trajectories
 
 
@@ -202,6 +182,7 @@ NEEDS = [
     '{"joints": [null, 1]}',
     '{"joints": ["ball", "revolute"]}',
     '{"joints": ["revolute", "revolute"], "wind": true}',
+    '{"joints": ["revolute", "revolute"], "joint_friction": ["rust"]}',
     '{"joints": ["revolute", "revolute"], "gravity": 1}',
     '{"joints": ["revolute", "revolute"], "friction": "yes"}',
     '{"joints": ["revolute", "revolute"], "actuation": {"a": 1}}',
@@ -237,7 +218,10 @@ ANY_JSON = st.recursive(
 @settings(max_examples=60, deadline=None)
 @given(st.dictionaries(st.sampled_from(Needs._fields), ANY_JSON) | ANY_JSON)
 def test_any_json_states_needs_or_is_refused(stated):
-    hash(assert_one_line_at_most(needs_from_json, stated))
+    try:
+        hash(needs_from_json(stated))
+    except InputError as error:
+        assert "\n" not in str(error)
 
 
 # config.json

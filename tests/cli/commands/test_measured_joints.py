@@ -12,8 +12,8 @@ from dln_jax.learning.measured_motions import motion
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
-from dln_jax.types import InputError, Needs
-from tests.calls import assert_refused, command, json_of
+from dln_jax.types import Needs
+from tests.calls import command, json_of, one_line
 from tests.standard_errors import SURE
 
 NEEDS = Needs(joints=("revolute", "revolute"), friction=True)
@@ -38,7 +38,6 @@ def double(tmp_path_factory):
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         np.savez("double.npz", **arrays, label=["a", "b", "c", "d"])
         np.savez("other.npz", **{key: value[:LENGTH] for key, value in arrays.items()})
-        np.savez("single.npz", t=arrays["t"][:LENGTH], q=q[0, :, :1], trajectory=np.zeros(LENGTH))
         yield folder
 
 
@@ -65,25 +64,18 @@ def test_coupled_joints_are_learned_and_reported(double, capsys):
 
 
 def test_tests_and_noise_may_be_stated(double):
-    data = double / "double.npz"
-    known = problem_of(MEASURED, data=data, stated=Stated(test="b, d", noise=(0.01, 0.02)))
-    assert known.noise is not None and known.noise.q == (0.01, 0.02) and known.noise.qd is None
+    def stated(**options):
+        return problem_of(MEASURED, data=double / "double.npz", stated=Stated(**options))
+
+    known = stated(test="b, d", noise=(0.01, 0.02))
+    assert known.noise.q == (0.01, 0.02) and known.noise.qd is None
     assert len(known.truth) == 2 and len(known.fitted.t) == 2 * LENGTH
-    other = problem_of(MEASURED, data=data, stated=Stated(test=str(double / "other.npz")))
+    other = stated(test=str(double / "other.npz"))
     assert len(other.truth) == 1 and len(other.fitted.t) == COUNT * LENGTH
-    for stated, message in (
-        (Stated(test="e"), "labelled 'e'"),
-        (Stated(test="a,b,c,d"), "are for the test"),
-        (Stated(test=str(double / "single.npz")), "has 1 coordinates"),
-        (Stated(noise=(0.1, 0.1, 0.1)), "noise has 3 numbers"),
+    for options, message in (
+        ({"test": "e"}, "labelled 'e'"),
+        ({"test": "a,b,c,d"}, "are for the test"),
+        ({"noise": (0.1, 0.1, 0.1)}, "noise has 3 numbers"),
     ):
-        with pytest.raises(InputError, match=message):
-            problem_of(MEASURED, data=data, stated=stated)
-
-
-def test_options_of_measured_tasks_are_refused_elsewhere(double, capsys):
-    rows = [
-        (MEASURE, "--model trigonometric --width 3", "--width is an option of networks"),
-        ("--task spring --test a", "--test is an option of --task measured"),
-    ]
-    assert_refused(capsys, train_hnn_task, rows, out=double / "no")
+        with one_line(message):
+            stated(**options)

@@ -31,7 +31,6 @@ from scripts.reports.hamiltonian.own_files import with_bounds
 from scripts.reports.hamiltonian.table import BOUNDS, TASKS, table_rows
 from scripts.reports.process import called
 from scripts.reports.published import HAMILTONIAN
-from scripts.reports.robots import recorded_arm
 from scripts.reports.rows import Row, expect, markdown
 from scripts.reports.turns import medians_in_turns
 
@@ -150,16 +149,6 @@ def test_hamiltonian_bounds_decide():
     rows = [row for kind, error in errors.items() for row in rows_of(kind, {"energy_mse": error})]
     passed = {row.case: row.passed for row in with_bounds(rows) if row.passed is not None}
     assert passed == {"own-files": True, "own-files-without-needs": False}
-
-
-def test_blocks_of_a_recorded_arm_count_by_the_whole_logs_variance():
-    sizes = {"usual-friction": [4.0, 1.0], "chosen-friction": [2.0, 1.0], "with-residual": [1.0, 1.0]}
-    squares = {name: [np.full((10, 2), size) for size in each] for name, each in sizes.items()}
-    rows = recorded_arm.rows_of(squares, np.array([10.0, 10.0]), "ab")
-    values = {(row.case.split("/")[-1], row.quantity): row.value for row in rows}
-    assert values["usual-friction", "nmse"] == pytest.approx(0.25)
-    assert values["usual-friction", "nmse_worst_blocks"] == pytest.approx(0.4)
-    assert values["with-residual", "over_without"] == pytest.approx(2 / 3)
 
 
 # Speed, compilation and rivals depend on the machine; other tests cover locking, slender beams, impact and gripper;

@@ -15,35 +15,34 @@ from dln_jax.cli.commands import simulate
 from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.rollout import rollout
 from dln_jax.softbody.driven import drive, driven_step
-from dln_jax.softbody.examples import beam, drop, twist
-from dln_jax.softbody.integrators import BACKWARD_EULER, BDF2
+from dln_jax.softbody.examples import beam, drop
+from dln_jax.softbody.integrators import BACKWARD_EULER
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import potential
 from dln_jax.softbody.verdict import Info
 from dln_jax.training.simulation_results import SimulatedMotion, finite_moments, warn
 
 
-def played(example, dt, steps, integrator=BACKWARD_EULER):
-    """x, v [T, n, dim] after each step; params -> motion, for one compilation."""
-    init, step = driven_step(example, dt, integrator)
-    driven = drive(example, dt, steps)
+def played(example, dt, steps):
+    """x, v [T, n, dim] after each step, which have all converged."""
+    init, step = driven_step(example, dt, BACKWARD_EULER)
+    params, driven = example.scene.params, drive(example, dt, steps)
 
     def observe(state, info):
         return state.x, state.v, info.converged
 
-    def run(params):
-        return rollout(functools.partial(step, params), init(), driven, observe=observe)[1]
-
-    return jax.jit(run)
+    x, v, converged = jax.jit(lambda: rollout(functools.partial(step, params), init(), driven, observe=observe)[1])()
+    assert converged.all()
+    return np.asarray(x), np.asarray(v)
 
 
 @pytest.mark.slow
 def test_the_beam_falls_and_its_energies_add_up():
     example = beam(cells=1)
     scene = example.scene
-    x, v, converged = (np.asarray(each) for each in played(example, 0.05, 12)(scene.params))
+    x, v = played(example, 0.05, 12)
     tip = int(np.argmax(scene.mesh.vertices[:, 0]))
-    assert converged.all() and x[-1, tip, 1] < scene.mesh.vertices[tip, 1] - 0.2
+    assert x[-1, tip, 1] < scene.mesh.vertices[tip, 1] - 0.2
     np.testing.assert_array_equal(x[-1][scene.held], scene.mesh.vertices[scene.held])
 
     energies = motion_energies(scene, scene.params, x, v)
@@ -57,27 +56,11 @@ def test_the_beam_falls_and_its_energies_add_up():
 
 
 @pytest.mark.slow
-def test_the_ends_of_the_bar_are_turned_by_the_angle():
-    example = twist(cells=1, turns=1.5)
-    rest, held = example.scene.mesh.vertices, example.scene.held
-    x, _, converged = played(example, 0.25, 8, BDF2)(example.scene.params)
-    last = np.asarray(x)[-1]
-    assert bool(converged.all())
-    # Half of 4 s: each end has turned by 3/8 of a turn about y, against each other.
-    arms, turned = ((p[held][:, 0] - 0.5) + 1j * (p[held][:, 2] - 0.5) for p in (rest, last))
-    upper = rest[held, 1] > 4.0
-    assert turned / arms == pytest.approx(np.exp(1j * np.where(upper, -1, 1) * 0.75 * np.pi), abs=1e-12)
-    assert last[held, 1] == pytest.approx(rest[held, 1], abs=1e-12)
-    free = np.setdiff1d(np.arange(len(rest)), held)
-    assert np.abs(last[free] - rest[free]).max() > 0.3
-
-
-@pytest.mark.slow
 def test_the_disc_bounces_and_hardly_sinks_in():
     example = drop(cells=2)
-    x, v, converged = (np.asarray(each) for each in played(example, 0.01, 75)(example.scene.params))
+    x, v = played(example, 0.01, 75)
     lowest = x[:, :, 1].min(axis=1)
-    assert converged.all() and example.scene.mesh.vertices[:, 1].min() == pytest.approx(1.0)
+    assert example.scene.mesh.vertices[:, 1].min() == pytest.approx(1.0)
     assert -0.01 < lowest.min() < 0.0
     assert lowest[-1] > 0.02 and v[:, :, 1].mean(axis=1).max() > 1.0
 
@@ -116,17 +99,16 @@ def test_steps_that_went_wrong_are_not_silent(capsys):
 @pytest.mark.slow
 def test_the_script_takes_a_mesh_of_ones_own(tmp_path, capsys):
     mesh = beam_mesh(2.0, 1.0, 2, 1)
-    right = np.flatnonzero(mesh.vertices[:, 0] == 2.0)
     # Clockwise, and one more triangle on an edge that two share already.
     elements = np.concatenate([mesh.elements[:, ::-1], [[0, 3, 4]]])
+    right = np.flatnonzero(mesh.vertices[:, 0] == 2.0)
     np.savez(tmp_path / "mesh.npz", vertices=mesh.vertices, elements=elements, held=right)
-    options = "--dt 0.05 --seconds 0.2 --youngs-modulus 1e5 --precision f32"
+    options = "--scene beam --dt 0.05 --seconds 0.2 --youngs-modulus 1e5 --precision f32 --mesh"
     run = tmp_path / "run"
-    command(simulate, "--scene beam", options, "--mesh", tmp_path / "mesh.npz", "--out", run)
+    command(simulate, options, tmp_path / "mesh.npz", "--out", run)
     metrics, report = (json_of(run / f"{name}.json") for name in ("metrics", "report"))
-    assert metrics["steps"] == 4 and metrics["steps_not_converged"] == 0 and metrics["newton_iterations_max"] >= 1
-    assert 0 < metrics["smallest_volume_ratio"] < 1 and metrics["steps_per_second"] > 0
-    assert json_of(run / "config.json")["dt"] == 0.05 and report["conditions"]["dtype"] == "float32"
+    assert metrics["steps"] == 4 and metrics["steps_not_converged"] == 0 and 0 < metrics["smallest_volume_ratio"] < 1
+    assert report["conditions"]["dtype"] == "float32"
     assert {row["quantity"]: row["value"] for row in report["rows"]} == metrics
     assert {"energy.png", "moments.png", "motion.gif"} <= {path.name for path in run.iterdir()}
     shown = capsys.readouterr().out
