@@ -1,6 +1,5 @@
 """All command lines: one line for a mistake, help that says what an option takes, bars that fit."""
 
-import importlib
 import io
 import os
 import re
@@ -21,7 +20,7 @@ from dln_jax.__main__ import REPORTS, main, report_names
 from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import interrupted, run
+from dln_jax.cli.running import run
 from dln_jax.errors import FitRefused
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.zoo.run_folder import CONFIG, run_folder
@@ -69,24 +68,6 @@ def test_what_cannot_be_parsed_is_one_line(monkeypatch, capsys):
         assert ended(monkeypatch, say, *arguments.split()) == 2
         line = capsys.readouterr().err
         assert line.count("\n") == 1 and line.startswith(f"error: {complaint}") and "--help)" in line
-
-
-def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsys):
-    assert ended(monkeypatch, say, "--help") == 0
-    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
-    assert "--kind {this,that} Which. (default: this)" in text and "--names {one,two}[,...] Some" in text
-    assert "--steps INT How many (default: 7)." in text and "None" not in text
-
-
-def test_only_a_command_that_continues_says_so(tmp_path):
-    (tmp_path / CONFIG).touch()
-    for name, arguments, resumes in (
-        ("compare_locomotion", {}, False),
-        ("train_locomotion", {"creature": "biped"}, True),
-        ("train_hnn_pixels", {}, True),
-    ):
-        given = importlib.import_module(f"{PACKAGES[name]}.{name}").Arguments(**arguments)
-        assert ("--resume" in interrupted(name, given, tmp_path)) == resumes
 
 
 def test_a_bar_shows_count_text_and_time_left_whole():

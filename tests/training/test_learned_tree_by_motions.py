@@ -11,7 +11,6 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree
 from dln_jax.training.dynamics.methods.learned_tree import refined_by_motions
-from dln_jax.training.dynamics.task import Refinement
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import describe
 
@@ -44,9 +43,3 @@ def test_motions_mend_the_bodies_of_a_tree_and_the_line_says_so():
     assert mended.kept and after > 2 * before and validated > by_torques
     assert mended.line.endswith("; kept") and f"test motions predicted for {after:.3g} s, by torques" in mended.line
     assert mended.metrics == {"by_torques_vpt_seconds": before, "by_motions_vpt_seconds": after, "refinement_kept": 1}
-
-
-def test_a_refinement_that_predicts_no_longer_is_not_kept():
-    line = Refinement(TRUE, False, (0.9, 0.8), (0.7, 0.75)).line
-    assert line.startswith("refined by motions: validation motions predicted for 0.8 s, by torques for 0.9 s; test")
-    assert line.endswith("not kept, as validation motions decide")

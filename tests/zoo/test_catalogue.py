@@ -15,7 +15,7 @@ from calls import one_line
 import dln_jax
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.dynamics import PhaseRates
-from dln_jax.mechanics.equations import Canonical, Energies, dynamics
+from dln_jax.mechanics.equations import Canonical, Energies
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
 from dln_jax.models.model import Model
@@ -32,22 +32,22 @@ PENDULUM = serial(
 )
 MODELS = {
     "structured-delan": {"needs": SWING, **SMALL, "shared_trunk": True},
-    "black-box-delan": {"needs": SWING, **SMALL, "activation": "softplus", "rate_scale": [2.0]},
+    "black-box-delan": {"needs": SWING, **SMALL, "rate_scale": [2.0]},
     "trigonometric": {"needs": SWING, "degree": [2]},
-    "trigonometric-kernel": {"needs": SWING, "samples": 4, "serial": False},
-    "trigonometric-residual": {"needs": SWING, "degree": [2], "terms": ["potential", "inertia"], **SMALL},
+    "trigonometric-kernel": {"needs": SWING, "samples": 4},
+    "trigonometric-residual": {"needs": SWING, "degree": [2], "terms": ["inertia"], **SMALL},
     "trigonometric-kernel-residual": {"needs": SWING, "samples": 4, "terms": ["dissipation"], **SMALL},
     "rigid-tree": {"needs": SWING, "tree": tree_to_json(PENDULUM)},
     "rigid-tree-residual": {"needs": SWING, "tree": tree_to_json(PENDULUM), "terms": ["dissipation"], **SMALL},
-    "planar-chain": {"needs": SWING, "symmetric": False},
-    "learned-tree": {"needs": SWING, "velocity_scale": 0.1},
-    "feed-forward": {"needs": FREE, **SMALL, "tau_scale": 3.0},
-    "structured-hnn": {"needs": SWING, **SMALL, "friction_width": 2},
-    "black-box-hnn": {"needs": SWING, **SMALL, "momentum_scale": 0.5},
-    "separable-hnn": {"needs": SWING, **SMALL, "initial_friction": 0.1},
-    "pairwise-hnn": {"needs": Needs(joints=("prismatic",) * 4), **SMALL, "features": ["inverse"]},
+    "planar-chain": {"needs": SWING},
+    "learned-tree": {"needs": SWING},
+    "feed-forward": {"needs": FREE, **SMALL},
+    "structured-hnn": {"needs": SWING, **SMALL},
+    "black-box-hnn": {"needs": SWING, **SMALL},
+    "separable-hnn": {"needs": SWING, **SMALL},
+    "pairwise-hnn": {"needs": Needs(joints=("prismatic",) * 4), **SMALL},
     "polynomial-hamiltonian": {"needs": FREE, "degree": 3},
-    "phase-network": {"needs": FREE, **SMALL, "rate_scale": 2.0},
+    "phase-network": {"needs": FREE, **SMALL},
     "helmholtz-hnn": {"needs": FREE, **SMALL},
     "differential-network": {"sizes": [2, 3, 1], "activation": "cos", "members": 2},
     "latent-phase": {"field": "black-box-hnn", "pixels": 6, "components": 2, "width": 3, "field_width": 3},
@@ -151,23 +151,12 @@ def test_functions_are_made_once_and_compute_in_the_precision_of_the_training(tm
     assert run.dynamics is run.dynamics and run.flow is run.flow
     tau = run.dynamics.inverse_dynamics([1], np.ones(1), np.ones(1))
     assert tau.dtype == run.flow.energy([1], [0.5]).dtype == jnp.float32
-
-
-def test_the_parameters_of_a_loaded_run_are_tuned_and_saved_again(tmp_path):
-    stored(tmp_path, "trigonometric")
-    run = dln_jax.load(tmp_path)
-
-    def torque(parameters):
-        return dynamics(run.model.energies(parameters)).inverse_dynamics(*jnp.array([[0.3], [0.2], [1.0]]))[0]
-
-    before, slope = jax.jit(jax.value_and_grad(torque))(run.parameters)
-    tuned = jax.tree.map(lambda leaf, change: leaf + 1e-4 * change, run.parameters, slope)
+    # Parameters that were tuned are saved again.
+    tuned = jax.tree.map(lambda leaf: 2 * leaf, run.parameters)
     with pytest.raises(InputError, match="has a model already"):
         dln_jax.save(tmp_path, run.description, tuned)
     dln_jax.save(tmp_path, run.description, tuned, overwrite=True)
-    again = dln_jax.load(tmp_path)
-    assert again.dynamics.inverse_dynamics([0.3], [0.2], [1.0])[0] > before
-    jax.tree.map(np.testing.assert_array_equal, again.parameters, tuned)
+    jax.tree.map(np.testing.assert_array_equal, dln_jax.load(tmp_path).parameters, tuned)
 
 
 # one's own models
@@ -228,29 +217,20 @@ def test_mistakes_in_a_description_are_named():
         ("unknown are 'colour'", "structured-delan", {"colour": 1}),
         ("which no file can hold", "black-box-hnn", {"initial_guess": jnp.sin}),
         ("tau_scale is inf", "feed-forward", {"tau_scale": np.inf}),
-        ("precision is 'f16'", "feed-forward", {"precision": "f16"}),
     ):
         with pytest.raises(InputError, match=message):
-            build(describe(name, **{"needs": FREE, "precision": "f64", **keywords}))
-    with pytest.raises(InputError, match="lacks needs"):
-        describe("structured-delan", precision="f64")
-    with pytest.raises(InputError, match="lacks acceleration_scale, activation, depth"):
-        build({"name": "feed-forward"})
+            describe(name, precision="f64", **{"needs": FREE, **keywords})
 
 
 def test_typical_sizes_are_those_of_the_data():
-    columns = np.random.default_rng(0).normal(size=(6, 50, 2)) * [1.0, 4.0]
-    arrays = dict(zip(("q", "qd", "qdd", "tau", "p", "pd"), columns, strict=True))
-    data = from_arrays({"t": np.arange(50.0), "trajectory": np.zeros(50, int), **arrays})
+    qd, tau, p, pd = np.random.default_rng(0).normal(size=(4, 50, 2)) * [1.0, 4.0]
+    times = {"t": np.arange(50.0), "trajectory": np.zeros(50, int)}
+    data = from_arrays({**times, "q": qd, "qd": qd, "qdd": qd, "tau": tau, "p": p, "pd": pd})
     pooled = typical_sizes("phase-network", data, pooled=True)
-    for size, expected in (
-        (typical_sizes("feed-forward", data)["tau_scale"], arrays["tau"].std(axis=0)),
-        (pooled["rate_scale"], np.concatenate([arrays["qd"], arrays["pd"]]).std()),
-        (pooled["momentum_scale"], arrays["p"].std()),
-    ):
-        np.testing.assert_allclose(size, expected, rtol=5e-3)
-    without = data._replace(p=None, pd=None)
+    np.testing.assert_allclose(typical_sizes("feed-forward", data)["tau_scale"], tau.std(axis=0), rtol=5e-3)
+    np.testing.assert_allclose(pooled["rate_scale"], np.std([qd, pd]), rtol=5e-3)
+    np.testing.assert_allclose(pooled["momentum_scale"], p.std(), rtol=5e-3)
+    without, needs = data._replace(p=None, pd=None), Needs(joints=("prismatic",) * 2)
     with pytest.raises(InputError, match="no momenta p"):
         typical_sizes("black-box-hnn", without, pooled=True)
-    needs = Needs(joints=("prismatic",) * 2)
     assert describe_for("black-box-hnn", without, needs, precision="f64")["momentum_scale"] == 1.0

@@ -8,7 +8,6 @@ from calls import assert_refused, command, exit_status, json_of, one_line
 from planar_arm import FRICTION, motions
 
 from dln_jax.cli.commands import identify
-from dln_jax.data import schema
 from dln_jax.data.robots import read_robot
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
@@ -137,12 +136,9 @@ def test_mistakes_are_one_line(workplace, capsys):
 
 
 def test_trajectories_are_held_out_whole_and_one_in_blocks_of_time():
-    columns = dict.fromkeys(("q", "qd", "qdd", "tau"), np.random.default_rng(0).normal(size=(60, 1)))
-    six = {"t": np.tile(np.arange(10.0), 6), "trajectory": np.repeat(np.arange(6), 10)}
-    data = schema.from_arrays({**columns, **six})
+    six, one = (motions(0, samples=samples, trajectories=count) for samples, count in ((10, 6), (60, 1)))
     for asked, held in ((None, [2]), (["0", "5"], [0, 5])):
-        assert np.unique(split(data, asked).test.trajectory).tolist() == held and not split(data, asked).blocks
-    one = schema.from_arrays({**columns, "t": np.arange(60.0), "trajectory": np.zeros(60)})
+        assert np.unique(split(six, asked).test.trajectory).tolist() == held and not split(six, asked).blocks
     blocks = split(one, None)
     assert blocks.blocks and len(blocks.train.t) == 48
     assert [blocks.test.label[k] for k in np.unique(blocks.test.trajectory)] == ["0[2]", "0[7]"]

@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import json_of, one_line, refused
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
@@ -26,11 +24,11 @@ from dln_jax.cli.commands import (
 from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.data import arrays, functions, meshes, schema
 from dln_jax.data.splits import split
-from dln_jax.data.stated_needs import needs_from_json, needs_from_text
+from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 from scripts.reports.commands import arm_table, delan_report, diffnet_table, hnn_table
 
@@ -149,17 +147,6 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
 # trajectories
 
 
-def test_a_trajectory_may_have_any_number_and_is_named_by_it():
-    numbers = np.repeat([20240131, 7, 20240202], 4)
-    arrays = {key: value[:12] for key, value in TRAJECTORIES.items()}
-    data = schema.from_arrays({**arrays, "trajectory": numbers})
-    assert data.label.tolist() == ["7", "20240131", "20240202"]
-    np.testing.assert_array_equal(data.label[data.trajectory].astype(int), numbers)
-    for wrong in (1e300, -1, 0.5):
-        with pytest.raises(InputError, match="not whole numbers >= 0"):
-            schema.from_arrays({**arrays, "trajectory": np.where(numbers == 7, wrong, numbers)})
-
-
 def test_a_copy_of_a_trajectory_in_the_test_is_refused(here, capsys):
     copied = {key: np.concatenate([values[:16], values[4:8]]) for key, values in STATES.items()}
     np.savez("copied.npz", **{**TRAJECTORIES, **copied})
@@ -206,22 +193,6 @@ def test_needs_that_are_none_are_refused(here, capsys):
         assert "needs" in refuse(capsys, script, *task, "--data data.npz --out run --needs", "{")
     np.savez("stated.npz", **TRAJECTORIES, needs=np.array("{"))
     assert "needs" in refuse(capsys, train_delan, "--data stated.npz --out run")
-
-
-ANY_JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["revolute", "prismatic", "", "joints"]),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from([*Needs._fields, "x"]), inner),
-    max_leaves=8,
-)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.dictionaries(st.sampled_from(Needs._fields), ANY_JSON) | ANY_JSON)
-def test_any_json_states_needs_or_is_refused(stated):
-    try:
-        hash(needs_from_json(stated))
-    except InputError as error:
-        assert "\n" not in str(error)
 
 
 # config.json

@@ -1,6 +1,5 @@
 """Numbers that no run can have are refused before anything is allocated or written, in one line."""
 
-import dataclasses
 import json
 import os
 import subprocess
@@ -12,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from calls import command, json_of, one_line, refused
-from motions import sums_of_sines
+from planar_arm import motions
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
@@ -30,8 +29,8 @@ from dln_jax.cli.commands import (
     train_value,
 )
 from dln_jax.cli.stored_arguments import with_stored_arguments, write_config
+from dln_jax.data import schema
 from dln_jax.training.values import Family, family_of, load_value, plant_named, save_value
-from dln_jax.types import InputError
 from scripts.reports.commands import (
     arm_table,
     compare_locomotion,
@@ -45,11 +44,6 @@ ROBOT = """<robot name="r"><link name="b"/><link name="l"><inertial><mass value=
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><joint name="j" type="revolute">
 <parent link="b"/><child link="l"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="9" velocity="3"/></joint>
 </robot>"""
-TWO = """<robot name="two"><link name="b"/><link name="l"><inertial><mass value="1"/>
-<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><joint name="j" type="continuous">
-<parent link="b"/><child link="l"/><axis xyz="0 1 0"/></joint><link name="m"><inertial><mass value="1"/>
-<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><joint name="k" type="continuous">
-<parent link="l"/><child link="m"/><axis xyz="0 1 0"/></joint></robot>"""
 DIGITS = "9" * 5000
 OPTIONS = {
     make_data: [
@@ -133,13 +127,10 @@ def test_messages_say_what_was_given_and_what_was_expected(here, capsys):
 
 def test_a_joint_whose_torque_stays_the_same_is_examined(here):
     """As that of every cart-pole, which is driven at its cart alone."""
-    t = np.arange(0.0, 2.0, 0.01)
-    q, qd, qdd = sums_of_sines(t, np.ones((2, 1)), np.array([[3.0], [2.0]]), np.array([[0.0], [1.5]]))
-    Path("two.urdf").write_text(TWO)
-    for still, *robot in ((0.0,), (5.0, "--robot two.urdf"), (1e-300,), (1e-300, "--robot two.urdf")):
-        tau = np.stack([qdd[:, 0] + 0.3 * qdd[:, 1], np.full(len(t), still)], axis=1)
-        np.savez("log.npz", t=t, q=q, qd=qd, qdd=qdd, tau=tau, trajectory=np.zeros(len(t), int))
-        command(check_data, "--data log.npz --no-figures --out", f"page{still}{len(robot)}", *robot)
+    log = motions(0, friction=False)
+    for still in (0.0, 5.0, 1e-300):
+        schema.save("log.npz", log._replace(tau=log.tau * [1, 0] + [0, still]), overwrite=True)
+        command(check_data, "--data log.npz --no-figures --out", f"page{still}")
 
 
 VALUES = [
@@ -166,30 +157,32 @@ def test_damaged_value_functions_are_refused(tmp_path):
 # folders that have moved
 
 
-@pytest.mark.parametrize("folder", [False, True], ids=["file", "folder"])
-def test_a_run_is_resumed_where_its_data_have_moved(here, monkeypatch, folder):
+@pytest.mark.parametrize("data", ["log", "log/part"], ids=["file", "folder"])
+def test_a_run_is_resumed_where_its_data_have_moved(here, monkeypatch, data):
     """By their new path; where they are where they were, relative to where the command is called, by none.
 
     Data may be a folder, such as a ROS bag.
     """
-    data = Path("log/part" if folder else "log")
-    data.parent.mkdir(exist_ok=True)
-    data.write_bytes(b"states")
-    Path("run").mkdir()
+
+    def resumed(**moved):
+        asked = type(given)(out=Path("run"), resume=True, **moved)
+        return with_stored_arguments(asked, train_delan.Arguments).data
+
+    file = here / data
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(b"states")
     given = arguments_of(train_delan.Arguments, data=Path("log"), out=Path("run"))
-    write_config(here / "run", given)
-    asked = type(given)(out=Path("run"), resume=True)
-    assert with_stored_arguments(asked, train_delan.Arguments).data == Path("log")
-    (here / "moved").mkdir()
-    (here / "run").rename(here / "moved" / "run")
-    monkeypatch.chdir(here / "moved")
-    with pytest.raises(InputError, match=r"log, which is not here; give its new path by --data"):
-        with_stored_arguments(asked, train_delan.Arguments)
-    again = dataclasses.replace(asked, data=Path("../log"))
-    assert with_stored_arguments(again, train_delan.Arguments).data == Path("../log")
-    (here / data).write_bytes(b"stated")
-    with pytest.raises(InputError, match=r"started with other data than .*log has now"):
-        with_stored_arguments(again, train_delan.Arguments)
+    (here / "moved" / "run").mkdir(parents=True)
+    write_config(here / "moved" / "run", given)
+    Path("run").symlink_to("moved/run")
+    assert resumed() == Path("log")
+    monkeypatch.chdir("moved")
+    with one_line("log, which is not here; give its new path by --data"):
+        resumed()
+    assert resumed(data=Path("../log")) == Path("../log")
+    file.write_bytes(b"stated")
+    with one_line("started with other data than .*log has now"):
+        resumed(data=Path("../log"))
 
 
 # processes

@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 
 from dln_jax import load
-from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_hnn, train_hnn_task
-from dln_jax.mechanics.equations import flow
 from dln_jax.training.hamiltonian import recipes, training
-from dln_jax.training.hamiltonian import run as phase_space
 from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.results import units_of_judgement
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
-from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.descriptions import build
 from tests.calls import command, exit_status, json_of, refused
 from tests.published_motions import PUBLISHED, integrated, published_arrays
 
@@ -60,16 +55,6 @@ def test_noise_that_nobody_measured_is_none(files):
     assert problem.trust.noise.any() and known["measured"].tolist() == [True, False] and not np.any(known["noise"])
 
 
-def test_recordings_are_counted_and_no_windows(files):
-    """Four motions, each recorded twice, of ten windows each."""
-    t = np.arange(0, 12, 0.02)
-    q = [np.stack([np.sin((2 + k) * t), np.cos(3 * t + k)], axis=1) for k in np.repeat(range(4), 2)]
-    np.savez("repeated.npz", t=np.tile(t, 8), q=np.concatenate(q), trajectory=np.repeat(range(8), len(t)))
-    stated = {"task": "measured", "data": files / "repeated.npz", "model": "structured-hnn", "width": 2, "depth": 1}
-    case = phase_space.prepare(arguments_of(train_hnn_task.Arguments, **stated))
-    assert any("8 recordings show 4 motions" in line for line in case.findings)
-
-
 def test_stated_noise_is_used_or_refused(files, capsys):
     one, two = (own_problem("spring", noise=noise).trust.weights for noise in ((0.3,), (0.3, 0.2)))
     assert two.state == (0.3, 0.2) and one.state == (0.3, pytest.approx(0.1, rel=0.15))
@@ -97,18 +82,6 @@ def energy_error(name, rates, K=4):
     learned = system._replace(rates=jax.jit(rates))
     true, predicted = (system.energy(*integrated(each, *starts, t)) for each in (system, learned))
     return float(np.mean((predicted - true) ** 2))
-
-
-@pytest.mark.slow
-def test_own_springs_are_learned_as_the_named_task(files):
-    """Same model, start and budget: 20 own trajectories, 4 more for the test, and 20 of the generated task."""
-    errors = []
-    for problem in (problem_of("spring", trajectories=40), own_problem("spring")):
-        description = description_of(problem, "separable-hnn")
-        trained = train(problem, description, seed=0, steps=12)
-        rates = flow(build(description).energies(trained.result.parameters)).rates
-        errors.append(energy_error("spring", rates))
-    assert errors[0] < 1e-3 and errors[1] < 2 * errors[0]
 
 
 @pytest.mark.slow
@@ -145,17 +118,6 @@ def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
     options = (TASK, "spring.npz", "--model separable-hnn --steps 3 --out half")
     assert "the fit of motions ended" in refused(capsys, train_hnn_task, *options)
     assert np.isfinite(load(files / "half").flow.rates([0.1], [0.2])).all()
-
-
-@pytest.mark.slow
-def test_the_fit_of_motions_ends_where_it_is_flat(files):
-    """At the floor of the noise iterations bring nothing: the fit stops by itself, and says that it has finished."""
-    own = own_problem("spring")
-    trained = train(own, description_of(own, "separable-hnn", width=3), seed=0, steps=200)
-    motions = trained.fits["motions"]
-    assert motions.stop.reason == "finished" and motions.stop.step < 100
-    losses = [at.loss for at in motions.history]
-    assert losses[-2] - losses[-1] <= 2e-5 * losses[-1]
 
 
 @pytest.mark.slow

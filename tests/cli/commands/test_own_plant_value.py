@@ -37,10 +37,8 @@ def brief(monkeypatch):
     """Iterations of a moment."""
     # What earlier tests of the process have traced in float64 may hold indices of 64 bits.
     jax.clear_caches()
-    monkeypatch.setattr(
-        "dln_jax.control.optimal.own_plants.Iteration",
-        lambda **numbers: Iteration(**{**numbers, "starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}),
-    )
+    short = {"starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}
+    monkeypatch.setattr("dln_jax.control.optimal.own_plants.Iteration", lambda **sizes: Iteration(**sizes | short))
 
 
 @pytest.mark.slow
@@ -134,10 +132,10 @@ def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
     for name in ("goal", "hanging", "scale", "weights", "box", "limits"):
         np.testing.assert_allclose(getattr(stored.own.problem, name), getattr(known.own.problem, name), atol=1e-5)
     x, u = jnp.array([0.7, 1.0]), jnp.array([1.5])
-    there, here = (rates(each.plant.problem)(x, u) for each in (stored, known))
-    np.testing.assert_allclose(there, here, rtol=1e-9)
-    # A body of 1.2 times the mass accelerates by the gravity as before, by the motor 1 / 1.2 as much.
-    heavy, light = (each.actuation(x)[1, 0] for each in (with_factors(known, [1.2, 1.0]), known.plant.problem))
+    accelerations = [rates(plant)(x, u) for plant in (stored.plant.problem, known.plant.problem)]
+    np.testing.assert_allclose(*accelerations, rtol=1e-9)
+    # A body of 1.2 times the mass is accelerated by the motor 1 / 1.2 as much.
+    heavy, light = (plant.actuation(x)[1, 0] for plant in (with_factors(known, [1.2, 1.0]), known.plant.problem))
     assert float(heavy / light) == pytest.approx(1 / 1.2, rel=1e-9)
     with pytest.raises(InputError, match="states no limits of the motors"):
         of_run(tmp_path, Wishes())

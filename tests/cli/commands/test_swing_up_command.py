@@ -77,15 +77,16 @@ def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(
     def learn(plant, *_, **__):
         description = describe("planar-chain", precision="f64", needs=plant.layout.needs)
         fitted = FittedPlant(description, build(description).init(jax.random.key(0)))
-        regulator = Regulator(np.zeros((1, 4)), np.zeros((4, 4)))
-        return Learned(None, None, fitted, Tuned(None, "plan", {}, regulator, 256, 1.0, 0.4, 1.4), None, 9.0)
+        law = Tuned(None, "plan", {}, Regulator(np.zeros((1, 4)), np.zeros((4, 4))), 256, 1.0, 0.4, 1.4)
+        return Learned(None, None, fitted, law, None, 9.0)
 
     few = Trials(np.array([np.inf, 1.0, np.inf]), ("'elbow' moves at 31/s",))
-    monkeypatch.setattr("dln_jax.training.swing_ups.of_file.learn_to_swing_up", learn)
-    monkeypatch.setattr("dln_jax.training.swing_ups.of_file.try_plant", lambda *_, **__: (few, []))
-    status = exit_status(swing_up, "--plant", two_links(tmp_path), MOTOR, "--starts 3 --out", tmp_path / "run")
+    place = "dln_jax.training.swing_ups.of_file"
+    monkeypatch.setattr(f"{place}.learn_to_swing_up", learn)
+    monkeypatch.setattr(f"{place}.try_plant", lambda *_, **__: (few, []))
+    assert exit_status(swing_up, "--plant", two_links(tmp_path), MOTOR, "--starts 3 --out", tmp_path / "run") == 1
     said = capsys.readouterr().out
-    assert status == 1 and "33.3% of 3 starts up" in said and "refused: fewer than half" in said
+    assert "33.3% of 3 starts up" in said and "refused: fewer than half" in said
     assert "1 of 3 were stopped; the first: 'elbow' moves at 31/s" in said
 
 

@@ -118,22 +118,18 @@ def test_a_killed_run_resumes_to_the_same_parameters(workplace):
 def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
     line = refused(capsys, train_delan, TINY, "--scene pendulum --learning-rate 1e19", BRIEF, "--out exploded")
     assert re.search(r"after step \d+", line) and "lower --learning-rate" in line
-    tau = load("exploded").dynamics.inverse_dynamics(*np.ones((3, 1)))
-    assert np.isfinite(tau).all()
+    assert np.isfinite(load("exploded").dynamics.inverse_dynamics(*np.ones((3, 1)))).all()
 
 
 @pytest.mark.slow
 def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(workplace, capsys):
-    folder = workplace / "late"
     options = f"--optimizer adam --width 3 --depth 1 {BRIEF} --scene pendulum --steps 400 --seconds 1e-6"
-    command(train_delan, options, "--out", folder)
+    command(train_delan, options, "--out late")
     assert "out of time at step" in capsys.readouterr().out
-    early = json_of(folder / "metrics.json")
+    early = json_of(workplace / "late" / "metrics.json")
     assert 0 < early["best_step"] == early["steps"] < 400
-    command(train_delan, "--out", folder, "--resume --seconds 2e-6", BRIEF)
-    later = json_of(folder / "metrics.json")
-    assert later["steps"] == 2 * early["steps"]
-    assert json_of(folder / "config.json")["seconds"] == 2e-6
+    command(train_delan, "--out late --resume --seconds 2e-6", BRIEF)
+    assert json_of(workplace / "late" / "metrics.json")["steps"] == 2 * early["steps"]
 
 
 ANGLES = np.random.default_rng(0).normal(size=(4, 20, 2))
@@ -220,13 +216,10 @@ def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(w
     said = capsys.readouterr().out
     assert "one recording: cut into blocks of time" in said and "friction of joints: viscous, coulomb, offset" in said
     assert "verdict: good" in said and "trigonometric is exact" in said
-    metrics, config, stored = (
-        json_of(workplace / "bare" / f"{name}.json") for name in ("metrics", "config", "model_selection")
-    )
+    metrics, stored = (json_of(workplace / "bare" / f"{name}.json") for name in ("metrics", "model_selection"))
     assert metrics["torque_mse"] < 1e-18 and metrics["verdict"] == 0 and metrics["validation_nmse"] < 1e-18
-    assert (config["model"], config["rate"]) == ("auto", 50) and len(config["chosen"]["validation_units"]) == 2
     assert stored["kept"] == "trigonometric" == load("bare").description["name"]
-    assert len(stored["candidates"][0]["validation_nmse_joints"]) == 2 and stored["ended"] == "trigonometric is exact"
+    assert stored["ended"] == "trigonometric is exact"
 
 
 def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(workplace, capsys):

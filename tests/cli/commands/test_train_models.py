@@ -10,7 +10,6 @@ from calls import command, json_of
 
 from dln_jax.cli.commands import train_delan, train_hnn
 from dln_jax.data import schema
-from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
@@ -124,12 +123,6 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     assert {(each["width"], each["networks"]) for each in candidates} == {(2, 1), (2, 2)}
     best = min(candidates, key=lambda each: each["validation_error"])
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]
-
-
-def test_the_objective_follows_the_data(workplace):
-    data = schema.load("swing.npz")
-    assert objective_of("structured-hnn", data) is CANONICAL
-    assert objective_of("structured-hnn", data._replace(p=None)) is objective_of("structured-delan", data) is TORQUE
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -27,15 +28,6 @@ from dln_jax.types import InputError
 
 WIDTHS = {"2": 3e-3, "4": 1e-4, "8": 2e-4}
 """Validation errors of simulated trainings by width; seeds add to them."""
-
-
-class Done:
-    """A future that is done."""
-
-    state = "OUT_OF_MEMORY"
-
-    def done(self):
-        return True
 
 
 def trained(job, resumed):
@@ -73,7 +65,7 @@ def executor(monkeypatch):
         begun.append(job.values)
         status = trained(job, resumed=begun.count(job.values) > 1)
         (job.folder / "status.json").write_text(json.dumps(status._asdict()))
-        return Done()
+        return Mock(state="OUT_OF_MEMORY")
 
     use(monkeypatch, submit)
     return begun
@@ -179,9 +171,11 @@ def test_damaged_status_is_refused(tmp_path):
             status_of(tmp_path)
 
 
-def test_finished_job_whose_run_is_gone_is_repeated(tmp_path, executor):
+def test_finished_job_whose_run_is_gone_is_repeated(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=4 seed=0", "--out", out)
+    line = refused(capsys, sweep, "--grid", "width=2 seed=0", "--out", out, "--resume")
+    assert "was started with grid = width=4 seed=0" in line
     for run in (out / "jobs" / "0000" / "run").iterdir():
         run.unlink()
     command(sweep, "--out", out, "--resume")
@@ -189,32 +183,25 @@ def test_finished_job_whose_run_is_gone_is_repeated(tmp_path, executor):
 
 
 def test_an_interrupt_cancels_the_jobs(tmp_path, monkeypatch, capsys):
-    cancelled = []
-
-    class Future:
-        def done(self):
-            raise KeyboardInterrupt
-
-        def cancel(self):
-            cancelled.append(self)
-
-    use(monkeypatch, lambda function, job: Future())
+    future = Mock()
+    future.done.side_effect = KeyboardInterrupt
+    use(monkeypatch, lambda function, job: future)
     status = exit_status(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
     assert status == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
-    assert len(cancelled) == 3
+    assert future.cancel.call_count == 3
 
 
 def test_an_interrupt_ends_the_processes_of_this_machine(tmp_path):
     """Jobs that have not begun never start."""
-    jobs = [Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
+    first, second = (Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab")
     with pytest.raises(KeyboardInterrupt), here(1, 0) as (submit, _):
-        futures = [submit(run_job, job) for job in jobs]
+        futures = [submit(run_job, job) for job in (first, second)]
         until = time.monotonic() + 60
-        while status_of(jobs[0].folder).state != "running" and time.monotonic() < until:
+        while status_of(first.folder).state != "running" and time.monotonic() < until:
             time.sleep(0.01)
         raise KeyboardInterrupt
-    assert futures[0].done() and futures[1].cancelled()
-    assert status_of(jobs[0].folder)[:2] == ("killed", "interrupted") and not jobs[1].folder.exists()
+    assert futures[0].done() and futures[1].cancelled() and not second.folder.exists()
+    assert status_of(first.folder)[:2] == ("killed", "interrupted")
 
 
 def test_jobs_get_the_gpus_that_the_user_has_made_visible(monkeypatch, tmp_path):
@@ -260,12 +247,6 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, monkeypatch):
         "--grid width=8 --where ray": "pip install 'dln-jax[ray]'",
     }
     assert_refused(capsys, sweep, rows.items(), out=tmp_path / "sweep")
-
-
-def test_another_grid_is_refused(tmp_path, executor, capsys):
-    command(sweep, "--grid", "width=2 seed=0", "--out", tmp_path / "s")
-    line = refused(capsys, sweep, "--grid", "width=4 seed=0", "--out", tmp_path / "s", "--resume")
-    assert "was started with grid = width=2 seed=0" in line
 
 
 def kill_as_it_begins(job):
