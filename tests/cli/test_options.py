@@ -69,13 +69,10 @@ def test_an_option_exists_for_the_choices_that_read_it():
         (train_delan, {}, "width target scene", "batch samples robot degree"),
         (train_delan, {"optimizer": "adam"}, "batch width", "samples"),
         (train_delan, {"data": "log.npz"}, "robot parents seconds", "width optimizer"),
-        (train_delan, {"data": "log.npz", "width": "4"}, "width optimizer", "robot"),
         (train_delan, {"model": "trigonometric"}, "degree objective", "width seconds seeds"),
         (train_hnn_task, {}, "trajectories width", "data noise learning_rate degree"),
         (train_hnn_task, {"task": "measured"}, "data noise order", "trajectories field"),
-        (train_hnn_task, {"model": "polynomial-hamiltonian"}, "degree", "width"),
         (train_diffnet, {"optimizer": "adam"}, "epochs samples", "steps"),
-        (train_diffnet, {"function": "own.npz"}, "steps", "samples noise epochs"),
         (train_value, {"stored": "run"}, "starts", "plant width seed"),
     ]:
         names = {field.name for field in dataclasses.fields(arguments_for(command.Arguments, stated))}

@@ -91,7 +91,6 @@ def test_joints_whose_potential_takes_a_constant():
         (needs, data, True, [2, 3]),
         (needs, data, False, [3]),
         (needs._replace(gravity=False), data, True, []),
-        (dry, data, True, []),
         (dry, one_way, True, [2, 3]),
         (viscous, one_way, True, []),
         (absolute, one_way._replace(qd=one_way.qd - [0, 0, 99]), True, [2, 3]),

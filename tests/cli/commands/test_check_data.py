@@ -80,13 +80,10 @@ def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_mis
     assert prepared(log, qd=np.gradient(log["q"], axis=0), qdd=log["tau"])[0] is None, "measured rates stay"
     cutoff, lines, _ = prepared(log, q=np.sin(5 * log["t"] + log["trajectory"])[:, None])
     assert cutoff is None and not any("filtered" in line for line in lines), "exact data are used as they are"
+    _, _, causes = prepared(log, q=np.degrees(log["q"]))
+    assert any("q of joint 1 goes to" in cause for cause in causes), "no filter repairs this"
     short = {key: value if key == "label" else value[log["t"] < 0.05] for key, value in log.items()}
     assert prepared(short)[0] is None
-
-
-def test_faults_of_a_log_that_no_filter_repairs_are_causes_of_a_verdict(log):
-    _, _, causes = prepared(log, q=np.degrees(log["q"]))
-    assert any("q of joint 1 goes to" in cause for cause in causes)
 
 
 def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, capsys):

@@ -57,15 +57,13 @@ def test_measured_motions_are_cut_at_gaps(workplace):
 @pytest.fixture(scope="module")
 def positions(workplace):
     """Six swings with q alone, two with a gap; and files that are refused."""
-    t = 0.1 * np.arange(40)
-    parts = [(np.delete(t, range(15, 18)) if number < 2 else t) for number in range(6)]
-    q = [np.cos(2 * part + number) for number, part in enumerate(parts)]
-    index = np.repeat(np.arange(6), [len(part) for part in parts])
-    np.savez("positions.npz", t=np.concatenate(parts), q=np.concatenate(q)[:, None], trajectory=index)
-    one = {"t": t, "q": np.cos(t)[:, None], "trajectory": np.zeros(40)}
-    np.savez("forced.npz", **one, tau=np.ones((40, 1)))
-    np.savez("marked.npz", **{**one, "q": np.where(np.arange(40) == 9, 1e308, np.cos(t))[:, None]})
-    np.savez("points.npz", **{**one, "trajectory": np.arange(40)}, qd=one["q"], qdd=one["q"])
+    t, trajectory = np.tile(0.1 * np.arange(40), 6), np.repeat(np.arange(6), 40)
+    six = {"t": t, "q": np.cos(2 * t + trajectory)[:, None], "trajectory": trajectory}
+    gaps = (trajectory < 2) & (abs(t - 1.6) < 0.15)
+    np.savez("positions.npz", **{key: values[~gaps] for key, values in six.items()})
+    np.savez("forced.npz", **six, tau=np.ones((240, 1)))
+    np.savez("marked.npz", **{**six, "q": np.where(np.arange(240)[:, None] == 9, 1e308, six["q"])})
+    np.savez("points.npz", **{**six, "trajectory": np.arange(240)}, qd=six["q"], qdd=six["q"])
     return workplace
 
 

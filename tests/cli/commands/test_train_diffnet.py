@@ -44,8 +44,8 @@ def own_file(path, **changes):
         u = x / units
         return jnp.array([jnp.sin(u[0]) + u[1] * u[2], 1e3 * jnp.exp(u[1])])
 
-    derivatives = jax.jit(jax.vmap(lambda x: (function(x), jax.jacfwd(function)(x), jax.hessian(function)(x))))
-    data = {"x": x, **dict(zip(("y", "dy", "d2y"), map(np.asarray, derivatives(x)), strict=True)), **changes}
+    functions = {"y": function, "dy": jax.jacfwd(function), "d2y": jax.hessian(function)}
+    data = {"x": x, **{key: np.asarray(jax.vmap(each)(x)) for key, each in functions.items()}, **changes}
     np.savez(path, **{key: value for key, value in data.items() if value is not None})
     return data
 
