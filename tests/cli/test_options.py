@@ -1,12 +1,13 @@
 """Options are stated without importing JAX: the names and numbers in them are those of the library."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 from typing import get_args, get_type_hints
 
 from dln_jax.cli.arguments import arguments_for
-from dln_jax.cli.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn_task, train_value
+from dln_jax.cli.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
 from dln_jax.cli.options import SCENES
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.identification.consistent import REGULARISATION
@@ -77,3 +78,9 @@ def test_an_option_exists_for_the_choices_that_read_it():
     ]:
         names = {field.name for field in dataclasses.fields(arguments_for(command.Arguments, stated))}
         assert names >= {*present.split()} and names.isdisjoint(absent.split())
+
+
+def test_every_model_of_a_command_has_a_method():
+    for command in (train_delan, train_hnn):
+        names = re.findall(r"'([\w-]+)'", repr(command.Arguments.__annotations__["model"]))
+        assert names and set(names) <= set(FITS)

@@ -12,6 +12,7 @@ from motions import sums_of_sines
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
+from dln_jax.data import schema
 from dln_jax.data.schema import from_arrays
 from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.mechanics import lagrangian
@@ -28,12 +29,10 @@ LETTERS = "letters.npz"
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     """A folder with the embedded letters, as a file that states no needs."""
-    folder, data = tmp_path_factory.mktemp("decompositions"), characters(dt=0.1)
-    keys = ("t", "q", "qd", "qdd", "tau", "trajectory", "label", "tau_inertial", "tau_coriolis", "tau_gravity")
-    np.savez(folder / LETTERS, **{key: getattr(data, key) for key in keys})
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        yield folder
+        patch.chdir(tmp_path_factory.mktemp("decompositions"))
+        schema.save(LETTERS, characters(dt=0.1)._replace(needs=None))
+        yield Path.cwd()
 
 
 def metrics_of(folder):

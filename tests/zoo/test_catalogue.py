@@ -77,20 +77,17 @@ def altered(folder, change):
 
 def answer(name, run):
     """One number of a run, by what it gives."""
-    q = [0.3, 0.1, -0.4, 0.9] if name == "pairwise-hnn" else [0.3]
     if name == "differential-network":
         return run.derivatives([0.1, 0.2]).hessian.sum()
     if name == "latent-phase":
         return sum(run.images.encode(np.linspace(0, 1, 12)))[0]
-    properties = CATALOGUE[name].properties
+    properties, q = CATALOGUE[name].properties, [0.3, 0.1, -0.4, 0.9][: len(MODELS[name]["needs"].joints)]
     # The catalogue describes a model by its energies.
     assert isinstance(run.energies, Energies) == properties.energy
     assert isinstance(run.energies, Canonical | PhaseRates) == properties.canonical
-    if properties.definite and properties.canonical:
+    if properties.definite:
         assert np.linalg.eigvalsh(run.dynamics.mass_matrix(q)).min() > 0
-    if properties.canonical:
-        return run.flow.rates(q, q)[1].sum()
-    return run.dynamics.inverse_dynamics(q, q, q).sum()
+    return (run.flow.rates(q, q)[1] if properties.canonical else run.dynamics.inverse_dynamics(q, q, q)).sum()
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -3,8 +3,11 @@
 import hashlib
 import json
 import struct
+from functools import partial
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -12,6 +15,7 @@ from calls import json_of, one_line
 
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.parameter_files import load_manifest, load_tree, save_tree
 from dln_jax.zoo.run import load, save
 
 NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)
@@ -121,3 +125,36 @@ def test_damaged_tensors_are_refused_even_if_the_digest_is_right(run_folder):
         (run_folder / "model.safetensors").write_bytes(tensors)
         with one_line("model.safetensors"):
             load(run_folder)
+
+
+# stored trees
+
+
+class State(NamedTuple):
+    layers: dict
+    count: jax.Array
+    done: jax.Array
+
+
+TREE = State(
+    {"a/b": {"w": jnp.arange(6.0).reshape(2, 3), "e": jnp.ones((), jnp.float32) / 3}},
+    jnp.int32(7),
+    jnp.array(True),
+)
+
+
+def test_arrays_come_back_however_they_lie_in_memory(tmp_path):
+    numbers = np.arange(24.0).reshape(4, 6)
+    tree = {"transposed": numbers.T, "columns": numbers.T[:, [True, False, True, False]], "strided": numbers[::2, ::3]}
+    save_tree(tmp_path, "state", tree, {})
+    jax.tree.map(np.testing.assert_array_equal, load_tree(tmp_path, "state", tree), tree)
+
+
+def test_a_tree_comes_back_bit_for_bit_and_old_states_are_removed(tmp_path):
+    for number in (1, 2):
+        save_tree(tmp_path, "checkpoint", TREE, {"note": number}, number=number)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-000000002.safetensors", "checkpoint.json"]
+    manifest = load_manifest(tmp_path, "checkpoint")
+    assert manifest["note"] == 2 and set(manifest["versions"]) >= {"jax", "dln-jax"}
+    assert manifest["tensors"]["count"] == {"shape": [], "dtype": "int32"}
+    jax.tree.map(partial(np.testing.assert_array_equal, strict=True), load_tree(tmp_path, "checkpoint", TREE), TREE)

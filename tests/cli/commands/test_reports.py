@@ -14,7 +14,7 @@ from dln_jax.scenes.pendulums import pendulum
 from dln_jax.training import low_latency_calls
 from dln_jax.types import InputError
 from scripts.reports import scale
-from scripts.reports.case import Findings, named, rows_of
+from scripts.reports.case import Findings, named
 from scripts.reports.commands import (
     arm_table,
     benchmark,
@@ -25,10 +25,8 @@ from scripts.reports.commands import (
     softbody_report,
     stability,
 )
-from scripts.reports.hamiltonian.own_files import with_bounds
-from scripts.reports.hamiltonian.table import table_rows
 from scripts.reports.process import called
-from scripts.reports.rows import Row, markdown
+from scripts.reports.rows import Row
 from scripts.reports.turns import medians_in_turns
 
 UNKNOWN = {"--only nonsense": "'nonsense' is unknown; choose from"}
@@ -123,19 +121,6 @@ def test_a_process_that_fails_leaves_the_row_out_with_a_reason(tmp_path, monkeyp
         said = []
         assert low_latency_calls.low_latency_metrics(tmp_path, (np.zeros((3, 2)),), said.append) == {}
         assert len(said) == 1 and reason in said[0] and "\n" not in said[0]
-
-
-def test_hamiltonian_bounds_decide():
-    measured = {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7, "train_seconds": 6.0}
-    rows = table_rows(rows_of("spring/separable-hnn", measured))
-    assert "| 1e-06 / 0.00038 | 2e-07 |" in markdown(rows)
-    passed = {row.quantity: row.passed for row in rows}
-    assert passed["energy_mse"] is True and passed["train_seconds"] is False
-    # Own files are held to twice the error of the named task.
-    errors = {"named-task": 1e-5, "own-files": 1.9e-5, "own-files-without-needs": 2.1e-5}
-    rows = [row for kind, error in errors.items() for row in rows_of(kind, {"energy_mse": error})]
-    passed = {row.case: row.passed for row in with_bounds(rows) if row.passed is not None}
-    assert passed == {"own-files": True, "own-files-without-needs": False}
 
 
 # Speed, compilation and rivals depend on the machine; other tests cover locking, slender beams, impact and gripper;
