@@ -29,7 +29,7 @@ def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path):
         "--processes 0": "expected a positive whole number",
         "--devices 0": "--devices is 0",
         f"--out run {TOGETHER}": "JAX has been used",
-        "--devices 1000": "--devices is 1000; JAX sees",
+        "--devices 200": "--devices is 200; JAX sees",
     }.items():
         assert message in refused(capsys, train_diffnet, options)
         assert not list(tmp_path.iterdir())

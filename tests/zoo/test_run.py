@@ -53,7 +53,7 @@ MANIFEST = {
     '{"schema_version": 99}': "schema version 99",
     '{"schema_version": true}': "schema version",
     '{"tensor_file": "../model.safetensors"}': "tensor_file is",
-    '{"tensor_file": ".."}': "tensor_file is",
+    '{"tensor_file": ".."}': "missing",
     '{"tensor_file": 3}': "tensor_file",
     '{"sha256": [1]}': "sha256",
     '{"model": null}': "describes no model",

@@ -125,7 +125,7 @@ def test_components_and_size_are_printed_and_suspicious_meshes_are_warned_of(tmp
             ["4 components, 0.043 x 0.01 m", "no two elements share a vertex"],
         ),
     ):
-        path, out = tmp_path / "mesh.npz", tmp_path / str(len(vertices))
+        path, out = tmp_path / "mesh.npz", tmp_path / str(len(elements))
         np.savez(path, vertices=vertices, elements=elements, held=[0, 1])
         command(simulate, "--scene beam --seconds 0.02 --dt 0.01 --no-figures --mesh", path, "--out", out)
         shown = capsys.readouterr().out
