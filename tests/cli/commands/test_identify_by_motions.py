@@ -33,7 +33,7 @@ def place(tmp_path_factory):
     tree = read_robot(folder / "rod.urdf").tree
     true = tree._replace(inertias=2 * tree.inertias, armature=np.array([0.02]))
     random = np.random.default_rng(0)
-    t, tau, states = moved(tree_system(true, joint_dissipation([0.1], [0.0])), 20)
+    t, tau, states = moved(tree_system(true, joint_dissipation([0.1], [0.0])), 20, substeps=4)
     q = states[:, :1] + 2e-4 * random.normal(size=tau.shape)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -41,12 +41,12 @@ def place(tmp_path_factory):
         yield folder
 
 
-def moved(system, seconds):
+def moved(system, seconds, **options):
     """Times, torques and states (q, qd) of a driven motion from rest."""
     t = np.arange(0, seconds, STEP)
     tau = (3 * np.sin(2 * t) + 2 * np.sin(5.1 * t + 1) + 1.5 * np.sin(0.7 * t))[:, None]
     with jax.enable_x64(True):
-        states = jax.jit(lambda: motion(dynamics(system), jnp.zeros(2), jnp.asarray(t), jnp.asarray(tau), substeps=4))()
+        states = jax.jit(lambda: motion(dynamics(system), jnp.zeros(2), jnp.asarray(t), jnp.asarray(tau), **options))()
     return t, tau, np.asarray(states)
 
 

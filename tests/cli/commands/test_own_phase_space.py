@@ -52,7 +52,7 @@ def test_noise_that_nobody_measured_is_none(files):
     np.savez("coarse.npz", t=np.tile(t, 6), q=q, trajectory=np.repeat(np.arange(6), len(t)))
     problem = own_problem("coarse")
     known = units_of_judgement(problem)
-    assert problem.trust.noise.any() and known["measured"].tolist() == [True, False] and not np.any(known["noise"])
+    assert not problem.trust.noise.any() and known["measured"].tolist() == [True, False] and not np.any(known["noise"])
 
 
 def test_stated_noise_is_used_or_refused(files, capsys):
