@@ -78,7 +78,7 @@ OF_DELAN = {
     '{"width": true}': "width",
     '{"width": -3}': "width",
     '{"depth": 1000000000}': "depth",
-    '{"diagonal_shift": NaN}': "diagonal_shift",
+    '{"diagonal_shift": NaN}': "not readable as JSON",
     '{"shared_trunk": ["yes"]}': "shared_trunk",
     '{"colour": [1.0]}': "colour",
 }
