@@ -8,11 +8,11 @@ import pytest
 
 from dln_jax import load
 from dln_jax.cli.commands import train_hnn, train_hnn_task
-from dln_jax.training.hamiltonian import recipes, training
+from dln_jax.training.hamiltonian import recipes
 from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.results import units_of_judgement
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
-from dln_jax.types import InputError, Needs
+from dln_jax.types import Needs
 from tests.calls import command, exit_status, json_of, refused
 from tests.published_motions import PUBLISHED, integrated, published_arrays
 
@@ -105,19 +105,6 @@ def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
     assert "state --order bodies (x1, y1, x2, y2) or --order axes" in line
     problem = problem_of(MEASURED, data=files / "orbits.npz")
     assert description_of(problem, "pairwise-hnn", order="bodies")["order"] == "bodies"
-
-
-@pytest.mark.slow
-def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
-    """Whatever ends the fit of motions, the folder holds a model."""
-
-    def broken(*_):
-        raise InputError("the fit of motions ended")
-
-    monkeypatch.setattr(training, "second_problem", broken)
-    options = (TASK, "spring.npz", "--model separable-hnn --steps 3 --out half")
-    assert "the fit of motions ended" in refused(capsys, train_hnn_task, *options)
-    assert np.isfinite(load(files / "half").flow.rates([0.1], [0.2])).all()
 
 
 @pytest.mark.slow

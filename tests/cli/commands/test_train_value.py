@@ -6,8 +6,7 @@ import pytest
 from calls import assert_refused, command, json_of
 
 from dln_jax.cli.commands import train_value
-from dln_jax.training.value_training import over_seeds
-from dln_jax.training.values import Trained, load_value
+from dln_jax.training.values import load_value
 
 TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 
@@ -26,11 +25,6 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     assert again["down_return_mean"] == pytest.approx(numbers["down_return_mean"])
     rows = [("--goal 0.1", "--goal is an option of a training, without --stored")]
     assert_refused(capsys, train_value, rows, "--stored", tmp_path / "run", out=tmp_path / "other")
-
-
-def test_the_numbers_of_several_seeds():
-    numbers = over_seeds([Trained(None, validation, 2.0 * validation) for validation in (3.0, 1.0, 2.0)])
-    assert numbers == {"validation_median": 2.0, "validation_worst": 3.0, "train_seconds_median": 4.0}
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
