@@ -51,11 +51,9 @@ OPTIONS = {
         "--scene pendulum --kind uniform --rate-bound nan",
         "--scene pendulum --kind uniform --seed -1",
         "--scene pendulum --kind uniform --samples 10000000000",
-        "--scene pendulum --kind uniform --samples 1",
         "--scene pendulum --kind free-swing --dt inf",
         "--scene pendulum --kind free-swing --trajectories 1000000000",
         "--scene pendulum --kind free-swing --steps 99999999",
-        "--dt inf",
     ],
     train_delan: [
         *("--width 1000000000", f"--width {DIGITS}", "--devices 1000000", f"--processes {DIGITS}"),
@@ -116,7 +114,6 @@ def test_messages_say_what_was_given_and_what_was_expected(here, capsys):
     Path("full").mkdir()
     Path("full/notes.txt").touch()
     for script, options, words in (
-        (simulate, "--dt soon", "--dt must be a number; got 'soon'"),
         (train_diffnet, "--samples 20 --out full", "already contains files; choose another --out\n"),
         (check_data, "--data data.npz --robot none.urdf", "none.urdf: no such file; give the URDF or MJCF"),
     ):
