@@ -70,10 +70,8 @@ def test_bad_input_is_one_line(arm, tmp_path, capsys):
         ("--velocity 1,2,3", "--velocity is '1,2,3'; expected 1 or 2 positive numbers"),
         ("--torque strong", "--torque is 'strong'"),
         ("--share 2", "share is 2"),
-        ("--payload -1", "payload is -1"),
         ("--payload-position 0,1 --payload 1", "expected 3 numbers"),
         ("--velocity-scale 0", "velocity_scale is 0"),
-        ("--starts 0", "starts is 0"),
         ("--allow-unlimited shoulder", "joint 'elbow' has no limit of position: state it (--position"),
         ("--allow-unlimited", "shoulder, wrist", "there is no joint 'wrist' to allow without limits"),
     ]

@@ -142,7 +142,6 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(tmp_path, capsys):
         "--friction 0.1": "the beam scene has no --friction",
         "--scene creature --mesh absent.npz": "the creature scene has no --mesh",
         "--seed -1": "seed is -1",
-        "--dimension 4": "dimension is 4",
         "--cells 0": "number of cells along x is 0",
         "--order 3": "order is 3; expected 1",
         "--mixed": "--mixed needs --order 2",

@@ -39,7 +39,6 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path):
         "--recover never": "choose from swing-up, plans",
         "--push inf": "--push is inf; expected a finite number",
         "--starts 0": "starts is 0",
-        "--seed -1": "seed is -1",
     }
     assert_refused(capsys, swing_up, rows.items(), out=tmp_path / "run")
     rows = [

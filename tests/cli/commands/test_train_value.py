@@ -35,8 +35,6 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
         "--plant cart-pole --goal 0,0.5": "not an equilibrium",
         "--goal 0,0": "expected the posture of pendulum, which has 1",
         "--goal up": "expected finite numbers",
-        "--width 0": "width is 0",
-        "--seed -1": "seed is -1",
         "--stored /nowhere": "no such file",
     }
     assert_refused(capsys, train_value, rows.items(), out=tmp_path / "run")

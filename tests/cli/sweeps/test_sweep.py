@@ -181,6 +181,14 @@ def test_finished_job_whose_run_is_gone_is_repeated(tmp_path, executor, capsys):
     assert len(executor) == 2
 
 
+def test_every_problem_has_its_best_job(tmp_path, executor):
+    for name in "ab":
+        (tmp_path / name).touch()
+    command(sweep, "--grid", f"data={tmp_path}/a,{tmp_path}/b width=2,4 seed=0", "--out", tmp_path / "s")
+    jobs = json_of(tmp_path / "s" / "sweep.json")["jobs"]
+    assert [job["values"]["width"] for job in jobs if job["best"]] == ["4", "4"]
+
+
 def test_an_interrupt_cancels_the_jobs(tmp_path, monkeypatch, capsys):
     future = Mock()
     future.done.side_effect = KeyboardInterrupt
