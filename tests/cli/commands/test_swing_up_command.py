@@ -38,7 +38,6 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path):
         "--seconds-of-data 1": "expected at least 12 s",
         "--recover never": "choose from swing-up, plans",
         "--push inf": "--push is inf; expected a finite number",
-        "--starts 0": "starts is 0",
     }
     assert_refused(capsys, swing_up, rows.items(), out=tmp_path / "run")
     rows = [
