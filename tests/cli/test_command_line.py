@@ -1,25 +1,26 @@
 """All command lines: one line for a mistake, help that says what an option takes, bars that fit."""
 
-import importlib
 import io
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import pytest
 from rich.console import Console
 
-from dln_jax.__main__ import REPORTS, command, main, report_names
-from dln_jax.cli.arguments import Unstated, choice, names_in
+from dln_jax.__main__ import REPORTS, main, report_names
+from dln_jax.cli.arguments import Unstated, choice
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.progress import progress
-from dln_jax.cli.running import interrupted, run
+from dln_jax.cli.running import run
 from dln_jax.errors import FitRefused
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.zoo.run_folder import CONFIG, run_folder
@@ -47,89 +48,43 @@ def say(given: Arguments) -> None:
     print(given)
 
 
-def called(monkeypatch, *arguments):
+def ended(monkeypatch, main, *arguments, options=Arguments):
+    """The status with which a command ends."""
     monkeypatch.setattr(sys, "argv", ["command", *arguments])
-    run(say, Arguments, prog="command")
+    with pytest.raises(SystemExit) as stop:
+        run(main, options, prog="command")
+    return stop.value.code
 
 
 def test_what_cannot_be_parsed_is_one_line(monkeypatch, capsys):
-    for arguments, complaint in [
-        (["--kind", "other"], "--kind is 'other'; choose from this, that"),
-        (["--steps", "many"], "--steps must be a whole number; got 'many'"),
-        (["--steps"], "--steps lacks a value"),
-        (["--stepz", "3"], "unrecognised option: --stepz"),
-        (["--precision", "None"], "--precision is 'None'; choose from f32, f64"),
-        (["stray"], "unrecognised option: stray"),
-    ]:
-        with pytest.raises(SystemExit) as stop:
-            called(monkeypatch, *arguments)
+    for arguments, complaint in {
+        "--kind other": "--kind is 'other'; choose from this, that",
+        "--steps many": "--steps must be a whole number; got 'many'",
+        "--steps": "--steps lacks a value",
+        "--stepz 3": "unrecognised option: --stepz",
+        "--precision None": "--precision is 'None'; choose from f32, f64",
+        "stray": "unrecognised option: stray",
+    }.items():
+        assert ended(monkeypatch, say, *arguments.split()) == 2
         line = capsys.readouterr().err
-        assert stop.value.code == 2 and line.count("\n") == 1
-        assert line.startswith(f"error: {complaint}") and "--help)" in line
+        assert line.count("\n") == 1 and line.startswith(f"error: {complaint}") and "--help)" in line
 
 
-def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsys):
-    with pytest.raises(SystemExit) as stop:
-        called(monkeypatch, "--help")
-    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
-    assert stop.value.code == 0
-    for shown in ("--kind {this,that} Which. (default: this)", "--names {one,two}[,...] Some (default: all).",
-                  "--steps INT How many (default: 7).", "--precision {f32,f64} Floating-point"):  # fmt: skip
-        assert shown in text
-    assert "None" not in text
-
-
-def test_every_command_says_its_choices_and_defaults(monkeypatch, capsys):
-    for name in PACKAGES:
-        monkeypatch.setattr(sys, "argv", [name, "--help"])
-        monkeypatch.setenv("COLUMNS", "100")
-        with pytest.raises(SystemExit) as stop:
-            command(name, name, package=PACKAGES[name])
-        text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
-        assert stop.value.code == 0
-        assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
-        assert "--gif" not in text and "--no-compilation-cache" in text
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments", "resumes"),
-    [
-        ("compare_locomotion", {}, False),
-        ("train_locomotion", {"creature": "biped"}, True),
-        ("train_hnn_pixels", {}, True),
-    ],
-)
-def test_only_a_command_that_continues_says_so(name, arguments, resumes, tmp_path):
-    (tmp_path / CONFIG).touch()
-    given = importlib.import_module(f"{PACKAGES[name]}.{name}").Arguments(**arguments)
-    assert ("--resume" in interrupted(name, given, tmp_path)) == resumes
-
-
-def test_names_are_taken_apart():
-    assert names_in("--only", "b, a", ("a", "b")) == ["b", "a"]
-
-
-@pytest.mark.parametrize("width", [80, 120])
-def test_a_bar_shows_count_text_and_time_left_whole(width):
-    out = io.StringIO()
+def test_a_bar_shows_count_text_and_time_left_whole():
     text = "motions: loss 1.23e-05  validation 1.23e-05"
-    with progress(20_000, console=Console(file=out, force_terminal=True, width=width, color_system=None)) as show:
-        show(5_000, text)
-        show(19_990, text)
-    last = [line for line in re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9?]*[A-Za-z]", "", out.getvalue())) if line][-1]
-    assert len(last) <= width and "19990/20000" in last and text in last and re.search(r"left \d\d:\d\d", last)
+    for width in (80, 120):
+        out = io.StringIO()
+        with progress(20_000, console=Console(file=out, force_terminal=True, width=width, color_system=None)) as show:
+            show(5_000, text)
+            show(19_990, text)
+        *_, last = filter(None, re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9?]*[A-Za-z]", "", out.getvalue())))
+        assert len(last) <= width and "19990/20000" in last and text in last and re.search(r"left \d\d:\d\d", last)
 
 
-def test_a_closed_pipe_ends_a_command_without_a_word():
+def test_a_list_that_nobody_reads_ends_without_a_word():
     """Its output stays in a buffer that nobody reads, and is flushed as the command ends."""
-    program = (
-        "import sys; sys.argv = ['command']; sys.path.append('tests/cli'); "
-        "from test_command_line import *; run(say, Arguments, prog='command')"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as child:
-        assert child.stdout is not None and child.stderr is not None
+    options = {"cwd": ROOT, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-m", "dln_jax"], **options) as child:
         child.stdout.close()
         said = child.stderr.read()
     assert said == b"" and child.returncode == 141
@@ -143,34 +98,25 @@ def ways(folder):
     """The three ways of calling `make_data`."""
     (folder / "dln-jax").write_text(CONSOLE)
     return {
-        "console": [str(folder / "dln-jax"), "make_data"],
-        "package": ["-m", "dln_jax", "make_data"],
-        "script": ["-m", "scripts.make_data"],
+        "dln-jax make_data": [str(folder / "dln-jax"), "make_data"],
+        "python -m dln_jax make_data": ["-m", "dln_jax", "make_data"],
+        "python -m scripts.make_data": ["-m", "scripts.make_data"],
     }
 
 
-WAYS = ("console", "package", "script")
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_an_interrupt_during_imports_is_one_word(tmp_path, way):
+def test_an_interrupt_during_imports_is_one_word(tmp_path):
     """The first import of the command waits, so that the interrupt meets it, also of a parent that ignores its own."""
     heard = "import signal, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
     (tmp_path / "jax.py").write_text(f"{heard}print('importing', flush=True)\ntime.sleep(60)\n")
-    with subprocess.Popen(
-        [sys.executable, *ways(tmp_path)[way], "--out", str(tmp_path / "data.npz")],
-        cwd=ROOT,
-        env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as child:
-        assert child.stdout is not None and child.stderr is not None
-        assert child.stdout.readline() == "importing\n"
-        time.sleep(0.05)
-        child.send_signal(signal.SIGINT)
-        said = child.stderr.read()
-    assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
+    options = {"cwd": ROOT, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    for way in ways(tmp_path).values():
+        told = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+        with subprocess.Popen([sys.executable, *way, "--out", "data.npz"], env=told, **options) as child:
+            assert child.stdout.readline() == "importing\n"
+            time.sleep(0.05)
+            child.send_signal(signal.SIGINT)
+            said = child.stderr.read()
+        assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
 
 
 ENDLESS = """
@@ -200,54 +146,30 @@ def test_an_interrupt_ends_a_command_whose_program_still_runs(tmp_path):
     assert (done.returncode, done.stderr) == (130, "interrupted\n")
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_each_way_of_calling_names_itself(tmp_path, way):
-    done = subprocess.run(
-        [sys.executable, *ways(tmp_path)[way], "--stepz"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
-    names = {"console": "dln-jax make_data", "package": "python -m dln_jax make_data"}
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stdout == ""
-    assert f"(see {names.get(way, 'python -m scripts.make_data')} --help)" in done.stderr
+def test_each_way_of_calling_names_itself(tmp_path):
+    told = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for name, way in ways(tmp_path).items():
+        line = [sys.executable, *way, "--stepz"]
+        done = subprocess.run(line, cwd=tmp_path, env=told, capture_output=True, text=True)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stdout == ""
+        assert f"(see {name} --help)" in done.stderr
 
 
 def test_without_a_name_there_is_a_list_and_an_unknown_one_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["/bin/dln-jax"])
-    main()
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("usage: dln-jax COMMAND")
-    listed = [line.split(maxsplit=1) for line in lines[5:-2]]
-    assert [name for name, _ in listed] == COMMANDS and all(text.endswith(".") for _, text in listed)
-    for nonsense in ("teapot", "", "../x", "a\nb", "x" * 5000, "--steps", "__init__"):
+    for line, words in ((["/bin/dln-jax"], "usage: dln-jax COMMAND"), (["dln-jax", "report"], "robot_report")):
+        monkeypatch.setattr(sys, "argv", line)
+        main()
+        out = capsys.readouterr().out
+        assert words in out
+        assert all(re.search(rf"^ *{name} .*\.$", out, re.MULTILINE) for name in COMMANDS) == ("COMMAND" in words)
+    for nonsense in ("teapot", "", "../x", "a\nb", "x" * 5000, "--steps", "__init__", "train-delen"):
         monkeypatch.setattr(sys, "argv", ["dln-jax", nonsense])
         with pytest.raises(SystemExit) as stop:
             main()
         line = capsys.readouterr().err
         assert stop.value.code == 2 and line.count("\n") == 1 and len(line) < 1000
-        assert line.startswith("error: ") and "is not a command; choose from" in line
-
-
-def test_a_name_that_is_nearly_right_is_suggested_and_reports_are_commands_of_a_checkout(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["dln-jax", "train-delen"])
-    with pytest.raises(SystemExit):
-        main()
-    assert "did you mean train_delan?" in capsys.readouterr().err
-    monkeypatch.setattr(sys, "argv", ["dln-jax", "report"])
-    main()
-    assert "robot_report" in capsys.readouterr().out
-
-
-def test_a_list_that_nobody_reads_ends_without_a_word():
-    with subprocess.Popen(
-        [sys.executable, "-m", "dln_jax"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as child:
-        assert child.stdout is not None and child.stderr is not None
-        child.stdout.close()
-        said = child.stderr.read()
-    assert said == b"" and child.returncode == 141
+        assert line.startswith("error: ") and "is not a command; " in line
+    assert "did you mean train_delan?" in line
 
 
 @dataclass(frozen=True)
@@ -259,39 +181,27 @@ class Resumable:
     continues: ClassVar = True
 
 
-@pytest.mark.parametrize(
-    ("arguments", "stored", "said"),
-    [
-        (Resumable, True, "interrupted; continue with: command --out {folder} --resume"),
-        (Resumable, False, "interrupted; {folder} is incomplete"),
-        (Arguments, True, "interrupted; {folder} is incomplete"),
-    ],
-)
-def test_an_interrupt_says_how_to_continue(monkeypatch, capsys, tmp_path, arguments, stored, said):
+def test_how_a_command_ended_is_its_status_and_one_line(monkeypatch, capsys, tmp_path):
     folder = tmp_path / "run"
 
-    def main(given):
+    def main(given, stored=True):
         with run_folder(folder, "command"):
             if stored:
                 (folder / CONFIG).write_text("{}")
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys, "argv", ["command"])
-    with pytest.raises(SystemExit) as ended:
-        run(main, arguments, prog="command")
-    assert ended.value.code == 130
-    assert capsys.readouterr().err == said.format(folder=folder) + "\n"
-
-
-def test_refused_fit_ends_with_its_own_status(monkeypatch, capsys):
-    def main(given):
+    def refuse(given):
         raise FitRefused(Verdict("refused", "nMSE 22.7", "check the sign of tau"))
 
-    monkeypatch.setattr(sys, "argv", ["command"])
-    with pytest.raises(SystemExit) as ended:
-        run(main, Arguments, prog="command")
-    assert ended.value.code == 1
-    assert capsys.readouterr().err == "error: the fit is refused: nMSE 22.7; check the sign of tau\n"
+    for options, function, status, said in (
+        (Resumable, main, 130, f"interrupted; continue with: command --out {folder} --resume\n"),
+        (Resumable, partial(main, stored=False), 130, f"interrupted; {folder} is incomplete\n"),
+        (Arguments, main, 130, f"interrupted; {folder} is incomplete\n"),
+        (Arguments, refuse, 1, "error: the fit is refused: nMSE 22.7; check the sign of tau\n"),
+    ):
+        assert ended(monkeypatch, function, options=options) == status
+        assert capsys.readouterr().err == said
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def test_every_command_has_a_script():

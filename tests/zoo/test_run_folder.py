@@ -47,39 +47,37 @@ def test_a_disk_without_locks_is_named(monkeypatch):
 def test_a_second_writer_is_refused_until_the_first_has_died():
     """A process that is killed leaves its lock file, and no lock."""
     code = (
-        "import sys, time; from pathlib import Path; from dln_jax.zoo.run_folder import run_folder\n"
+        "import time; from pathlib import Path; from dln_jax.zoo.run_folder import run_folder\n"
         "with run_folder(Path('shared'), 'x'): print('locked', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as first:
-        assert first.stdout is not None and first.stdout.readline() == "locked\n"
+        assert first.stdout.readline() == "locked\n"
         for resume in (False, True):
-            message = "another process is writing there"
-            with pytest.raises(InputError, match=message), run_folder(Path("shared"), "x", resume=resume):
+            words = "another process is writing there"
+            with pytest.raises(InputError, match=words), run_folder(Path("shared"), "x", resume=resume):
                 pass
         first.kill()
     Path("shared/config.json.0123abcd.partial").touch()
     with run_folder(Path("shared"), "x"):
         assert names("shared") == [LOCK]
-    with run_folder(Path("shared"), "x", resume=True):
-        pass
 
 
 def test_a_run_that_came_to_nothing_leaves_nothing_and_one_that_did_stays():
     def fail(out, name=CONFIG, kind=InputError):
-        with pytest.raises(kind), run_folder(out, "train") as folder:
+        with pytest.raises(kind), run_folder(out and Path(out), "train") as folder:
             write_json(folder / name, {})
             raise kind("no")
 
     fail(None)
-    fail(Path("a/b/c"))
+    fail("a/b/c")
     assert names() == []
     Path("mine").mkdir()
     Path("mine/data.csv.partial").touch()
-    fail(Path("mine"))
+    fail("mine")
     assert names("mine") == ["data.csv.partial"], "what is not of a run is left alone"
-    fail(Path("mine"), "checkpoint.json")
+    fail("mine", "checkpoint.json")
     assert names("mine") == [LOCK, "checkpoint.json", "data.csv.partial"]
-    fail(Path("interrupted"), kind=KeyboardInterrupt)
+    fail("interrupted", kind=KeyboardInterrupt)
     assert names("interrupted") == [LOCK, CONFIG], "it can be resumed"
 
 
@@ -87,17 +85,15 @@ def test_a_folder_that_is_none_or_holds_something_is_refused():
     Path("full").mkdir()
     Path("full/notes.txt").touch()
     Path("file").touch()
-    Path("link").symlink_to("nowhere")
-    for out, message in (
-        ("full", "already contains"),
-        ("file", "cannot create"),
-        ("file/below", "cannot create"),
-        ("link", "cannot create"),
-        ("x" * 5000, "cannot create"),
-    ):
-        with pytest.raises(InputError, match=message), run_folder(Path(out), "train"):
-            pass
-    assert names("full") == ["notes.txt"] and names() == ["file", "full", "link"]
     Path("runs").symlink_to("nowhere")
-    with pytest.raises(InputError, match="cannot create"), run_folder(None, "train"):
-        pass
+    for out, message in (
+        (Path("full"), "already contains"),
+        (Path("file"), "cannot create"),
+        (Path("file/below"), "cannot create"),
+        (Path("runs"), "cannot create"),
+        (Path("x" * 5000), "cannot create"),
+        (None, "cannot create"),
+    ):
+        with pytest.raises(InputError, match=message), run_folder(out, "train"):
+            pass
+    assert names("full") == ["notes.txt"] and names() == ["file", "full", "runs"]

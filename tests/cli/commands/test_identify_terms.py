@@ -3,31 +3,24 @@
 import jax
 import numpy as np
 import pytest
-from calls import assert_refused, command, json_of, one_line
+from calls import assert_refused, command, json_of
 from motions import sums_of_sines
 
-from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import identify
-from dln_jax.data import schema
 from dln_jax.data.robots import read_robot
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.training.identification.terms import wanted
-from dln_jax.types import InputError
 from dln_jax.zoo.run import load
 
-mujoco = pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
-BODY = """<body name="{0}" pos="0.1 0 0.2"><joint name="{1}" axis="{2}" armature="0.1"/>
-<inertial pos="0.1 0.05 0.2" mass="2" diaginertia="0.03 0.04 0.02"/>"""
-MJCF = (
-    "<mujoco><worldbody>"
-    + BODY.format("upper", "shoulder", "0 0.6 0.8")
-    + BODY.format("lower", "elbow", "0 1 0")
-    + "</body></body></worldbody></mujoco>"
-)
-S, COOLING, LOAD = ((1.0, 0.0), (1.0, 1.0)), (0.02, 0.01), (0.15, 0.25)
+pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
+MJCF = """<mujoco><worldbody>
+<body name="upper" pos="0.1 0 0.2"><joint name="shoulder" axis="0 0.6 0.8" armature="0.1"/>
+<inertial pos="0.1 0.05 0.2" mass="2" diaginertia="0.03 0.04 0.02"/>
+<body name="lower" pos="0.1 0 0.2"><joint name="elbow" axis="0 1 0" armature="0.1"/>
+<inertial pos="0.1 0.05 0.2" mass="2" diaginertia="0.03 0.04 0.02"/></body></body></worldbody></mujoco>"""
+TERMS = {"motors": ((1.0, 0.0), (1.0, 1.0)), "cooling": (0.02, 0.01), "load": (0.15, 0.25)}
 
 
 @pytest.fixture(scope="module")
@@ -35,28 +28,25 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("terms")
     (folder / "arm.xml").write_text(MJCF)
     tree = read_robot(folder / "arm.xml").tree
-    model = make_rigid_tree(
-        tree._replace(inertias=1.2 * tree.inertias), friction=("viscous", "coulomb", "load"), velocity_scale=0.05,
-        load=LOAD, cooling=COOLING, motors=S,
-    )  # fmt: skip
-    parameters = model.init(jax.random.key(0))._replace(
-        armature=np.array([0.15, 0.3]), viscous=np.array([0.5, 0.4]), coulomb=np.array([0.4, 0.3])
-    )
+    heavier = tree._replace(inertias=1.2 * tree.inertias)
+    model = make_rigid_tree(heavier, friction=("viscous", "coulomb", "load"), velocity_scale=0.05, **TERMS)
+    known = {"armature": [0.15, 0.3], "viscous": [0.5, 0.4], "coulomb": [0.4, 0.3]}
+    parameters = model.init(jax.random.key(0))._replace(**{key: np.array(value) for key, value in known.items()})
     random, t = np.random.default_rng(3), np.arange(0, 30, 0.02)
     states = sums_of_sines(t, *random.uniform([0.2, 0.5, 0], [0.6, 4, 6], (2, 5, 3)).transpose(2, 0, 1))
     temperature = 20 + 25 * (1 - np.exp(-t / 12))
 
-    def one(q, qd, qdd, temperature):
+    @jax.jit
+    @jax.vmap
+    def torque(q, qd, qdd, temperature):
         return dynamics(model.energies(parameters, temperature)).inverse_dynamics(q, qd, qdd)
 
-    torque = jax.jit(jax.vmap(one))
     tau = np.asarray(torque(*states, temperature)) + 0.02 * random.normal(size=(len(t), 2))
-    state = dict(zip(("q", "qd", "qdd"), states, strict=True))
-    log = {**state, "tau": tau, "joint_names": np.array(["shoulder", "elbow"])}
-    np.savez(folder / "log.npz", t=t, temperature=temperature, **log)
-    np.savez(folder / "cold.npz", t=t, **log)
+    log = {"t": t, **dict(zip(("q", "qd", "qdd"), states, strict=True)), "tau": tau}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        np.savez("log.npz", temperature=temperature, **log)
+        np.savez("cold.npz", **log)
         yield folder
 
 
@@ -66,62 +56,32 @@ def test_all_terms_are_identified_and_written(place, capsys):
     command(identify, "--robot arm.xml --data log.npz --out run --no-figures", terms)
     said = capsys.readouterr().out
     assert "friction by load: kept" in said and "friction by temperature: kept" in said and "verdict: good" in said
+    metrics = json_of(place / "run" / "metrics.json")
+    assert metrics["nmse"] < 2 * metrics["noise_nmse"]
+    state = np.random.default_rng(1).normal(size=(3, 2))
     with jax.enable_x64(True):
         run = load("run")
-        np.testing.assert_allclose(run.description["load"], LOAD, atol=0.04)
-        np.testing.assert_allclose(run.description["cooling"], COOLING, atol=3e-3)
+        np.testing.assert_allclose(run.description["load"], TERMS["load"], atol=0.04)
+        np.testing.assert_allclose(run.description["cooling"], TERMS["cooling"], atol=3e-3)
         np.testing.assert_allclose(run.parameters.coulomb, [0.4, 0.3], atol=0.05)
-        state = np.random.default_rng(1).normal(size=(3, 2))
-        M = run.dynamics.mass_matrix(state[0], state[1])
         # Hot grease: the same functions in C at a stated temperature.
         export_run("run", "c", functions=("inverse_dynamics",), temperature=60.0)
         hot = dynamics(run.model.energies(run.parameters, 60.0)).inverse_dynamics(*state)
         np.testing.assert_allclose(load_c("c").inverse_dynamics(*state), hot, rtol=1e-10)
         assert np.abs(hot - run.dynamics.inverse_dynamics(*state)).max() > 0.05
-    metrics = json_of(place / "run" / "metrics.json")
-    assert metrics["nmse"] < 2 * metrics["noise_nmse"]
-    # MuJoCo reads the same mass matrix, with the coupled motor as a tendon.
-    theirs = mujoco.MjModel.from_xml_path("run/arm_identified.xml")
-    data = mujoco.MjData(theirs)
-    data.qpos[:] = state[0]
-    mujoco.mj_forward(theirs, data)
-    full = np.zeros((2, 2))
-    mujoco.mj_fullM(theirs, data, full)
-    np.testing.assert_allclose(full, M, rtol=1e-8)
-    assert theirs.tendon_damping[0] == pytest.approx(float(run.parameters.viscous[1]))
-    np.testing.assert_allclose(
-        read_robot("run/arm_identified.xml").tree.armature,
-        np.array(S).T @ np.diag(run.parameters.armature) @ np.array(S),
-    )
+    # The file has the coupled motor.
+    S = np.array(TERMS["motors"])
+    armature = S.T @ np.diag(run.parameters.armature) @ S
+    np.testing.assert_allclose(read_robot("run/arm_identified.xml").tree.armature, armature)
 
 
 def test_terms_that_are_none_are_refused(place, capsys):
-    data = schema.load("cold.npz")
-    for terms, words in (
-        ({"motors": "1,0"}, "--motors has 1 rows; expected 2"),
-        ({"motors": "1,1;1,1"}, "--motors is .* that can be inverted"),
-        ({"coupled": "1-2"}, "--coupled has '1-2'; expected pairs of joints such as 2:3"),
-        ({"coupled": "1:3"}, "--coupled is 1:3; expected each pair of different joints"),
-        ({"temperature": True, "friction": "coulomb"}, "--temperature changes viscous friction"),
-    ):
-        options = arguments_of(identify.Arguments, robot=place / "arm.xml", data=place / "cold.npz", **terms)
-        with one_line(words):
-            wanted(options, tuple(options.friction.split(",")), data)
-    rows = [("--temperature", "friction is to depend on temperature, which the data do not have")]
-    assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz", out=place / "none")
-
-
-def test_a_run_without_temperature_is_not_exported_for_one(place, tmp_path):
-    from dln_jax.mechanics.trees import tree_to_json
-    from dln_jax.zoo.descriptions import build, describe
-    from dln_jax.zoo.run import save
-
-    tree = read_robot("arm.xml").tree
-    description = describe("rigid-tree", precision="f64", needs=tree.needs, tree=tree_to_json(tree))
-    older = {key: value for key, value in description.items() if key not in ("motors", "coupled", "cooling")}
-    with jax.enable_x64(True):
-        assert build(older) is not None  # files of releases without these terms
-        (tmp_path / "run").mkdir()
-        save(tmp_path / "run", description, build(description).init(jax.random.key(0)))
-        with pytest.raises(InputError, match="does not depend on temperature"):
-            export_run(tmp_path / "run", tmp_path / "c", temperature=40.0)
+    rows = [
+        ("--motors 1,0", "--motors has 1 rows; expected 2"),
+        ("--motors 1,1;1,1", "that can be inverted"),
+        ("--coupled 1-2", "--coupled has '1-2'; expected pairs of joints such as 2:3"),
+        ("--coupled 1:3", "--coupled is 1:3; expected each pair of different joints"),
+        ("--temperature --friction coulomb", "--temperature changes viscous friction"),
+        ("--temperature", "friction is to depend on temperature, which the data do not have"),
+    ]
+    assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=place / "none")

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import assert_refused, command, exit_status, json_of, refused
+from calls import assert_refused, command, exit_status, json_of
 
 from dln_jax.cli.commands import train_value
 from dln_jax.control.optimal.action_costs import quadratic
@@ -37,10 +37,8 @@ def brief(monkeypatch):
     """Iterations of a moment."""
     # What earlier tests of the process have traced in float64 may hold indices of 64 bits.
     jax.clear_caches()
-    monkeypatch.setattr(
-        "dln_jax.control.optimal.own_plants.Iteration",
-        lambda **numbers: Iteration(**{**numbers, "starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}),
-    )
+    short = {"starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}
+    monkeypatch.setattr("dln_jax.control.optimal.own_plants.Iteration", lambda **sizes: Iteration(**sizes | short))
 
 
 @pytest.mark.slow
@@ -49,24 +47,21 @@ def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, ca
     command(train_value, *arguments, "--out", tmp_path / "whole")
     output = capsys.readouterr().out
     assert "hinge 2.5 N m" in output and "box, half widths: hinge 3.14 rad" in output and "verdict: " in output
-    store, count = Kept.store, []
+    store = Kept.store
 
-    def stop(self, seed, state):
-        store(self, seed, state)
-        count.append(seed)
+    def stop(*state):
+        store(*state)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Kept, "store", stop)
-    status = exit_status(train_value, *arguments, "--out", tmp_path / "cut")
-    assert status == 130 and len(count) == 1
-    assert "--resume" in capsys.readouterr().err
-    monkeypatch.setattr(Kept, "store", store)
+    with monkeypatch.context() as patch:
+        patch.setattr(Kept, "store", stop)
+        assert exit_status(train_value, *arguments, "--out", tmp_path / "cut") == 130
     command(train_value, "--out", tmp_path / "cut", "--resume")
     whole, cut = (load_value(tmp_path / name) for name in ("whole", "cut"))
     x = jnp.array([1.0, -0.5])
     np.testing.assert_array_equal(whole.law(x), cut.law(x))
-    numbers = [json_of(tmp_path / name / "metrics.json") for name in ("whole", "cut")]
-    assert numbers[0]["heavy_weak_return_mean"] == numbers[1]["heavy_weak_return_mean"]
+    one, other = (json_of(tmp_path / name / "metrics.json")["heavy_weak_return_mean"] for name in ("whole", "cut"))
+    assert one == other
     # The model in the folder is the file's plant.
     expected = (2.0 + 9.81 / 2 * np.sin(1.0) - 0.05 * -0.5) / (0.25 + 0.08333)
     np.testing.assert_allclose(rates(whole.problem)(x, jnp.array([2.0])), [-0.5, expected], rtol=1e-6)
@@ -74,16 +69,20 @@ def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, ca
 
 def test_the_verdict_counts_the_starts_that_end_up():
     numbers = {"down_up_share": 1.0, "uniform_up_share": 1.0}
-    assert verdict_of(numbers, 100).level == "good"
-    assert verdict_of(numbers | {"uniform_up_share": 0.99}, 100).level == "doubtful"
-    assert verdict_of(numbers | {"heavy_weak_up_share": 0.9, "light_strong_up_share": 1.0}, 100).level == "doubtful"
-    assert verdict_of(numbers | {"down_up_share": 0.89}, 100).level == "refused"
-    assert verdict_of(numbers | {"down_up_share": np.nan}, 100).level == "refused"
-    wrong = verdict_of(numbers | {"value_error": 0.3}, 100)
-    assert wrong.level == "doubtful" and "V differs from the cost of its law by 30.0%" in wrong.reason
-    assert verdict_of(numbers | {"value_error": 0.01}, 100).level == "good"
-    robust = {"value_error": 0.3, "heavy_weak_up_share": 1.0, "light_strong_up_share": 1.0}
-    assert verdict_of(numbers | robust, 100).level == "good", "the value of the worst case exceeds the cost"
+    # The value of the worst case exceeds the cost.
+    robust = {"heavy_weak_up_share": 1.0, "light_strong_up_share": 1.0}
+    for level, changes in (
+        ("good", {}),
+        ("good", {"value_error": 0.01}),
+        ("good", {"value_error": 0.3, **robust}),
+        ("doubtful", {"uniform_up_share": 0.99}),
+        ("doubtful", {**robust, "heavy_weak_up_share": 0.9}),
+        ("doubtful", {"value_error": 0.3}),
+        ("refused", {"down_up_share": 0.89}),
+        ("refused", {"down_up_share": np.nan}),
+    ):
+        assert verdict_of({**numbers, **changes}, 100).level == level, changes
+    assert "V differs from the cost of its law by 30.0%" in verdict_of({**numbers, "value_error": 0.3}, 100).reason
 
 
 def test_error_of_a_known_value_is_that_of_the_quadrature():
@@ -100,36 +99,30 @@ def test_error_of_a_known_value_is_that_of_the_quadrature():
         [0.0],
     )
     plant = ValuePlant(problem, 1.0, Starts([0.0], [0.0], [1.0]), (0,), evaluation=Evaluation(1000.0, 10.0, 1))
-    network = value_network(problem)._replace(
-        value_and_gradient=lambda scale, x: (scale * x[0] ** 2 / 4, scale * x / 2)
-    )
+    value = lambda scale, x: (scale * x[0] ** 2 / 4, scale * x / 2)  # noqa: E731
+    network = value_network(problem)._replace(value_and_gradient=value)
     runs = evaluate(plant, lambda x: -x / 2, np.linspace(0.3, 0.9, 4)[:, None])
     for scale in (1.0, 1.2):
-        run = ValueRun("integrator", plant, network, scale)
-        assert value_error(run, runs) == pytest.approx(scale - 1, abs=2e-3)
-    assert np.isnan(value_error(run, runs._replace(settled=np.full(4, np.inf))))
-
-
-MISTAKES = [
-    ("--actuated ²", "there is no joint '\u00b2'"),
-    ("--actuated elbow", "there is no joint 'elbow'"),
-    ("--control -1", "expected finite positive numbers"),
-    ("--control 1 --goal 0.6", "the limits are"),
-    ("--positions 1:0", "expected LOW:HIGH or free"),
-    ("--positions free,free", "2 ranges; the plant has 1 joints"),
-    ("--positions -1:1", "is outside"),
-    ("--weights 1", "expected 2 positive numbers"),
-    ("--robust 1.5", "robust is 1.5"),
-]
+        error = value_error(ValueRun("integrator", plant, network, scale), runs)
+        assert error == pytest.approx(scale - 1, abs=2e-3)
+    assert np.isnan(value_error(ValueRun("", plant, network, 1.0), runs._replace(settled=np.full(4, np.inf))))
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
-    assert_refused(capsys, train_value, MISTAKES, "--plant", rod, out=tmp_path / "run")
-
-
-def test_options_of_an_own_plant_need_one(capsys):
-    assert "--effort is an option of one's own plant" in refused(capsys, train_value, "--effort 1")
-    assert "no such file" in refused(capsys, train_value, "--run /nowhere")
+    rows = {
+        "--actuated ²": "there is no joint '\u00b2'",
+        "--actuated elbow": "there is no joint 'elbow'",
+        "--control -1": "expected finite positive numbers",
+        "--control 1 --goal 0.6": "the limits are",
+        "--positions 1:0": "expected LOW:HIGH or free",
+        "--positions free,free": "2 ranges; the plant has 1 joints",
+        "--positions -1:1": "is outside",
+        "--weights 1": "expected 2 positive numbers",
+        "--robust 1.5": "robust is 1.5",
+    }
+    assert_refused(capsys, train_value, rows.items(), "--plant", rod, out=tmp_path / "run")
+    rows = {"--effort 1": "--effort is an option of one's own plant", "--run /nowhere": "no such file"}
+    assert_refused(capsys, train_value, rows.items(), out=tmp_path / "run")
 
 
 def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
@@ -139,10 +132,10 @@ def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
     for name in ("goal", "hanging", "scale", "weights", "box", "limits"):
         np.testing.assert_allclose(getattr(stored.own.problem, name), getattr(known.own.problem, name), atol=1e-5)
     x, u = jnp.array([0.7, 1.0]), jnp.array([1.5])
-    np.testing.assert_allclose(rates(stored.plant.problem)(x, u), rates(known.plant.problem)(x, u), rtol=1e-9)
-    # A body of 1.2 times the mass accelerates by the gravity as before, by the motor 1 / 1.2 as much.
-    heavy = with_factors(known, [1.2, 1.0])
-    ratio = heavy.actuation(x)[1, 0] / known.plant.problem.actuation(x)[1, 0]
-    assert float(ratio) == pytest.approx(1 / 1.2, rel=1e-9)
+    accelerations = [rates(plant)(x, u) for plant in (stored.plant.problem, known.plant.problem)]
+    np.testing.assert_allclose(*accelerations, rtol=1e-9)
+    # A body of 1.2 times the mass is accelerated by the motor 1 / 1.2 as much.
+    heavy, light = (plant.actuation(x)[1, 0] for plant in (with_factors(known, [1.2, 1.0]), known.plant.problem))
+    assert float(heavy / light) == pytest.approx(1 / 1.2, rel=1e-9)
     with pytest.raises(InputError, match="states no limits of the motors"):
         of_run(tmp_path, Wishes())

@@ -4,16 +4,13 @@ import io
 import re
 import subprocess
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import command, json_of, refused
+from calls import command, json_of
 
 from dln_jax.cli.commands import train_delan, train_hnn
 from dln_jax.data import schema
-from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
 from dln_jax.mechanics.dynamics import PlainDynamics
-from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 from dln_jax.training import low_latency_calls
@@ -49,8 +46,6 @@ def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
     assert "descents" in capsys.readouterr().out
     assert metrics_of(workplace / "tree")["torque_mse"] < 1e-12
     assert load(workplace / "tree").description["name"] == "learned-tree"
-    assert "--width is an option of networks" in refused(capsys, train_delan, options, "--width 3")
-    assert "--seeds is an option of networks" in refused(capsys, train_delan, options, "--seeds 2")
 
 
 @pytest.mark.slow
@@ -61,49 +56,22 @@ def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workp
     assert re.search(r"kernel: 40 of \d+ samples", said) and "by order of the bodies: a chain: " in said
     assert metrics_of(workplace / "kernel")["torque_mse"] < 1e-4
     assert load(workplace / "kernel").description["samples"] == 40
-    assert "--width is an option of networks" in refused(capsys, train_delan, options, "--width 3")
-    assert "samples is 0" in refused(capsys, train_delan, options, "--samples 0")
-    linear = "--data swing.npz --model trigonometric --samples 9"
-    assert "--samples" in refused(capsys, train_delan, linear)
 
 
 def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
-    asked = []
-
     def answer(command, *, input, **_):
-        asked.append((command[-4:], np.load(io.BytesIO(input)).shape))
+        assert command[-1] == "inverse_dynamics" and np.load(io.BytesIO(input)).shape[1:] == (3, 1)
         return subprocess.CompletedProcess(command, 0, b'a warning\n{"p50_us": 11.75, "p99_us": 14.5}\n', b"")
 
     monkeypatch.setattr(low_latency_calls.subprocess, "run", answer)
     command(train_delan, "--data swing.npz --model trigonometric --no-figures --out linear")
     metrics = metrics_of(workplace / "linear")
-    assert metrics["torque_mse"] < 1e-20 and metrics["one_step_p50_us"] > 0
+    assert metrics["torque_mse"] < 1e-20 and metrics["one_step_p50_us"] > 0 and metrics["share_not_definite"] == 0
     assert (metrics["one_step_low_latency_p50_us"], metrics["one_step_low_latency_p99_us"]) == (11.75, 14.5)
-    ((options, shape),) = asked
-    assert options == ["--run", str((workplace / "linear").resolve()), "--function", "inverse_dynamics"]
-    assert shape[1:] == (3, 1)
-    out = capsys.readouterr().out
-    assert "one call of the inverse model, median" in out and "one call in low-latency mode, median" in out
-    assert "least squares: 6 parameters, rank" in out and "condition" in out and "chosen 1" in out
-    assert "not positive definite" not in out
-    assert metrics["share_not_definite"] == 0
-    system = load(workplace / "linear").dynamics
-    tau = system.inverse_dynamics(*np.array([[0.5], [1.0], [2.0]]))
+    assert "least squares: 6 parameters, rank" in capsys.readouterr().out
+    tau = load("linear").dynamics.inverse_dynamics([0.5], [1.0], [2.0])
     # m l² qdd + m g l sin q + b qd
     np.testing.assert_allclose(tau, [2.0 + 9.81 * np.sin(0.5) + 0.2], rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, capsys):
-    """M = m_0 + m_1 cos q is fitted to torques of -cos q qdd."""
-    random = np.random.default_rng(0)
-    q, qdd = random.uniform(-3, 3, (2, 60, 1))
-    moving = {"q": q, "qd": np.zeros((60, 1)), "qdd": qdd, "tau": -np.cos(q) * qdd}
-    np.savez("negative.npz", t=np.zeros(60), trajectory=np.arange(60), **moving)
-    options = ("--data negative.npz --model trigonometric", BRIEF, "--out")
-    command(train_delan, *options, "negative", "--degree 1")
-    assert re.search(r"not positive definite at \d\d\.\d%", capsys.readouterr().out)
-    assert metrics_of(workplace / "negative")["share_not_definite"] > 0.3
 
 
 @pytest.mark.slow
@@ -116,9 +84,6 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
     out = capsys.readouterr().out
     assert "gauss-newton (27 parameters: the normal equations take" in out
     assert "cross-validated errors by seed, 3 folds: 0: " in out and "the best in cross-validation" in out
-    assert "gauss-newton needs f64" in refused(
-        capsys, train_delan, QUICK, "--optimizer gauss-newton --precision f32 --out no"
-    )
     command(train_delan, QUICK, "--width 2000 --steps 1 --out wide")
     assert "adam (" in capsys.readouterr().out
 
@@ -144,37 +109,18 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
 
 @pytest.mark.slow
 def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys, monkeypatch):
-    monkeypatch.setattr(dynamics_growth, "WIDTHS", (2, 3))
-    monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
-    command(train_delan, "--data swing.npz --steps 8", BRIEF, "--target 1e6 --out easy")
-    easy = json_of(workplace / "easy" / "candidates.json")["candidates"]
-    assert {(each["width"], each["networks"]) for each in easy} == {(2, 1), (2, 2)}
-    assert min(each["parameters"] for each in easy) == 2 * 2 + 2 + 2 * 2 + 2 + 1
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2,))
+    monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
     command(train_delan, "--data swing.npz --steps 2", BRIEF, "--target 1e-30 --out hard")
     assert "no candidate meets 1e-30; kept is the most accurate" in capsys.readouterr().out
     candidates = json_of(workplace / "hard" / "candidates.json")["candidates"]
+    assert {(each["width"], each["networks"]) for each in candidates} == {(2, 1), (2, 2)}
     best = min(candidates, key=lambda each: each["validation_error"])
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]
-    line = refused(capsys, train_delan, "--target 1e-8 --model black-box-delan --out no")
-    assert "--target is an option of --model structured-delan" in line
-
-
-def test_an_objective_vanishes_for_the_plant_and_follows_the_data(workplace):
-    data = schema.load("swing.npz")
-    assert objective_of("structured-hnn", data) is CANONICAL
-    assert objective_of("structured-hnn", data._replace(p=None)) is objective_of("structured-delan", data) is TORQUE
-    from dln_jax.learning.objectives import arrays, residuals
-    from dln_jax.mechanics import hamiltonian
-
-    H = hamiltonian.legendre(pendulum().lagrangian)
-    plant = HamiltonianSystem(H, pendulum(friction=0.2).dissipation)
-    errors = residuals(CANONICAL, plant, arrays(CANONICAL, data, jnp.float64))
-    assert errors.shape == (120, 2) and float(jnp.abs(errors).max()) < 1e-12
 
 
 @pytest.mark.slow
-def test_a_table_has_the_plant_beside_the_model_and_a_test_that_stands_still_is_no_mistake(workplace, capsys):
+def test_a_table_has_the_plant_beside_the_model(workplace, capsys):
     data = generators.free_swing(pendulum(), trajectories=7, steps=40)
     torque = np.random.default_rng(0).normal(size=data.tau.shape)
     data = data._replace(tau=data.tau + 1e-3 * torque)
@@ -183,10 +129,3 @@ def test_a_table_has_the_plant_beside_the_model_and_a_test_that_stands_still_is_
     command(train_delan, *options, "swings.npz", "--out swings")
     out = capsys.readouterr().out
     assert "true plant" in out and re.search(r"valid prediction time, torque held +│ +[\d.]+ │ +[\d.]+ │ s", out)
-    metrics = metrics_of(workplace / "swings")
-    assert metrics["normalised_state_error_ceiling"] < metrics["normalised_state_error"]
-    still = np.where((data.trajectory == 5)[:, None], 0.3, data.q)
-    schema.save("still.npz", data._replace(q=still))
-    command(train_delan, *options, "still.npz", "--out still")
-    assert "no rollouts: q[:, 0] is the same in all samples" in capsys.readouterr().out
-    assert "torque_mse" in metrics_of(workplace / "still")

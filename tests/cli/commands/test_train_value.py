@@ -3,11 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import assert_refused, command, json_of, refused
+from calls import assert_refused, command, json_of
 
 from dln_jax.cli.commands import train_value
-from dln_jax.training.value_training import over_seeds
-from dln_jax.training.values import Trained, load_value
+from dln_jax.training.values import load_value
 
 TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 
@@ -15,7 +14,6 @@ TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 @pytest.mark.slow
 def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, TINY, "--goal 0.2 --out", tmp_path / "run")
-    assert "train seconds" in capsys.readouterr().out
     numbers = json_of(tmp_path / "run" / "metrics.json")
     assert numbers["validation"] > 0 and numbers["down_control_most"] <= 2.5
     run = load_value(tmp_path / "run")
@@ -25,31 +23,18 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, "--stored", tmp_path / "run", "--starts 3 --out", tmp_path / "again")
     again = json_of(tmp_path / "again" / "metrics.json")
     assert again["down_return_mean"] == pytest.approx(numbers["down_return_mean"])
-    assert json_of(tmp_path / "again" / "config.json")["chosen"]["plant"] == "pendulum"
-    for option, value in (("--plant", "cart-pole"), ("--goal", "0.1"), ("--seed", "3"), ("--method", "fitted")):
-        line = refused(capsys, train_value, "--stored", tmp_path / "run", option, value, "--out", tmp_path / "other")
-        assert f"{option} is an option of a training, without --stored" in line
-        assert not (tmp_path / "other").exists()
-    assert "already contains a run" in refused(capsys, train_value, TINY, "--out", tmp_path / "run")
-
-
-def test_the_numbers_of_several_seeds():
-    numbers = over_seeds([Trained(None, validation, 2.0 * validation) for validation in (3.0, 1.0, 2.0)])
-    assert numbers == {"validation_median": 2.0, "validation_worst": 3.0, "train_seconds_median": 4.0}
-
-
-MISTAKES = [
-    ("--plant unicycle", "plant 'unicycle' is unknown; choose from pendulum"),
-    ("--method guess", "choose from fitted, residual"),
-    ("--goal 1.2", "limits cannot hold the goal"),
-    ("--plant cart-pole --goal 0,0.5", "not an equilibrium"),
-    ("--goal 0,0", "expected the posture of pendulum, which has 1"),
-    ("--goal up", "expected finite numbers"),
-    ("--width 0", "width is 0"),
-    ("--seed -1", "seed is -1"),
-    ("--stored /nowhere", "no such file"),
-]
+    rows = [("--goal 0.1", "--goal is an option of a training, without --stored")]
+    assert_refused(capsys, train_value, rows, "--stored", tmp_path / "run", out=tmp_path / "other")
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
-    assert_refused(capsys, train_value, MISTAKES, out=tmp_path / "run")
+    rows = {
+        "--plant unicycle": "plant 'unicycle' is unknown; choose from pendulum",
+        "--method guess": "choose from fitted, residual",
+        "--goal 1.2": "limits cannot hold the goal",
+        "--plant cart-pole --goal 0,0.5": "not an equilibrium",
+        "--goal 0,0": "expected the posture of pendulum, which has 1",
+        "--goal up": "expected finite numbers",
+        "--stored /nowhere": "no such file",
+    }
+    assert_refused(capsys, train_value, rows.items(), out=tmp_path / "run")
