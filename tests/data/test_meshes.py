@@ -1,6 +1,5 @@
 """Meshes against geometry and topology, nonsense against its messages, and creatures against their drawings."""
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,8 +21,6 @@ from dln_jax.softbody.mesh.shapes import beam, biped, body_length, box, crawler,
 from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
 from tests.calls import one_line
 
-SIZES = st.floats(0.01, 100.0)
-COUNTS = st.integers(1, 5)
 BEAM = beam(4.0, 1.0, 8, 3)
 # A ring of cells: a hole, which has a boundary of its own.
 RING = make_mesh(*lattice([(x, y) for x in range(3) for y in range(3) if (x, y) != (1, 1)]))
@@ -84,35 +81,20 @@ def test_volume_boundary_and_centre(shape):
     # Equal shares reproduce the first moment of each simplex.
     masses = lumped_masses(mesh, 700.0)
     np.testing.assert_allclose(masses @ mesh.vertices, 700.0 * volume * np.array(centre), atol=1e-10 * volume)
-    assert masses.min() > 0
+    assert masses.min() > 0 and regularity(mesh.vertices, mesh.elements).min() > 0.5
     assert euler_characteristic(mesh) == (0 if shape == "ring" else 1)
 
 
-@pytest.mark.parametrize("shape", ["ring", "box"])
-def test_gradient_of_the_volume_is_the_normals(shape):
-    """dV/dx of a vertex is 1/dim of the normals of the boundary facets around it: none inside."""
-    mesh = SHAPES[shape][0]
-    gradient = jax.jit(jax.grad(lambda x: simplex_volumes(x, mesh.elements).sum()))(jax.numpy.asarray(mesh.vertices))
-    expected = np.zeros_like(mesh.vertices)
-    for facet, normal in zip(boundary(mesh), outward_normals(mesh.vertices, boundary(mesh)), strict=True):
-        expected[facet] += normal / mesh.dimension
-    np.testing.assert_allclose(gradient, expected, atol=1e-13)
-
-
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(SIZES, COUNTS), min_size=2, max_size=3))
+@given(st.lists(st.tuples(st.floats(0.01, 100.0), st.integers(1, 5)), min_size=2, max_size=3))
 def test_any_beam_or_box(axes):
     lengths, cells = (tuple(values) for values in zip(*axes, strict=True))
     mesh = beam(*lengths, *cells) if len(axes) == 2 else box(lengths, cells)
-    assert len(mesh.vertices) == np.prod([count + 1 for count in cells])
+    assert len(mesh.vertices) == np.prod(np.add(cells, 1))
     assert len(mesh.elements) == (2 if len(axes) == 2 else 5) * np.prod(cells)
     np.testing.assert_allclose(volumes(mesh).sum(), np.prod(lengths), rtol=1e-12)
-    assert euler_characteristic(mesh) == 1
-    np.testing.assert_array_equal(mesh.vertices.max(axis=0), lengths)
-    inside = ((mesh.vertices > 0) & (mesh.vertices < np.array(lengths))).all(axis=1)
+    inside = ((mesh.vertices > 0) & (mesh.vertices < lengths)).all(axis=1)
     np.testing.assert_array_equal(boundary_vertices(mesh), np.flatnonzero(~inside))
-    density = np.linspace(1.0, 3.0, len(mesh.elements))
-    np.testing.assert_allclose(lumped_masses(mesh, density).sum(), density @ volumes(mesh), rtol=1e-12)
 
 
 def test_vertices_of_a_beam_are_numbered_along_its_short_side():
@@ -122,14 +104,6 @@ def test_vertices_of_a_beam_are_numbered_along_its_short_side():
     assert mesh.elements.dtype == np.int32 and mesh.vertices.dtype == np.float64
 
 
-def test_elements_of_a_disc_are_regular_and_its_edge_is_round():
-    for rings in (1, 6):
-        mesh = disc(2.0, rings)
-        assert (len(mesh.vertices), len(mesh.elements)) == (1 + 3 * rings * (rings + 1), 6 * rings**2)
-        np.testing.assert_allclose(np.linalg.norm(mesh.vertices[boundary_vertices(mesh)], axis=1), 2.0)
-        assert regularity(mesh.vertices, mesh.elements).min() > 0.6
-
-
 def test_no_direction_is_preferred():
     """Even numbers of cells: a mirror image of itself, so that straight loads do not bend or twist it."""
     for mesh in (beam(4.0, 1.0, 6, 2), box((3.0, 1.0, 1.0), (4, 2, 2))):
@@ -137,15 +111,15 @@ def test_no_direction_is_preferred():
             assert same_simplices(mirrored(mesh, axis)[mesh.elements], mesh.elements)
 
 
-def test_regularity():
-    equilateral = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 3**0.5]])
-    regular = np.array([[0.0, 0, 0], [1, 1, 0], [0, 1, 1], [1, 0, 1]])
-    for vertices in (equilateral, regular):
-        n = len(vertices)
-        elements = np.array([np.arange(n), [1, 0, *range(2, n)], [0, *range(1, n - 1), 0]])
-        for scale in (1e-150, 1.0, 1e150):
+def test_regularity_is_one_for_regular_simplices_of_any_size():
+    for vertices in (
+        np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 3**0.5]]),
+        np.array([[0.0, 0, 0], [1, 1, 0], [0, 1, 1], [1, 0, 1]]),
+    ):
+        corners = list(range(len(vertices)))
+        elements = np.array([corners, [1, 0, *corners[2:]], [0, *corners[1:-1], 0]])
+        for scale in (1e-150, 1e150):
             np.testing.assert_allclose(regularity(scale * vertices, elements), [1.0, -1.0, 0.0], atol=1e-12)
-    assert regularity(np.ones((3, 2)), np.array([[0, 1, 2]])) == 0.0
 
 
 SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
@@ -153,28 +127,22 @@ HALVES = [[0, 1, 2], [0, 2, 3]]
 # A face in the plane z = 0, with 3 and 5 above it and 4 below.
 BIPYRAMID = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 1], [0.2, 0.2, -1], [0.3, 0.3, 2]]
 UP, DOWN = [0, 1, 2, 3], [0, 2, 1, 4]
-NAN, INF = float("nan"), float("inf")
 LOOSE = box((1.0, 1.0, 1.0), (3, 3, 3))
 NONSENSE = (
-    ([*SQUARE[:3], [0.0, NAN]], HALVES, r"vertex 3 is at \[0.0, nan\]; expected finite"),
-    ([[INF, 0.0, 0.0], *BIPYRAMID[1:5]], [UP, DOWN], r"vertex 0 is at \[inf, 0.0, 0.0\]"),
+    ([*SQUARE[:3], [0.0, np.nan]], HALVES, r"vertex 3 is at \[0.0, nan\]; expected finite"),
     (np.array(SQUARE) + 0j, HALVES, "vertices has type complex128; expected real"),
     (np.zeros((3, 4)), HALVES, r"vertices has shape \[3, 4\]; expected \[n, 2\]"),
     ([[0.0, 0.0], [1.0]], HALVES, "vertices is not an array: its rows differ in length"),
-    (SQUARE, [[0, 1, 2], [0, 1]], "elements is not an array"),
     (SQUARE, np.array(HALVES, float), "elements has type float64; expected integers"),
-    (SQUARE, np.array(HALVES, bool), "elements has type bool; expected integers"),
     (BIPYRAMID, HALVES, r"elements has shape \[2, 3\]; expected \[m, 4\] .* each tetrahedron"),
     (SQUARE, np.zeros((0, 3), int), r"elements has shape \[0, 3\]; expected \[m, 3\] with m >= 1"),
     (SQUARE, [[0, 1, 2], [0, 2, 4]], "element 1 has corner 4, but there are 4 vertices"),
     (SQUARE, [[0, 1, 2], [0, 2, 2**32 + 3]], "element 1 has corner 4294967299"),  # which wraps to 3 in 32 bits
     (SQUARE, [[0, 1, -2], [0, 2, 3]], "element 0 has corner -2, .*expected 0 to 3"),
     (SQUARE, [[0, 1, 2], [0, 3, 3]], r"element 1 has corner 3 twice: \[0, 3, 3\]"),
-    (BIPYRAMID[:5], [UP, [4, 2, 1, 4]], "element 1 has corner 4 twice"),
     (SQUARE, [*HALVES, [0, 2, 1]], "element 2 is a duplicate of element 0"),
     ([*SQUARE, [1.5, -0.4e-12]], [*HALVES, [0, 4, 1]], "element 2 is degenerate: the area of triangle"),
     ([*BIPYRAMID[:4], [1.0, 1.0, 0.0]], [UP, [0, 1, 2, 4]], "element 1 is degenerate: the volume"),
-    ([*SQUARE, [0.0, 0.0], [0.0, 0.0]], [*HALVES, [0, 4, 5]], "element 2 is degenerate"),
     ([*SQUARE, [2.0, 2.0], [3.0, 3.0]], HALVES, r"vertex 4 is dangling: .* no element.*\(1 more like it\)"),
     (
         LOOSE.vertices[LOOSE.elements].reshape(-1, 3),  # vertices that were never merged
@@ -191,29 +159,27 @@ def test_nonsense_is_named():
 
 
 def test_what_is_left_when_the_nonsense_is_removed():
-    """The table's meshes without their faults are accepted, however they are given."""
-    assert make_mesh([[0, 0], [1, 0], [1, 1], [0, 1]], HALVES).vertices.dtype == np.float64
-    make_mesh(BIPYRAMID[:5], np.array([UP, DOWN], np.uint8))
+    assert make_mesh([[0, 0], [1, 0], [1, 1], [0, 1]], np.array(HALVES, np.uint8)).vertices.dtype == np.float64
     make_mesh(1e-9 * np.array(SQUARE), HALVES)
     make_mesh([*SQUARE, [1.5, -4e-12]], [*HALVES, [0, 4, 1]])  # flat, but just above rounding
-    make_mesh([[0, 0], [1, 0], [0, 1], [5, 0], [6, 0], [5, 1]], [[0, 1, 2], [3, 4, 5]])  # two bodies
+    # Shared vertices connect elements; bodies that are apart are bodies.
+    apart = make_mesh([[0, 0], [1, 0], [0, 1], [5, 0], [6, 0], [5, 1]], [[0, 1, 2], [3, 4, 5]])
+    hinged = make_mesh([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]], [[0, 1, 2], [0, 3, 4]])
+    assert components(apart).tolist() == [0, 1] and components(hinged).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_inverted_elements_are_turned_and_counted(dimension):
-    """Delaunay meshes of scipy have either orientation in space, and here in the plane as well."""
+    """Delaunay meshes of scipy, whose orientations are drawn."""
     random = np.random.default_rng(dimension)
     points = random.uniform(-1.0, 1.0, (60, dimension))
-    elements = Delaunay(points).simplices
-    if dimension == 2:
-        elements = random.permuted(elements, axis=1)
+    elements = random.permuted(Delaunay(points).simplices, axis=1)
     mesh = make_mesh(points, elements)
     assert mesh.turned == (simplex_volumes(points, elements) < 0).sum()
     assert 0.25 < mesh.turned / len(elements) < 0.75
     assert volumes(mesh).min() > 0 and make_mesh(points, mesh.elements).turned == 0
     np.testing.assert_array_equal(np.sort(mesh.elements, axis=1), np.sort(elements, axis=1))
     hull = ConvexHull(points)
-    np.testing.assert_allclose(volumes(mesh).sum(), hull.volume, rtol=1e-12)
     assert same_simplices(boundary(mesh), hull.simplices) and len(overlaps(mesh)) == 0
     np.testing.assert_allclose(flux(points, boundary(mesh)), dimension * hull.volume, rtol=1e-12)
 
@@ -223,7 +189,6 @@ def test_overlapping_elements_are_accepted_and_named():
     for vertices, elements, facet, one_sided in (
         ([*SQUARE, [0.2, 0.5]], [*HALVES, [0, 2, 4]], {0, 2}, False),
         (BIPYRAMID, [UP, DOWN, [0, 1, 2, 5]], {0, 1, 2}, False),
-        ([*SQUARE[:3], [1.0, 0.5]], [[0, 1, 2], [0, 1, 3]], {0, 1}, True),
         ([*BIPYRAMID[:4], BIPYRAMID[5]], [UP, [1, 2, 0, 4]], {0, 1, 2}, True),
     ):
         mesh = make_mesh(vertices, elements)
@@ -232,25 +197,20 @@ def test_overlapping_elements_are_accepted_and_named():
         skin = [frozenset(row) for row in boundary(mesh).tolist()]
         assert len(set(skin)) == len(skin) == len(elements) * mesh.dimension + one_sided
         assert (facet in skin) == one_sided
-        assert lumped_masses(mesh, 2.0).sum() == pytest.approx(2.0 * volumes(mesh).sum())
 
 
 def test_arguments_that_make_no_sense_are_named():
     for call, message in (
         (lambda: beam(0.0, 1.0, 2, 2), "length along x is 0.0; expected a positive"),
-        (lambda: beam(1.0, NAN, 2, 2), "length along y is nan"),
         (lambda: beam(1.0, 1.0, 2, 0), "number of cells along y is 0"),
-        (lambda: box((1.0, 1.0, INF), (1, 1, 1)), "length along z is inf; expected a finite"),
-        (lambda: box((1.0, 1.0, 1.0), (-1, 1, 1)), "number of cells along x is -1"),
+        (lambda: box((1.0, 1.0, np.inf), (1, 1, 1)), "length along z is inf; expected a finite"),
         (lambda: disc(-1.0, 2), "radius is -1.0"),
         (lambda: disc(1.0, 0), "rings is 0"),
         (lambda: lumped_masses(BEAM, -1.0), "density is -1.0; expected a positive"),
-        (lambda: lumped_masses(BEAM, INF), "density is inf"),
-        (lambda: lumped_masses(BEAM, [1.0] * 7 + [NAN] + [1.0] * 40), "density of element 7 is nan"),
+        (lambda: lumped_masses(BEAM, [1.0] * 7 + [np.nan] + [1.0] * 40), "density of element 7 is nan"),
         (lambda: lumped_masses(BEAM, [1.0, 2.0]), r"density has shape \[2\]; .* or \[48\]"),
         (lambda: vertices_where(BEAM, lambda x: x[:, 0] > 5), r"no vertex .* \[4.0, 1.0\] m"),
         (lambda: vertices_where(BEAM, lambda x: x > 0), r"bool of shape \[36, 2\]"),
-        (lambda: vertices_where(BEAM, lambda x: x[:, 0]), "float64 of shape"),
     ):
         with one_line(message):
             call()
@@ -280,13 +240,5 @@ def test_creatures_are_symmetric_bodies_with_muscles_on_either_side_of_each_leg(
     # Each sole is the end of a leg with a muscle on either side.
     soles = [edge for edge in boundary(mesh).tolist() if (mesh.vertices[edge, 1] == 0).all()]
     corners = {corner for sole in soles for corner in sole}
-    assert len(soles) == legs and len(corners) == 2 * legs
+    assert len(soles) == legs == len(corners) / 2
     assert all(np.sum(pairs == corner) == 1 for corner in corners)
-
-
-def test_components_are_connected_by_vertices():
-    mesh = box((2.0, 1.0, 1.0), (2, 1, 1))
-    twice = make_mesh(np.concatenate([mesh.vertices, mesh.vertices + 5.0]), [*mesh.elements, *(mesh.elements + 12)])
-    assert components(twice).tolist() == [0] * 10 + [1] * 10
-    hinged = make_mesh([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]], [[0, 1, 2], [0, 3, 4]])
-    assert (components(hinged) == 0).all()

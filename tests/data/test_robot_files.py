@@ -2,12 +2,15 @@
 
 import xml.etree.ElementTree as ET
 
+import jax
 import numpy as np
 import pytest
 
-from dln_jax.data.robot_files import write_robot
-from dln_jax.data.robots import read_robot
-from dln_jax.types import InputError
+from dln_jax.data.robot_files import mjcf, write_robot
+from dln_jax.data.robots import Robot, read_robot
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system
+from tests.calls import one_line
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 INERTIAL = """<inertial><origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/><mass value="{mass}"/>
@@ -34,6 +37,7 @@ MJCF = """<mujoco><compiler angle="radian" inertiafromgeom="true"/><default><joi
         <body name="d" pos="0 0.1 0.2"><geom type="box" size=".05 .1 .02"/></body></body>
     </body></body></worldbody></mujoco>"""
 FILES = {"arm.urdf": URDF, "arm.xml": MJCF}
+TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 
 
 @pytest.fixture(params=FILES)
@@ -43,10 +47,9 @@ def original(request, tmp_path):
     return path
 
 
-def test_what_is_written_is_read_again(original):
+def test_what_is_written_is_read_again_and_mistakes_are_one_line(original):
     robot = read_robot(original)
-    d = robot.tree.degrees_of_freedom
-    random = np.random.default_rng(0)
+    d, random = robot.tree.degrees_of_freedom, np.random.default_rng(0)
     heavier = robot.tree.inertias * random.uniform(1, 2, d)[:, None]
     armature = random.uniform(0.1, 0.2, d) * (original.suffix == ".xml")
     tree = robot.tree._replace(inertias=heavier, armature=armature)
@@ -57,10 +60,22 @@ def test_what_is_written_is_read_again(original):
     assert again.tree.parents == tree.parents and again.tree.names == tree.names
     for name in ("rotations", "positions", "axes", "inertias", "armature"):
         np.testing.assert_allclose(getattr(again.tree, name), getattr(tree, name), rtol=1e-12, atol=1e-14)
-    np.testing.assert_array_equal(again.damping, damping)
-    np.testing.assert_array_equal(again.coulomb, coulomb)
-    np.testing.assert_array_equal(again.position_limits, robot.position_limits)
+    for ours, expected in zip(again[1:4], (damping, coulomb, robot.position_limits), strict=True):
+        np.testing.assert_array_equal(ours, expected)
     assert original.read_text() == FILES[original.name] and "Identified - - once." in path.read_text()
+    hollow = np.where(np.arange(10) == 4, -1.0, heavier)
+    if original.suffix == ".xml":
+        including = original.with_name("including.xml")
+        including.write_text(MJCF.replace("<default>", '<include file="more.xml"/><default>'))
+        original.with_name("more.xml").write_text("<mujoco><option/></mujoco>")
+    for change, source, target, message in (
+        ({}, original, original, "is the original file"),
+        ({"names": tuple("abc"[:d])}, original, path, "the tree has a, b"),
+        ({"inertias": hollow}, original, path, "is not physically consistent"),
+        *([({}, including, path, "<include>")] if original.suffix == ".xml" else []),
+    ):
+        with one_line(message):
+            write_robot(target, source, tree._replace(**change))
 
 
 def test_a_file_keeps_what_is_not_identified(tmp_path):
@@ -68,30 +83,36 @@ def test_a_file_keeps_what_is_not_identified(tmp_path):
     original.write_text(URDF)
     tree = read_robot(original).tree
     write_robot(path, original, tree._replace(armature=np.array([0.5, 0.25])))
-    text = path.read_text()
-    assert (
-        "kept" in text and "nowhere.stl" in text and "URDF cannot state (kg m² or kg): shoulder 0.5, elbow 0.25" in text
-    )
-    root = ET.parse(path).getroot()
-    masses = {link.get("name"): link.find("inertial/mass") for link in root.findall("link")}
+    for words in ("kept", "nowhere.stl", "URDF cannot state (kg m² or kg): shoulder 0.5, elbow 0.25"):
+        assert words in path.read_text()
+    masses = {link.get("name"): link.find("inertial/mass") for link in ET.parse(path).getroot().findall("link")}
     assert masses["base"].get("value") == "9" and masses["hand"] is masses["finger"] is None
     np.testing.assert_allclose(float(masses["two"].get("value")), 0.75)
 
 
-def test_mistakes_are_one_line(original, tmp_path):
-    tree = read_robot(original).tree
-    hollow = tree.inertias.copy()
-    hollow[-1, 4] = -1.0
-    for change, path, message in (
-        ({}, original, "is the original file"),
-        ({"names": tuple("abcdefg"[: len(tree.names)])}, tmp_path / "new", "the tree has a, b"),
-        ({"inertias": hollow}, tmp_path / "new", "is not physically consistent"),
-    ):
-        with pytest.raises(InputError, match=message) as caught:
-            write_robot(path, original, tree._replace(**change))
-        assert "\n" not in str(caught.value)
-    if original.suffix == ".xml":
-        original.write_text(MJCF.replace("<default>", '<include file="more.xml"/><default>'))
-        (tmp_path / "more.xml").write_text("<mujoco><option/></mujoco>")
-        with pytest.raises(InputError, match="<include>"):
-            write_robot(tmp_path / "new", original, tree)
+def robot(mass=1.3):
+    """A prismatic joint between two revolute ones, and a branch, depth first as MuJoCo orders joints."""
+    bodies = [inertial_parameters(m, [0.1, -0.2, 0.05 * m], np.diag([0.02, 0.03, 0.04])) for m in (2.0, mass, 0.5, 0.7)]
+    tree = make_tree(
+        [-1, 0, 1, 0], ["revolute", "prismatic", "revolute", "revolute"], [TURN, np.eye(3), TURN.T, TURN @ TURN],
+        np.arange(12.0).reshape(4, 3) / 10, [[0, 0, 1], [1, 0, 0], [0.6, 0, 0.8], [0, 1, 0]], bodies,
+        armature=[0.1, 0.0, 0.2, 0.3], gravity=[1, -2, -9], names=("a", "b", "c", "d"),
+    )  # fmt: skip
+    limits = np.array([[-1, 2], [-0.1, 0.3], [-np.inf, np.inf], [-3, 3]])
+    return Robot(tree, np.array([0.1, 0.2, 0.0, 0.3]), np.array([0.0, 0.4, 0.5, 0.6]), limits, 10 * limits)
+
+
+def test_a_robot_survives_as_mjcf(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(mjcf(robot()))
+    again = read_robot(path)
+    assert (again.tree.names, again.tree.parents, again.tree.joints) == (robot().tree[-1], *robot().tree[:2])
+    for numbers, expected in zip(again[1:], robot()[1:], strict=True):
+        np.testing.assert_array_equal(numbers, expected)
+    state = np.random.default_rng(0).normal(size=(3, 4))
+    forces = (jax.jit(dynamics(tree_system(each.tree)).inverse_dynamics)(*state) for each in (again, robot()))
+    np.testing.assert_allclose(*forces, rtol=1e-12, atol=1e-12)
+    with one_line("the link of joint 'b' has a mass of 0 kg"):
+        mjcf(robot(mass=0.0))
+    with one_line("time_step is 0.0; expected a positive number"):
+        mjcf(robot(), time_step=0.0)
