@@ -75,26 +75,21 @@ def assert_nearly_best(data, key, truth, trim, cutoffs):
 
 
 def test_noise_is_found_whatever_its_size_and_jumps_are_none():
-    for noise in (1e-6, 1e-4, 1e-2):
+    for noise in (0.0, 1e-6, 1e-2):
         arrays, _, _ = log(noise=noise)
-        assert noise_of(arrays["q"], arrays["trajectory"]) == pytest.approx([noise, noise], rel=0.1)
-    arrays, _, _ = log(noise=0.0)
-    jumps = arrays["q"] + 0.5 * np.sign(np.sin(3 * arrays["t"]))[:, None]
-    for values in (arrays["q"], jumps):
-        assert (noise_of(values, arrays["trajectory"]) < 1e-7).all()
-    arrays, _, _ = log()
-    clean = smooth(schema.from_arrays(arrays))
+        jumps = arrays["q"] + 0.5 * np.sign(np.sin(3 * arrays["t"]))[:, None]
+        for values in (arrays["q"], jumps):
+            assert noise_of(values, arrays["trajectory"]) == pytest.approx([noise, noise], rel=0.1, abs=1e-7)
+    # Noise is filtered in spite of jumps.
     arrays["q"][50::97, 0] += 0.05
-    jumping = smooth(schema.from_arrays(arrays))
-    assert np.isfinite(jumping.cutoff) and jumping.noise_q == pytest.approx(clean.noise_q, rel=0.1)
+    assert np.isfinite(smooth(schema.from_arrays(arrays)).cutoff)
 
 
 def test_steps_of_an_encoder_are_found_and_are_noise():
     arrays, _, _ = log(noise=0.0)
     step = 2 * np.pi / 4096
     stepped = np.round(arrays["q"] / step) * step
-    assert step_of(stepped) == pytest.approx([step, step], rel=1e-6)
-    assert not step_of(arrays["q"]).any()
+    assert step_of(stepped) == pytest.approx([step, step], rel=1e-6) and not step_of(arrays["q"]).any()
     assert (noise_of(stepped, arrays["trajectory"]) >= 0.999 * step / np.sqrt(12)).all()
 
 
@@ -107,13 +102,12 @@ def test_the_filter_has_its_gain_and_no_delay():
     assert left[500:1500] == pytest.approx(gain(mapped, 10.0) * waves[500:1500], abs=1e-4)
 
 
-def test_the_filter_commutes_with_what_is_linear():
+def test_the_filter_is_linear_and_trajectories_are_filtered_alone():
     random = np.random.default_rng(0)
     columns, theta = random.normal(size=(400, 3)), random.normal(size=(3, 1))
-    settings = {"rate": RATE, "cutoff": 7.0, "trajectory": np.repeat([0, 1], 200)}
-    left = low_pass(columns, **settings)
-    assert low_pass(columns @ theta, **settings) == pytest.approx(left @ theta, abs=1e-9)
-    assert np.array_equal(left[:200], low_pass(columns[:200], rate=RATE, cutoff=7.0))
+    settings = {"rate": RATE, "cutoff": 7.0}
+    left = low_pass(columns, trajectory=np.repeat([0, 1], 200), **settings)
+    assert low_pass(columns[:200] @ theta, **settings) == pytest.approx(left[:200] @ theta, abs=1e-9)
 
 
 def test_derivatives_are_exact_for_polynomials_of_degree_five():
@@ -136,12 +130,10 @@ def test_the_cut_off_is_nearly_the_best_there_is(noise, rate):
 
 def test_lines_of_a_periodic_motion_are_not_cut_off_though_only_noise_is_between_them():
     t, order = np.arange(6000) / 500.0, np.arange(1, 60, 2)
-    size = np.exp(-0.005 * order**2) / order**2  # a triangle with round corners, of odd harmonics only
+    size, w = np.exp(-0.005 * order**2) / order**2, 2 * np.pi * order / 0.6  # a triangle with round corners
+    q, qd = np.cos(w * t[:, None]) @ size, -np.sin(w * t[:, None]) @ (w * size)
     noise = 4e-4 * np.random.default_rng(0).normal(size=len(t))
-    for period in (0.6, 1.3):
-        w = 2 * np.pi * order / period
-        q, qd = np.cos(w * t[:, None]) @ size, -np.sin(w * t[:, None]) @ (w * size)
-        assert_nearly_best(one_channel(t, q + noise), "qd", qd[:, None], 1.0, np.geomspace(2.0, 100.0, 25))
+    assert_nearly_best(one_channel(t, q + noise), "qd", qd[:, None], 1.0, np.geomspace(2.0, 100.0, 25))
 
 
 def test_motions_of_a_motor_that_chatters_are_not_cut_off():
@@ -164,35 +156,14 @@ def test_commands_of_uneven_samples_keep_their_impulse_at_equal_steps():
     u = random.choice([-1.0, 1.0], (300, 1))
     data = one_channel(t, np.sin(3 * t), u)
     even = sampling.held_at_equal_steps(data, 100.0)
-    first, second = np.split(np.arange(len(even.t)), np.flatnonzero(np.diff(even.t) > 0.015) + 1)
-    np.testing.assert_allclose(np.diff(even.t[first]), 0.01, atol=1e-12)
     np.testing.assert_allclose(even.q, np.sin(3 * even.t)[:, None], atol=1e-5)
-    for rows, part in ((first, slice(0, 200)), (second, slice(200, 300))):
-        fine = even.t[rows[0]] + 1e-5 * (np.arange(1000 * (len(rows) - 1)) + 0.5)
-        held = u[part][np.searchsorted(t[part], fine, side="right") - 1].reshape(-1, 1000).mean(axis=1)
-        np.testing.assert_allclose(even.tau[rows[:-1], 0], held, atol=4e-3)
+    first = np.flatnonzero(np.diff(even.t) > 0.015)[0]
+    np.testing.assert_allclose(np.diff(even.t[: first + 1]), 0.01, atol=1e-12)
+    fine = even.t[0] + 1e-5 * (np.arange(1000 * first) + 0.5)
+    held = u[np.searchsorted(t, fine, side="right") - 1].reshape(-1, 1000).mean(axis=1)
+    np.testing.assert_allclose(even.tau[:first, 0], held, atol=4e-3)
     already = data._replace(t=np.arange(300) / 100.0)
     np.testing.assert_array_equal(sampling.held_at_equal_steps(already).tau, u)
-
-
-def test_rates_of_filtered_encoders_are_far_better_than_differences():
-    arrays, qd, qdd = log()
-    data = schema.from_arrays(arrays)
-    smoothed = smooth(data)
-    inside = within(data, round(smoothed.trim * RATE))
-    assert rms(smoothed.data.qdd - qdd[inside]) < 0.02 * rms((data.qdd - qdd)[inside])
-    assert rms(smoothed.data.qd - qd[inside]) < 0.1 * rms((data.qd - qd)[inside])
-
-
-def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
-    errors = []
-    for seed in range(6):
-        arrays, _, qdd = log(seed=seed, trajectories=4)
-        data = schema.from_arrays(arrays)
-        smoothed = smooth(data, 5.0)
-        errors.append((smoothed.data.qdd - qdd[within(data, round(smoothed.trim * RATE))]).reshape(4, -1, 2))
-    at = np.sqrt(np.mean(np.square(errors), axis=(0, 1, 3)))
-    assert max(rms(at[:12]), rms(at[-12:])) < 2 * rms(at[400:600])
 
 
 def test_clean_data_are_not_filtered():
@@ -205,14 +176,10 @@ def test_clean_data_are_not_filtered():
 
 
 def test_uneven_samples_come_to_equal_steps():
-    random = np.random.default_rng(1)
-    t = np.sort(np.arange(1250) / RATE + random.uniform(-0.3, 0.3, 1250) / RATE)
-    data = schema.from_arrays(log(t=t, noise=1e-5)[0])
-    assert sampling.timing(data.t, data.trajectory).jitter > 0.1
-    smoothed = smooth(data, trim=0.5)
+    t = (np.arange(1250) + np.random.default_rng(1).uniform(-0.3, 0.3, 1250)) / RATE
+    smoothed = smooth(schema.from_arrays(log(t=t, noise=1e-5)[0]), trim=0.5)
     even = smoothed.data
-    steps = np.diff(even.t)[np.diff(even.trajectory) == 0]
-    assert steps == pytest.approx(np.full(len(steps), 1 / smoothed.rate), rel=1e-9)
+    np.testing.assert_allclose(np.diff(even.t)[np.diff(even.trajectory) == 0], 1 / smoothed.rate, rtol=1e-9)
     _, qd, qdd = motion(even.t + SECONDS * even.trajectory)
     assert np.all(np.std(even.qd - qd, axis=0) < 2e-3 * np.std(qd, axis=0))
     assert np.all(np.std(even.qdd - qdd, axis=0) < 0.03 * np.std(qdd, axis=0))
@@ -220,10 +187,8 @@ def test_uneven_samples_come_to_equal_steps():
 
 def test_long_gaps_cut_and_short_ones_are_bridged():
     arrays, _, _ = log()
-    # Two samples of run0, and 1.6 s of run1.
-    kept = np.delete(np.arange(len(arrays["t"])), np.r_[200:202, 1750:1950])
-    data = schema.from_arrays({key: x if key == "label" else x[kept] for key, x in arrays.items()})
-    smoothed = smooth(data, 8.0)
+    kept = np.delete(np.arange(len(arrays["t"])), np.r_[200:202, 1750:1950])  # two samples of run0, 1.6 s of run1
+    smoothed = smooth(schema.from_arrays({key: x if key == "label" else x[kept] for key, x in arrays.items()}), 8.0)
     assert (smoothed.bridged, smoothed.parts, smoothed.left_out) == (1, 4, 0)
     assert list(smoothed.data.label) == ["run0", "run1/1", "run1/2", "run2"]
     assert labels_of_parts(smoothed.data, ["run1", "run2", "other"]) == ["run1/1", "run1/2", "run2", "other"]
@@ -248,7 +213,6 @@ def test_what_cannot_be_filtered_is_one_line():
         (arrays, {"cutoff": 80.0}, "expected less than 62.5 Hz"),
         (arrays, {"cutoff": -1.0}, "cutoff is -1.0"),
         (arrays, {"cutoff": 10.0, "decimate": 8}, "more than twice the cut-off"),
-        (arrays, {"decimate": 0}, "decimate is 0"),
         (arrays, {"cutoff": 0.1}, "longer motions"),
         (arrays, {"trim": -0.1}, "trim is -0.1"),
         (noise, {}, "moves by more than its noise"),
@@ -283,15 +247,13 @@ def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff(rate, noise, k
 
 def test_inserted_rows_give_their_time_back():
     arrays, _, _ = log(t=np.arange(720) / 30.0, trajectories=1)
-    place = np.arange(46, 690, 49)
-    order = np.sort(np.r_[: len(arrays["t"]), place])
+    order = np.sort(np.r_[:720, 46:690:49])
     longer = {key: arrays[key][order] for key in ("q", "tau", "trajectory")}
     inserted = schema.from_arrays({**longer, "t": np.arange(len(order)) / 30.0})
     data, repeats = without_repeats(inserted)
-    assert repeats.inserted and repeats.rows.sum() == len(place)
+    assert repeats.inserted and repeats.rows.sum() == len(order) - 720
     assert np.array_equal(data.q, arrays["q"])
-    steps = np.diff(data.t)
-    assert steps == pytest.approx(np.full(len(steps), steps[0])) and steps[0] > 1 / 30.0
+    assert np.ptp(np.diff(data.t)) < 1e-9 and data.t[1] > 1 / 30.0
     assert smooth(inserted).cutoff == pytest.approx(smooth(schema.from_arrays(arrays)).cutoff, rel=0.05)
 
 
