@@ -23,21 +23,20 @@ def load(tmp_path):
     return loaded
 
 
-def test_a_log_is_read_as_the_same_arrays_in_an_npz_file(load, tmp_path):
+def test_columns_come_in_any_order_as_the_arrays_of_an_npz_file(load, tmp_path):
     arrays = {"t": [0, 0.1, 0.2], "q": [[1, 2], [5, 6], [9, 10]], "tau": [[3, 4], [7, 8], [11, 12]]}
     np.savez(tmp_path / "log.npz", **arrays)
-    for one, other in zip(load(HEADER + ROWS), schema.load(tmp_path / "log.npz"), strict=True):
+    plain, shuffled = (
+        load(HEADER + ROWS),
+        load("tau2_Nm,note,q2_rad,q1_rad,t_s,tau1_Nm\n4,fine,2,1,0,3\n8,,6,5,0.1,7\n12,a b,10,9,0.2,11\n"),
+    )
+    for one, other in zip(plain, schema.load(tmp_path / "log.npz"), strict=True):
         np.testing.assert_array_equal(one, other)
-    of_checks = checks.read(tmp_path / "log.csv").data
-    np.testing.assert_array_equal(of_checks.tau, arrays["tau"])
-
-
-def test_columns_come_in_any_order_with_others_beside_them(load):
-    text = "tau2_Nm,note,q2_rad,q1_rad,t_s,tau1_Nm\n4,fine,2,1,0,3\n8,,6,5,0.1,7\n12,a b,10,9,0.2,11\n"
-    data, plain = load(text), load(HEADER + ROWS)
     for key in ("t", "q", "qd", "tau", "trajectory"):
-        np.testing.assert_array_equal(getattr(data, key), getattr(plain, key))
-    assert data.remarks == ("not read: note",) and plain.remarks == ()
+        np.testing.assert_array_equal(getattr(shuffled, key), getattr(plain, key))
+    assert (
+        shuffled.remarks == ("not read: note",) and checks.read(tmp_path / "log.csv").data.remarks == shuffled.remarks
+    )
 
 
 def test_every_column_that_is_not_read_is_named(load):
@@ -81,19 +80,13 @@ def test_radians_are_not_read_as_degrees(load):
     np.testing.assert_allclose(load("t,q1,q2\n" + rows + "3,2,7\n", units="degrees").q[0, 0], np.deg2rad(1.5))
 
 
-def test_joints_may_have_names_whose_order_is_that_of_q(load):
-    data = load("t [s],qd elbow [rad/s],q base [rad],q elbow [rad],qd base [rad/s]\n0,4,1,2,3\n1,8,5,6,7\n2,4,1,2,3\n")
-    assert data.joint_names.tolist() == ["base", "elbow"]
-    np.testing.assert_array_equal(data.q[0], [1, 2])
-    np.testing.assert_array_equal(data.qd[0], [3, 4])
-
-
 def test_planned_motions_are_read_back_as_they_were_written(tmp_path):
-    t, q, qd = np.arange(5.0), *np.random.default_rng(0).normal(size=(2, 5, 2))
-    write_motion(tmp_path / "m.csv", t, q, qd, names=("left arm", "lift"), joints=("revolute", "prismatic"))
+    q, qd = np.random.default_rng(0).normal(size=(2, 5, 2))
+    write_motion(
+        tmp_path / "m.csv", np.arange(5.0), q, qd, names=("left arm", "lift"), joints=("revolute", "prismatic")
+    )
     data = schema.load(tmp_path / "m.csv")
-    np.testing.assert_allclose(data.q, q, rtol=1e-8)
-    np.testing.assert_allclose(data.qd, qd, rtol=1e-8)
+    np.testing.assert_allclose([data.q, data.qd], [q, qd], rtol=1e-8)
     assert data.joint_names.tolist() == ["left_arm", "lift"]
 
 
@@ -112,7 +105,6 @@ MALFORMED = (
     (HEADER + "0,1,1,2,5,3,4\n", "line 2 has 7 values, the header 5 titles; decimals take a point"),
     (HEADER + '0,"1,5",2,3,4\n', r"line 2: 'q1 \[rad\]' is '1,5'; expected a number"),
     (SEVEN.replace(",", ";"), "separated by semicolons"),
-    (SEVEN.replace(",", "\t"), "separated by tabs"),
     (SEVEN.replace("7", ""), r"line 3: 'tau1 \[N m\]' is empty"),
     (SEVEN.replace("7", "7_0"), r"'tau1 \[N m\]' is '7_0'"),  # which Python reads as 70
     (SEVEN.replace("7", "1e999"), "tau has 1 NaN or infinite value"),
@@ -123,15 +115,12 @@ MALFORMED = (
     ("t [s],,q1 [rad]\n0,1,2\n", "column 2 has no title"),
     ("t [s],q1 [rad],q2 [rad],tau1 [N m]\n0,1,2,3\n", "no column 'tau2'"),
     ("t [s],q1 [rad],tau1 [N m],tau2 [N m]\n0,1,2,3\n", "no column 'q2'"),
-    ("t [s],q1 [furlong]\n0,1\n", r"the unit of 'q1 \[furlong\]' is not known; expected one of rad"),
     ("t [s],q1 [rad],tau1 [MN m]\n0,1,2\n", r"the unit of 'tau1 \[MN m\]' is not known"),  # not milli
     ("t_s,q1_rad,tau1_MNm\n0,1,2\n", "there is no column 'q1_MNm'|tau1_MNm"),
-    ("t [Ms],q1 [rad]\n0,1\n", r"the unit of 't \[Ms\]' is not known"),
     ("t [s],q1 [rad],qd1 [rad]\n0,1,2\n", r"the unit of 'qd1 \[rad\]' is not known"),
     (b"\xff\xfe\x00t\x00,", "not a text file in UTF-8"),
     (HEADER.encode() + b"\x00\x00,1,2,3,4\n", "line"),
     (HEADER + f'"{"x" * 200_000}",1,2,3,4\n', "line 2 is not CSV"),
-    (SEVEN + "0.1,1,2,3,4\n", "t does not increase at sample 3.*column 'trajectory'"),
 )
 
 

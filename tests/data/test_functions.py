@@ -5,13 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.cli.optimisers import optimiser_named
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.learning import functions as regression
 from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.functions import GAUSS_NEWTON, Network, mean_loss, published_adam, residual, targets
-from dln_jax.learning.standardisation import layers_in_own_units, own_units, standard_units, to_units
+from dln_jax.learning.functions import Network, mean_loss, published_adam, targets
+from dln_jax.learning.standardisation import layers_in_own_units, standard_units, to_units
 from dln_jax.metrics.functions import errors, predictions, typical_spread
 from dln_jax.nn import ensembles
 from dln_jax.nn.activations import cos, tanh
@@ -60,9 +59,9 @@ def test_grids_are_exact_and_samples_have_the_published_noise_on_everything(name
 
 
 def test_generators_follow_their_seed_and_bound():
-    one, same, other = (functions.cosine_sine(samples=500, seed=seed, bound=2.0) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(one.d2y, same.d2y)
-    assert abs(one.x - other.x).max() > 0.1 and 1.9 < abs(one.x).max() < 2.01
+    one, same, other = (functions.cosine_sine(samples=500, seed=seed, bound=2.0).x for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, same)
+    assert abs(one - other).max() > 0.1 and 1.9 < abs(one).max() < 2.01
 
 
 def test_a_file_is_read_back_with_or_without_derivatives_and_axes_of_length_one(tmp_path):
@@ -72,25 +71,20 @@ def test_a_file_is_read_back_with_or_without_derivatives_and_axes_of_length_one(
     assert remarks == ("not read: gradient",)
     for ours, theirs in zip(data, full.values(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    short = arrays(y=full["y"][:, :1], dy=full["dy"][:, 0], d2y=full["d2y"][:, 0])
-    data = functions.from_arrays(short)
-    assert data.dy.shape == (12, 1, 3)
-    np.testing.assert_array_equal(data.d2y[:, 0], short["d2y"])
+    data = functions.from_arrays(arrays(y=full["y"][:, :1], dy=full["dy"][:, 0], d2y=full["d2y"][:, 0]))
+    np.testing.assert_array_equal(data.dy[:, 0], full["dy"][:, 0])
+    np.testing.assert_array_equal(data.d2y[:, 0], full["d2y"][:, 0])
     whole = functions.from_arrays(arrays(x=np.arange(12)[:, None], dy=None, d2y=None))
     assert whole.x.dtype == np.float64 and whole.dy is None
 
 
 def test_what_does_not_fit_is_named():
-    one = {key: value[:1] for key, value in arrays().items()}
     for content, message in (
-        (arrays(x=None), "key 'x' is missing"),
         (arrays(x=np.zeros(12)), r"x has shape \(12,\); expected \[N, n\].*x\[:, None\]"),
         (arrays(x=np.zeros((12, 0))), "n >= 1"),
         (arrays(y=np.zeros((11, 2))), "y has 11 samples, but x has 12"),
-        (one, r"1 sample\(s\)"),
         (arrays(dy=np.zeros((12, 3, 2))), r"dy has shape \(12, 3, 2\); expected \(12, 2, 3\) to match x"),
         (arrays(d2y=np.zeros((12, 3, 3))), r"d2y has shape \(12, 3, 3\); expected \(12, 2, 3, 3\)"),
-        (arrays(dy=np.full((12, 2, 3), np.inf)), "dy has 72 NaN or infinite"),
         (arrays(y=np.zeros((12, 2), complex)), "y has type complex128; expected real"),
     ):
         with one_line(message):
@@ -100,8 +94,7 @@ def test_what_does_not_fit_is_named():
 def test_a_split_has_every_sample_once():
     data = functions.sine(samples=101, noise=0.0)
     train, validation = functions.split(data, seed=1)
-    assert (len(train.x), len(validation.x)) == (91, 10)
-    np.testing.assert_array_equal(np.sort(np.concatenate([train.x, validation.x]), axis=0), np.sort(data.x, axis=0))
+    assert len(validation.x) == 10 and sorted([*train.x, *validation.x]) == sorted(data.x)
     np.testing.assert_allclose(validation.dy[:, 0], np.cos(validation.x))
 
 
@@ -109,18 +102,14 @@ SINE = ((jnp.ones((1, 1)), jnp.array([-jnp.pi / 2])), (jnp.ones((1, 1)), jnp.zer
 """sin x = cos(x - π/2) as a network."""
 
 
-@pytest.mark.parametrize("derivative", [1, 2])
-@pytest.mark.parametrize("loss", regression.LOSSES)
+@pytest.mark.parametrize(("loss", "derivative"), [("type1", 1), ("type1", 2), ("type2", 2)])
 def test_an_exact_model_has_no_loss_and_a_wrong_one_that_of_its_terms(loss, derivative):
     grid = functions.sine_grid(points=50)
     batch = targets(grid, Network(loss=loss, derivative=derivative, precision="f64"))
     assert float(mean_loss(SINE, batch, activation=cos)) < 1e-30
-    terms = 1 + (loss == "type1") + (derivative == 2)
-    sample = jax.tree.map(lambda array: array[0], batch)
-    assert residual(SINE, *sample, activation=cos).shape == (terms,)
     double = (SINE[0], (2 * SINE[1][0], SINE[1][1]))
     read = [grid.y, *([grid.dy] if loss == "type1" else []), *([grid.d2y] if derivative == 2 else [])]
-    expected = sum(np.mean(np.sum(each.reshape(50, -1) ** 2, axis=1)) for each in read)
+    expected = sum(np.mean(each**2) for each in read)
     np.testing.assert_allclose(mean_loss(double, batch, activation=cos), expected, rtol=1e-12)
 
 
@@ -129,15 +118,9 @@ def test_settings_that_make_no_sense_are_named():
     bare = data._replace(dy=None, d2y=None)
     for call, message in (
         (lambda: targets(data, Network(loss="type3")), "loss is 'type3'"),
-        (lambda: targets(data, Network(derivative=3)), "derivative is 3"),
         (lambda: targets(data, Network(activation="sigmoidal")), "activation is 'sigmoidal'; choose one of"),
-        (lambda: targets(data, Network(members=0)), "members is 0"),
         (lambda: targets(bare, Network(loss="type1")), "no dy"),
         (lambda: targets(bare, Network(loss="type2", derivative=2)), "no d2y"),
-        (lambda: optimiser_named("sgd", precision="f64"), "optimizer is 'sgd'"),
-        (lambda: optimiser_named("gauss-newton", precision="f32"), "needs f64"),
-        (lambda: published_adam(10, epochs=-1), "epochs is -1"),
-        (lambda: functions.sine(samples=0), "samples"),
         (lambda: functions.sine(noise=float("nan")), "noise is nan"),
         (lambda: functions.split(data, validation_share=1.0), "share"),
     ):
@@ -147,8 +130,7 @@ def test_settings_that_make_no_sense_are_named():
 
 
 def test_a_network_of_standard_units_is_the_same_in_the_users_units():
-    random = np.random.default_rng(0)
-    data = functions.from_arrays(arrays(x=1e3 + 40 * random.normal(size=(12, 3)), y=1e-3 * random.normal(size=(12, 2))))
+    data = functions.from_arrays(arrays(x=1e3 + 40 * arrays()["x"], y=1e-3 * arrays()["y"]))
     units = standard_units(data)
     standard = to_units(data, units)
     np.testing.assert_allclose(standard.x.std(axis=0), 1)
@@ -159,37 +141,24 @@ def test_a_network_of_standard_units_is_the_same_in_the_users_units():
         outer = predictions(layers_in_own_units(layers, units), data.x, activation=tanh).mean
         for ours, theirs in zip(to_units(outer, units), inner, strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
-    constant = standard_units(data._replace(x=np.ones((12, 3))))
-    assert (constant.x_size == 1).all()
-    np.testing.assert_array_equal(to_units(data, own_units(data)).d2y, data.d2y)
+    assert (standard_units(data._replace(x=np.ones((12, 3)))).x_size == 1).all()
 
 
-def test_metrics_sum_over_components_and_ensembles_average():
+def test_errors_are_sums_over_components_and_ensembles_average():
     truth = functions.cosine_sine_grid(points=5)
     off = truth._replace(y=truth.y + 0.5, dy=truth.dy + np.array([0.3, 0.4]), d2y=truth.d2y + 1.0)
     assert errors(off, truth) == pytest.approx({"value_mse": 0.25, "gradient_mse": 0.25, "hessian_mse": 4.0})
     assert set(errors(off, truth._replace(d2y=None))) == {"value_mse", "gradient_mse"}
     layers = ensembles.init(jax.random.key(0), (2, 4, 1), members=3)
-    together = predictions(layers, truth.x, activation=tanh)
-    alone = [predictions(jax.tree.map(lambda a, k=k: a[k : k + 1], layers), truth.x, activation=tanh) for k in range(3)]
-    assert alone[0].spread is None
+    together, *alone = (
+        predictions(jax.tree.map(lambda a, part=part: a[part], layers), truth.x, activation=tanh)
+        for part in (slice(3), slice(1), slice(1, 2), slice(2, 3))
+    )
     stacked = np.stack([each.mean.d2y for each in alone])
     np.testing.assert_allclose(together.mean.d2y, stacked.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(together.spread.d2y, stacked.std(axis=0, ddof=1), atol=1e-12)
     first = np.arange(25) < 5
     np.testing.assert_allclose(typical_spread(together.spread, first) ** 2, np.mean(together.spread.y[:5] ** 2))
-
-
-def test_gauss_newton_reaches_the_noise_and_selects_by_validation():
-    sets = functions.split(functions.sine(samples=1000))
-    settings = Network(precision="f64", width=4)
-    training = regression.train(sets, settings, GAUSS_NEWTON)
-    predicted = predictions(training.parameters, functions.sine_grid().x, activation=cos).mean
-    found = errors(predicted, functions.sine_grid())
-    assert found["value_mse"] < 1e-7 and found["hessian_mse"] < 1e-5
-    kept = jax.tree.map(lambda leaf: leaf[0], training.parameters)
-    best = mean_loss(kept, targets(sets.validation, settings), activation=cos)
-    np.testing.assert_allclose(best, min(at.validation for at in training.history), rtol=1e-9)
 
 
 def test_members_of_an_ensemble_train_as_if_alone():

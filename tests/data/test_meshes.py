@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, Delaunay
 
 from dln_jax.softbody.mesh.mesh import (
@@ -84,20 +82,11 @@ def test_volume_boundary_and_centre(shape):
     assert euler_characteristic(mesh) == (0 if shape == "ring" else 1)
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(st.floats(0.01, 100.0), st.integers(1, 5)), min_size=2, max_size=3))
-def test_any_beam_or_box(axes):
-    lengths, cells = (tuple(values) for values in zip(*axes, strict=True))
-    mesh = beam(*lengths, *cells) if len(axes) == 2 else box(lengths, cells)
-    assert len(mesh.vertices) == np.prod(np.add(cells, 1))
-    assert len(mesh.elements) == (2 if len(axes) == 2 else 5) * np.prod(cells)
-    np.testing.assert_allclose(volumes(mesh).sum(), np.prod(lengths), rtol=1e-12)
-    inside = ((mesh.vertices > 0) & (mesh.vertices < lengths)).all(axis=1)
-    np.testing.assert_array_equal(boundary_vertices(mesh), np.flatnonzero(~inside))
-
-
 def test_vertices_of_a_beam_are_numbered_along_its_short_side():
     mesh = beam(4.0, 1.0, 40, 10)
+    inside = ((mesh.vertices > 0) & (mesh.vertices < [4.0, 1.0])).all(axis=1)
+    np.testing.assert_array_equal(boundary_vertices(mesh), np.flatnonzero(~inside))
+    assert (len(mesh.vertices), len(mesh.elements)) == (451, 800)
     assert np.ptp(mesh.elements, axis=1).max() == 12  # a narrow band
     np.testing.assert_array_equal(vertices_where(mesh, lambda x: x[:, 0] < 1e-9), np.arange(11))
     assert mesh.elements.dtype == np.int32 and mesh.vertices.dtype == np.float64
@@ -111,14 +100,12 @@ def test_no_direction_is_preferred():
 
 
 def test_regularity_is_one_for_regular_simplices_of_any_size():
-    for vertices in (
-        np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 3**0.5]]),
-        np.array([[0.0, 0, 0], [1, 1, 0], [0, 1, 1], [1, 0, 1]]),
-    ):
+    for vertices in ([[0.0, 0.0], [2.0, 0.0], [1.0, 3**0.5]], [[0.0, 0, 0], [1, 1, 0], [0, 1, 1], [1, 0, 1]]):
         corners = list(range(len(vertices)))
         elements = np.array([corners, [1, 0, *corners[2:]], [0, *corners[1:-1], 0]])
         for scale in (1e-150, 1e150):
-            np.testing.assert_allclose(regularity(scale * vertices, elements), [1.0, -1.0, 0.0], atol=1e-12)
+            found = regularity(scale * np.array(vertices), elements)
+            np.testing.assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-12)
 
 
 SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
@@ -158,12 +145,12 @@ def test_nonsense_is_named():
 
 
 def test_what_is_left_when_the_nonsense_is_removed():
-    assert make_mesh([[0, 0], [1, 0], [1, 1], [0, 1]], np.array(HALVES, np.uint8)).vertices.dtype == np.float64
-    make_mesh(1e-9 * np.array(SQUARE), HALVES)
+    assert make_mesh(1e-9 * np.array(SQUARE), np.array(HALVES, np.uint8)).vertices.dtype == np.float64
     make_mesh([*SQUARE, [1.5, -4e-12]], [*HALVES, [0, 4, 1]])  # flat, but just above rounding
     # Shared vertices connect elements; bodies that are apart are bodies.
-    apart = make_mesh([[0, 0], [1, 0], [0, 1], [5, 0], [6, 0], [5, 1]], [[0, 1, 2], [3, 4, 5]])
-    hinged = make_mesh([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]], [[0, 1, 2], [0, 3, 4]])
+    corners = np.array([[0, 0], [1, 0], [0, 1]])
+    apart = make_mesh(np.vstack([corners, corners + 5]), [[0, 1, 2], [3, 4, 5]])
+    hinged = make_mesh(np.vstack([corners, -corners[1:]]), [[0, 1, 2], [0, 3, 4]])
     assert components(apart).tolist() == [0, 1] and components(hinged).tolist() == [0, 0]
 
 
@@ -203,11 +190,9 @@ def test_arguments_that_make_no_sense_are_named():
         (lambda: beam(0.0, 1.0, 2, 2), "length along x is 0.0; expected a positive"),
         (lambda: beam(1.0, 1.0, 2, 0), "number of cells along y is 0"),
         (lambda: box((1.0, 1.0, np.inf), (1, 1, 1)), "length along z is inf; expected a finite"),
-        (lambda: disc(-1.0, 2), "radius is -1.0"),
         (lambda: disc(1.0, 0), "rings is 0"),
         (lambda: lumped_masses(BEAM, -1.0), "density is -1.0; expected a positive"),
         (lambda: lumped_masses(BEAM, [1.0] * 7 + [np.nan] + [1.0] * 40), "density of element 7 is nan"),
-        (lambda: lumped_masses(BEAM, [1.0, 2.0]), r"density has shape \[2\]; .* or \[48\]"),
         (lambda: vertices_where(BEAM, lambda x: x[:, 0] > 5), r"no vertex .* \[4.0, 1.0\] m"),
         (lambda: vertices_where(BEAM, lambda x: x > 0), r"bool of shape \[36, 2\]"),
     ):
@@ -230,9 +215,9 @@ def test_creatures_are_symmetric_bodies_with_muscles_on_either_side_of_each_leg(
     assert euler_characteristic(mesh) == 1  # in one piece, without holes
     # Distinct pairs that are edges of the mesh, none on the ground, ordered along the body.
     distinct = {tuple(sorted(pair)) for pair in pairs.tolist()}
-    assert len(distinct) == muscles and distinct <= {tuple(pair) for pair in edges(mesh).tolist()}
-    assert (mesh.vertices[pairs, 1].max(axis=1) > 0).all()
-    assert (np.diff(mesh.vertices[pairs, 0].mean(axis=1)) > -1e-12).all()
+    assert len(distinct) == muscles and distinct <= {*map(tuple, edges(mesh).tolist())}
+    middles = mesh.vertices[pairs].mean(axis=1)
+    assert (middles[:, 1] > 0).all() and (np.diff(middles[:, 0]) > -1e-12).all()
     # Symmetric about the vertical axis: neither direction is easier.
     image = mirrored(mesh, 0)
     assert same_simplices(image[mesh.elements], mesh.elements) and same_simplices(image[pairs], pairs)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from dln_jax.data.robot_files import mjcf, write_robot
-from dln_jax.data.robots import Robot, read_robot
+from dln_jax.data.robots import read_robot
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system
+from dln_jax.mechanics.trees import tree_system
 from tests.calls import one_line
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
@@ -37,7 +37,6 @@ MJCF = """<mujoco><compiler angle="radian" inertiafromgeom="true"/><default><joi
         <body name="d" pos="0 0.1 0.2"><geom type="box" size=".05 .1 .02"/></body></body>
     </body></body></worldbody></mujoco>"""
 FILES = {"arm.urdf": URDF, "arm.xml": MJCF}
-TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 
 
 @pytest.fixture(params=FILES)
@@ -90,29 +89,22 @@ def test_a_file_keeps_what_is_not_identified(tmp_path):
     np.testing.assert_allclose(float(masses["two"].get("value")), 0.75)
 
 
-def robot(mass=1.3):
-    """A prismatic joint between two revolute ones, and a branch, depth first as MuJoCo orders joints."""
-    bodies = [inertial_parameters(m, [0.1, -0.2, 0.05 * m], np.diag([0.02, 0.03, 0.04])) for m in (2.0, mass, 0.5, 0.7)]
-    tree = make_tree(
-        [-1, 0, 1, 0], ["revolute", "prismatic", "revolute", "revolute"], [TURN, np.eye(3), TURN.T, TURN @ TURN],
-        np.arange(12.0).reshape(4, 3) / 10, [[0, 0, 1], [1, 0, 0], [0.6, 0, 0.8], [0, 1, 0]], bodies,
-        armature=[0.1, 0.0, 0.2, 0.3], gravity=[1, -2, -9], names=("a", "b", "c", "d"),
-    )  # fmt: skip
-    limits = np.array([[-1, 2], [-0.1, 0.3], [-np.inf, np.inf], [-3, 3]])
-    return Robot(tree, np.array([0.1, 0.2, 0.0, 0.3]), np.array([0.0, 0.4, 0.5, 0.6]), limits, 10 * limits)
-
-
 def test_a_robot_survives_as_mjcf(tmp_path):
-    path = tmp_path / "arm.xml"
-    path.write_text(mjcf(robot()))
+    original, path = tmp_path / "arm.urdf", tmp_path / "arm.xml"
+    original.write_text(URDF)
+    robot = read_robot(original)
+    changes = {"joints": ("revolute", "prismatic"), "armature": np.array([0.1, 0.2]), "gravity": np.array([1, -2, -9])}
+    robot = robot._replace(tree=robot.tree._replace(**changes))
+    path.write_text(mjcf(robot))
     again = read_robot(path)
-    assert (again.tree.names, again.tree.parents, again.tree.joints) == (robot().tree[-1], *robot().tree[:2])
-    for numbers, expected in zip(again[1:], robot()[1:], strict=True):
+    assert (again.tree.names, again.tree.parents, again.tree.joints) == (robot.tree.names, *robot.tree[:2])
+    for numbers, expected in zip(again[1:5], robot[1:5], strict=True):
         np.testing.assert_array_equal(numbers, expected)
-    state = np.random.default_rng(0).normal(size=(3, 4))
-    forces = (jax.jit(dynamics(tree_system(each.tree)).inverse_dynamics)(*state) for each in (again, robot()))
+    state = np.random.default_rng(0).normal(size=(3, len(robot.damping)))
+    forces = (jax.jit(dynamics(tree_system(each.tree)).inverse_dynamics)(*state) for each in (again, robot))
     np.testing.assert_allclose(*forces, rtol=1e-12, atol=1e-12)
-    with one_line("the link of joint 'b' has a mass of 0 kg"):
-        mjcf(robot(mass=0.0))
+    massless = robot.tree._replace(inertias=0 * robot.tree.inertias)
+    with one_line(f"the link of joint '{robot.tree.names[0]}' has a mass of 0 kg"):
+        mjcf(robot._replace(tree=massless))
     with one_line("time_step is 0.0; expected a positive number"):
-        mjcf(robot(), time_step=0.0)
+        mjcf(robot, time_step=0.0)

@@ -1,4 +1,4 @@
-"""Robots that MuJoCo reads move as they do in MuJoCo, and as in Pinocchio where it is installed; others are refused."""
+"""Robots that MuJoCo reads move as they do in MuJoCo; what is no tree of joints is refused."""
 
 import os
 import textwrap
@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from dln_jax.data.robots import quiet, read_robot
+from dln_jax.data.robots import read_robot
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
 from tests.calls import one_line
@@ -99,17 +99,6 @@ def test_forces_are_those_of_mujoco(name, tmp_path):
         np.testing.assert_allclose(origins[turning], data.xanchor[turning], atol=1e-12)
 
 
-def test_forces_are_those_of_pinocchio(tmp_path):
-    pinocchio = pytest.importorskip("pinocchio", reason="the reference is Pinocchio, of the extra [reference]")
-    path = written(tmp_path, "arm.urdf", ARM.replace("continuous", "revolute"))
-    robot, model = read_robot(path), pinocchio.buildModelFromUrdf(str(path))
-    order = [model.joints[model.getJointId(name)].idx_q for name in robot.tree.names]
-    state = np.random.default_rng(0).normal(size=(3, model.nv))
-    tau = pinocchio.rnea(model, model.createData(), *state)[order]
-    ours = jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*state[:, order])
-    np.testing.assert_allclose(ours, tau, rtol=1e-10, atol=1e-10)
-
-
 def test_what_a_file_states_of_its_joints(tmp_path):
     in_namespace = ARM.replace("<robot", '<robot xmlns="https://drake.mit.edu"')
     robot = read_robot(written(tmp_path, "arm.urdf", in_namespace))
@@ -122,17 +111,6 @@ def test_what_a_file_states_of_its_joints(tmp_path):
     np.testing.assert_array_equal(robot.tree.gravity, [0, 0, -9.81])
 
 
-def test_a_locked_joint_is_fixed(tmp_path):
-    locked = read_robot(written(tmp_path, "arm.urdf", ARM), lock=["elb*"])
-    fixed = ARM.replace('"elbow" type="continuous"', '"elbow" type="fixed"')
-    robot = read_robot(written(tmp_path, "fixed.urdf", fixed))
-    assert locked.tree.names == robot.tree.names == ("shoulder", "slide")
-    assert (locked.tree.parents, locked.tree.joints) == (robot.tree.parents, robot.tree.joints)
-    np.testing.assert_array_equal(locked.position_limits, robot.position_limits)
-    for key in ("rotations", "positions", "axes", "inertias", "armature"):
-        np.testing.assert_allclose(getattr(locked.tree, key), getattr(robot.tree, key), rtol=1e-12, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("file", "lock"),
     [("branched.xml", {"x": 0.7, "w": -0.4}), ("referenced.xml", {"x": 0.7, "y": 0.2}), ("arm.urdf", {"slide": 0.2})],
@@ -141,13 +119,12 @@ def test_joints_are_locked_at_their_positions(file, lock, tmp_path):
     path = written(tmp_path, file, FILES[file])
     free, locked = read_robot(path), read_robot(path, lock=lock)
     place = np.array([free.tree.names.index(name) for name in locked.tree.names])
-    q, qd, qdd = np.zeros((3, free.tree.degrees_of_freedom))
-    for joint, position in lock.items():
-        q[free.tree.names.index(joint)] = position
-    q[place], qd[place], qdd[place] = np.random.default_rng(0).normal(size=(3, len(place)))
+    state = np.zeros((3, free.tree.degrees_of_freedom))
+    state[0] = [lock.get(name, 0.0) for name in free.tree.names]
+    state[:, place] = np.random.default_rng(0).normal(size=(3, len(place)))
     every, fewer = (
         jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*states)
-        for robot, states in ((free, (q, qd, qdd)), (locked, (q[place], qd[place], qdd[place])))
+        for robot, states in ((free, state), (locked, state[:, place]))
     )
     np.testing.assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
 
@@ -157,7 +134,7 @@ def test_a_gripper_whose_fingers_are_tied_and_a_free_base_can_be_locked(tmp_path
     path = written(tmp_path, "arm.urdf", tied)
     with one_line(r"joint 'slide' follows another \(mimic\)"):
         read_robot(path)
-    assert read_robot(path, lock=["slide"]).tree.names == ("shoulder", "elbow")
+    assert read_robot(path, lock=["sl*"]).tree.names == ("shoulder", "elbow")
     with one_line(r"there is no joint 'finger\*' to lock; the joints are shoulder, elbow"):
         read_robot(path, lock=["finger*"])
     base = '<body><freejoint name="root"/><geom size="1"/><body name="arm">'
@@ -200,7 +177,6 @@ REFUSED = (
     (b"\x00\xff" * 50, "not XML"),
     ("<sdf/>", "its outer element is <sdf>"),
     (HEADED.format("teapot") + ARM, "teapot"),
-    (HEADED.format("utf-7") + ARM, "encodings"),
     (BOMB, "entities"),
     ((HEADED.format("utf-16") + BOMB).encode("utf-16"), "entities"),
     (nested(100_000), "nested"),
@@ -222,11 +198,9 @@ REFUSED = (
     ),
     (HINGE.replace('<joint name="elbow" axis="0 1 0" {}', '<freejoint name="root"'), "joint 'root' is free"),
     (HINGE.format('stiffness="2"'), r"joint 'elbow' has a spring \(stiffness 2\)"),
-    (limited('damping="0.2"', 'damping="much"'), "damping in <dynamics> is 'much'"),
     (limited('damping="0.2"', 'damping="nan"'), "damping in <dynamics> is 'nan'"),
     (limited('damping="0.2"', 'damping="-1"'), "zero or more"),
     (limited('velocity="3"', 'velocity="fast"'), "limit of velocity of 'fast'; expected a number"),
-    (limited('velocity="3"', 'velocity="-3"'), "limit of velocity of '-3'"),
     (limited('effort="30"', 'effort="nan"'), "limit of effort of 'nan'"),
     # MuJoCo would read each of these as a joint without limits.
     (limited('lower="-1"', ""), RANGE),
@@ -286,13 +260,3 @@ def test_a_pipe_in_a_model_is_refused_and_not_waited_for(name, tmp_path):
     (tmp_path / "arm.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
     with one_line("is no regular file"):
         read_robot(tmp_path / "arm.xml")
-
-
-def test_a_diverging_simulation_leaves_no_log(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    model = mujoco.MjModel.from_xml_string(BRANCHED)
-    data = mujoco.MjData(model)
-    with quiet(mujoco):
-        data.qvel[:] = 1e12
-        mujoco.mj_step(model, data, 3)
-    assert not list(tmp_path.iterdir()) and mujoco.get_mju_user_warning() is None

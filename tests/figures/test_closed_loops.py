@@ -30,7 +30,6 @@ def test_traces_show_every_coordinate_and_the_limits():
     assert [float(line.get_ydata()[0]) for line in control.lines[1:]] == [-2.0]
     assert np.abs(pole.lines[0].get_ydata()).max() <= np.pi
     assert np.isfinite(energy.lines[0].get_ydata()).all()
-    figure.draw_without_rendering()
     with one_line(r"expected \[K, T, 2 d\]"):
         closed_loop_traces(runs, ("revolute",))
 

