@@ -2,12 +2,15 @@
 
 import xml.etree.ElementTree as ET
 
+import jax
 import numpy as np
 import pytest
 
-from dln_jax.data.robot_files import write_robot
+from dln_jax.data.robot_files import mjcf, write_robot
 from dln_jax.data.robots import read_robot
-from dln_jax.types import InputError
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import tree_system
+from tests.calls import one_line
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 INERTIAL = """<inertial><origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/><mass value="{mass}"/>
@@ -43,10 +46,9 @@ def original(request, tmp_path):
     return path
 
 
-def test_what_is_written_is_read_again(original):
+def test_what_is_written_is_read_again_and_mistakes_are_one_line(original):
     robot = read_robot(original)
-    d = robot.tree.degrees_of_freedom
-    random = np.random.default_rng(0)
+    d, random = robot.tree.degrees_of_freedom, np.random.default_rng(0)
     heavier = robot.tree.inertias * random.uniform(1, 2, d)[:, None]
     armature = random.uniform(0.1, 0.2, d) * (original.suffix == ".xml")
     tree = robot.tree._replace(inertias=heavier, armature=armature)
@@ -57,10 +59,22 @@ def test_what_is_written_is_read_again(original):
     assert again.tree.parents == tree.parents and again.tree.names == tree.names
     for name in ("rotations", "positions", "axes", "inertias", "armature"):
         np.testing.assert_allclose(getattr(again.tree, name), getattr(tree, name), rtol=1e-12, atol=1e-14)
-    np.testing.assert_array_equal(again.damping, damping)
-    np.testing.assert_array_equal(again.coulomb, coulomb)
-    np.testing.assert_array_equal(again.position_limits, robot.position_limits)
+    for ours, expected in zip(again[1:4], (damping, coulomb, robot.position_limits), strict=True):
+        np.testing.assert_array_equal(ours, expected)
     assert original.read_text() == FILES[original.name] and "Identified - - once." in path.read_text()
+    hollow = np.where(np.arange(10) == 4, -1.0, heavier)
+    if original.suffix == ".xml":
+        including = original.with_name("including.xml")
+        including.write_text(MJCF.replace("<default>", '<include file="more.xml"/><default>'))
+        original.with_name("more.xml").write_text("<mujoco><option/></mujoco>")
+    for change, source, target, message in (
+        ({}, original, original, "is the original file"),
+        ({"names": tuple("abc"[:d])}, original, path, "the tree has a, b"),
+        ({"inertias": hollow}, original, path, "is not physically consistent"),
+        *([({}, including, path, "<include>")] if original.suffix == ".xml" else []),
+    ):
+        with one_line(message):
+            write_robot(target, source, tree._replace(**change))
 
 
 def test_a_file_keeps_what_is_not_identified(tmp_path):
@@ -68,30 +82,29 @@ def test_a_file_keeps_what_is_not_identified(tmp_path):
     original.write_text(URDF)
     tree = read_robot(original).tree
     write_robot(path, original, tree._replace(armature=np.array([0.5, 0.25])))
-    text = path.read_text()
-    assert (
-        "kept" in text and "nowhere.stl" in text and "URDF cannot state (kg m² or kg): shoulder 0.5, elbow 0.25" in text
-    )
-    root = ET.parse(path).getroot()
-    masses = {link.get("name"): link.find("inertial/mass") for link in root.findall("link")}
+    for words in ("kept", "nowhere.stl", "URDF cannot state (kg m² or kg): shoulder 0.5, elbow 0.25"):
+        assert words in path.read_text()
+    masses = {link.get("name"): link.find("inertial/mass") for link in ET.parse(path).getroot().findall("link")}
     assert masses["base"].get("value") == "9" and masses["hand"] is masses["finger"] is None
     np.testing.assert_allclose(float(masses["two"].get("value")), 0.75)
 
 
-def test_mistakes_are_one_line(original, tmp_path):
-    tree = read_robot(original).tree
-    hollow = tree.inertias.copy()
-    hollow[-1, 4] = -1.0
-    for change, path, message in (
-        ({}, original, "is the original file"),
-        ({"names": tuple("abcdefg"[: len(tree.names)])}, tmp_path / "new", "the tree has a, b"),
-        ({"inertias": hollow}, tmp_path / "new", "is not physically consistent"),
-    ):
-        with pytest.raises(InputError, match=message) as caught:
-            write_robot(path, original, tree._replace(**change))
-        assert "\n" not in str(caught.value)
-    if original.suffix == ".xml":
-        original.write_text(MJCF.replace("<default>", '<include file="more.xml"/><default>'))
-        (tmp_path / "more.xml").write_text("<mujoco><option/></mujoco>")
-        with pytest.raises(InputError, match="<include>"):
-            write_robot(tmp_path / "new", original, tree)
+def test_a_robot_survives_as_mjcf(tmp_path):
+    original, path = tmp_path / "arm.urdf", tmp_path / "arm.xml"
+    original.write_text(URDF)
+    robot = read_robot(original)
+    changes = {"joints": ("revolute", "prismatic"), "armature": np.array([0.1, 0.2]), "gravity": np.array([1, -2, -9])}
+    robot = robot._replace(tree=robot.tree._replace(**changes))
+    path.write_text(mjcf(robot))
+    again = read_robot(path)
+    assert (again.tree.names, again.tree.parents, again.tree.joints) == (robot.tree.names, *robot.tree[:2])
+    for numbers, expected in zip(again[1:5], robot[1:5], strict=True):
+        np.testing.assert_array_equal(numbers, expected)
+    state = np.random.default_rng(0).normal(size=(3, len(robot.damping)))
+    forces = (jax.jit(dynamics(tree_system(each.tree)).inverse_dynamics)(*state) for each in (again, robot))
+    np.testing.assert_allclose(*forces, rtol=1e-12, atol=1e-12)
+    massless = robot.tree._replace(inertias=0 * robot.tree.inertias)
+    with one_line(f"the link of joint '{robot.tree.names[0]}' has a mass of 0 kg"):
+        mjcf(robot._replace(tree=massless))
+    with one_line("time_step is 0.0; expected a positive number"):
+        mjcf(robot, time_step=0.0)

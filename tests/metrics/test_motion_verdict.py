@@ -9,13 +9,23 @@ from dln_jax.metrics.verdict import judge_motions
 
 T = np.linspace(0, 10, 200)
 PHASES = np.linspace(0, 6, 8)[:, None]
-TRUE = Motions(T, np.cos(T + PHASES)[..., None], -np.sin(T + PHASES)[..., None])
-SIZE = np.full(2, 2**-0.5)
+BOUNDED = np.array([True, True])
 
 
-def level(predicted, *, angle=False, **known):
-    bounded = np.array([not angle, True])
-    return judge_motions([predicted], [TRUE], size=SIZE, bounded=bounded, **known).level
+def swings(t, pace=1.0):
+    return Motions(t, np.cos(pace * t + PHASES)[..., None], -np.sin(t + PHASES)[..., None])
+
+
+TRUE = swings(T)
+NO_MOMENTA = {"measured": np.array([True, False])}
+
+
+def judged(predicted, true=TRUE, *, size=(2**-0.5, 2**-0.5), bounded=BOUNDED, **known):
+    return judge_motions([predicted], [true], size=np.array(size), bounded=np.array(bounded), **known)
+
+
+def scaled(q, p):
+    return TRUE._replace(q=q * TRUE.q, p=p * TRUE.p)
 
 
 def spoiled(place, value):
@@ -25,84 +35,66 @@ def spoiled(place, value):
     return TRUE._replace(q=q)
 
 
-def test_the_truth_is_good():
-    assert level(TRUE) == "good"
-
-
-@pytest.mark.parametrize("value", [np.inf, np.nan, 1e3], ids=str)
-def test_one_motion_that_explodes_late_is_refused(value):
-    verdict = judge_motions([spoiled(150, value)], [TRUE], size=SIZE, bounded=np.array([True, True]))
-    assert verdict.level == "refused" and "1 of 8 predicted test motions" in verdict.reason
-
-
-def test_an_angle_may_turn_over_and_over_but_not_to_infinity():
-    assert level(spoiled(150, 1e3), angle=True) == "good"
-    assert level(spoiled(150, np.inf), angle=True) == "refused"
-
-
-def test_motions_that_part_late_are_good_and_standing_still_is_refused():
-    assert level(spoiled(100, 0.5)) == "good"
-    assert level(TRUE._replace(q=0 * TRUE.q, p=0 * TRUE.p)) == "refused"
-
-
-def test_noise_of_starts_is_no_error_of_the_model():
+def test_level():
+    angle = {"bounded": [False, True]}
+    unknown = {**NO_MOMENTA, "noise": np.array([0.0, 30.0])}
     shifted = TRUE._replace(q=TRUE.q + 0.3, p=TRUE.p + 0.3)
-    assert level(shifted) == "doubtful"
-    assert level(shifted, noise=np.full(2, 0.3)) == "good"
+    for why, predicted, known, level in (
+        ("the truth", TRUE, {}, "good"),
+        ("motions that part late", spoiled(100, 0.5), {}, "good"),
+        ("standing still", scaled(0, 0), {}, "refused"),
+        ("an angle that turns over", spoiled(150, 1e3), angle, "good"),
+        ("but not to infinity", spoiled(150, np.inf), angle, "refused"),
+        ("shifted", shifted, {}, "doubtful"),
+        ("shifted by the noise of the start", shifted, {"noise": np.full(2, 0.3)}, "good"),
+        ("momenta that were not measured", scaled(1, 3), NO_MOMENTA, "good"),
+        ("nor does their noise count", scaled(0, 1), unknown, "refused"),
+        ("half as fast", swings(T, 0.5), unknown, "refused"),
+        ("rates that are explained", TRUE, {"rates": (0.0, 0.01)}, "good"),
+        ("rates that are nearly explained", TRUE, {"rates": (0.0, 0.1)}, "doubtful"),
+        ("rates that are not explained", TRUE, {"rates": (0.43, 0.4)}, "refused"),
+    ):
+        assert judged(predicted, **known).level == level, why
 
 
-@pytest.mark.parametrize("step", [0.2, 0.05, 0.01, 0.001])
-def test_straight_lines_are_no_model_at_any_rate(step):
-    t = np.arange(0, 10, step)
-    true = Motions(t, np.cos(t + PHASES)[..., None], -np.sin(t + PHASES)[..., None])
-    q = true.q[:, 29:30] + true.p[:, 29:30] * (t - t[29])[:, None]
-    lines = Motions(t, q, np.broadcast_to(true.p[:, 29:30], q.shape))
-    bounded = np.array([False, True])
-    for fitted in (1, 30):
-        assert judge_motions([lines], [true], size=SIZE, bounded=bounded, fitted=fitted).level == "refused"
-        assert judge_motions([true], [true], size=SIZE, bounded=bounded, fitted=fitted).level == "good"
+def test_one_motion_that_explodes_late_is_refused():
+    for value in (np.inf, np.nan, 1e3):
+        verdict = judged(spoiled(150, value))
+        assert verdict.level == "refused" and "1 of 8 predicted test motions" in verdict.reason
+
+
+def test_straight_lines_are_no_model_at_any_rate():
+    for step in (0.2, 0.01):
+        t = np.arange(0, 10, step)
+        true = swings(t)
+        q = true.q[:, 29:30] + true.p[:, 29:30] * (t - t[29])[:, None]
+        lines = Motions(t, q, np.broadcast_to(true.p[:, 29:30], q.shape))
+        for fitted in (1, 30):
+            levels = [judged(each, true, bounded=[False, True], fitted=fitted).level for each in (lines, true)]
+            assert levels == ["refused", "good"]
 
 
 def test_samples_that_the_start_saw_do_not_count():
     seen = np.arange(len(T))[:, None] < 30
-    stopped = Motions(T, np.where(seen, TRUE.q, 0.0), np.where(seen, TRUE.p, 0.0))
-    assert level(stopped, fitted=30) == "refused"
-
-
-def test_unmeasured_momenta_count_neither_as_errors_nor_as_noise():
-    measured, unknown = np.array([True, False]), np.array([0.0, 30.0])
-    assert level(TRUE._replace(p=3 * TRUE.p), measured=measured) == "good"
-    half = Motions(T, np.cos(T / 2 + PHASES)[..., None], TRUE.p)
-    for wrong in (TRUE._replace(q=0 * TRUE.q), half):
-        assert level(wrong, measured=measured, noise=unknown) == "refused"
+    assert judged(scaled(seen, seen), fitted=30).level == "refused"
 
 
 def test_a_short_way_is_judged_in_units_of_the_straight_line():
     """Bodies start far apart and their forces bend their ways by 1e-4 of the spread of the data."""
-    starts = np.linspace(-1, 1, 6)[:, None]
-    t = np.linspace(0, 1, 40)
+    starts, t = np.linspace(-1, 1, 6)[:, None], np.linspace(0, 1, 40)
     bent, straight = (
         Motions(t, (starts + 0.1 * t + bend * t**2 / 2)[..., None], 0 * starts[..., None] + (0.1 + bend * t)[:, None])
         for bend in (0.02, 0.0)
     )
-    known = {"size": np.array([0.7, 0.1]), "bounded": np.array([True, True])}
     assert np.mean(((bent.q - straight.q) / 0.7) ** 2) < 1e-4
-    assert judge_motions([bent], [bent], **known).level == "good"
-    assert judge_motions([straight], [bent], **known).level == "refused"
+    levels = [judged(each, bent, size=[0.7, 0.1]).level for each in (bent, straight)]
+    assert levels == ["good", "refused"]
 
 
 def test_another_random_walk_is_no_prediction():
     walks = np.cumsum(np.random.default_rng(0).normal(size=(2, 9, 300, 1)), axis=2)
     truth, predicted = (Motions(np.arange(300.0), walk - walk[:, :1], 0 * walk) for walk in walks)
-    known = {"size": np.array([walks.std(), 1.0]), "bounded": np.ones(2, bool), "measured": np.array([True, False])}
-    assert judge_motions([predicted], [truth], **known).level == "refused"
-
-
-@pytest.mark.parametrize(
-    ("shares", "expected"), [((0.0, 0.01), "good"), ((0.0, 0.1), "doubtful"), ((0.43, 0.4), "refused")]
-)
-def test_measured_rates_have_to_be_explained(shares, expected):
-    assert level(TRUE, rates=np.array(shares)) == expected
+    assert judged(predicted, truth, size=[walks.std(), 1.0], **NO_MOMENTA).level == "refused"
 
 
 def test_time_is_that_of_the_system():

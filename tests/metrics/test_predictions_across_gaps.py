@@ -9,13 +9,11 @@ from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics.measured_predictions import (
     cut_recordings,
     grid_places,
-    on_grid,
-    padded,
     predict_measured,
     valid_times,
 )
 from dln_jax.models.model import Model
-from dln_jax.types import InputError
+from tests.calls import one_line
 
 STEP, FITTED, FREQUENCY = 0.05, 12, 3.0
 
@@ -38,44 +36,34 @@ def with_gaps():
     return swings(kept)
 
 
-def test_places_fill_gaps_at_the_median_step():
+def test_rounding_of_times_adds_no_step_to_a_gap():
     t = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 7.4])
-    np.testing.assert_array_equal(grid_places(t), [0, 1, 2, 5, 6, 7])
-    np.testing.assert_array_equal(grid_places(0.1 * t), [0, 1, 2, 5, 6, 7])
-    q = t[:, None]
-    whole = on_grid(t, q, q)
-    np.testing.assert_allclose(whole.t, [0, 1, 2, 3, 4, 5, 6, 7.4])
-    np.testing.assert_array_equal(whole.weight, [1, 1, 1, 0, 0, 1, 1, 1])
-    both = padded([whole, on_grid(t[:3], q[:3], q[:3])])
-    np.testing.assert_array_equal(both.t[1], [0, 1, 2, 2, 2, 2, 2, 2])
-    np.testing.assert_array_equal(both.weight[1], [1, 1, 1, 0, 0, 0, 0, 0])
+    for scale in (1.0, 0.1):
+        np.testing.assert_array_equal(grid_places(scale * t), [0, 1, 2, 5, 6, 7])
 
 
-def test_an_exact_model_is_right_to_the_end_of_a_recording_with_gaps():
-    """The part after a gap is as short as one sample more than a window; predictions go on by time stamps."""
-    for data in (with_gaps(), swings(np.ones(81, bool))):
-        recordings = cut_recordings(data, 200, fitted=FITTED)
-        predicted = predict_measured(
-            oscillator(FREQUENCY), jnp.zeros(1), recordings, fitted=FITTED, substeps=4, momenta=True
-        )
-        times = valid_times(recordings, predicted, fitted=FITTED, variance=data.q.var(axis=0))
-        assert times == pytest.approx([4 - (FITTED - 1) * STEP])
+def valid_time(data, frequency):
+    """Of an oscillator's prediction of one recording."""
+    recordings = cut_recordings(data, 200, fitted=FITTED)
+    options = {"fitted": FITTED, "substeps": 4, "momenta": True}
+    predicted = predict_measured(oscillator(frequency), jnp.zeros(1), recordings, **options)
+    return valid_times(recordings, predicted, fitted=FITTED, variance=np.array([0.5]))
 
 
-def test_a_wrong_model_fails_at_the_same_time_with_gaps_and_without():
-    """cos(w t) and cos(w' t) part at one time, whether samples before it were measured or not."""
-    wrong = oscillator(1.03 * FREQUENCY)
-    times = []
-    for data in (with_gaps(), swings(np.ones(81, bool))):
-        recordings = cut_recordings(data, 200, fitted=FITTED)
-        predicted = predict_measured(wrong, jnp.zeros(1), recordings, fitted=FITTED, substeps=4, momenta=True)
-        times.append(valid_times(recordings, predicted, fitted=FITTED, variance=np.array([0.5]))[0])
-    late, exact = times
+def test_predictions_go_on_by_time_stamps_across_gaps():
+    """The part after a gap is as short as one sample more than a window; an exact model is right to the end.
+
+    cos(w t) and cos(w' t) part at one time, whether samples before it were measured or not.
+    """
+    both = with_gaps(), swings(np.ones(81, bool))
+    for data in both:
+        assert valid_time(data, FREQUENCY) == pytest.approx([4 - (FITTED - 1) * STEP])
+    late, exact = (valid_time(data, 1.03 * FREQUENCY)[0] for data in both)
     assert FITTED * STEP < exact <= late < 3.0 and late - exact <= 14 * STEP
 
 
 def test_starts_lie_on_parts_without_a_gap():
     recordings = cut_recordings(with_gaps(), 30, fitted=FITTED)
     assert np.all(recordings.weight[:, :FITTED] == 1) and len(recordings.t) > 1
-    with pytest.raises(InputError, match="no test motion has 41 samples without a gap"):
+    with one_line("no test motion has 41 samples without a gap"):
         cut_recordings(with_gaps(), 200, fitted=40)
