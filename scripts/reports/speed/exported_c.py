@@ -276,7 +276,8 @@ def beside_casadi(*, turns: int = 9, repeats: int = 15, calls: int = 2_000, cold
             kinds[name] = casadi_step(root / name, shared=shared)
         for name in kinds:
             folder = root / name
-            built[name] = programs(folder, compiled(folder, folder), [STEP], root / "energies")[STEP]
+            stated = root / "closed-form" if name.startswith("casadi") else folder
+            built[name] = programs(folder, compiled(folder, folder), [STEP], stated)[STEP]
         times = in_turns(built, turns, repeats=repeats, calls=calls, cold=cold)
     warm = {name: np.median([hot(one) for one in of_turns]) for name, of_turns in times.items()}
     rival = min(("casadi", "casadi-shared"), key=lambda name: warm[name])
