@@ -1,199 +1,297 @@
-"""benchmark c: exported C, called in a warm loop, with cold caches and from Python; its derivatives, rivals and making.
+"""Exported C: calls in a warm loop, with cold caches and from Python, beside Pinocchio's and CasADi's C.
 
-Programs that are compared take turns in one run, in separate processes; medians over turns count, and quantiles of cold
-calls are those of all turns. Before a cold call twice the last-level cache is read, 64 MiB at most. Parameters are
-random, since times do not depend on them.
+Programs that are compared take turns in one run, in separate processes, and medians over turns count. Before a cold
+call twice the last-level cache is read, 64 MiB at most. Parameters are random, since times do not depend on them.
 """
 
+import json
 import math
+import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from string import Template
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.export.c.families import functions_of_system
-from dln_jax.export.c.load import FLAGS, load_c
+from dln_jax.export.c.interface import Signature, read_interface, stated_costs
+from dln_jax.export.c.load import FLAGS, STANDARD, compile_c, load_c
 from dln_jax.export.c.source import export_c
+from dln_jax.mechanics.discrete import linearised
+from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from dln_jax.precision import data_type
-from dln_jax.scenes.pendulums import chain
-from dln_jax.types import InputError
+from dln_jax.scenes.pendulums import chain, two_link_arm
 from dln_jax.zoo.descriptions import build, describe
-from scripts.reports.case import Findings
-from scripts.reports.robots.pinocchio import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
-from scripts.reports.rows import Row, expect
-from scripts.reports.speed.calls_in_c import Times, compiled, evicting, last_level_cache, programs, timed
+from scripts.reports.control.problems import Formula
+from scripts.reports.rival_modules import casadi
+from scripts.reports.rivals import optimal_control
+from scripts.reports.run import Numbers
 
-
-class Arm(NamedTuple):
-    """A structured DeLaN of a chain of d links, with two layers."""
-
-    width: int
-    precision: str
-    d: int
-    speedup: float | None = None
-    """Smallest speed-up of its inverse dynamics over another export."""
-
-
+PROGRAM = Path(__file__).with_name("time_calls.c.in").read_text()
 ARMS = {
-    f"structured-delan-{arm.width}x{arm.width}-{arm.precision}-d-{arm.d}": arm
-    for arm in (Arm(8, "f64", 2, 1.2), Arm(64, "f64", 2, 2.0), Arm(64, "f32", 2, 1.3), Arm(8, "f64", 7))
+    "structured-delan-8x8-f64-d-2": (8, "f64", 2),
+    "structured-delan-64x64-f64-d-2": (64, "f64", 2),
+    "structured-delan-64x64-f32-d-2": (64, "f32", 2),
+    "structured-delan-8x8-f64-d-7": (8, "f64", 7),
 }
-SMALLEST, *_, RIVALLED = ARMS
-"""The arms of a quick run; the rival gets as many joints as the second."""
-LARGEST = {"structured-delan-64x64-f64-d-7": Arm(64, "f64", 7)}
+"""Width of two layers, precision and number of joints of structured DeLaNs; the last has a rival."""
+LARGEST = "structured-delan-64x64-f64-d-7"
 """An arm that is only exported and compiled."""
 FUNCTIONS = INVERSE, FORWARD, JACOBIAN = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian")
-"""Functions to time, if an export declares them."""
-OURS, OTHERS = "ours", "against"
-TURNS, QUICK_TURNS = 5, 2
-SECONDS = 20.0
-"""Time limit for writing and compiling the largest export."""
-AGREEMENT = {"f64": 1e-11, "f32": 1e-4}
-"""Bound on the relative difference of sums of results of two exports."""
+STEP = "step_rk4_jacobian"
+WRAPPER = """#include "casadi.c"
+
+void model_step_rk4_jacobian(const double *x, const double *u, double dt, double *x_next, double *A, double *B)
+{
+    const double *arguments[] = {x, u, &dt};
+    double *results[] = {x_next, A, B}, w[%d];
+    long long int iw[%d];
+    step(arguments, results, iw, w, 0);
+}
+"""
+HEADER = "void model_step_rk4_jacobian(const double *, const double *, double, double *, double *, double *);\n"
 
 
-def export(arm: Arm, folder: Path) -> None:
-    """Writes the C code of an arm with fixed random parameters, as model.c, .h and .json."""
-    needs = chain(arm.d).needs
-    description = describe("structured-delan", precision=arm.precision, needs=needs, width=arm.width, depth=2)
-    random = np.random.default_rng(0)
-    shapes = jax.eval_shape(build(description).init, jax.random.key(0))
+class Times(NamedTuple):
+    """Nanoseconds of calls of one function in one process."""
+
+    hot: np.ndarray
+    """Mean times of a call in a loop, one per repeat."""
+    cold: np.ndarray
+    """Times of single calls, without the clock's own time."""
+    sum: float
+    """Sum of the magnitudes of all results, for comparing exports of one model; NaN if not finite."""
+
+
+def random_network(d: int, width: int, precision: str):
+    """Energies of a structured DeLaN of a chain with two layers and fixed random parameters."""
+    model = build(describe("structured-delan", precision=precision, needs=chain(d).needs, width=width, depth=2))
+    random, dtype = np.random.default_rng(0), data_type(precision)
+    shapes = jax.eval_shape(model.init, jax.random.key(0))
     drawn = jax.tree.map(lambda leaf: random.normal(size=leaf.shape) / np.sqrt(leaf.shape[0]), shapes)
-    dtype = data_type(arm.precision)
-    energies = build(description).energies(jax.tree.map(lambda leaf: leaf.astype(dtype), drawn))
-    functions = functions_of_system(energies, arm.d, dtype=dtype)
-    export_c(functions, folder, precision=arm.precision, leave_out_large=True)
+    return model.energies(jax.tree.map(lambda leaf: leaf.astype(dtype), drawn))
 
 
-def export_all(folder: Path) -> None:
-    """Exports all arms into folders named after them; another release can measure against them with `--against`."""
-    for name, arm in ARMS.items():
-        export(arm, folder / name)
+def compiled(export: Path, place: Path) -> Path:
+    """Compiles an export's source to an object file as `load_c` does."""
+    built = place / "model.o"
+    compile_c([*STANDARD, *FLAGS, f"-I{export}", "-c", str(export / "model.c"), "-o", str(built)])
+    return built
 
 
-def measure(quick: bool, against: Path | None = None) -> Findings:
-    """Times all functions of all arms, hot, cold and from Python, against Pinocchio and against another export.
+def program(function: str, signature: Signature, precision: str) -> str:
+    """C source of a program that times one function; it takes REPEATS CALLS COLD BYTES and prints JSON, in ns."""
+    arguments, sizes = [], {"inputs": 0, "results": 0}
+    for leaf in signature.arguments:
+        arguments.append(f"&x[{sizes['inputs']}]" if leaf.shape else f"x[{sizes['inputs']}]")
+        sizes["inputs"] += math.prod(leaf.shape)
+    for leaf in signature.results:
+        arguments += [] if signature.returns else [f"&y[{sizes['results']}]"]
+        sizes["results"] += math.prod(leaf.shape)
+    call = f"{'y[0] = ' * signature.returns}model_{function}({', '.join(arguments)})"
+    real = {"f64": "double", "f32": "float"}[precision]
+    return Template(PROGRAM).substitute(sizes, name="model", real=real, call=call)
 
-    Args:
-        quick: fewer arms, turns and calls.
-        against: folder written by `export_all`, such as that of another release.
 
-    Raises:
-        InputError: the other export lacks an arm, or something does not compile.
+def programs(export: Path, model: Path, functions: Iterable[str], stated: Path | None = None) -> dict[str, Path]:
+    """Builds timing programs of an export's functions beside the object file `model` of its source.
+
+    The signatures are those of `stated`, another export, if the files have no description.
     """
-    names = (SMALLEST, RIVALLED) if quick else tuple(ARMS)
-    require_exports(against, names)
-    effort = {"repeats": 3, "calls": 200, "cold": 50} if quick else {"repeats": 15, "calls": 2_000, "cold": 200}
-    rows: list[Row] = []
-    with tempfile.TemporaryDirectory() as place:
-        ours, others = (Path(place) / whose for whose in (OURS, OTHERS))
-        making: dict[str, tuple[float, float]] = {}
-        every: list[Times] = []
-        for name in names:
-            making[name] = made(ARMS[name], ours / name)
-            timing = {OURS: programs(ours / name, ours / name / "model.o", FUNCTIONS)}
-            if against:
-                (others / name).mkdir(parents=True)
-                timing[OTHERS] = programs(against / name, compiled(against / name, others / name), FUNCTIONS)
-            built = {(whose, function): path for whose, paths in timing.items() for function, path in paths.items()}
-            turns = [
-                {key: timed(program, mebibytes=evicting(), **effort) for key, program in built.items()}
-                for _ in range(QUICK_TURNS if quick else TURNS)
-            ]
-            every += turns[0].values()
-            rows += rows_of_calls(name, ARMS[name], {key: [turn[key] for turn in turns] for key in built})
-            print(f"{name}: {sum(making[name]):.1f} s to make; {len(built)} functions timed", flush=True)
-        loaded = {name: load_c(ours / name) for name in names}
-        making |= {name: made(arm, ours / name) for name, arm in LARGEST.items()}
-    rows += from_python(loaded, repetitions=20 if quick else 200)
-    rows += [row for name, seconds in making.items() for row in rows_of_making(name, seconds, every[0].compiler)]
-    rows.append(Row("caches", "emptied_by_mib", evicting(), "MiB", expected="read before each cold call"))
-    rows.append(Row("caches", "last_level_mib", last_level_cache() or math.nan, "MiB"))
-    rows.append(Row("clock", "subtracted_ns", every[0].timer, "ns", expected="taken off each cold call"))
-    return Findings(rows)
+    precision, signatures, _ = read_interface(stated or export, "model")
+    built = {}
+    for function in functions:
+        source = model.with_name(f"time_{function}.c")
+        source.write_text(program(function, signatures[function], precision))
+        built[function] = source.with_suffix("")
+        # Compiled separately from the model, so that no call is inlined into the loop.
+        compile_c([*STANDARD, *FLAGS, f"-I{export}", str(source), str(model), "-lm", "-o", str(built[function])])
+    return built
 
 
-def require_exports(against: Path | None, names: Sequence[str]) -> None:
-    """Raises `InputError` if the folder, if any, lacks an export of an arm."""
-    wanted = [f"{name}/model{suffix}" for name in names for suffix in (".h", ".c")]
-    missing = [path for path in wanted if against and not (against / path).is_file()]
-    if missing:
-        raise InputError(f"{against} lacks {missing[0]}; expected what `exported_c.export_all` wrote there")
+def timed(program: Path, *, repeats: int, calls: int, cold: int, mebibytes: int) -> Times:
+    """Runs a program: loops of warm calls, calls per loop, single cold calls, memory to read before each of them."""
+    command = [program, *map(str, (repeats, calls, cold, mebibytes << 20))]
+    answer = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    hot, of_cold = (np.asarray(answer[key], float) for key in ("hot_ns", "cold_ns"))
+    return Times(hot, of_cold, math.nan if answer["sum"] is None else answer["sum"])
 
 
-def made(arm: Arm, folder: Path) -> tuple[float, float]:
-    """Exports an arm and compiles it to model.o in the same folder; returns both times, s."""
-    began = time.perf_counter()
-    export(arm, folder)
-    written = time.perf_counter()
-    compiled(folder, folder)
-    return written - began, time.perf_counter() - written
+def evicting() -> int:
+    """Memory to read to empty the caches, MiB: twice the last-level cache, if the system reports it, from 8 to 64."""
+    units = {"K": 2**10, "M": 2**20}
+    texts = [path.read_text().strip() for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size")]
+    sizes = [int(text[:-1]) * units[text[-1]] >> 20 for text in texts if text[-1:] in units]
+    return min(max(2 * max(sizes, default=64), 8), 64)
 
 
-def rows_of_making(arm: str, seconds: tuple[float, float], compiler: str) -> list[Row]:
-    """Rows of the times returned by `made` and of their sum, which has a bound for the largest export."""
-    rows = [Row(arm, f"{what}_seconds", s, "s") for what, s in zip(("export", "compiler"), seconds, strict=True)]
-    words = f"export, and {compiler} {' '.join(FLAGS)}"
-    bound = SECONDS if arm in LARGEST else None
-    return [*rows, Row(arm, "making_seconds", sum(seconds), "s", bound=bound, expected=words)]
+def in_turns(built: dict[str, Path], turns: int, **effort: int) -> dict[str, list[Times]]:
+    """Times of programs by turn."""
+    rounds = [{key: timed(path, mebibytes=evicting(), **effort) for key, path in built.items()} for _ in range(turns)]
+    return {key: [one[key] for one in rounds] for key in built}
 
 
-def rows_of_calls(name: str, arm: Arm, turns: Mapping[tuple[str, str], Sequence[Times]]) -> list[Row]:
-    """Rows of one arm's calls in C, by origin of the code and function; ratios are medians over turns."""
-    rows = []
-    for (whose, function), times in turns.items():
-        case = f"{name}/{function}" if whose == OURS else f"{name}/{function}/{whose}"
-        cold = np.percentile(np.concatenate([turn.cold for turn in times]), [50, 99, 99.9])
-        of_turns = [hot(turn) for turn in times]
-        numbers = [np.median(of_turns), np.ptp(of_turns), *cold]
-        names = ("hot", "hot_spread", "cold_p50", "cold_p99", "cold_p999")
-        rows += [Row(case, f"{name}_ns", float(number), "ns") for name, number in zip(names, numbers, strict=True)]
-        if function == JACOBIAN:
-            words, bound = f"d + 3 times the time of {INVERSE}", arm.d + 3.0 if whose == OURS else None
-            rows.append(
-                Row(case, "over_inverse", ratio(times, turns[whose, INVERSE], hot), bound=bound, expected=words)
-            )
-        if whose == OURS and (OTHERS, function) in turns:
-            others, bound = turns[OTHERS, function], arm.speedup if function == INVERSE else None
-            rows.append(Row(case, "speedup", ratio(others, times, hot), bound=bound, at_least=True))
-            rows.append(Row(case, "cold_speedup", ratio(others, times, cold_median)))
-            difference = abs(times[0].sum / others[0].sum - 1)
-            rows.append(Row(case, "relative_difference", difference, bound=AGREEMENT[arm.precision]))
-    return rows
-
-
-def hot(times: Times) -> float:
-    """Time of a call in a loop, ns, median over repeats."""
-    return float(np.median(times.hot))
-
-
-def cold_median(times: Times) -> float:
-    """Median time of a cold call, ns."""
-    return float(np.median(times.cold))
-
-
-def ratio(one: Sequence[Times], other: Sequence[Times], number: Callable[[Times], float]) -> float:
+def ratio(one: Sequence[Times], other: Sequence[Times], number: Callable[[Times], Any]) -> float:
     """Ratio of the times of one and the other, median over turns."""
     return float(np.median([number(a) / number(b) for a, b in zip(one, other, strict=True)]))
 
 
-def from_python(exports: Mapping[str, Any], *, repetitions: int) -> list[Row]:
-    """Times of calls from Python, µs, of loaded exports by arm and of Pinocchio, and their ratios."""
-    functions = {
-        f"{name}/{function}": Timed(getattr(loaded, function), ARMS[name].d, data_type(ARMS[name].precision))
-        for name, loaded in exports.items()
-        for function in RIVALS
-    }
-    rivals = pinocchio_functions(rival_arm(ARMS[RIVALLED].d)) if RIVALLED in exports else {}
+def hot(times: Times):
+    """Time of a call in a loop, ns, median over repeats."""
+    return np.median(times.hot)
+
+
+def cold_median(times: Times):
+    """Median time of a cold call, ns."""
+    return np.median(times.cold)
+
+
+def exported(
+    *,
+    arms: tuple[str, ...] = tuple(ARMS),
+    largest: int = 1,
+    turns: int = 5,
+    repeats: int = 15,
+    calls: int = 2_000,
+    cold: int = 200,
+    repetitions: int = 200,
+) -> Numbers:
+    """Times of all functions of all arms, of making them, and with `largest` of making the largest export."""
+    from scripts.reports.robots.pinocchio import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
+
+    found: dict[str, dict[str, float]] = {}
+    functions, rivals = {}, pinocchio_functions(rival_arm(ARMS[arms[-1]][2]))
+    with tempfile.TemporaryDirectory() as place:
+        for name in (*arms, *[LARGEST] * largest):
+            width, precision, d = ARMS.get(name, (64, "f64", 7))
+            began, folder = time.perf_counter(), Path(place) / name
+            every = functions_of_system(random_network(d, width, precision), d, dtype=data_type(precision))
+            export_c(every, folder, precision=precision, leave_out_large=True)
+            written = time.perf_counter()
+            model = compiled(folder, folder)
+            made = {"export_seconds": written - began, "compiler_seconds": time.perf_counter() - written}
+            found[f"c/{name}"] = {**made, "making_seconds": sum(made.values())}
+            if name == LARGEST:
+                continue
+            times = in_turns(programs(folder, model, FUNCTIONS), turns, repeats=repeats, calls=calls, cold=cold)
+            for function, of_turns in times.items():
+                warm = [hot(one) for one in of_turns]
+                p50, p99, p999 = np.percentile([one.cold for one in of_turns], [50, 99, 99.9])
+                numbers = {"hot_ns": np.median(warm), "hot_spread_ns": np.ptp(warm)}
+                found[f"c/{name}/{function}"] = {
+                    **numbers,
+                    "cold_p50_ns": p50,
+                    "cold_p99_ns": p99,
+                    "cold_p999_ns": p999,
+                }
+            found[f"c/{name}/{JACOBIAN}"]["over_inverse"] = ratio(times[JACOBIAN], times[INVERSE], hot)
+            loaded = load_c(folder)
+            for function in RIVALS:
+                functions[f"c/{name}/{function}"] = Timed(getattr(loaded, function), d, data_type(precision))
     seconds = seconds_of_calls({**functions, **rivals}, repetitions=repetitions)
-    rows = [Row(case, "python_us", 1e6 * seconds[case], "us") for case in functions]
+    for case in functions:
+        found[case]["python_us"] = 1e6 * seconds[case]
     for function, rival in RIVALS.items():
         if rival in rivals:
-            case, words = f"{RIVALLED}/{function}", f"from Python, the time of {rivals[rival].title} for as many joints"
-            rows.append(Row(case, "pinocchio_us", 1e6 * seconds[rival], "us"))
-            rows.append(expect(case, f"over_{rival}", words, seconds[case] / seconds[rival], 1.0))
-    return rows
+            case = f"c/{arms[-1]}/{function}"
+            found[case] |= {"pinocchio_us": 1e6 * seconds[rival], f"over_{rival}": seconds[case] / seconds[rival]}
+    return found
+
+
+def textbook_rates() -> Formula:
+    """Rates of the two-link arm by the textbook's formulas, for JAX and for CasADi, with the scene's parameters."""
+    scene, rest = two_link_arm(), jnp.zeros(2)
+    assert scene.gravity is not None
+    (inertia, coupled), (_, elbow) = np.asarray(scene.mass_matrix(rest)).tolist()
+    coupling, (both, weight) = coupled - elbow, np.asarray(scene.gravity(rest)).tolist()
+
+    def rates(f, x, u):
+        sine, cosine = coupling * f.sin(x[1]), coupling * f.cos(x[1])
+        a, b, d = inertia - 2 * coupling + 2 * cosine, elbow + cosine, elbow
+        pull = weight * f.cos(x[0] + x[1])
+        p = u[0] + sine * (2 * x[2] * x[3] + x[3] ** 2) - ((both - weight) * f.cos(x[0]) + pull)
+        q = u[1] - sine * x[2] ** 2 - pull
+        determinant = a * d - b * b
+        return [x[2], x[3], (d * p - b * q) / determinant, (a * q - b * p) / determinant]
+
+    return rates
+
+
+def our_steps() -> dict[str, Any]:
+    """The Runge-Kutta step with A and B, and examples of its arguments, by origin."""
+    scene, rates = two_link_arm(), textbook_rates()
+    step = linearised(lambda x, u, dt: runge_kutta(CLASSICAL, lambda t, x: jnp.stack(rates(jnp, x, u)))(0.0, x, dt))
+
+    def formulas(x, u, dt):
+        x_next, (A, B) = step(x, u, dt)
+        return {"x_next": x_next, "A": A, "B": B}
+
+    origins = {"energies": scene.energies, "closed-form": scene.closed_form}
+    made = {name: functions_of_system(system, 2, dtype=np.float64)[STEP] for name, system in origins.items()}
+    return {**made, "formulas": (formulas, (np.zeros(4), np.zeros(2), np.zeros(())))}
+
+
+def casadi_step(folder: Path, *, shared: bool) -> dict[str, int]:
+    """Writes CasADi's C with the interface of ours, and returns its operations by kind.
+
+    `shared` lets CasADi compute common expressions once.
+    """
+    ca = casadi()
+    x, u, dt = ca.SX.sym("x", 4), ca.SX.sym("u", 2), ca.SX.sym("dt")
+    x_next = optimal_control.runge_kutta(textbook_rates(), dt)(x, u)
+    # Transposed, because CasADi stores columns and C rows.
+    results = [x_next, *(ca.densify(ca.jacobian(x_next, variable)).T for variable in (x, u))]
+    step = ca.Function("step", [x, u, dt], results, {"cse": shared})
+    folder.mkdir()
+    generator = ca.CodeGenerator("casadi.c")
+    generator.add(step)
+    generator.generate(f"{folder}/")
+    (folder / "model.h").write_text(HEADER)
+    (folder / "model.c").write_text(WRAPPER % (max(step.sz_w(), 1), max(step.sz_iw(), 1)))
+    kinds = {
+        "additions": (ca.OP_ADD, ca.OP_SUB, ca.OP_TWICE),
+        "multiplications": (ca.OP_MUL, ca.OP_SQ),
+        "divisions": (ca.OP_DIV, ca.OP_INV),
+        "functions": (ca.OP_SIN, ca.OP_COS),
+    }
+    every = [step.instruction_id(k) for k in range(step.n_instructions())]
+    return {kind: sum(map(every.count, operations)) for kind, operations in kinds.items()}
+
+
+def beside_casadi(*, turns: int = 9, repeats: int = 15, calls: int = 2_000, cold: int = 200) -> Numbers:
+    """Operations and times of all programs; the faster of CasADi's two is the rival."""
+    with tempfile.TemporaryDirectory() as place:
+        root, kinds, built = Path(place), {}, {}
+        for origin, function in our_steps().items():
+            for name, finite in ((origin, True), (f"{origin}-any-arguments", False)):
+                export_c({STEP: function}, root / name, finite=finite)
+                cost = stated_costs(root / name)[STEP]._asdict()
+                kinds[name] = {kind: cost[kind] for kind in ("additions", "multiplications", "divisions", "functions")}
+        for name, shared in (("casadi", False), ("casadi-shared", True)):
+            kinds[name] = casadi_step(root / name, shared=shared)
+        for name in kinds:
+            folder = root / name
+            stated = root / "closed-form" if name.startswith("casadi") else folder
+            built[name] = programs(folder, compiled(folder, folder), [STEP], stated)[STEP]
+        times = in_turns(built, turns, repeats=repeats, calls=calls, cold=cold)
+    warm = {name: np.median([hot(one) for one in of_turns]) for name, of_turns in times.items()}
+    rival = min(("casadi", "casadi-shared"), key=lambda name: warm[name])
+    least, found = min(sum(kinds[name].values()) for name in ("casadi", "casadi-shared")), {}
+    for name, of_turns in times.items():
+        operations = sum(kinds[name].values())
+        numbers: dict[str, float] = {**kinds[name], "operations": operations, "hot_ns": warm[name]}
+        numbers["cold_p50_ns"] = np.median([cold_median(one) for one in of_turns])
+        if not name.startswith("casadi"):
+            numbers |= {
+                "over_casadi": ratio(of_turns, times[rival], hot),
+                "cold_over_casadi": ratio(of_turns, times[rival], cold_median),
+                "operations_over_casadi": operations / least,
+                "relative_difference": abs(of_turns[0].sum / times[rival][0].sum - 1),
+            }
+        found[f"casadi/two-link-arm/{name}"] = numbers
+    return found

@@ -1,4 +1,4 @@
-"""The published plants are as printed, and the truths beside fitted values are those of a linear plant."""
+"""The published plants are as printed."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,6 @@ import pytest
 
 from dln_jax.control.optimal.plants import PLANTS, evaluate, starts
 from dln_jax.control.optimal.problem import checked, rates
-from scripts.reports.control.values.truths import direct_values, followed, regulator_value
 
 
 def test_the_pendulum_as_printed():
@@ -52,13 +51,3 @@ def test_returns_of_rest_and_of_a_law_that_fails():
     failed = evaluate(plant, lambda x: jnp.full(1, jnp.nan), hanging)
     assert np.isnan(failed.returns[0]) and np.isinf(failed.settled[0])
     assert np.abs(starts(plant, "down")[:, 0] - np.pi).max() < 0.2 and len(starts(plant, "uniform", 7)) == 7
-
-
-@pytest.mark.slow
-def test_direct_optimisation_near_the_goal_is_the_regulator():
-    plant = PLANTS["pendulum"]()
-    value = regulator_value(plant.problem)
-    x = np.array([[0.01, -0.02], [-0.02, 0.01]])
-    guess = followed(plant.problem, lambda x: -4 * x[:1] - x[1:], x, dt=0.02, steps=20)
-    found = direct_values(plant.problem, x, guess[None], limit=plant.limit, dt=0.02, iterations=20)
-    np.testing.assert_allclose(found[0], [float(value(jnp.asarray(each))) for each in x], rtol=2e-3)

@@ -1,1 +1,0 @@
-"""Value functions of published plants: plants, reference values, and returns of their policies."""

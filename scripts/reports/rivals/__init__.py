@@ -1,0 +1,1 @@
+"""Rivals: other programs and methods on the same tasks, one file each."""
