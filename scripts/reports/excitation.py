@@ -15,48 +15,29 @@ from dln_jax.identification.excitation.design import CRITERIA, best_design, make
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import Task, make_task
 from dln_jax.models.rigid_tree import make_rigid_tree
-from scripts.reports.case import Findings
 from scripts.reports.robots.simulated_arms import panda
-from scripts.reports.rows import Row
-
-PERIOD, HARMONICS = 20.0, 5
-SMOOTH = 0.05
-"""Velocity scale of the dry friction in the design of motions, rad/s."""
-DESIGNS, SEEDS = 6, 60
-"""Number of motions of either kind, and number of seeds for the noise."""
+from scripts.reports.run import Numbers
 
 
-def excitation(quick: bool) -> Findings:
-    """Ratios of parameter errors after designed and random motions of the same series, by criterion."""
-    task, count = lip_task(3 if quick else 7), 2 if quick else DESIGNS
-    drawn, starts = random_designs(task, count), random_designs(task, count, seed=1)
-    rows = [_condition("random", drawn)]
-    for criterion in CRITERIA:
-        optimise = make_optimiser(task, CRITERIA[criterion])
-        designed = [best_design(task, optimise, CRITERIA[criterion], [start]) for start in starts]
-        ratios = error_ratios(task, designed, drawn, seeds=SEEDS)
-        case, words = f"excitation/{criterion}", f"of {SEEDS} draws of noise, over errors after random motions"
-        bound = 1.0 if criterion == "information" else None
-        rows += [
-            _condition(criterion, designed),
-            Row(case, "error_worst", float(np.max(ratios)), expected=words),
-            Row(case, "error_median", float(np.median(ratios)), bound=bound, expected=words),
-        ]
-    return Findings(rows)
-
-
-def _condition(name: str, designs: Sequence[Design]) -> Row:
-    median = float(np.median([design.condition for design in designs]))
-    return Row(f"excitation/{name}", "condition_median", median)
-
-
-def lip_task(active: int) -> Task:
-    """The design task for the Panda of the LIP protocol, with its limits and unknown inertias and friction."""
-    robot = panda(active)
-    model = make_rigid_tree(robot.tree, friction=True, velocity_scale=SMOOTH)
-    free = np.tile([-np.inf, np.inf], (active, 1))
+def excitation(*, joints: int = 7, designs: int = 6, draws: int = 60) -> Numbers:
+    """Ratios of parameter errors after designed and random motions of the same series of a Panda, by criterion."""
+    robot = panda(joints)
+    model = make_rigid_tree(robot.tree, friction=True, velocity_scale=0.05)
+    free = np.tile([-np.inf, np.inf], (joints, 1))
     limits = MotionLimits(robot.limits, robot.rates, robot.accelerations, free)
-    return make_task(model, model.init(jax.random.key(0)), limits, period=PERIOD, harmonics=HARMONICS)
+    task = make_task(model, model.init(jax.random.key(0)), limits, period=20.0, harmonics=5)
+    drawn, starts = random_designs(task, designs), random_designs(task, designs, seed=1)
+    numbers = {"excitation/random": {"condition_median": np.median([design.condition for design in drawn])}}
+    for name, criterion in CRITERIA.items():
+        optimise = make_optimiser(task, criterion)
+        designed = [best_design(task, optimise, criterion, [start]) for start in starts]
+        ratios = error_ratios(task, designed, drawn, seeds=draws)
+        numbers[f"excitation/{name}"] = {
+            "condition_median": np.median([design.condition for design in designed]),
+            "error_worst": np.max(ratios),
+            "error_median": np.median(ratios),
+        }
+    return numbers
 
 
 def error_ratios(
@@ -73,7 +54,7 @@ def error_ratios(
         samples: number of equally spaced samples in a motion's period.
         seeds: number of seeds for the noise.
     """
-    errors = [_solver(task, designs, samples) for designs in (designed, drawn)]
+    errors = [solvers(task, designs, samples) for designs in (designed, drawn)]
     # Standard deviations of the parameters after random motions, averaged over the motions.
     scale = np.sqrt(np.mean([np.sum(inverse**2, axis=1) for inverse in errors[1]], axis=0))
     ratios = []
@@ -84,7 +65,7 @@ def error_ratios(
     return np.array(ratios)
 
 
-def _solver(task: Task, designs: Sequence[Design], samples: int) -> list[np.ndarray]:
+def solvers(task: Task, designs: Sequence[Design], samples: int) -> list[np.ndarray]:
     """Matrices [B, N d], one per motion, that map normalised noise to errors of parameters."""
     functions = functions_at(task, task.period * np.arange(samples) / samples)
     inverses = []

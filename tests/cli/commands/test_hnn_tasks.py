@@ -1,4 +1,4 @@
-"""Hamiltonian tasks: hnn_table and train_hnn_task end to end on tiny budgets, and what they refuse."""
+"""Hamiltonian tasks: their report and train_hnn_task end to end on tiny budgets, and what they refuse."""
 
 import json
 
@@ -27,12 +27,8 @@ from dln_jax.training.hamiltonian.tasks import pieces, problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
-from scripts.reports.case import Findings, rows_of
-from scripts.reports.commands import hnn_table
-from scripts.reports.hamiltonian import table
-from scripts.reports.hamiltonian.table import BOUNDS, TASKS, models_of, table_rows
-from scripts.reports.published import HAMILTONIAN
-from scripts.reports.rows import markdown
+from scripts.reports import hamiltonian
+from scripts.reports.cases import hnn
 
 MEASURED = {
     "spring": ("polynomial-hamiltonian",),
@@ -87,9 +83,9 @@ def workplace(tmp_path_factory):
         for module in (hnn_tasks, measurements):
             patch.setattr(module, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
         patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
-        patch.setattr(table, "models_of", MEASURED.get)
+        patch.setattr(hamiltonian, "models_of", MEASURED.get)
         patch.setattr(predictions, "predict", quick_prediction)
-        patch.setattr(table, "train", quick_training)
+        patch.setattr(hamiltonian, "train", quick_training)
         for module in (phase_samples, hnn_tasks):
             patch.setattr(module, "reference_motion", quick_motion)
         patch.setattr(hnn_tasks, "STARTS", 2)
@@ -101,65 +97,36 @@ def workplace(tmp_path_factory):
         yield folder
 
 
-TINY = "--seeds 1 --steps 1 --trajectories 10"
-
-
 @pytest.mark.slow
-def test_every_task_runs_and_reports(workplace, capsys):
-    command(hnn_table, TINY, "--real-pendulum swing.npz --out all")
-    report = json_of(workplace / "all" / "report.json")
-    rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
-    assert rows["pixels/black-box-hnn", "energy_mse_over_baseline"]["pass"] is True
-    assert "| pixels/phase-network |" in (workplace / "all" / "table.md").read_text()
-    for task in MEASURED:
-        assert (workplace / "all" / f"{task}.png").read_bytes().startswith(b"\x89PNG")
-        for kind in MEASURED[task]:
-            quantities = {quantity for case, quantity in rows if case == f"{task}/{kind}"}
+def test_every_task_is_measured(workplace):
+    few = {"seeds": 1, "steps": 1}
+    numbers = dict(hamiltonian.real_pendulum(real_pendulum=workplace / "swing.npz", **few))
+    for task in set(MEASURED) - {hnn_tasks.REAL}:
+        numbers |= hamiltonian.phase_task(task=task, trajectories=10, **few)
+    for task, kinds in MEASURED.items():
+        for kind in kinds:
+            quantities = set(numbers[f"{task}/{kind}"])
             assert {"energy_mse", "rollout_mse", "train_seconds", "compile_seconds", "parameters"} <= quantities
             if task != hnn_tasks.REAL:
                 assert {"test_loss", "train_loss", "clean_field_mse", "energy_mse_standard_error"} <= quantities
-            beside = HAMILTONIAN.values[f"{task}/{kind if kind == 'phase-network' else 'black-box-hnn'}"]
-            for quantity, published in beside.items():
-                if (f"{task}/{kind}", quantity) in rows:
-                    assert rows[f"{task}/{kind}", quantity]["reference"] == published
     # The polynomial holds the oscillator.
-    assert rows["spring/polynomial-hamiltonian", "clean_field_mse"]["value"] < 0.1
-    assert rows["three-body/pairwise-hnn", "energy_mse"]["bound"] == 4.2e-3
-    assert "published_energy_mse" in {quantity for case, quantity in rows if case == "pendulum/phase-network"}
+    assert numbers["spring/polynomial-hamiltonian"]["clean_field_mse"] < 0.1
+    assert "published_energy_mse" in numbers["pendulum/phase-network"]
 
 
-@pytest.mark.slow
-def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch):
-    monkeypatch.setattr(table, "problem_of", lambda *a, **k: pytest.fail("measured again"))
-    monkeypatch.setattr(hnn_table, "chosen_tasks", lambda given: list(TASKS))
-    before = (workplace / "all" / "jobs.json").read_bytes()
-    command(hnn_table, "--out all --resume")
-    assert (workplace / "all" / "jobs.json").read_bytes() == before
-
-
-def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypatch):
-    numbers = {"energy_mse": 1e-6, "train_seconds": 6.0}
-    monkeypatch.setattr(table, "models_of", lambda task: ("separable-hnn",))
-    monkeypatch.setattr(table, "phase_task", lambda name, **given: Findings(rows_of(f"{name}/separable-hnn", numbers)))
-    command(hnn_table, TINY, "--tasks spring,real-pendulum --no-figures --out part")
-    out = capsys.readouterr().out
-    assert "real-pendulum is left out" in out
-    assert not (workplace / "part" / "spring.png").exists()
-    assert "needs its data" in refused(capsys, hnn_table, "--tasks real-pendulum --out no")
-
-
-def test_bounds_decide():
-    rows = table_rows(rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7}))
-    assert "| 1e-06 / 0.00038 | 2e-07 |" in markdown(rows)
-    bare = rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})
-    rows = {row.quantity: row for row in table_rows(bare)}
-    assert rows["energy_mse"].passed is True and rows["train_seconds"].passed is False
-    assert all(row.bound is None for row in table_rows(rows_of("spring/phase-network", {"energy_mse": 1e-6})))
-    suited = {task: RECIPES[task].suits for task in TASKS if task in RECIPES} | {"pixels": "black-box-hnn"}
-    assert {f"{task}/{name}" for task, name in suited.items()} == set(BOUNDS)
-    rivals = ("black-box-hnn", "phase-network")
-    assert {f"{task}/{name}" for task in TASKS for name in rivals} == set(HAMILTONIAN.values)
+def test_bounds_are_those_of_the_model_that_suits_the_scene(workplace):
+    images = hamiltonian.images(seeds=1)
+    assert images["pixels/black-box-hnn"]["energy_mse_over_baseline"] == pytest.approx(1e-2)
+    suited = {task: model for task, (model, _) in hnn.BOUNDS.items()}
+    assert suited == {task: RECIPES[task].suits for task in suited if task in RECIPES} | {"pixels": "black-box-hnn"}
+    assert suited.keys() == hnn.PUBLISHED.keys()
     assert set(RECIPES) == set(hnn_tasks.TASKS)
+    assert hamiltonian.real_pendulum() == {}
+
+
+def test_a_folder_without_files_is_refused(workplace):
+    with pytest.raises(InputError, match="has no files such as spring-101.npz"):
+        hamiltonian.own_files(own=workplace, tasks=("two-body",))
 
 
 def test_measured_motions_are_cut_at_gaps(workplace):
@@ -176,19 +143,13 @@ def test_measured_motions_are_cut_at_gaps(workplace):
 def test_mistakes_are_one_line(workplace, capsys):
     two = schema.load("swing.npz")
     schema.save("double.npz", two._replace(q=np.hstack([two.q, two.q]), estimated=("qd", "qdd", "tau")))
-    rows = [
-        ("--tasks spring,pixel", "--tasks: 'pixel' is unknown"),
-        ("--seeds 0", "seeds is 0"),
-        ("--steps 0", "steps is 0"),
-        ("--real-pendulum missing.npz", "no such file"),
-        ("--real-pendulum double.npz", "has 2 coordinates"),
-        ("--tasks two-body --trajectories 3", "trajectories is 3"),
-    ]
-    assert_refused(capsys, hnn_table, rows, out=workplace / "no")
     for name, message in (("delan", "model is 'delan'; this release knows"), ("feed-forward", "is of no phase space")):
         with pytest.raises(InputError, match=message):
             description_of(problem_of(hnn_tasks.REAL, data=workplace / "swing.npz"), name)
-    assert models_of("spring") == ("separable-hnn", "black-box-hnn", "phase-network", "polynomial-hamiltonian")
+    with pytest.raises(InputError, match="has 2 coordinates"):
+        hamiltonian.real_pendulum(real_pendulum=workplace / "double.npz")
+    with pytest.raises(InputError, match="trajectories is 3"):
+        hamiltonian.phase_task(task="two-body", trajectories=3)
 
 
 @pytest.fixture(scope="module")
