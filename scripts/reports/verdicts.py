@@ -167,28 +167,6 @@ def spoiled_log(seed: int, d: int, fault: str) -> tuple[Arm, Arrays]:
     return arm, {**arrays, "trajectory": np.repeat(np.arange(TRAJECTORIES), len(t))}
 
 
-def double_pendulum(t: float, x: np.ndarray) -> np.ndarray:
-    """Rates of two equal points on rods of 1 m, by angles from the vertical and their velocities."""
-    (a, b), (va, vb), c = x[:2], x[2:], np.cos(x[0] - x[1])
-    s, g = np.sin(a - b), 9.81
-    push = np.array([-s * vb**2 - 2 * g * np.sin(a), s * va**2 - g * np.sin(b)])
-    return np.concatenate([x[2:], np.linalg.solve([[2, c], [c, 1]], push)])
-
-
-def two_bodies(t: float, x: np.ndarray) -> np.ndarray:
-    """Rates of two bodies of unit mass in a plane: x1, y1, x2, y2."""
-    apart = x[:2] - x[2:4]
-    pull = apart / np.linalg.norm(apart) ** 3
-    return np.concatenate([x[4:], -pull, pull])
-
-
-def circling(random: np.random.Generator) -> np.ndarray:
-    """A start of two bodies on nearly circular orbits."""
-    x = random.uniform(0.5, 1.5, 2)
-    v = np.array([-x[1], x[0]]) / (2 * np.linalg.norm(x) ** 1.5) * (1 + 0.05 * random.normal())
-    return np.concatenate([x, -x, v, -v])
-
-
 class Plant(NamedTuple):
     """A plant and how it is recorded."""
 
@@ -214,28 +192,20 @@ RATES: dict[str, Callable[[float, np.ndarray], Any]] = {
     "forced-duffing": lambda t, x: (x[1], x[0] - x[0] ** 3 - 0.3 * x[1] + 0.5 * np.cos(1.2 * t)),
     "lotka-volterra": lambda t, x: (x[0] * (1 - x[1]), -x[1] * (1 - x[0])),
     "random-walk": lambda t, x: 0 * x,
-    "one-angle-of-two": double_pendulum,
-    "two-bodies": two_bodies,
 }
 """t and (q, p) of all coordinates -> their rates."""
 STARTS: dict[str, Callable[[np.random.Generator], Any]] = {
     "anywhere": lambda random: random.uniform(-1.5, 1.5, 2),
     "swing": lambda random: (random.uniform(-2.5, 2.5), 0.0),
     "animals": lambda random: random.uniform(0.3, 2.0, 2),
-    "tumble": lambda random: np.concatenate([random.uniform(-2.0, 2.0, 2), np.zeros(2)]),
-    "circling": circling,
 }
 PLANTS = {
-    "spring": Plant("spring", "anywhere", 8, 50, SLIDE, True),
     "spring-noisy-momenta": Plant("spring", "anywhere", 6, 20, SLIDE, True, "qpr", 0.1),
     "pendulum": Plant("pendulum", "swing", 6, 100, TURN, True),
     "pendulum-coarse": Plant("pendulum", "swing", 12, 5, TURN, True),
-    "pendulum-noise": Plant("pendulum", "swing", 6, 50, TURN, True, "q", 0.02),
     "damped-pendulum": Plant("damped-pendulum", "swing", 8, 50, TURN, True, "qv", friction=True),
-    "two-bodies": Plant("two-bodies", "circling", 20, 2.5, 4 * SLIDE, True, "qpr"),
     "lotka-volterra": Plant("lotka-volterra", "animals", 13.5, 20, SLIDE, False, "qpr"),
     "forced-duffing": Plant("forced-duffing", "anywhere", 15, 100, SLIDE, False, friction=True),
-    "one-angle-of-two": Plant("one-angle-of-two", "tumble", 7.4, 50, TURN, False),
     "random-walk": Plant("random-walk", "anywhere", 7.4, 50, SLIDE, False),
 }
 """Plants by name; the random walk has no rates."""

@@ -92,17 +92,6 @@ def sliding(*, slide_steps: int = 120) -> Numbers:
     return {"sliding": {**numbers, "relative_error_of_way": abs(slid * 2 * 0.3 * GRAVITY - 1)}}
 
 
-def ring(*, ring_steps: int = 60) -> Numbers:
-    """A soft ball (a block) is pressed through a held ring that is narrower than it."""
-    frame = [box((0.2, 0.2, 1.0), (1, 1, 3)), moved(box((0.2, 0.2, 1.0), (1, 1, 3)), 0.9, 0.0, 0.0)]
-    frame += [moved(box((0.7, 0.2, 0.2), (2, 1, 1)), 0.2, 0.0, z) for z in (-0.23, 1.03)]
-    mesh = joined(*frame, moved(box((0.75, 0.75, 0.75), (3, 3, 3)), 0.175, 0.23, 0.125))
-    contact = body_contact(mesh, distance=0.02, stiffness=1e5)
-    scene = scene_of(mesh, 2e4, contact, vertices_where(mesh, lambda x: x[:, 1] < 0.21), weight=False)
-    v = np.where(mesh.vertices[:, 1:2] > 0.21, [0.0, -4.0, 0.0], 0.0)
-    return {"ball-through-ring": moving(scene, 0.01, ring_steps, v=v)[0]}
-
-
 def twisted_bar(*, turns: float = 3.0) -> Numbers:
     """A bar is twisted by its held ends until it meets itself, 50 steps of 20 ms a turn."""
     mesh, seconds = box((0.2, 2.0, 0.2), (1, 10, 1)), turns
@@ -119,23 +108,6 @@ def twisted_bar(*, turns: float = 3.0) -> Numbers:
         return np.stack([0.1 + around[0], y + lower, 0.1 + around[1]], axis=1)
 
     return {"twisted-bar": moving(scene, 0.02, round(50 * turns), path=path)[0]}
-
-
-def gripper() -> Numbers:
-    """Two held jaws close on a disc and lift it by friction, by 0.41 m."""
-    jaws = [moved(beam(0.2, 0.6, 2, 6), x, -0.3) for x in (-0.75, 0.55)]
-    mesh = joined(*jaws, disc(0.4, 4))
-    held = vertices_where(mesh, lambda x: abs(x[:, 0]) > 0.7)
-    scene = scene_of(mesh, 3e5, body_contact(mesh, distance=0.01, stiffness=1e5, friction=0.8), held)
-    rest = mesh.vertices[held]
-
-    def path(t: float) -> np.ndarray:
-        close, lift = 0.22 * min(t / 0.08, 1.0), 0.6 * max(0.0, t - 0.12)
-        return rest + np.stack([-np.sign(rest[:, 0]) * close, np.full(len(rest), lift)], axis=1)
-
-    numbers, x = moving(scene, 0.005, 160, path=path)
-    ball = np.arange(len(mesh.vertices)) >= 2 * len(jaws[0].vertices)
-    return {"gripper": {**numbers, "lifted_metres": float((x - mesh.vertices)[ball, 1].mean())}}
 
 
 def bounce(*, milliseconds: tuple[float, ...] = (10.0, 5.0, 2.0, 1.0, 0.5, 0.2)) -> Numbers:
