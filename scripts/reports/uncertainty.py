@@ -10,22 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.compilation import quick_compilation
+from dln_jax.data import Trajectories, load, select
 from dln_jax.data.encoders import smooth
-from dln_jax.data.schema import Trajectories, from_arrays, load
-from dln_jax.data.splits import in_blocks, select, with_joints
+from dln_jax.data.schema import from_arrays
+from dln_jax.data.splits import in_blocks, with_joints
 from dln_jax.data.splits import split as split_by_labels
+from dln_jax.learning import GaussNewton, fit, fit_linear
 from dln_jax.learning import dynamics as problems
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.uncertainty import Estimate, estimate
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
 from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.model import Model, Parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models import Model, Parameters, make_delan, make_rigid_tree
 from dln_jax.models.uncertainty import out_of_distribution, predictive
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm

@@ -19,8 +19,8 @@ from scipy.integrate import solve_ivp
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import identify, train_delan, train_hnn_task
+from dln_jax.data import Robot
 from dln_jax.data.robot_files import mjcf
-from dln_jax.data.robots import Robot
 from dln_jax.errors import FitRefused
 from dln_jax.files import read_json
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial

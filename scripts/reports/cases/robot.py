@@ -4,11 +4,9 @@ Rivals are measured where they are installed: pip install 'dln-jax[reference]'. 
 given. Only `speed` depends on the machine.
 """
 
-from scripts.reports.encoder_data import cutoffs, encoders
-from scripts.reports.excitation import excitation
+from scripts.reports.encoder_data import cutoffs, encoders, excitation
 from scripts.reports.robots import learned, log_checks, other_logs, recordings
-from scripts.reports.robots.added_terms import added_terms
-from scripts.reports.robots.known_kinematics import clean, noisy
+from scripts.reports.robots.known_kinematics import added_terms, clean, noisy
 from scripts.reports.robots.pinocchio import speed
 from scripts.reports.run import AtLeast, Case
 

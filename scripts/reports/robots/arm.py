@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from dln_jax.data import Robot, Trajectories
 from dln_jax.data.robot_files import mjcf
-from dln_jax.data.robots import Robot
-from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, serial
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models import Model, Parameters
 from scripts.reports.robots.simulated_arms import CENTRES, MASSES, panda
 
 D = 7

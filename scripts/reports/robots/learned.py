@@ -13,12 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import Split
-from dln_jax.learning import Adam, GaussNewton, dynamics, fit, objectives
-from dln_jax.learning.kernel import fit_kernel
+from dln_jax.data import Split, Trajectories
+from dln_jax.learning import Adam, GaussNewton, dynamics, fit, fit_kernel, fit_linear, objectives
 from dln_jax.learning.kinematics import Search, fit_tree
-from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics import equations, trees
 from dln_jax.models import make_delan, make_rigid_tree, make_serial_tree, make_trigonometric_kernel
 from dln_jax.types import FrictionLaw, Needs

@@ -12,9 +12,8 @@ import jax
 import numpy as np
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data import schema
+from dln_jax.data import Robot, schema
 from dln_jax.data.checks import Finding, quick
-from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
 from scripts.reports.robots.simulated_arms import panda
 from scripts.reports.run import Numbers

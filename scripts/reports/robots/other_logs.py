@@ -12,10 +12,9 @@ import jax
 import numpy as np
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data import schema
+from dln_jax.data import Robot, schema
 from dln_jax.data.encoders import source_clock
 from dln_jax.data.repeated_motions import motion_numbers
-from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
 from scripts.reports.robots.log_checks import Arrays, findings, late, motion, quintic, without_friction
 from scripts.reports.run import Numbers

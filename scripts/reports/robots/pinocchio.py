@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import DTypeLike
 
-from dln_jax.data.schema import Trajectories
+from dln_jax.data import Trajectories
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c

@@ -12,29 +12,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from dln_jax.data import schema
+from dln_jax.data import Trajectories, read_robot, schema, select
 from dln_jax.data.encoders import low_pass, smooth
 from dln_jax.data.encoders.smoothing import TRIMMED
-from dln_jax.data.robots import read_robot
-from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import in_blocks, label_indices, select, window_indices, with_joints
-from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.data.splits import in_blocks, label_indices, window_indices, with_joints
+from dln_jax.identification import identify, parameters_of
 from dln_jax.identification.residual import fit_residual
-from dln_jax.learning import measured_motions
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
-from dln_jax.learning.friction import FrictionFit, fit_friction
+from dln_jax.learning import GaussNewton, Problem, fit, fit_friction, measured_motions
+from dln_jax.learning.engine.problem import mean_square, unmonitored
+from dln_jax.learning.friction import FrictionFit
 from dln_jax.learning.kinematics import fit_tree
 from dln_jax.learning.linear import design
 from dln_jax.learning.measured_motions import Noise, cut_measured_windows
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree, inertial_parameters, serial
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
-from dln_jax.models.joint_friction import with_joint_friction
-from dln_jax.models.model import Model, Parameters
-from dln_jax.models.planar_chain import make_planar_chain
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models import Model, Parameters, make_planar_chain, make_rigid_tree, with_joint_friction
 from dln_jax.models.serial_tree import tree_of
 from dln_jax.solvers import least_squares
 from dln_jax.training.identification.motions import MotionSets, fit_by

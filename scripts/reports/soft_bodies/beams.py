@@ -15,15 +15,12 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay
 
 from dln_jax.rollout import rollout
-from dln_jax.softbody import examples
-from dln_jax.softbody.mesh.mesh import Mesh, make_mesh, vertices_where
-from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody import SoftScene, examples, make_scene, make_step, with_parameters
+from dln_jax.softbody.mesh import Mesh, beam, make_mesh, vertices_where
 from dln_jax.softbody.mesh.simplices import regularity
-from dln_jax.softbody.scene import SoftScene, element_energies, make_scene, prepare, with_parameters
-from dln_jax.softbody.step import Step, make_step
-from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.scene import element_energies, prepare
+from dln_jax.softbody.step import Step
+from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
 from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians

@@ -9,15 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.rollout import rollout
+from dln_jax.softbody import (
+    AVERAGE_VECTOR_FIELD,
+    BACKWARD_EULER,
+    BDF2,
+    Integrator,
+    SoftScene,
+    make_scene,
+    make_step,
+    potential,
+)
 from dln_jax.softbody.contact import body_contact, crossings, half_space, obstacle_contact
-from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, BDF2, Integrator
-from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses, make_mesh, vertices_where
-from dln_jax.softbody.mesh.shapes import beam, box, disc
-from dln_jax.softbody.scene import SoftScene, contact_energies, make_scene, potential, prepare_contacts
-from dln_jax.softbody.step import make_step
-from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.mesh import Mesh, beam, box, disc, lumped_masses, make_mesh, vertices_where
+from dln_jax.softbody.scene import contact_energies, prepare_contacts
+from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 from scripts.reports.run import Numbers
 

@@ -12,16 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import Delaunay
 
-from dln_jax.softbody.equilibrium import static_solve
-from dln_jax.softbody.mesh.mesh import Mesh, boundary_vertices, make_mesh, vertices_where, volumes
-from dln_jax.softbody.mesh.quadratic import barycentric_split, quadratic
-from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody import make_scene, static_solve, with_parameters
+from dln_jax.softbody.mesh import (
+    Mesh,
+    barycentric_split,
+    beam,
+    boundary_vertices,
+    box,
+    make_mesh,
+    quadratic,
+    vertices_where,
+    volumes,
+)
 from dln_jax.softbody.mesh.simplices import SIDES
-from dln_jax.softbody.scene import make_scene, with_parameters
-from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.loads import point_force
-from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.terms import elastic, gravity, point_force, stable_neo_hookean
 from scripts.reports.run import Numbers
 from scripts.reports.soft_bodies.beams import processor_seconds
 

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Array
 
 from dln_jax.rollout import rollout
+from dln_jax.softbody import SoftScene, make_step, positions_and_convergence, with_parameters
 from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh import shapes
-from dln_jax.softbody.scene import SoftScene, with_parameters
-from dln_jax.softbody.step import make_step, positions_and_convergence
 from dln_jax.softbody.terms.creature import TIME_STEP
 from scripts.reports.run import Numbers
 from scripts.reports.turns import medians_in_turns

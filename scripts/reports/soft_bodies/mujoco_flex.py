@@ -11,7 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dln_jax.softbody.mesh.mesh import components, lumped_masses
+from dln_jax.softbody.mesh import lumped_masses
+from dln_jax.softbody.mesh.mesh import components
 from scripts.reports.soft_bodies.body import DENSITY, GRAVITY, KIRCHHOFF, Body, Run, measured
 
 RADIUS = 1e-4

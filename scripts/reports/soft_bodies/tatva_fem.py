@@ -15,7 +15,7 @@ from tatva import Mesh, Operator, sparse
 from tatva.element import Tetrahedron4
 from tatva.lifter import Fixed, Lifter
 
-from dln_jax.softbody.mesh.mesh import lumped_masses
+from dln_jax.softbody.mesh import lumped_masses
 from scripts.reports.soft_bodies.body import DENSITY, GRAVITY, Body, Run, measured
 
 

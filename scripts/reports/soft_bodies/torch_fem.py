@@ -7,7 +7,7 @@ import torch
 from torchfem import Solid
 from torchfem.materials import Hyperelastic3D
 
-from dln_jax.softbody.mesh.mesh import lumped_masses
+from dln_jax.softbody.mesh import lumped_masses
 from scripts.reports.soft_bodies.body import DENSITY, GRAVITY, Body, Run, measured
 
 
