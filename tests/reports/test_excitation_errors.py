@@ -8,7 +8,7 @@ from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.mechanics import trees
 from dln_jax.models.rigid_tree import make_rigid_tree
-from scripts.reports.excitation import error_ratios
+from scripts.reports.encoder_data import error_ratios
 
 LINK = trees.inertial_parameters(1.0, [0.2, 0.0, 0.0], 0.01 * np.eye(3))
 ARM = trees.serial(*trees.dh_frames([[-np.pi / 2, 0, 0, 0]]), [LINK])

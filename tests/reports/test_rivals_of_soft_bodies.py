@@ -6,29 +6,27 @@ import pytest
 from dln_jax.precision import in_float64
 from dln_jax.softbody.mesh.mesh import vertices_where
 from dln_jax.softbody.mesh.shapes import box
-from scripts.reports.soft_bodies.rivals import own
-from scripts.reports.soft_bodies.rivals.body import (
+from scripts.reports.soft_bodies.body import (
     KIRCHHOFF,
     NEO_HOOKEAN,
     SMITH,
     Body,
     elastic_forces,
+    motion,
     reference_motion,
     relative_error,
 )
-from scripts.reports.soft_bodies.rivals.finer import cantilever
-from scripts.reports.soft_bodies.rivals.simulators import NEEDED, rivals
-from scripts.reports.soft_bodies.rivals.touching import depth, force_on_lower, hitting
+from scripts.reports.soft_bodies.rivals import cantilever, depth, hitting
 
 MESH = box((0.4, 0.2, 0.2), (2, 1, 1))
 
 
 @pytest.mark.parametrize("law", [NEO_HOOKEAN, KIRCHHOFF])
 def test_explicit_reference_agrees_with_implicit_midpoint_steps(law):
-    body = Body(MESH, vertices_where(MESH, lambda x: x[:, 0] == 0), 1e5, 0.3, np.array([0.1, 0.2]), law=law)
+    body = Body(MESH, vertices_where(MESH, lambda x: x[:, 0] == 0), 1e5, np.array([0.1, 0.2]), law=law)
     reference = reference_motion(body, 4e-4)
     coarse, fine = (
-        relative_error(body, in_float64(lambda dt=dt: own.motion(body, "midpoint", dt))().x, reference)
+        relative_error(body, in_float64(lambda dt=dt: motion(body, "midpoint", dt))().x, reference)
         for dt in (0.01, 0.005)
     )
     assert fine < 5e-3
@@ -37,7 +35,7 @@ def test_explicit_reference_agrees_with_implicit_midpoint_steps(law):
 
 def test_reference_of_a_fall_is_free_until_it_meets_the_floor():
     mesh = MESH._replace(vertices=MESH.vertices + np.array([0.0, 0.0, 0.1]))
-    body = Body(mesh, np.zeros(0, int), 1e5, 0.3, np.array([0.1, 0.2]), floor=True)
+    body = Body(mesh, np.zeros(0, int), 1e5, np.array([0.1, 0.2]), floor=True)
     x = reference_motion(body, 2e-4, 1e6)
     np.testing.assert_allclose(
         x[0] - mesh.vertices, np.tile([0.0, 0.0, -0.5 * 9.81 * 0.1**2], (len(mesh.vertices), 1)), atol=1e-9
@@ -61,17 +59,3 @@ def test_depth_of_blocks_that_overlap_and_distance_of_those_that_do_not():
     upper = np.asarray(body.v)[:, 2] < 0
     deepest, _ = depth(body.mesh, body.mesh.vertices - np.where(upper[:, None], [0.0, 0.0, 0.016], 0.0))
     assert deepest == pytest.approx(0.01)
-
-
-def test_nothing_presses_on_a_block_that_rests_alone():
-    body = Body(MESH, vertices_where(MESH, lambda x: x[:, 2] == 0), 1e5, 0.3, np.ones(1))
-    x = in_float64(lambda: own.static(body))().x[0]
-    assert abs(force_on_lower(body, x)) < 1e-6 * 9.81 * 1000 * 0.4 * 0.2 * 0.2
-    assert np.abs(x - MESH.vertices).max() > 1e-4
-
-
-def test_missing_simulators_are_named_once():
-    simulators, missing = rivals()
-    for name, package in NEEDED.items():
-        assert (name in simulators) == (package not in missing)
-    assert missing.count("newton") <= 1

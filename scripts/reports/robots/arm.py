@@ -7,31 +7,22 @@ series; logs have 125 samples per second, with noise on encoders and torques.
 """
 
 import functools
-import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from dln_jax.data import Robot, Trajectories
 from dln_jax.data.robot_files import mjcf
-from dln_jax.data.robots import INSTALL, Robot
-from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, serial
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError
-from scripts.reports.robots.simulated_arms import panda
+from dln_jax.models import Model, Parameters
+from scripts.reports.robots.simulated_arms import CENTRES, MASSES, panda
 
 D = 7
-MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
-"""Masses of the links, kg."""
-CENTRES = (
-    *((0.004, 0.002, -0.175), (-0.003, -0.029, 0.003), (0.028, 0.039, -0.067), (-0.053, 0.104, 0.027)),
-    *((-0.012, 0.041, -0.038), (0.060, -0.014, -0.011), (0.011, -0.004, 0.062)),
-)
-"""Centres of mass in the link's frame, m."""
 SPREADS = (
     *((0.08, 0.08, 0.04), (0.05, 0.05, 0.04), (0.06, 0.06, 0.04), (0.06, 0.06, 0.05)),
     *((0.09, 0.08, 0.03), (0.04, 0.04, 0.04), (0.03, 0.03, 0.03)),
@@ -71,23 +62,11 @@ class Motion(NamedTuple):
     qdd: np.ndarray
 
 
-class Log(NamedTuple):
-    """Noise-free samples of one simulated motion; fields [N, d]."""
-
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    tau: np.ndarray
-    """Motor torques, N m."""
-    reference: np.ndarray
-    """Reference of q, rad."""
-
-
 def arm(*, coulomb: bool) -> Robot:
     """The arm, with or without dry friction."""
     links = [
         inertial_parameters(m, c, m * (np.sum(np.square(s)) * np.eye(3) - np.diag(np.square(s))))
-        for m, c, s in zip(MASSES, CENTRES, SPREADS, strict=True)
+        for m, c, s in zip(np.round(MASSES, 2), np.round(CENTRES, 3), SPREADS, strict=True)
     ]
     frames = panda().tree
     tree = serial(frames.rotations, frames.positions, links, armature=np.array(ARMATURE))
@@ -111,11 +90,10 @@ def motion(random: np.random.Generator) -> Motion:
     return Motion(q, qd, np.gradient(qd, STEP, axis=0, edge_order=2))
 
 
-def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None) -> Log:
-    """Runs the arm in MuJoCo under PD control, with optional feed-forward torques [T, d]; logs every eighth step.
+def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None) -> np.ndarray:
+    """Runs the arm in MuJoCo under PD control, with optional feed-forward torques [T, d].
 
-    Raises:
-        InputError: MuJoCo is missing.
+    Returns q, qd, qdd, the motors' tau and the reference of every eighth step [5, N, d], without noise.
     """
     mujoco, model, data = simulator(robot)
     data.qpos[:], data.qvel[:] = wanted.q[0], wanted.qd[0]
@@ -129,7 +107,7 @@ def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None)
         if step % EVERY == 0:
             logged.append(np.stack([data.qpos, data.qvel, data.qacc, data.ctrl, q]))
         mujoco.mj_step(model, data)
-    return Log(*np.stack(logged, axis=1))
+    return np.stack(logged, axis=1)
 
 
 def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
@@ -144,26 +122,20 @@ def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
 
 
 def simulator(robot: Robot) -> tuple[Any, Any, Any]:
-    """MuJoCo, its model of the arm, and a state; `InputError` if MuJoCo is missing."""
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError:
-        raise InputError(f"MuJoCo simulates the arm and is missing; {INSTALL}") from None
+    """MuJoCo, its model of the arm, and a state."""
+    import mujoco
+
     model = mujoco.MjModel.from_xml_string(mjcf(robot, time_step=STEP))
     return mujoco, model, mujoco.MjData(model)
 
 
 def logs(robot: Robot, random: np.random.Generator, count: int) -> Trajectories:
-    """Noise-free logs of random motions under PD control, as trajectories with q, qd, qdd and tau."""
-    return trajectories([follow(robot, motion(random)) for _ in range(count)])
-
-
-def trajectories(recorded: list[Log]) -> Trajectories:
-    """Converts logs to noise-free trajectories."""
-    counts = [len(log.q) for log in recorded]
-    arrays = {key: np.concatenate([getattr(log, key) for log in recorded]) for key in ("q", "qd", "qdd", "tau")}
-    t = np.concatenate([STEP * EVERY * np.arange(count) for count in counts])
-    return from_arrays({"t": t, "trajectory": np.repeat(np.arange(len(counts)), counts), **arrays})
+    """Noise-free logs of random motions under PD control."""
+    recorded = np.stack([follow(robot, motion(random))[:4] for _ in range(count)], axis=1)
+    samples = recorded.shape[2]
+    arrays = dict(zip(("q", "qd", "qdd", "tau"), recorded.reshape(4, -1, D), strict=True))
+    t = np.tile(STEP * EVERY * np.arange(samples), count)
+    return from_arrays({"t": t, "trajectory": np.repeat(np.arange(count), samples), **arrays})
 
 
 def measured(data: Trajectories, random: np.random.Generator) -> dict[str, np.ndarray]:
@@ -179,13 +151,13 @@ def measured(data: Trajectories, random: np.random.Generator) -> dict[str, np.nd
 
 def torque_of(model: Model, parameters: Parameters) -> Torque:
     """The inverse dynamics of a model for many states."""
-    batch = _torques(model)
-    return lambda q, qd, qdd: np.asarray(batch(parameters, q, qd, qdd))
+    program = torque_program(model)
+    return lambda *states: np.asarray(program(parameters, *states))
 
 
 @functools.lru_cache(maxsize=4)
-def _torques(model: Model) -> Callable[..., Any]:
-    """One program for all parameters."""
+def torque_program(model: Model) -> Callable[..., Any]:
+    """(parameters, q, qd, qdd) -> torques of many states, one program for all parameters."""
     return jax.jit(lambda parameters, *x: jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*x))
 
 

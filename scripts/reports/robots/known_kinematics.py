@@ -1,64 +1,37 @@
-"""A seven-axis arm with known frames, identified from logs: torque errors on unseen motions, and tracking at 1 kHz.
+"""Arms with known frames, identified from logs: torque errors on unseen motions, tracking at 1 kHz, and added terms.
 
 The rival gets the same samples, filter and columns, and in a second run also our velocity scales. Errors are those on
 noise-free unseen motions of the true arm.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.data import Trajectories
 from dln_jax.data.encoders import smooth
-from dln_jax.data.robots import Robot
-from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every
 from dln_jax.identification import identify, parameters_of
-from dln_jax.learning.friction import fit_friction
+from dln_jax.learning import fit_friction
+from dln_jax.learning.friction_selection import choose_terms
+from dln_jax.learning.friction_terms import terms_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import Tree, tree_system
-from dln_jax.models.rigid_tree import make_rigid_tree
-from scripts.reports.case import Findings
-from scripts.reports.robots.arm import (
-    D,
-    Log,
-    Motion,
-    Torque,
-    arm,
-    error_of,
-    exact_torque,
-    follow,
-    logs,
-    measured,
-    motion,
-    torque_of,
-)
+from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial, tree_system
+from dln_jax.models import make_rigid_tree
+from dln_jax.types import FrictionLaw
+from scripts.reports.robots.arm import D, arm, error_of, exact_torque, follow, logs, measured, motion, torque_of
 from scripts.reports.robots.pinocchio import regression
-from scripts.reports.rows import Row, expect
+from scripts.reports.run import Numbers
 
 LAWS = ("viscous", "coulomb", "offset")
 USUAL_SCALE = 0.01
 """Velocity scale of dry friction, rad/s, where it is not fitted: for the rival and our robust fit."""
 DECIMATE = 3
 """Stride of the fitted samples; torques are not filtered, which would smear dry friction."""
-CLEAN, SEEN = 1e-12, 1.65e-3
-"""nMSE to reach: on clean data with viscous friction, and on noisy data with dry friction (a regressor's result)."""
-TRACKING = 1.1
-"""Tracking error to reach, relative to the error with true parameters."""
-
-
-class Effort(NamedTuple):
-    """Size of the measurement."""
-
-    seeds: int
-    motions: int
-    unseen: int
-
-
-FULL, QUICK = Effort(5, 15, 6), Effort(1, 4, 2)
 
 
 def rough(tree: Tree) -> Tree:
@@ -83,91 +56,118 @@ def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = Fal
     return model, parameters_of(solution.theta, start)
 
 
-def clean(quick: bool) -> Findings:
-    """Exact states of an arm with viscous friction."""
-    effort, robot, errors = (QUICK if quick else FULL), arm(coulomb=False), []
-    for seed in range(effort.seeds):
+def clean(*, seeds: int = 5, motions: int = 15, unseen: int = 6) -> Numbers:
+    """Exact states of an arm with viscous friction: the worst error of the seeds."""
+    robot, errors = arm(coulomb=False), []
+    for seed in range(seeds):
         random = np.random.default_rng(seed)
-        train, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
+        train, test = (logs(robot, random, count) for count in (motions, unseen))
         model = make_rigid_tree(rough(robot.tree), friction=True)
         start = model.init(jax.random.key(0))
         solution = identify(model, start, every(train, DECIMATE), joints=robot.tree.joints, consistent=False)
         errors.append(error_of(torque_of(model, parameters_of(solution.theta, start)), test).mean())
-    words = f"of torques on unseen motions, the worst of {effort.seeds} seeds"
-    return Findings([expect("arm/clean-viscous", "nmse", words, max(errors), CLEAN)])
+    return {"arm/clean-viscous": {"nmse": max(errors)}}
 
 
-def noisy(quick: bool) -> Findings:
-    """Noisy encoders and torques, dry friction: our fit (fitted scales, or robust), and Pinocchio's regressor."""
-    effort, robot = (QUICK if quick else FULL), arm(coulomb=True)
-    by_method: dict[str, list[np.ndarray]] = {}
+def noisy(*, seeds: int = 5, motions: int = 15, unseen: int = 6) -> Numbers:
+    """Noisy encoders and torques, dry friction: our fit (fitted scales, or robust), and Pinocchio's regressor.
+
+    Errors are means over joints. Each method is also the feed-forward of PD control along the unseen motions.
+    """
+    robot = arm(coulomb=True)
+    true = tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE))
+    exact = jax.jit(jax.vmap(dynamics(true).inverse_dynamics))
+    errors: dict[str, list[float]] = {}
     tracked: dict[str, list[float]] = {}
-    for seed in range(effort.seeds):
+    for seed in range(seeds):
         random = np.random.default_rng(seed)
-        train, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
+        train, test = (logs(robot, random, count) for count in (motions, unseen))
         data = every(smooth(from_arrays(measured(train, random))).data, DECIMATE)
         scales = fit_friction(rough(robot.tree), data, LAWS).shape["velocity_scale"]
         methods = {
             "ours": torque_of(*identified(robot.tree, data, scales)),
             "ours-robust": torque_of(*identified(robot.tree, data, USUAL_SCALE, robust=True)),
+            "pinocchio": regression(robot.tree, data, USUAL_SCALE),
+            "pinocchio-with-our-scales": regression(robot.tree, data, scales),
         }
-        for name, scale in (("pinocchio", USUAL_SCALE), ("pinocchio-with-our-scales", scales)):
-            if (rival := regression(robot.tree, data, velocity_scale=scale)) is not None:
-                methods[name] = rival
+        methods = {name: torque for name, torque in methods.items() if torque}
         for name, torque in methods.items():
-            by_method.setdefault(name, []).append(error_of(torque, test))
-        for name, values in tracking(robot, methods, random, effort.unseen).items():
-            tracked.setdefault(name, []).extend(values)
-    return Findings([*rows_of_errors(by_method, effort.seeds), *rows_of_tracking(tracked)])
+            errors.setdefault(name, []).append(float(error_of(torque, test).mean()))
+        for _ in range(unseen):
+            wanted = motion(random)
+            feeds = {"without": None, "simulator": exact_torque(robot, wanted)}
+            feeds["true-parameters"] = np.asarray(exact(*wanted))
+            for name, feed in (feeds | {name: torque(*wanted) for name, torque in methods.items()}).items():
+                q, _, _, _, reference = follow(robot, wanted, feed)
+                tracked.setdefault(name, []).append(1e3 * float(np.sqrt(np.mean((q - reference) ** 2))))
+    return summary(errors, tracked)
 
 
-def tracking(
-    robot: Robot, methods: dict[str, Torque], random: np.random.Generator, count: int
-) -> dict[str, list[float]]:
-    """Rms tracking errors, mrad, on unseen motions under PD control, by model of the feed-forward and without any."""
-    true = tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE))
-    exact = jax.jit(jax.vmap(dynamics(true).inverse_dynamics))
-    feeds: dict[str, Callable[[Motion], np.ndarray | None]] = {
-        "without": lambda wanted: None,
-        "simulator": lambda wanted: exact_torque(robot, wanted),
-        "true-parameters": lambda wanted: np.asarray(exact(*wanted)),
-        **{name: lambda wanted, torque=torque: torque(*wanted) for name, torque in methods.items()},
-    }
-    errors: dict[str, list[float]] = {name: [] for name in feeds}
-    for _ in range(count):
-        wanted = motion(random)
-        for name, feed in feeds.items():
-            errors[name].append(1e3 * rms(follow(robot, wanted, feed(wanted))))
-    return errors
-
-
-def rows_of_errors(by_method: dict[str, list[np.ndarray]], seeds: int) -> list[Row]:
-    """Median and worst over seeds of the mean nMSE over joints, and our errors relative to the rivals'."""
-    means = {name: np.mean(errors, axis=1) for name, errors in by_method.items()}
-    rows = []
-    for name, values in means.items():
-        case, bound = f"arm/noisy-coulomb/{name}", SEEN if name == "ours" else None
-        rows.append(Row(case, "nmse", float(np.median(values)), bound=bound, expected=f"median of {seeds} seeds"))
-        rows.append(Row(case, "nmse_worst", float(np.max(values))))
+def summary(errors: dict[str, list[float]], tracked: dict[str, list[float]]) -> Numbers:
+    """Medians and worst over seeds, and medians of our errors relative to the rival's and to true parameters."""
+    numbers = {}
+    for name, values in errors.items():
+        numbers[f"arm/noisy-coulomb/{name}"] = {"nmse": np.median(values), "nmse_worst": np.max(values)}
         if name.startswith("pinocchio"):
-            words = f"median over seeds of ours over {name}, the same samples and filter"
-            ratio = np.median(means["ours"] / values)
-            rows.append(expect("arm/noisy-coulomb/ours", f"over_{name}", words, ratio, 1))
-    return rows
+            numbers["arm/noisy-coulomb/ours"][f"over_{name}"] = np.median(np.divide(errors["ours"], values))
+    for name, values in tracked.items():
+        numbers[f"arm/tracking/{name}"] = {"rms_mrad": np.median(values)}
+        if name.startswith("ours"):
+            ratio = np.median(np.divide(values, tracked["true-parameters"]))
+            numbers[f"arm/tracking/{name}"]["over_true_parameters"] = ratio
+    return numbers
 
 
-def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
-    """Median errors over motions and seeds, and our errors relative to those with true parameters."""
-    rows = [
-        Row(f"arm/tracking/{name}", "rms_mrad", float(np.median(errors)), "mrad") for name, errors in tracked.items()
-    ]
-    words = "median over motions of ours over that with true parameters and dry friction of the usual scale"
-    for name in (name for name in tracked if name.startswith("ours")):
-        ratio = np.median(np.divide(tracked[name], tracked["true-parameters"]))
-        rows.append(expect(f"arm/tracking/{name}", "over_true_parameters", words, float(ratio), TRACKING))
-    return rows
+# An arm of two joints moves for 20 s while its gears warm up from 20 to 45 °C.
+NOISE, SAMPLES, STEP = 0.02, 800, 0.025
+PLANT_LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
+LINK = inertial_parameters(2.0, [0.05, 0.02, 0.1], np.diag([0.02, 0.03, 0.01]))
+ARM = serial(*dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0.1, 0, 0]]), [LINK] * 2, armature=[0.1, 0.05])
+PLANTS: dict[str, dict[str, Any]] = {
+    "none": {"friction": PLANT_LAWS},
+    "coupled": {"friction": PLANT_LAWS, "coupled": ((0, 1),)},
+    "load": {"friction": (*PLANT_LAWS, "load"), "load": (0.2, 0.1)},
+    "temperature": {"friction": PLANT_LAWS, "cooling": (0.02, 0.01), "reference_temperature": 25.0},
+}
 
 
-def rms(log: Log) -> float:
-    """Root mean square tracking error, rad."""
-    return float(np.sqrt(np.mean((log.q - log.reference) ** 2)))
+def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
+    """How often cross-validation keeps terms that a plant has, or not: shares of its logs, by plant and term.
+
+    An arm of two joints moves for 20 s while its gears warm up; torques have noise of about 1 % of their size.
+    """
+    options: dict[str, Any] = {"cooling": False, "motors": None, "coupled": ()}
+    terms = terms_of(PLANT_LAWS, None, (), **options)
+    candidates = {
+        "coupled": terms._replace(coupled=((0, 1),)),
+        "load": terms_of(("load",), None, (), **options),
+        "temperature": terms._replace(learned=("cooling",)),
+    }
+    numbers = {}
+    for plant, keywords in PLANTS.items():
+        count = logs_without if plant == "none" else logs_with
+        model = make_rigid_tree(ARM, velocity_scale=0.02, **keywords)
+        energies: Any = model.energies  # of a rigid tree, which takes a temperature too
+        parameters = model.init(jax.random.key(0))._replace(viscous=np.array([0.4, 0.3]), coulomb=np.array([0.5, 0.3]))
+        if plant == "coupled":
+            parameters = parameters._replace(coupling={"1_2": np.array(0.03)})
+
+        def torque(q: Any, qd: Any, qdd: Any, temperature: Any, energies=energies, parameters=parameters) -> Any:
+            return dynamics(energies(parameters, temperature)).inverse_dynamics(q, qd, qdd)
+
+        program = jax.jit(jax.vmap(torque))
+        kept = {f"share_keeping_{name}": 0.0 for name in candidates}
+        for seed in range(count):
+            random, w = np.random.default_rng(seed), np.arange(1.0, 6.0)[:, None]
+            t = STEP * np.arange(SAMPLES)
+            sizes, phases = 0.7 * random.normal(size=(2, 5, 1)), random.uniform(0, 2 * np.pi, (2, 5, 1))
+            angles = w * t + phases
+            waves = np.sin(angles) / w, np.cos(angles), -w * np.sin(angles)
+            state = dict(zip(("q", "qd", "qdd"), (np.sum(sizes * wave, axis=1).T for wave in waves), strict=True))
+            state["temperature"] = np.stack([20 + 25 * (1 - np.exp(-t / 8))] * 2, axis=1)
+            tau = np.asarray(program(**state)) + NOISE * random.normal(size=(SAMPLES, 2))
+            log = from_arrays({"t": t, "trajectory": np.zeros(SAMPLES, int), "tau": tau, **state})
+            for tried in choose_terms(ARM, log, terms, list(candidates.items()))[1]:
+                kept[f"share_keeping_{tried.name}"] += tried.kept / count
+        numbers[f"added-terms/{plant}"] = kept
+    return numbers

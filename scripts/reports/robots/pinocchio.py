@@ -1,26 +1,29 @@
-"""Times of calls from Python, of exported C and of Pinocchio, a rival in dynamics of rigid bodies.
+"""Pinocchio, a rival in dynamics of rigid bodies: its model of a tree, its functions, and a regression by it."""
 
-The rival's regressor of torques, with columns of armature and friction, is fitted by ordinary least squares.
-"""
-
-import importlib
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import DTypeLike
 
-from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.trees import Tree, inertial_parameters, serial
+from dln_jax.data import Trajectories
+from dln_jax.export.c.families import functions_of_system
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import Tree, inertial_parameters, serial, tree_system
+from scripts.reports.robots.arm import D, Torque, arm
+from scripts.reports.run import Numbers
 from scripts.reports.turns import medians_in_turns
 
-STATES = 256
+STATES, BATCH = 256, 10_000
 RIVALS = {"inverse_dynamics": "rnea", "forward_dynamics": "aba"}
 """Pinocchio's functions with the same arguments."""
-
-Torque = Callable[[Any, Any, Any], np.ndarray]
-"""q, qd, qdd [N, d] -> tau [N, d]."""
 
 
 class Timed(NamedTuple):
@@ -31,6 +34,34 @@ class Timed(NamedTuple):
     dtype: DTypeLike = np.float64
     title: str = ""
     """Name and release of a rival."""
+
+
+def speed(*, repetitions: int = 200, batches: int = 15) -> Numbers:
+    """Time of a call from Python in C and in Pinocchio, and throughput of batches, for a seven-axis tree."""
+    tree = arm(coulomb=False).tree
+    system = tree_system(tree)
+    exported = functions_of_system(system, D, dtype=np.float64)
+    # Without armature: ours adds it, and Pinocchio does a little less.
+    rivals = pinocchio_functions(tree)
+    with tempfile.TemporaryDirectory() as place:
+        export_c({name: exported[name] for name in RIVALS}, Path(place) / "arm")
+        loaded = load_c(Path(place) / "arm")
+        ours = {name: Timed(getattr(loaded, name), D) for name in RIVALS}
+        seconds = seconds_of_calls({**ours, **rivals}, repetitions=repetitions)
+    numbers = {}
+    for name, rival in RIVALS.items():
+        times = {"python_us": 1e6 * seconds[name]}
+        if rivals:
+            times |= {"pinocchio_us": 1e6 * seconds[rival], f"over_{rival}": seconds[name] / seconds[rival]}
+        numbers[f"seven-axis-tree/{name}"] = times
+    states = tuple(np.random.default_rng(0).normal(size=(3, BATCH, D)))
+    batched = jax.jit(jax.vmap(dynamics(system).inverse_dynamics))
+    loops = {"jax": partial(batched, *map(jnp.asarray, states))}
+    if rivals:
+        loops["pinocchio"] = partial(call_all, rivals["rnea"].function, list(zip(*states, strict=True)))
+    medians = medians_in_turns(loops, (), repetitions=batches)
+    rates = {f"{name}_states_per_second": BATCH / median for name, median in medians.items()}
+    return {**numbers, f"seven-axis-tree/batch-of-{BATCH}": rates}
 
 
 def seconds_of_calls(functions: Mapping[str, Timed], *, repetitions: int) -> dict[str, float]:
@@ -52,10 +83,11 @@ def call_all(function: Callable[..., Any], states: Sequence[tuple[np.ndarray, ..
 def pinocchio() -> Any:
     """The package; prints a line and returns `None` if it is missing."""
     try:
-        return importlib.import_module("pinocchio")
+        import pinocchio as pin
     except ImportError:
         print("Pinocchio is missing, and so are its rows; pip install 'dln-jax[reference]'")
         return None
+    return pin
 
 
 def pinocchio_model(pin: Any, tree: Tree) -> Any:
@@ -98,26 +130,22 @@ def rival_arm(d: int) -> Tree:
     return serial(rotations, 0.3 * random.normal(size=(d, 3)), links)
 
 
-def regression(tree: Tree, data: Trajectories, *, velocity_scale: Any) -> Torque | None:
-    """Pinocchio's regressor with armature, viscous, dry friction and an offset of each joint; `None` without Pinocchio.
+def regression(tree: Tree, data: Trajectories, velocity_scale: Any) -> Torque | None:
+    """Least squares by Pinocchio's regressor with armature, viscous, dry friction and an offset of each joint.
 
-    Args:
-        tree: tree with known frames.
-        data: data to fit, without the test data.
-        velocity_scale: velocity scale of dry friction, as in `joint_dissipation`, by joint or one for all.
+    `velocity_scale` is that of `joint_dissipation`, by joint or one for all. `None` without Pinocchio.
     """
     if (pin := pinocchio()) is None:
         return None
     model = pinocchio_model(pin, tree)
     of_states, d = model.createData(), tree.degrees_of_freedom
 
-    def columns(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        links = np.array(pin.computeJointTorqueRegressor(model, of_states, q, qd, qdd))
-        joints = (np.diag(rates) for rates in (qdd, qd, np.tanh(qd / velocity_scale), np.ones(d)))
-        return np.hstack([links, *joints])
-
-    def stacked(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        return np.concatenate([columns(*state) for state in zip(*map(np.asarray, (q, qd, qdd)), strict=True)])
+    def stacked(*states: Any) -> np.ndarray:
+        rows = []
+        for q, qd, qdd in zip(*map(np.asarray, states), strict=True):
+            joints = (np.diag(rates) for rates in (qdd, qd, np.tanh(qd / velocity_scale), np.ones(d)))
+            rows.append(np.hstack([pin.computeJointTorqueRegressor(model, of_states, q, qd, qdd), *joints]))
+        return np.concatenate(rows)
 
     theta = np.linalg.lstsq(stacked(data.q, data.qd, data.qdd), data.tau.ravel(), rcond=1e-10)[0]
-    return lambda q, qd, qdd: (stacked(q, qd, qdd) @ theta).reshape(-1, d)
+    return lambda *states: (stacked(*states) @ theta).reshape(-1, d)

@@ -1,13 +1,4 @@
-"""Gradients of a motion against finite differences along the gradient itself.
-
-For each quantity theta with gradient g, the slope along d = g/|g| is |g|; against it stand central differences of
-fourth order,
-
-    D(e) = (8 (L(e) - L(-e)) - (L(2 e) - L(-2 e))) / 12 e,    L(e) = L(theta + e d)
-
-for steps e that halve. The quotient that changes least from the previous step counts, a rule that does not depend on
-the gradient.
-"""
+"""The crawler: gradients of its motion against finite differences, and the time of its steps and of reverse mode."""
 
 import functools
 from collections.abc import Callable
@@ -19,58 +10,90 @@ import numpy as np
 from jaxtyping import Array
 
 from dln_jax.rollout import rollout
+from dln_jax.softbody import SoftScene, make_step, positions_and_convergence, with_parameters
 from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh import shapes
-from dln_jax.softbody.scene import SoftScene, with_parameters
-from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.creature import TIME_STEP
-from scripts.reports.case import Findings
-from scripts.reports.rows import expect
+from scripts.reports.run import Numbers
+from scripts.reports.turns import medians_in_turns
 
-BOUND = 1e-7
-STEPS = 100
-TOLERANCE = 1e-9
-"""Tolerance of the steps, m/s²: differences need more digits than motions."""
-HALVINGS = 14
-LARGEST_STEP = 2.0**-8
-"""Largest step e, relative to the size of theta."""
-
+LANES = 64
 Loss = Callable[[dict[str, Any]], Array]
 
 
-def crawler(quick: bool) -> Findings:
-    """A crawler of 28 vertices over contact steps with ground, friction and muscles: reverse mode for everything."""
-    loss, at = crawling(40 if quick else STEPS)
-    at = {key: np.asarray(leaf) for key, leaf in at.items()}
-    value, gradients = jax.tree.map(np.asarray, jax.jit(jax.value_and_grad(loss))(at))
-    slopes = {key: np.sqrt(np.sum(leaf**2)) for key, leaf in gradients.items()}
-    directions = {key: leaf / slopes[key] for key, leaf in gradients.items()}
-    # The unit of steps is the largest entry, or 1 for zeros.
-    scales = {key: float(np.max(np.abs(leaf))) or 1.0 for key, leaf in at.items()}
-    lengths = LARGEST_STEP * 2.0 ** -np.arange(HALVINGS)
-    both = np.concatenate([lengths, -lengths])
+def crawler(*, contact_steps: int = 100) -> Numbers:
+    """Reverse mode for everything, over contact steps with ground, friction and muscles.
 
-    def moved(group: Array, length: Array) -> Array:
-        shifts = {key: jnp.where(group == number, length, 0.0) for number, key in enumerate(at)}
-        return loss({key: leaf + shifts[key] * directions[key] for key, leaf in at.items()})
+    For each quantity theta with gradient g, the slope along d = g/|g| is |g|; against it stand central differences of
+    fourth order,
 
-    groups, tried = np.repeat(np.arange(len(at)), len(both)), np.concatenate([both * scales[key] for key in at])
-    values = np.asarray(jax.jit(jax.vmap(moved))(groups, tried)).reshape(len(at), 2, HALVINGS)
-    text = f"the slope along the gradient, by central differences (motion ends at {float(value):.3g})"
-    rows = []
-    for key, (ahead, behind) in zip(at, values, strict=True):
+        D(e) = (8 (L(e) - L(-e)) - (L(2 e) - L(-2 e))) / 12 e,    L(e) = L(theta + e d)
+
+    for steps e that halve. The quotient that changes least from the previous step counts, a rule that does not depend
+    on the gradient.
+    """
+    loss, at = crawling(contact_steps, tolerance=1e-9)  # m/s²: differences need more digits than motions
+    gradients = jax.jit(jax.grad(loss))(at)
+
+    def moved(direction: dict[str, Any], length: Array) -> Array:
+        return loss(jax.tree.map(lambda leaf, slope: leaf + length * slope, at, direction))
+
+    program, errors = jax.jit(jax.vmap(moved, in_axes=(None, 0))), {}
+    for key, gradient in gradients.items():
+        slope = float(jnp.sqrt(jnp.sum(gradient**2)))
+        direction = {name: leaf / slope if name == key else 0 * leaf for name, leaf in gradients.items()}
+        # The unit of steps is the largest entry, or 1 for zeros.
+        lengths = (float(jnp.max(jnp.abs(at[key]))) or 1.0) * 2.0 ** -np.arange(8, 22)
+        ahead, behind = np.asarray(program(direction, np.concatenate([lengths, -lengths]))).reshape(2, -1)
         central = ahead - behind
-        fourth = (8 * central[1:] - central[:-1]) / (12 * lengths[1:] * scales[key])
+        fourth = (8 * central[1:] - central[:-1]) / (12 * lengths[1:])
         best = fourth[1 + np.argmin(abs(np.diff(fourth)))]
-        slope = float(slopes[key])
-        rows.append(
-            expect("gradient/crawler", f"{key}_relative_error", text, abs(best / slope - 1), BOUND, reference=slope)
-        )
-    return Findings(rows)
+        errors[f"{key}_relative_error"] = abs(best / slope - 1)
+    return {"gradient/crawler": errors}
+
+
+def creature(*, steps: int = 1000) -> Numbers:
+    """Steps per second of one crawler, and of many gaits side by side by vmap, 100 steps each."""
+    scene, muscles = crawling_scene()
+    init, step = make_step(scene, TIME_STEP)
+
+    def run(controls: Any) -> Any:
+        return rollout(functools.partial(step, scene.params), init(), controls, observe=positions_and_convergence)[1]
+
+    controls = gait(steps, muscles)
+    lanes = gait(100, muscles) * jnp.linspace(0.8, 1.0, LANES)[:, None, None]
+    alone, together = jax.jit(run), jax.jit(jax.vmap(lambda controls: run(controls)[0][-1]))
+    seconds, lanes_seconds = (
+        medians_in_turns({"": program}, (given,), repetitions=9)[""]
+        for program, given in ((alone, controls), (together, lanes))
+    )
+    return {
+        "speed/crawler": {
+            "steps_per_second": steps / seconds,
+            "steps_not_converged": np.sum(~np.asarray(alone(controls)[1])),
+        },
+        f"speed/{LANES}-crawlers": {"environment_steps_per_second": 100 * LANES / lanes_seconds},
+    }
+
+
+def backward(*, repetitions: int = 30) -> Numbers:
+    """Time of reverse mode over that of the motion itself, 100 steps of the crawler."""
+    loss, at = crawling(100, tolerance=1e-6)
+
+    def slopes(at: Any, names: list[str]) -> Any:
+        return jax.value_and_grad(lambda part: loss({**at, **part}))({name: at[name] for name in names})
+
+    chosen = {"controls": ["controls"], "everything": list(at)}
+    programs = {name: jax.jit(functools.partial(slopes, names=names)) for name, names in chosen.items()}
+    seconds = medians_in_turns({"motion": jax.jit(loss), **programs}, (at,), repetitions=repetitions)
+    return {
+        f"speed/gradient-by-{name}": {"backward_over_forward": seconds[name] / seconds["motion"] - 1}
+        for name in programs
+    }
 
 
 def crawling_scene() -> tuple[SoftScene, int]:
-    """The preset crawler and its number of muscles."""
+    """The preset crawler of 28 vertices, and its number of muscles."""
     body = shapes.crawler()
     return creature_scene(body), len(body.muscles)
 
@@ -81,8 +104,8 @@ def gait(steps: int, muscles: int) -> Array:
     return jnp.asarray(0.85 + 0.15 * np.sin(phase))
 
 
-def crawling(steps: int, tolerance: float = TOLERANCE) -> tuple[Loss, dict[str, Any]]:
-    """Distance of the crawler as a function of all its inputs, and the point of evaluation."""
+def crawling(steps: int, *, tolerance: float) -> tuple[Loss, dict[str, Any]]:
+    """Distance of the crawler, m, plus terms of its shape and velocity, as a function of its inputs; and these."""
     scene, muscles = crawling_scene()
     init, step = make_step(scene, TIME_STEP, tolerance=tolerance)
     terms, start = scene.params.terms, init()
@@ -100,7 +123,6 @@ def crawling(steps: int, tolerance: float = TOLERANCE) -> tuple[Loss, dict[str, 
     }
 
     def loss(at: dict[str, Array]) -> Array:
-        """Distance of the body, m, plus terms of its shape and velocity."""
         params = with_parameters(
             scene.params._replace(rest=at["rest_shape"], masses=at["masses"]),
             elastic={"mu": at["mu"], "lam": at["lambda"]},
@@ -111,4 +133,4 @@ def crawling(steps: int, tolerance: float = TOLERANCE) -> tuple[Loss, dict[str, 
         last, _ = rollout(functools.partial(step, params), start, at["controls"], observe=lambda state, info: None)
         return last.x[:, 0].mean() + 0.1 * (last.x[:, 1] ** 2).sum() + 0.1 * last.v[0, 0]
 
-    return loss, at
+    return loss, jax.tree.map(jnp.asarray, at)

@@ -1,1 +1,0 @@
-"""Hamiltonian tasks: data, training and errors, compared with published results."""

@@ -1,0 +1,307 @@
+"""Recordings of real robots: a double pendulum with motors, and an arm whose file is known.
+
+The double pendulum is `design_A.0` (DFKI, BSD 3-Clause): nine recordings of q, t and tau, of which pairs are held out.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from dln_jax.data import Trajectories, read_robot, schema, select
+from dln_jax.data.encoders import low_pass, smooth
+from dln_jax.data.encoders.smoothing import TRIMMED
+from dln_jax.data.splits import in_blocks, label_indices, window_indices, with_joints
+from dln_jax.identification import identify, parameters_of
+from dln_jax.identification.residual import fit_residual
+from dln_jax.learning import GaussNewton, Problem, fit, fit_friction, measured_motions
+from dln_jax.learning.engine.problem import mean_square, unmonitored
+from dln_jax.learning.friction import FrictionFit
+from dln_jax.learning.kinematics import fit_tree
+from dln_jax.learning.linear import design
+from dln_jax.learning.measured_motions import Noise, cut_measured_windows
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import Tree, inertial_parameters, serial
+from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
+from dln_jax.models import Model, Parameters, make_planar_chain, make_rigid_tree, with_joint_friction
+from dln_jax.models.serial_tree import tree_of
+from dln_jax.solvers import least_squares
+from dln_jax.training.identification.motions import MotionSets, fit_by
+from dln_jax.types import FrictionLaw, InputError, Needs
+from scripts.reports.robots.arm import Torque, error_of, torque_of
+from scripts.reports.robots.known_kinematics import USUAL_SCALE
+from scripts.reports.robots.pinocchio import regression
+from scripts.reports.run import Numbers
+
+CUTOFF, FINE, BASE, RATE = 6.0, 30.0, 500.0, 100.0
+"""Cut-off at which least squares of filtered motions predict held-out recordings best (of 2, 3, 4, 6, 8, 10, 12, 25),
+cut-off that keeps the motion, approximate rate of the recordings, and rate of the fitted samples, Hz."""
+HELD_OUT = (("02", "11"), ("00", "12"), ("04", "13"), ("01", "05"), ("03", "13"))
+"""Held-out recordings, by split."""
+WINDOW = 11
+"""Samples of a window and of a prediction's fitted start: 0.1 s."""
+PENDULUM_SCALE, SCALES = 0.1, (0.05, 0.1, 0.2, 0.5, 1.0)
+"""Default and candidate velocity scales of dry friction, rad/s."""
+LAWS: tuple[tuple[FrictionLaw, ...], ...] = (
+    ("viscous", "coulomb", "offset"),
+    ("viscous", "coulomb", "stribeck", "offset"),
+    ("asymmetric", "offset"),
+)
+"""Candidate sets of friction laws of the arm."""
+Logs = tuple[Trajectories, Trajectories]
+"""Recordings filtered at `CUTOFF`, and so that they keep the motion, at the same times."""
+
+
+def double_pendulum(*, double_pendulum: Path | None = None, splits: int = len(HELD_OUT)) -> Numbers:
+    """Planar chains of ten parameters, fitted in several ways to the recordings that are not held out.
+
+        least-squares   torques of filtered motions, as engineers fit them; q and tau are filtered alike
+        chosen-scale    the same, with the velocity scale that explains each recording best from the others
+        low-passed      the regressor of less filtered motions is filtered, and tau with it
+        stacked         the equations of both, with equal weights
+        both            motions and torques in one objective, with friction by load
+
+    Recorded torques explain slow accelerations well and those above 3 Hz badly, because forces act that were not
+    recorded. They draw least squares of torques to small inertias, which are best for torques and bad for predictions.
+    """
+
+    def fits(rest: Logs, held: Logs) -> dict[str, tuple[Model, Parameters]]:
+        scale, usual = best_scale(rest), chain(PENDULUM_SCALE)
+        model = chain(scale)
+        coarse, smoothed = (equations(model, rest, filtered=filtered) for filtered in (False, True))
+        solved = {"chosen-scale": coarse, "low-passed": smoothed, "stacked": [*coarse, *smoothed]}
+        return {
+            "least-squares": (usual, with_vector(usual, solution(equations(usual, rest)))),
+            **{name: (model, with_vector(model, solution(found))) for name, found in solved.items()},
+            "both": motions_and_torques(rest, scale),
+        }
+
+    return judged("double-pendulum", double_pendulum, splits, fits)
+
+
+def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_OUT)) -> Numbers:
+    """`identify --by torques, motions, both`: a rigid tree of two links, the second 0.3 m from the first, rough masses.
+
+    Inner splits of the training recordings choose the windows of motions, which both takes over.
+    """
+    link = inertial_parameters(0.6, [0.0, 0.0, -0.2], 1e-3 * np.eye(3))
+    tree = serial(
+        np.tile(np.eye(3), (2, 1, 1)), [[0.0, 0.0, 0.0], [0.0, 0.0, -0.3]], [link] * 2,
+        axes=np.tile([0.0, 1.0, 0.0], (2, 1)), armature=np.full(2, 1e-3), gravity=(0.0, 0.0, -9.81),
+    )  # fmt: skip
+    model = make_rigid_tree(tree, friction=LAWS[0], velocity_scale=PENDULUM_SCALE)
+    known: Parameters = model.init(jax.random.key(0))
+
+    def fits(rest: Logs, held: Logs) -> dict[str, tuple[Model, Parameters]]:
+        by_torques, sets = identify(model, known, rest[0]), MotionSets(rest[1], held[1])
+        by_motions, _, choice = fit_by("motions", model, known, by_torques, rest[0], sets, None)
+        by_both = by_torques
+        if choice.window is not None:
+            by_both, *_ = fit_by("both", model, known, by_torques, rest[0], sets, choice.window)
+        found = {"torques": by_torques, "motions": by_motions, "both": by_both}
+        return {way: (model, parameters_of(solution.theta, known)) for way, solution in found.items()}
+
+    numbers = judged("identify-by", double_pendulum, splits, fits)
+    times = {
+        way: [row[key] for key in row if key.startswith("vpt") and key[-1].isdigit()] for way, row in numbers.items()
+    }
+    for way in numbers:
+        ratios = np.divide(times[way], times["identify-by/torques"])
+        numbers[way] |= {"vpt_over_torques_worst": np.min(ratios), "vpt_over_torques_median": np.median(ratios)}
+    return numbers
+
+
+def judged(name: str, path: Path | None, splits: int, fits: Any) -> dict[str, dict[str, float]]:
+    """Torque errors of filtered motions and valid prediction times by way to fit: median, worst, and by split.
+
+    Errors are relative to the variance over all recordings, times are means over segments of 2.2 s.
+    """
+    if path is None:
+        return {}
+    known = {"rate": BASE, "trim": 0.3, "decimate": round(BASE / RATE), "filter_torque": True}
+    coarse, fine = (smooth(schema.load(path), cutoff, **known).data for cutoff in (CUTOFF, FINE))
+    found: dict[str, list[tuple[float, float]]] = {}
+    for labels in HELD_OUT[:splits]:
+        held = label_indices(fine, labels)
+        others = np.setdiff1d(np.unique(fine.trajectory), held)
+        rest, test = ((select(coarse, part), select(fine, part)) for part in (others, held))
+        segments = cut_segments(test[1], round(2.2 * RATE), every=round(0.5 * RATE))
+        for way, (model, parameters) in fits(rest, test).items():
+            off = torque_of(model, parameters)(test[0].q, test[0].qd, test[0].qdd) - test[0].tau
+            predicted = predict_measured(model, parameters, segments, fitted=WINDOW)
+            times = valid_times(segments, predicted, fitted=WINDOW, variance=fine.q.var(axis=0))
+            error = float(np.mean(off**2 / coarse.tau.var(axis=0)))
+            found.setdefault(f"{name}/{way}", []).append((error, float(np.mean(times))))
+    numbers: dict[str, dict[str, float]] = {}
+    for way, values in found.items():
+        for quantity, worst, of_splits in zip(
+            ("torque_nmse", "vpt_mean_seconds"), (np.max, np.min), np.transpose(values), strict=True
+        ):
+            row = {quantity: np.median(of_splits), f"{quantity}_worst": worst(of_splits)}
+            row |= {f"{quantity}_{'_'.join(key)}": value for key, value in zip(HELD_OUT, of_splits, strict=False)}
+            numbers.setdefault(way, {}).update(row)
+    return numbers
+
+
+def chain(velocity_scale: float, laws: tuple[FrictionLaw, ...] = ()) -> Model:
+    """The planar chain of two links with motors; additional friction laws add parameters."""
+    needs = Needs(joints=("revolute", "revolute"), friction=True, velocity_scale=velocity_scale)
+    rigid = make_planar_chain(needs, armature=True, velocity_scale=velocity_scale)
+    return with_joint_friction(rigid, needs._replace(joint_friction=laws), dtype=jnp.float64)
+
+
+def equations(model: Model, logs: Logs, *, filtered: bool = False) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Columns and torques of each recording over the torques' deviations: coarse motions, or low-passed fine ones.
+
+    Ends of low-passed columns are dropped, where the filter has data on one side only.
+    """
+    data, scale = logs[int(filtered)], logs[0].tau.std(axis=0)
+    Phi = np.asarray(design(model)(zeros(model), data.q, data.qd, data.qdd)[0])
+    ends, listed = round(TRIMMED * RATE / CUTOFF), []
+    for index in np.unique(data.trajectory):
+        both = np.concatenate([Phi, data.tau[:, :, None]], axis=2)[data.trajectory == index] / scale[:, None]
+        if filtered:
+            columns = low_pass(both.reshape(len(both), -1), rate=RATE, cutoff=CUTOFF)[ends:-ends]
+            both = columns.reshape(-1, *both.shape[1:])
+        rows = both.reshape(-1, both.shape[2])
+        listed.append((rows[:, :-1], rows[:, -1]))
+    return listed
+
+
+def solution(listed: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Least squares of equations."""
+    A, b = (np.concatenate(parts) for parts in zip(*listed, strict=True))
+    return least_squares.solve(A, b).x
+
+
+def best_scale(logs: Logs) -> float:
+    """The velocity scale with the lowest leave-one-out error over the recordings."""
+    errors = []
+    for scale in SCALES:
+        listed = equations(chain(scale), logs)
+        off = [A @ solution(listed[:out] + listed[out + 1 :]) - b for out, (A, b) in enumerate(listed)]
+        errors.append(np.mean(np.concatenate(off) ** 2))
+    return SCALES[int(np.argmin(errors))]
+
+
+def motions_and_torques(logs: Logs, scale: float) -> tuple[Model, Parameters]:
+    """Fits motions and torques in one objective, with load-dependent friction; the middle recording selects the step.
+
+        loss = mean over windows of |r_w|² + 3 * mean over samples of sum_j ((tau_hat_j - tau_j) / noise_j)²
+
+    r_w is that of `learning.measured_motions`, tau_hat belongs to filtered motions, and the noise is what low-passed
+    equations leave. The standard deviation of q, 2 mrad, is larger than the sensor noise, for unmodelled forces.
+    """
+    rigid, model, smoothed = chain(scale), chain(scale, ("load",)), equations(chain(scale), logs, filtered=True)
+    x = solution(smoothed)
+    off = np.concatenate([A @ x - b for A, b in smoothed]).reshape(-1, 2)
+    noise = logs[0].tau.std(axis=0) * np.sqrt(np.mean(off**2, axis=0))
+    present = np.unique(logs[0].trajectory)
+    middle = present[len(present) // 2]
+    coarse, fine = ([select(data, part) for part in (present[present != middle], [middle])] for data in logs)
+    windows = [cut_measured_windows(part, WINDOW) for part in fine]
+    start = model.init(jax.random.key(0)) | {"model": with_vector(rigid, x)}
+    task = measured_motions.problem(model, start, *windows, noise=Noise(2e-3, tau=tuple(noise.tolist())))
+    arrays, validation = (torque_windows(part) for part in coarse)
+    split, motion_residual = len(task.arrays), task.residual
+    assert motion_residual is not None
+
+    def torque_error(parameters: Parameters, q: Any, qd: Any, qdd: Any, tau: Any, weight: Any) -> Any:
+        missed = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(q, qd, qdd) - tau
+        return jnp.ravel(jnp.sqrt(3.0 * weight / jnp.sum(weight))[:, None] * missed / noise)
+
+    def residual(parameters: Parameters, *window: Any) -> Any:
+        motion, torque = motion_residual(parameters, *window[:split]), torque_error(parameters, *window[split:])
+        return jnp.concatenate([jnp.ravel(motion), torque])
+
+    def score(parameters: Parameters) -> tuple[Any, Any]:
+        torques = mean_square(lambda *window: torque_error(parameters, *window), validation)
+        return unmonitored(task.score(parameters)[0] + torques)
+
+    both: Problem = task._replace(residual=residual, arrays=(*task.arrays, *arrays), score=score)
+    return model, fit(both, GaussNewton(8, steps_per_dispatch=4)).parameters
+
+
+def torque_windows(data: Trajectories) -> tuple[Any, ...]:
+    """q, qd, qdd and tau [W, T, d] and weights [W, T] of the same windows as `cut_measured_windows`."""
+    indices, weight = window_indices(data, WINDOW)
+    return tuple(map(jnp.asarray, (*(array[indices] for array in (data.q, data.qd, data.qdd, data.tau)), weight)))
+
+
+def zeros(model: Model) -> Any:
+    """Parameters that are zero."""
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
+
+
+def with_vector(model: Model, x: np.ndarray) -> Any:
+    """Parameters from their vector."""
+    return ravel_pytree(zeros(model))[1](jnp.asarray(x))
+
+
+def recorded_arm(*, log: Path | None = None, robot: Path | None = None, pairs: int = 5) -> Numbers:
+    """A recorded arm in ten blocks, two neighbours held out at a time, by models that have not seen them.
+
+    Errors are over the variance of the whole log, so that a block in which a joint rests does not count for more. Laws
+    of friction, the network and the learned frames are chosen by blocks of the fitted data.
+    """
+    if log is None and robot is None:
+        return {}
+    if log is None or robot is None:
+        raise InputError("--log and --robot belong together; give both, or neither")
+    tree = read_robot(robot).tree
+    data = in_blocks(smooth(with_joints(schema.load(log), tree.names), 5.0, decimate=2).data, 10)
+    squares: dict[str, list[np.ndarray]] = {}
+    for pair in ((2 * place, 2 * place + 1) for place in range(pairs)):
+        held = select(data, pair)
+        for name, torque in arm_fits(tree, select(data, np.setdiff1d(np.unique(data.trajectory), pair))).items():
+            squares.setdefault(name, []).append((torque(held.q, held.qd, held.qdd) - held.tau) ** 2)
+    return block_errors(squares, data.tau.var(axis=0), tree.names)
+
+
+def block_errors(squares: Mapping[str, list[np.ndarray]], variance: np.ndarray, names: Sequence[str]) -> Numbers:
+    """Mean nMSE over joints for all blocks and for the worst pair of blocks, and nMSE by joint."""
+    numbers: dict[str, dict[str, float]] = {}
+    for name, errors in squares.items():
+        joints = np.mean(np.concatenate(errors), axis=0) / variance
+        worst = max(float(np.mean(pair.mean(axis=0) / variance)) for pair in errors)
+        by_joint = {f"nmse_{joint}": value for joint, value in zip(names, joints, strict=True)}
+        numbers[f"recorded-arm/{name}"] = {"nmse": joints.mean(), "nmse_worst_blocks": worst, **by_joint}
+    for name, over, other in (
+        ("with-residual", "over_without", "chosen-friction"),
+        ("chosen-friction", "over_pinocchio", "pinocchio"),
+    ):
+        if other in squares:
+            own, rival = (numbers[f"recorded-arm/{each}"]["nmse"] for each in (name, other))
+            numbers[f"recorded-arm/{name}"][over] = own / rival
+    return numbers
+
+
+def arm_fits(tree: Tree, data: Trajectories) -> dict[str, Torque]:
+    """Torques by method, fitted to these blocks; every fourth one chooses."""
+    present = np.unique(data.trajectory)
+    chosen = present[1::4]
+    train, validation = select(data, np.setdiff1d(present, chosen)), select(data, chosen)
+
+    def torque_by(fitted: FrictionFit) -> Torque:
+        return torque_of(fitted.model, fitted.parameters)
+
+    laws = min(LAWS, key=lambda laws: error_of(torque_by(fit_friction(tree, train, laws)), validation).mean())
+    full = fit_friction(tree, data, laws)
+    # The tree has seen what the network's size is chosen by, which leaves a network less to better there.
+    network = fit_residual(full.model, full.parameters, tree.needs, train, validation)
+    needs = tree.needs._replace(friction=True)
+    trees = [fit_tree(needs, train, validation, velocity_scale=scale) for scale in (0.01, 0.1)]
+    learned = tree_of(min(trees, key=lambda found: found.validation_error).parameters, needs)
+    frames = {"rotations": np.asarray(learned.rotations), "positions": np.asarray(learned.positions)}
+    torques = {
+        "usual-friction": torque_by(fit_friction(tree, data, LAWS[0])),
+        "chosen-friction": torque_by(full),
+        "with-residual": torque_of(network.model, network.parameters),
+        "learned-tree": torque_by(fit_friction(learned._replace(**frames), data, laws)),
+    }
+    rival = regression(tree, data, USUAL_SCALE)
+    return torques if rival is None else {**torques, "pinocchio": rival}

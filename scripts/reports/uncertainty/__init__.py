@@ -1,1 +1,0 @@
-"""Quality of uncertainty estimates: coverage of bands on held-out motions, and out-of-distribution flags."""
