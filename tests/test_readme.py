@@ -16,13 +16,14 @@ from calls import command
 from conftest import PROGRAMS, SHORTEST_COMPILATION, slow_among
 from interpreters import Program, interpreters
 
-from dln_jax.cli.arguments import parse
+from dln_jax.cli.arguments import names_listed, parse
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.cli.options import CompilationCache
 from dln_jax.data import schema
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 from dln_jax.scenes.poles import cart_pole
+from scripts.reports.run import arguments_of, chosen_cases
 
 ROOT = Path(__file__).parent.parent
 PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}
@@ -60,9 +61,16 @@ def commands(text):
 
 def script_and_arguments(words):
     assert words[:2] == ["python", "-m"] and words[2].startswith("scripts."), words
-    name = words[2].removeprefix("scripts.")
-    package = "dln_jax.cli.commands" if name in COMMANDS else "scripts.reports.commands"
-    return importlib.import_module(f"{package}.{name}"), words[3:]
+    return importlib.import_module(f"dln_jax.cli.commands.{words[2].removeprefix('scripts.')}"), words[3:]
+
+
+def cases_and_line(words):
+    """The cases of a report, and the words after its name, of which a first one without dashes is a subject."""
+    source = (ROOT / "scripts" / f"{words[2].removeprefix('scripts.')}.py").read_text()
+    called = re.search(r'^report\("(\w+)"', source, re.MULTILINE)
+    name, line = (called[1], words[3:]) if called else (words[3], words[4:])
+    subject = ["--only"] if line and not line[0].startswith("-") else []
+    return importlib.import_module(f"scripts.reports.cases.{name}").CASES, [*subject, *line]
 
 
 EVERY = [words for block in blocks("bash") for words in commands(block.text)]
@@ -116,7 +124,13 @@ def test_a_command_of_a_block_runs(words, workplace):
 
 def test_commands_in_the_text_parse():
     for text in INLINE:
-        script, words = script_and_arguments(shlex.split(text))
+        words = shlex.split(text)
+        if words[2].removeprefix("scripts.") not in COMMANDS:
+            cases, line = cases_and_line(words)
+            options = parse(arguments_of(cases), prog=text, description=None, line=line, common=CompilationCache)
+            chosen_cases(cases, names_listed(options.own.only))
+            continue
+        script, words = script_and_arguments(words)
         parsed = parse(script.Arguments, prog=script.__name__, description=None, line=words, common=CompilationCache)
         for name, hint in get_type_hints(type(parsed.own), include_extras=True).items():
             for shown in (getattr(mark, "metavar", None) for mark in getattr(hint, "__metadata__", ())):

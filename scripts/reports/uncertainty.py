@@ -26,7 +26,7 @@ from dln_jax.models import Model, Parameters, make_delan, make_rigid_tree
 from dln_jax.models.uncertainty import out_of_distribution, predictive
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm
-from scripts.reports.parts import partition_labels
+from scripts.reports.arm.data import partition_labels
 from scripts.reports.robots.simulated_arms import RIGHT, panda
 from scripts.reports.run import Numbers
 

@@ -8,10 +8,10 @@ from dln_jax import figures
 from dln_jax.learning.engine.problem import Progress, one_after_the_other
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors
+from dln_jax.metrics.report import Row, conditions, write_report
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from scripts.reports.predictions import predictions
-from scripts.reports.rows import Row, conditions, write_report
 from tests.calls import json_of
 
 

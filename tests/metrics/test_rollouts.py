@@ -20,7 +20,7 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_time,
     valid_prediction_times,
 )
-from scripts.reports.arm.published_swings import STARTS, uniform_tests
+from scripts.reports.arm.data import STARTS, published_swings
 from scripts.reports.predictions import rollout_metrics
 from tests.calls import one_line
 
@@ -145,7 +145,7 @@ def test_recordings_that_cannot_be_followed_are_refused():
 
 
 def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
-    data = uniform_tests()
+    data = published_swings()
     assert data.q.shape == (1200, 2) and data.t[399] == pytest.approx(7.98)
     np.testing.assert_array_equal(data.tau, 0.0)
     np.testing.assert_array_equal(data.q[::400], STARTS)

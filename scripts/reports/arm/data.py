@@ -55,7 +55,7 @@ def whole_circle() -> Trajectories:
     return generators.uniform(two_link_arm(), samples=1_000, seed=1, **bounds)
 
 
-def partition_labels(data: Trajectories, parts: int) -> list[list[str]]:
+def partition_labels(data: Trajectories, parts: int, *, seed: int = 0) -> list[list[str]]:
     """Labels in groups of nearly equal size for cross-validation: every trajectory is in one test.
 
     Raises:
@@ -64,7 +64,7 @@ def partition_labels(data: Trajectories, parts: int) -> list[list[str]]:
     labels = np.sort(data.label[np.unique(data.trajectory)])
     if not 2 <= parts <= len(labels):
         raise InputError(f"{len(labels)} trajectories cannot be cut into {parts} tests; ask for 2 to {len(labels)}")
-    permuted = np.random.default_rng(0).permutation(labels)
+    permuted = np.random.default_rng(seed).permutation(labels)
     return [part.tolist() for part in np.array_split(permuted, parts)]
 
 

@@ -19,7 +19,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree, inertial_parameters, serial, tree_system
 from scripts.reports.robots.arm import D, Torque, arm
 from scripts.reports.run import Numbers
-from scripts.reports.turns import medians_in_turns
+from scripts.reports.timing import medians_in_turns
 
 STATES, BATCH = 256, 10_000
 RIVALS = {"inverse_dynamics": "rnea", "forward_dynamics": "aba"}

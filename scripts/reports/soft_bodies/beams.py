@@ -26,7 +26,7 @@ from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians
 from scripts.reports.run import Numbers
 from scripts.reports.soft_bodies.gradients import crawling
-from scripts.reports.turns import medians_in_turns
+from scripts.reports.timing import medians_in_turns
 
 DT = 1 / 30
 BARS = ((10, 4, 4), (17, 6, 6), (36, 13, 13))

@@ -15,7 +15,7 @@ from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh import shapes
 from dln_jax.softbody.terms.creature import TIME_STEP
 from scripts.reports.run import Numbers
-from scripts.reports.turns import medians_in_turns
+from scripts.reports.timing import medians_in_turns
 
 LANES = 64
 Loss = Callable[[dict[str, Any]], Array]

@@ -30,7 +30,6 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK
-from scripts.reports.commands import arm_table, delan_report, diffnet_table, hnn_table
 
 STATES = {key: np.random.default_rng(0).normal(size=(20, 2)) for key in ("q", "qd", "qdd", "tau")}
 TRAJECTORIES = {"t": np.tile(np.arange(4.0), 5), **STATES, "trajectory": np.repeat(np.arange(5), 4)}
@@ -124,9 +123,6 @@ def test_commands_refuse_damaged_archives(here, capsys):
         (train_hnn_task, TRAJECTORIES, "--task=measured --data"),
         (train_diffnet, {"x": np.ones((20, 1))}, "--function"),
         (simulate, MESH, "--mesh"),
-        (arm_table, TRAJECTORIES, "--data"),
-        (delan_report, TRAJECTORIES, "--data"),
-        (hnn_table, TRAJECTORIES, "--real-pendulum"),
     ):
         Path("garbled.npz").write_bytes(garbled(members))
         assert "garbled.npz" in refuse(capsys, script, option, "garbled.npz", "--out run")
@@ -203,10 +199,7 @@ RESUMED = [
     (train_hnn_task, {"task": "spring"}, "trajectories"),
     (train_hnn_pixels, {}, "steps"),
     (train_diffnet, {}, "depth"),
-    (diffnet_table, {}, "steps"),
     (train_locomotion, {}, "episode"),
-    (arm_table, {}, "seeds"),
-    (hnn_table, {}, "seeds"),
 ]
 WRONG_NUMBERS = ["3", 2.5, True, [3], {"a": 3}, float("nan"), float("inf"), 10**30, -3]
 
@@ -224,21 +217,6 @@ def test_damaged_configs_are_refused(here, capsys):
             Path("run", CONFIG).write_text(text)
             line = refuse(capsys, module, "--out run --resume")
             assert CONFIG in line or (f'"{number}": -3' in text and number in line), text
-
-
-def test_a_damaged_table_of_what_was_measured_is_refused(here, capsys):
-    Path("run").mkdir()
-    Path("run", LOCK).touch()
-    write_json(Path("run", CONFIG), {**stored_arguments(diffnet_table.Arguments()), "samples": 50})
-    for stored in (
-        "{",
-        '{"teapot": {}}',
-        '{"sin/type1/cos/gauss-newton": 3}',
-        '{"sin/type1/cos/gauss-newton": {"value_mse": "small"}}',
-        '{"sin/type1/cos/gauss-newton": {"value_mse": 1.0}}',
-    ):
-        Path("run", "jobs.json").write_text(stored)
-        assert "jobs.json" in refuse(capsys, diffnet_table, "--out run --resume")
 
 
 # checkpoints
@@ -284,8 +262,6 @@ def test_places_that_cannot_be_written_to_are_refused(here, capsys, monkeypatch)
         (train_diffnet, "--samples 20"),
         (train_locomotion,),
         (simulate,),
-        (hnn_table, "--tasks spring"),
-        (delan_report, "--only published --data data.npz --test 4"),
     ):
         assert "--out" in refuse(capsys, script, *options, "--out file")
     monkeypatch.setenv("XDG_CACHE_HOME", "file")

@@ -31,14 +31,6 @@ from dln_jax.cli.commands import (
 from dln_jax.cli.stored_arguments import with_stored_arguments, write_config
 from dln_jax.data import schema
 from dln_jax.training.values import Family, family_of, load_value, plant_named, save_value
-from scripts.reports.commands import (
-    arm_table,
-    compare_locomotion,
-    diffnet_report,
-    diffnet_table,
-    hnn_table,
-    scale_report,
-)
 
 ROBOT = """<robot name="r"><link name="b"/><link name="l"><inertial><mass value="1"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><joint name="j" type="revolute">
@@ -79,12 +71,6 @@ OPTIONS = {
         *(f"--grid seed=0:{DIGITS}", f"--grid width=8,{DIGITS}"),
         *("--grid width=2 --where here --slurm time=5", "--grid width=2 --where later --slurm many"),
     ],
-    arm_table: ["--adam-steps -1"],
-    scale_report: [f"--lanes {DIGITS}"],
-    diffnet_table: ["--samples 1"],
-    diffnet_report: ["--depth 5000"],
-    compare_locomotion: ["--upright inf", "--rivals ppo,dreams"],
-    hnn_table: ["--tasks spring,teapot"],
 }
 """Numbers and names that no run can have, by command."""
 

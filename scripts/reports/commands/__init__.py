@@ -1,1 +1,0 @@
-"""The commands that measure the project, one file each: `dln-jax report NAME`."""
