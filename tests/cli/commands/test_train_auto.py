@@ -32,7 +32,7 @@ PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'
 def workplace(tmp_path_factory):
     """A log of the planar arm, its file with other masses, and a kinematic prior of it."""
     folder = tmp_path_factory.mktemp("selection")
-    schema.save(folder / "rigid.npz", motions(0, noise=0.02, trajectories=8, samples=60))
+    schema.save(folder / "rigid.npz", motions(0, noise=0.02, trajectories=8, samples=240))
     schema.save(folder / "one.npz", motions(0, samples=60))
     rough = ARM._replace(inertias=0.8 * ARM.inertias)
     free = np.tile([-np.inf, np.inf], (2, 1))
