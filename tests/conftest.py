@@ -105,10 +105,10 @@ def slow_among(values, is_slow):
 
 
 LONGEST = """
-    compilation readme examples families malformed fit measured_motions train_with_friction measured_joints
-    mechanics delan learned_trees agreement functions arm_table checks train_models simulate train_delan
-    uncertainty hamiltonian_tasks command_line identify data soft_energies hnn_tasks trees softbody_report
-    benchmark residual_networks differential_mlp excite projection rigid_tree stability hamiltonian design
+    compilation readme examples families malformed fit measured_motions
+    mechanics delan learned_trees agreement functions checks train_models simulate train_delan
+    uncertainty hamiltonian_tasks command_line identify data soft_energies hnn_tasks trees
+    residual_networks differential_mlp excite projection rigid_tree hamiltonian design
 """
 """Names of test files behind `test_`, the longest first."""
 

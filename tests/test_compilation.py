@@ -13,31 +13,9 @@ from jaxlib import xla_client
 from dln_jax import compilation
 
 ROOT = Path(__file__).parent.parent
-AS_USERS_COMPILE = (
-    "test_compilation.py::test_the_compiler_is_at_its_defaults_where_asked",
-    "nn/test_activations.py::test_derivatives_equal_high_precision",
-    *(
-        f"mechanics/test_mechanics.py::test_{name}[double-pendulum-friction]"
-        for name in (
-            "generic_mechanics_equals_the_textbook",
-            "decomposition_equals_the_textbook_and_sums_to_the_total",
-            "structured_path_equals_generic_path",
-            "power_balance",
-        )
-    ),
-    "nn/test_differential_mlp.py::test_parameter_gradients_equal_those_through_autodiff[silu-sizes0]",
-    "mechanics/test_integrators.py::test_single_precision_states_stay_so_and_converge",
-    "cli/commands/test_train_models.py::test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes",
-)
-"""Tests that fusion, fast approximations and reordering could break, and that compile quickly with them."""
 
 
-def test_the_named_tests_exist():
-    for name in AS_USERS_COMPILE:
-        path, test = name.split("[")[0].split("::")
-        assert f"def {test}(" in (ROOT / "tests" / path).read_text(), name
-
-
+@pytest.mark.as_users_compile
 def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
     level = xla_client.CompileOptions().executable_build_options.debug_options.xla_backend_optimization_level
     optimised = pytestconfig.getoption("--optimised")
@@ -50,9 +28,8 @@ def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
 def test_what_users_run_is_right_as_they_compile_it(pytestconfig):
     if pytestconfig.getoption("--optimised"):
         pytest.skip("with --optimised every test is compiled with default flags, not only these")
-    tests = [f"tests/{name}" for name in AS_USERS_COMPILE]
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    command = [sys.executable, "-m", "pytest", "-n", "0", "--optimised", "--slow", *tests]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "--optimised", "-m", "as_users_compile"]
     result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
 

@@ -123,6 +123,7 @@ def test_rollout_is_its_steps_in_turn():
             state = step(time, state, half)
 
 
+@pytest.mark.as_users_compile
 def test_single_precision_states_stay_so_and_converge():
     state = {"angle": jnp.float32(1.0), "rate": jnp.zeros((), jnp.float32)}
     step = implicit_midpoint(lambda t, y: {"angle": y["rate"], "rate": -y["angle"]})

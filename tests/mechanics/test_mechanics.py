@@ -43,6 +43,7 @@ CASES = [(scene, path) for scene in SCENES for path in PATHS if path != "hamilto
 
 
 @pytest.mark.parametrize(("scene", "path"), CASES, ids=lambda case: getattr(case, "name", case))
+@pytest.mark.as_users_compile
 def test_every_path_equals_the_textbook_and_balances_power(scene, path):
     """Forces, accelerations, M and the parts of a force; dE/dt = qdᵀ tau - qdᵀ dD/dqd; H(q, M qd) is the energy."""
     energies = PATHS[path](scene)

@@ -56,6 +56,7 @@ def reference_derivatives(name: str, x: float) -> list:
 
 
 @pytest.mark.parametrize("name", activations.ALL)
+@pytest.mark.as_users_compile
 def test_derivatives_equal_high_precision(name):
     """|error| <= 4 eps |f|, plus eps |x f'| where the function is ill-conditioned, at 0, ±1e-12 ... ±1e4; orders
     0 to 2 are the formulas, 3 is autodiff of `second`."""

@@ -100,6 +100,7 @@ def test_either_sweep_is_exact_in_a_batch(sweep, monkeypatch):
     assert_close(*both(layers, xs))
 
 
+@pytest.mark.as_users_compile
 def test_parameter_gradients_equal_those_through_autodiff():
     """A loss on value, Jacobian and Hessian; in reverse, and forward as Levenberg-Marquardt may want it."""
     # Second derivatives of the first go forward, of the second backward.

@@ -26,8 +26,12 @@ BEST = {
 RETURNS = {"pendulum": -30.96, "cart-pole": -25.05}
 """Mean returns of published policies from downward starts, re-run; the draw of the starts hardly matters."""
 UP = {"down_up_share": AtLeast(1.0), "uniform_up_share": AtLeast(1.0)}
-QUIET = {f"estimates/{plant}/{model}/{name} torque_rms_ratio": 0.2 for plant in POLES
-         for model in ("known", "identified", "analytic") for name in ("extended", "unscented")}  # fmt: skip
+QUIET = {
+    f"estimates/{plant}/{model}/{name} torque_rms_ratio": 0.2
+    for plant in POLES
+    for model in ("known", "identified", "analytic")
+    for name in ("extended", "unscented")
+}
 """The rms of the torque at the goal, as a share of that by differences."""
 
 
@@ -39,82 +43,166 @@ def small(plant: str, **numbers: float):
 
 CASES = (
     *(
-        Case(f"{'starts' if anywhere else 'swing-up'}/{plant}", desktop.known_models,
-             {"plant": plant, "anywhere": anywhere}, {"starts": 50},
-             bound={} if anywhere else {"success_share": AtLeast(0.995)})
+        Case(
+            f"{'starts' if anywhere else 'swing-up'}/{plant}",
+            desktop.known_models,
+            {"plant": plant, "anywhere": anywhere},
+            {"starts": 50},
+            bound={} if anywhere else {"success_share": AtLeast(0.995)},
+        )
         for anywhere in (False, True)
         for plant in POLES
     ),
     *(
-        Case(f"board/{name}-energy", board.energy_laws, {"motor": motor}, {"draws": 100},
-             bound={"score": AtLeast(0.40)} if name == "acrobot" else {})
+        Case(
+            f"board/{name}-energy",
+            board.energy_laws,
+            {"motor": motor},
+            {"draws": 100},
+            bound={"score": AtLeast(0.40)} if name == "acrobot" else {},
+        )
         for name, motor in MOTORS.items()
     ),
     *(
-        Case(f"board/{name}-planned", board.planned, {"motor": motor},
-             {"horizons": (1.6,), "slope_weights": (1e-3,), "guesses": 1},
-             published={"score": 0.655} if name == "acrobot" else {},
-             bound={"score": AtLeast(0.66)} if name == "acrobot" else {})
+        Case(
+            f"board/{name}-planned",
+            board.planned,
+            {"motor": motor},
+            {"horizons": (1.6,), "slope_weights": (1e-3,), "guesses": 1},
+            published={"score": 0.655} if name == "acrobot" else {},
+            bound={"score": AtLeast(0.66)} if name == "acrobot" else {},
+        )
         for name, motor in MOTORS.items()
     ),
     *(
-        Case(f"learned/{plant}-{model}", desktop.learned, {"plant": plant, "model": model},
-             {"seeds": 1, "starts": 50}, bound={"success_share": AtLeast(0.995)} if model == "delan" else {})
+        Case(
+            f"learned/{plant}-{model}",
+            desktop.learned,
+            {"plant": plant, "model": model},
+            {"seeds": 1, "starts": 50},
+            bound={"success_share": AtLeast(0.995)} if model == "delan" else {},
+        )
         for plant in POLES
         for model in ("delan", "identified", "analytic")
     ),
     *(
-        Case(f"{plant}-{sizes}", plants.swing_up, {"plant": plant, "sizes": sizes}, {"starts": 10},
-             bound={"success_share": AtLeast(0.99)})
+        Case(
+            f"{plant}-{sizes}",
+            plants.swing_up,
+            {"plant": plant, "sizes": sizes},
+            {"starts": 10},
+            bound={"success_share": AtLeast(0.99)},
+        )
         for plant in plants.PLANTS
         for sizes in (0, 1, 2)
     ),
     *(
-        Case(f"rig/late-by-{mean}-ms", plants.late_samples, {"milliseconds": mean}, {"starts": 3},
-             bound={"success_share": AtLeast(0.99)})
+        Case(
+            f"rig/late-by-{mean}-ms",
+            plants.late_samples,
+            {"milliseconds": mean},
+            {"starts": 3},
+            bound={"success_share": AtLeast(0.99)},
+        )
         for mean in (0, 1, 3)
     ),
-    Case("equation/pendulum", values.equation, {"robust": False},
-         {"width": 8, "samples": 512, "iterations": 5, "seeds": 1},
-         published={f"down_return_{which}": RETURNS["pendulum"] for which in ("median", "worst")}),
-    Case("equation/robust", values.equation, {"robust": True, "width": 16, "samples": 2048},
-         {"width": 8, "samples": 512, "iterations": 5, "seeds": 1, "starts_down": 20}),
-    Case("value/pendulum", values.pendulum, {},
-         {"fit": small("pendulum", iterations=4, seconds=1.0), "seeds": 1, "points": (41, 81)},
-         published={"down_return": RETURNS["pendulum"]},
-         bound={"down_return": AtLeast(-30.9), "median_relative_error": 1e-2, "grid_converged": AtLeast(1.0), **UP}),
+    Case(
+        "equation/pendulum",
+        values.equation,
+        {"robust": False},
+        {"width": 8, "samples": 512, "iterations": 5, "seeds": 1},
+        published={f"down_return_{which}": RETURNS["pendulum"] for which in ("median", "worst")},
+    ),
+    Case(
+        "equation/robust",
+        values.equation,
+        {"robust": True, "width": 16, "samples": 2048},
+        {"width": 8, "samples": 512, "iterations": 5, "seeds": 1, "starts_down": 20},
+    ),
+    Case(
+        "value/pendulum",
+        values.pendulum,
+        {},
+        {"fit": small("pendulum", iterations=4, seconds=1.0), "seeds": 1, "points": (41, 81)},
+        published={"down_return": RETURNS["pendulum"]},
+        bound={"down_return": AtLeast(-30.9), "median_relative_error": 1e-2, "grid_converged": AtLeast(1.0), **UP},
+    ),
     *(
-        Case(f"value/{plant}", values.beside_shooting, {"plant": plant},
-             {"fit": small(plant, iterations=3, seconds=0.5, steps=50), "seeds": 1, "starts_around": 4,
-              "iterations": 5},
-             published={"down_return": RETURNS[plant]} if plant in RETURNS else {},
-             bound={"median_relative_error": 1e-2, **UP,
-                    **({"down_return": AtLeast(-25.0)} if plant in RETURNS else {})})
+        Case(
+            f"value/{plant}",
+            values.beside_shooting,
+            {"plant": plant},
+            {"fit": small(plant, iterations=3, seconds=0.5, steps=50), "seeds": 1, "starts_around": 4, "iterations": 5},
+            published={"down_return": RETURNS[plant]} if plant in RETURNS else {},
+            bound={
+                "median_relative_error": 1e-2,
+                **UP,
+                **({"down_return": AtLeast(-25.0)} if plant in RETURNS else {}),
+            },
+        )
         for plant in POLES
     ),
     *(
-        Case(f"estimates/{plant}-{model}", desktop.estimates, {"plant": plant, "model": model},
-             {"starts": 30, "fewer": 30},
-             bound={**QUIET, "driven_rate_error_ratio": 0.5, "pole_rate_error_ratio": 0.5})
+        Case(
+            f"estimates/{plant}-{model}",
+            desktop.estimates,
+            {"plant": plant, "model": model},
+            {"starts": 30, "fewer": 30},
+            bound={**QUIET, "driven_rate_error_ratio": 0.5, "pole_rate_error_ratio": 0.5},
+        )
         for plant in reversed(POLES)
         for model in ("known", "identified", "analytic")
     ),
-    Case("tracking/seven-axis", arm.tracking,
-         quick={"seeds": 1, "motions": 4, "unseen": 1, "samples": 400, "steps": 2,
-                "search": Search(starts=2, iterations=5)}),
+    Case(
+        "tracking/seven-axis",
+        arm.tracking,
+        quick={
+            "seeds": 1,
+            "motions": 4,
+            "unseen": 1,
+            "samples": 400,
+            "steps": 2,
+            "search": Search(starts=2, iterations=5),
+        },
+    ),
     *(
-        Case(f"robustness/{name}", disturbed_board.robustness, {"motor": motor}, {"draws": 20, "every": 10},
-             published={f"share_{key}": share for key, share in zip(CRITERIA, BEST[name], strict=True)})
+        Case(
+            f"robustness/{name}",
+            disturbed_board.robustness,
+            {"motor": motor},
+            {"draws": 20, "every": 10},
+            published={f"share_{key}": share for key, share in zip(CRITERIA, BEST[name], strict=True)},
+        )
         for name, motor in MOTORS.items()
     ),
     Case("laws/in-c", laws_in_c.laws_in_c, quick={"repeats": 3, "calls": 100, "cold": 50}),
-    Case("plans/beside-ipopt", plans.beside_ipopt, quick={"count": 2, "names": ("cart-pole", "shortest-time")},
-         bound={"plans/all as_low_share": AtLeast(90 / 108), "wrongly_converged": 0, "wrongly_infeasible": 0,
-                "cpu_over_ipopt": 1.0}),
-    Case("realtime/cart-pole", real_time.beside_rivals, quick={"loops": 1, "rival_loops": 1},
-         bound={"realtime/cart-pole/c p99_ms": 0.3}),
-    Case("realtime/seven-axis", arm.beyond_limits, quick={"seconds": 1.0},
-         bound={"p99_ms": 1.0, "largest_angle_rad": arm.RANGE}),
-    Case("rail/cart-pole", real_time.on_a_rail, quick={"runs": 5},
-         bound={"success_share": AtLeast(1.0), "farthest_m": real_time.RAIL}),
-)  # fmt: skip
+    Case(
+        "plans/beside-ipopt",
+        plans.beside_ipopt,
+        quick={"count": 2, "names": ("cart-pole", "shortest-time")},
+        bound={
+            "plans/all as_low_share": AtLeast(90 / 108),
+            "wrongly_converged": 0,
+            "wrongly_infeasible": 0,
+            "cpu_over_ipopt": 1.0,
+        },
+    ),
+    Case(
+        "realtime/cart-pole",
+        real_time.beside_rivals,
+        quick={"loops": 1, "rival_loops": 1},
+        bound={"realtime/cart-pole/c p99_ms": 0.3},
+    ),
+    Case(
+        "realtime/seven-axis",
+        arm.beyond_limits,
+        quick={"seconds": 1.0},
+        bound={"p99_ms": 1.0, "largest_angle_rad": arm.RANGE},
+    ),
+    Case(
+        "rail/cart-pole",
+        real_time.on_a_rail,
+        quick={"runs": 5},
+        bound={"success_share": AtLeast(1.0), "farthest_m": real_time.RAIL},
+    ),
+)

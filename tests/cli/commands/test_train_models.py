@@ -58,6 +58,7 @@ def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workp
     assert load(workplace / "kernel").description["samples"] == 40
 
 
+@pytest.mark.as_users_compile
 def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
     def answer(command, *, input, **_):
         assert command[-1] == "inverse_dynamics" and np.load(io.BytesIO(input)).shape[1:] == (3, 1)

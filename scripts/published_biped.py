@@ -1,0 +1,3 @@
+from scripts.reports.run import report
+
+report("locomotion", "published")
