@@ -12,7 +12,6 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, serial, tree_system
 from dln_jax.scenes.poles import cart_pole
 from scripts.reports.control import plants, problems, values
-from scripts.reports.control.desktop import known_models
 
 
 def test_cart_pole_is_that_of_the_scenes():
@@ -84,17 +83,3 @@ def test_late_pendulum_follows_ten_milliseconds_after_and_loses_energy_by_fricti
 def test_worst_disturbance_moves_the_published_pendulum():
     problem, x, u = PLANTS["pendulum"]().problem, jnp.array([0.3, -1.0]), jnp.array([0.8])
     np.testing.assert_allclose(values.rod(x, u, jnp.ones(2)), rates(problem)(x, u), rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_direct_optimisation_near_the_goal_is_the_regulator():
-    plant, x = PLANTS["pendulum"](), np.array([[0.01, -0.02], [-0.02, 0.01]])
-    law = lambda x: -4 * x[:1] - x[1:]  # noqa: E731
-    found = values.direct_values(plant.problem, x, [law], limit=plant.limit, dt=0.02, iterations=20)
-    value = values.regulator_value(plant.problem)
-    np.testing.assert_allclose(found, [float(value(jnp.asarray(one))) for one in x], rtol=2e-3)
-
-
-@pytest.mark.slow
-def test_poles_come_up_from_encoders_alone():
-    assert known_models(plant="rotary-pendulum", starts=8)["swing-up/rotary-pendulum/known"]["success_share"] == 1
