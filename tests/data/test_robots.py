@@ -53,7 +53,7 @@ BRANCHED = """
       <geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.4"/>
       <body name="b" pos="0 0 0.4"><joint name="z" damping="0.5"/><geom type="sphere" size=".1" pos=".2 0 0"/></body>
       <body name="c" pos="0.3 0 0" euler="0 90 0">
-        <joint name="w" axis="0 1 0"/><geom type="sphere" size=".15" pos="0 .2 0"/>
+        <joint name="w" axis="0 1 0" pos="0.1 0 0"/><geom type="sphere" size=".15" pos="0 .2 0"/>
         <body name="d" pos="0 0.1 0.2"><geom type="box" size=".05 .1 .02"/></body></body>
     </body>
   </body>
@@ -113,7 +113,7 @@ def test_what_a_file_states_of_its_joints(tmp_path):
 
 @pytest.mark.parametrize(
     ("file", "lock"),
-    [("branched.xml", {"x": 0.7, "w": -0.4}), ("referenced.xml", {"x": 0.7, "y": 0.2}), ("arm.urdf", {"slide": 0.2})],
+    [("branched.xml", {"z": 0.7, "w": -0.4}), ("referenced.xml", {"x": 0.7, "y": 0.2}), ("arm.urdf", {"slide": 0.2})],
 )
 def test_joints_are_locked_at_their_positions(file, lock, tmp_path):
     path = written(tmp_path, file, FILES[file])

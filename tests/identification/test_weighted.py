@@ -6,7 +6,7 @@ And a motor that turns with two joints is found in what a fit leaves unexplained
 import numpy as np
 
 from dln_jax.identification.base import null_directions
-from dln_jax.identification.equations import Equations, Regressor, compressed
+from dln_jax.identification.equations import Equations, Regressor, about, compressed, squares, weighted
 from dln_jax.identification.shared_motors import shared_motor
 from dln_jax.identification.weighted import correlation_times, fit_robust, fit_weighted, residual_statistics
 from tests.calls import one_line
@@ -35,6 +35,17 @@ def regressor(Phi, tau, chunk=70):
 def measured(Phi, seed):
     """Equations of noisy torques."""
     return compressed(regressor(Phi, Phi @ TRUE + NOISE * np.random.default_rng(seed).normal(size=(300, 2))))
+
+
+def test_triangles_have_all_that_data_say():
+    random, Phi = np.random.default_rng(0), design(0)
+    theta, tau, weights = random.normal(size=5), random.normal(size=(300, 2)), random.uniform(0.1, 1, (300, 2))
+    equations = compressed(regressor(Phi, tau), weights)
+    expected = np.sum(weights * (tau - Phi @ theta) ** 2, axis=0)
+    np.testing.assert_allclose(squares(equations, theta), expected, rtol=1e-10)
+    np.testing.assert_allclose(squares(about(equations, theta), 0 * theta), expected, rtol=1e-10)
+    whole = weighted(equations, NOISE) @ np.append(theta, -1.0)
+    np.testing.assert_allclose(whole @ whole, np.sum(expected / NOISE**2), rtol=1e-10)
 
 
 def test_standard_errors_are_those_of_repeated_experiments():

@@ -38,7 +38,7 @@ def with_gaps():
 
 def test_rounding_of_times_adds_no_step_to_a_gap():
     t = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 7.4])
-    for scale in (1.0, 0.1):
+    for scale in (0.1, 0.7):
         np.testing.assert_array_equal(grid_places(scale * t), [0, 1, 2, 5, 6, 7])
 
 

@@ -20,9 +20,7 @@ from dln_jax.data.checks.hypotheses import decisive
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.poles import cart_pole
 from tests.calls import one_line
 from tests.motions import sums_of_sines
@@ -180,14 +178,6 @@ def test_nothing_is_found_in_clean_logs(clean):
     assert quick(spoiled(clean, lambda a: {"q": motions(seed=1)[1].reshape(-1, 3), **RATELESS})) == []
     assert quick(generators.uniform(cart_pole(), samples=200)) == []
     assert quick(generators.characters()) == []
-
-
-def test_nothing_is_found_in_an_exact_log_of_two_links(clean):
-    scene = two_link_arm()
-    q, qd, qdd = (x.reshape(-1, 3)[:, :2] for x in motions(seed=3)[1:])
-    tau = jax.jit(jax.vmap(dynamics(scene.closed_form).inverse_dynamics))(q, qd, qdd)
-    data = spoiled(clean, lambda a: {"needs": None, "q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(tau)})
-    assert quick(data._replace(needs=scene.needs)) == []
 
 
 @pytest.mark.parametrize("name", LOG_FAULTS)

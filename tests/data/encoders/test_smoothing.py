@@ -166,6 +166,17 @@ def test_commands_of_uneven_samples_keep_their_impulse_at_equal_steps():
     np.testing.assert_array_equal(sampling.held_at_equal_steps(already).tau, u)
 
 
+def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
+    errors = []
+    for seed in range(6):
+        arrays, _, qdd = log(seed=seed, trajectories=4)
+        smoothed = smooth(schema.from_arrays(arrays), 4.0)
+        inside = within(schema.from_arrays(arrays), round(smoothed.trim * RATE))
+        errors.append((smoothed.data.qdd - qdd[inside]).reshape(4, -1, 2))
+    at = np.sqrt(np.mean(np.square(errors), axis=(0, 1, 3)))
+    assert max(rms(at[:12]), rms(at[-12:])) < 2 * rms(at[400:600])
+
+
 def test_clean_data_are_not_filtered():
     arrays, qd, qdd = log(noise=0.0)
     smoothed = smooth(schema.from_arrays(arrays))
