@@ -82,7 +82,7 @@ def learn_by_ppo(task: LocomotionTask, seed: int, goal: Goal, *, lanes: int = 16
 
     def lane() -> TransformReward:
         # Copies share the compiled programs. Rewards in body lengths per second suit the critic.
-        return TransformReward(copy.copy(one), lambda reward: reward / TIME_STEP)
+        return TransformReward(copy.copy(one), lambda reward: float(reward) / TIME_STEP)
 
     model = PPO(
         "MlpPolicy", make_vec_env(lane, n_envs=lanes, seed=seed), n_steps=rollout, batch_size=256, n_epochs=10,

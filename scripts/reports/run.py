@@ -9,6 +9,7 @@ import time
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, make_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -139,7 +140,7 @@ def kind_of(function: Callable[..., Numbers], keyword: str) -> Any:
 
 def annotation_of(function: Callable[..., Numbers], keyword: str) -> Any:
     """The type of a function's keyword; the function may be partial."""
-    while hasattr(function, "func"):
+    while isinstance(function, partial):
         function = function.func
     return typing.get_type_hints(function).get(keyword)
 

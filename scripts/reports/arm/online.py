@@ -98,7 +98,7 @@ def drawn_letters(data: Trajectories, count: int, seed: int, speed: float) -> li
     return motions
 
 
-Write = Callable[[Any, tuple[Reference, int]], tuple[tuple[float, float, float], tuple[np.ndarray, ...]]]
+Write = Callable[[Any, tuple[Reference, int]], tuple[tuple[float, float, float], tuple[Any, Any, Any, Any]]]
 """(parameters, letter) -> errors of joints in rad and tip in m, share of saturated samples; and the recording."""
 
 
@@ -127,7 +127,9 @@ def writing(learner: Learner | None, model: str, *, speed: float, gains: float, 
         x = done.x[:-1]
         return done, jax.vmap(field)(x, done.u)[:, 2:], tip(x[:, :2]) - tip(wanted.q)
 
-    def write(parameters: Any, letter: tuple[Reference, int]) -> tuple[tuple[float, float, float], tuple]:
+    def write(
+        parameters: Any, letter: tuple[Reference, int]
+    ) -> tuple[tuple[float, float, float], tuple[Any, Any, Any, Any]]:
         wanted, samples = letter
         done, qdd, off_tip = jax.tree.map(np.asarray, run(parameters, wanted, jax.random.key(samples)))
         off = done.x[:-1, :2] - wanted.q

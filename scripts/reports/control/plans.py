@@ -54,7 +54,11 @@ def between_knots(problem: Planned, planned: TrajectoryProblem, solution: Shooti
     move = integrated(lambda x, u: jnp.stack(problem.rates(jnp, x, u)), problem.dt / FINE)
 
     def excess(x, u):
-        after = jax.lax.scan(lambda x, _: (move(x, u),) * 2, x, length=FINE)[1]
+        def fine(x, _):
+            x = move(x, u)
+            return x, x
+
+        after = jax.lax.scan(fine, x, length=FINE)[1]
         off = jnp.maximum(jnp.max(planned.lower_x - after), jnp.max(after - planned.upper_x))
         return off if planned.states is None else jnp.maximum(off, jnp.max(jax.vmap(planned.states)(after)))
 

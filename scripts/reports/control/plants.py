@@ -82,7 +82,7 @@ def drawn(sizes: int, low: tuple[float, ...], high: tuple[float, ...]) -> np.nda
     return np.random.default_rng(sizes).uniform(low, high)
 
 
-def mjcf(body: str, driven: list[Any], control, noise: float, seed: int, encoder=TURN) -> Plant:
+def mjcf(body: str, driven: list[Any], control, noise: float, seed: int, encoder: Any = TURN) -> Plant:
     """A plant in MuJoCo, without contacts, with encoders, noise and a sample of delay."""
     text = f"""<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="RK4"/>
       <default><geom contype="0" conaffinity="0"/></default><worldbody>{body}</worldbody></mujoco>"""
@@ -158,7 +158,7 @@ def gymnasium_acrobot(sizes: int, seed: int) -> Plant:
     return gymnasium_plant(env, described, coordinates, action=lambda u: float(u[0]), seed=seed)
 
 
-def urdf(parts: str, driven: str, noise: float, seed: int, encoder=TURN) -> Plant:
+def urdf(parts: str, driven: str, noise: float, seed: int, encoder: Any = TURN) -> Plant:
     """A plant from a URDF file, as a user exports it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plant.urdf"

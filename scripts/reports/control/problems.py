@@ -24,8 +24,8 @@ class Planned(NamedTuple):
     """A problem; constraints are not above zero, equations of the end are zero."""
 
     name: str
-    x0: Sequence[float]
-    goal: Sequence[float]
+    x0: Any
+    goal: Any
     steps: int
     rates: Formula
     """Rates of the state, or its next value if `dt` is `None`."""

@@ -72,7 +72,7 @@ def program(problem: Planned) -> tuple[dict[str, Any], dict[str, np.ndarray], An
     return {"x": unknowns, "f": cost, "g": ca.vertcat(*rows)}, limits, ca.vertcat(*roots)
 
 
-def unknowns_of(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def unknowns_of(x: Any, u: Any) -> np.ndarray:
     """x_0, u_0, x_1, ..., x_N."""
     return np.append(np.concatenate([x[:-1], u], axis=1).ravel(), x[-1])
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from dln_jax.data import Robot, Trajectories
 from dln_jax.data.robot_files import mjcf
+from dln_jax.data.robots import compiled_model
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters, serial
@@ -123,9 +124,7 @@ def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
 
 def simulator(robot: Robot) -> tuple[Any, Any, Any]:
     """MuJoCo, its model of the arm, and a state."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_string(mjcf(robot, time_step=STEP))
+    mujoco, model = compiled_model(mjcf(robot, time_step=STEP))
     return mujoco, model, mujoco.MjData(model)
 
 

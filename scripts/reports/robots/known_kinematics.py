@@ -163,7 +163,9 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
             sizes, phases = 0.7 * random.normal(size=(2, 5, 1)), random.uniform(0, 2 * np.pi, (2, 5, 1))
             angles = w * t + phases
             waves = np.sin(angles) / w, np.cos(angles), -w * np.sin(angles)
-            state = dict(zip(("q", "qd", "qdd"), (np.sum(sizes * wave, axis=1).T for wave in waves), strict=True))
+            state: dict[str, np.ndarray] = dict(
+                zip(("q", "qd", "qdd"), (np.sum(sizes * wave, axis=1).T for wave in waves), strict=True)
+            )
             state["temperature"] = np.stack([20 + 25 * (1 - np.exp(-t / 8))] * 2, axis=1)
             tau = np.asarray(program(**state)) + NOISE * random.normal(size=(SAMPLES, 2))
             log = from_arrays({"t": t, "trajectory": np.zeros(SAMPLES, int), "tau": tau, **state})

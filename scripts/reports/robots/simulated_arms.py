@@ -139,7 +139,7 @@ def sum_of_sines(arm: Arm, *, seed: int, duration: float = 50.0) -> tuple[np.nda
     w = 2 * np.pi * 0.02 * np.arange(1, SINES + 1)
     cosines, sines = np.cos(np.outer(t, w)), np.sin(np.outer(t, w))
     random = np.random.default_rng(seed)
-    joints = []
+    joints, q, qd, qdd = [], t, t, t
     for limits, rate, acceleration in zip(arm.limits, arm.rates, arm.accelerations, strict=True):
         reach = 0.25 * np.ptp(limits)
         for tries in itertools.count():

@@ -164,9 +164,10 @@ def mesh_error(*, moments: int = 5) -> Numbers:
                 runs[f"dln_jax/quadratic/{cells // 3}"] = fine, motion(fine, "midpoint", 0.01)
             elif flex:
                 runs[f"mujoco-euler/linear/{cells}"] = linear, flex.motion(linear, "Euler", 0.003 / cells)
-        if runs:
-            finest = body(3, order=2)
-            exact = common(finest, motion(finest, "midpoint", 0.005).x)
+        if not runs:
+            continue
+        finest = body(3, order=2)
+        exact = common(finest, motion(finest, "midpoint", 0.005).x)
         for key, (each, run) in runs.items():
             error = float(np.linalg.norm(common(each, run.x) - exact) / np.linalg.norm(exact))
             numbers[f"rivals/mesh/{key}"] = {

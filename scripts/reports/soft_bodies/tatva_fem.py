@@ -5,6 +5,7 @@ Newton's method with SciPy's sparse LU and the adjoint equation are written here
 It has neither motions nor a solver of its own.
 """
 
+import itertools
 from typing import Any
 
 import jax
@@ -43,13 +44,12 @@ def static(body: Body) -> tuple[Run, Run]:
     def solve() -> tuple[Any, Any]:
         """Free displacements and factors: at most 30 iterations, until residual forces are below 1e-9 N."""
         free = jnp.zeros(lifter.size_reduced)
-        for _ in range(31):
+        for attempt in itertools.count():
             force, matrix = both(free, body.modulus)
             factors = splu(matrix.to_csr().tocsc())
-            if np.abs(force).max() < 1e-9:
-                break
+            if np.abs(force).max() < 1e-9 or attempt == 30:
+                return free, factors
             free = free - factors.solve(np.asarray(force))
-        return free, factors
 
     def positions() -> np.ndarray:
         return body.mesh.vertices + np.asarray(lifter.lift_from_zeros(solve()[0])).reshape(1, -1, 3)
