@@ -5,7 +5,6 @@ Newton's method with SciPy's sparse LU and the adjoint equation are written here
 It has neither motions nor a solver of its own.
 """
 
-import itertools
 from typing import Any
 
 import jax
@@ -44,12 +43,12 @@ def static(body: Body) -> tuple[Run, Run]:
     def solve() -> tuple[Any, Any]:
         """Free displacements and factors: at most 30 iterations, until residual forces are below 1e-9 N."""
         free = jnp.zeros(lifter.size_reduced)
-        for attempt in itertools.count():
+        for _ in range(30):
             force, matrix = both(free, body.modulus)
-            factors = splu(matrix.to_csr().tocsc())
-            if np.abs(force).max() < 1e-9 or attempt == 30:
-                return free, factors
-            free = free - factors.solve(np.asarray(force))
+            if np.abs(force).max() < 1e-9:
+                break
+            free = free - splu(matrix.to_csr().tocsc()).solve(np.asarray(force))
+        return free, splu(both(free, body.modulus)[1].to_csr().tocsc())
 
     def positions() -> np.ndarray:
         return body.mesh.vertices + np.asarray(lifter.lift_from_zeros(solve()[0])).reshape(1, -1, 3)
