@@ -79,10 +79,10 @@ def measure_letters(
                 }.items():
                     values.setdefault((f"data/{name}/{setting}", quantity), []).append(value)
     numbers: dict[str, dict[str, float]] = {}
-    for (case, quantity), found in values.items():
+    for (case, quantity), measured in values.items():
         ends = ("_median", "_worst") if quantity == "torque_mse" else ("",)
         for end, of in zip(ends, (np.median, np.max), strict=False):
-            numbers.setdefault(case, {})[quantity + end] = float(of(found))
+            numbers.setdefault(case, {})[quantity + end] = float(of(measured))
     return numbers
 
 

@@ -127,9 +127,7 @@ def writing(learner: Learner | None, model: str, *, speed: float, gains: float, 
         x = done.x[:-1]
         return done, jax.vmap(field)(x, done.u)[:, 2:], tip(x[:, :2]) - tip(wanted.q)
 
-    def write(
-        parameters: Any, letter: tuple[Reference, int]
-    ) -> tuple[tuple[float, float, float], tuple[Any, Any, Any, Any]]:
+    def write(parameters: Any, letter: tuple[Reference, int]) -> tuple[Any, Any]:
         wanted, samples = letter
         done, qdd, off_tip = jax.tree.map(np.asarray, run(parameters, wanted, jax.random.key(samples)))
         off = done.x[:-1, :2] - wanted.q

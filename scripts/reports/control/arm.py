@@ -167,15 +167,15 @@ def tracking(
         for name, law in laws.items():
             tracked = [track(robot, law, motion, samples) for motion in wanted]
             runs.setdefault(f"tracking/{name}", []).extend(tracked)
-    found: dict[str, dict[str, float]] = {name: {"nmse": np.median(values)} for name, values in errors.items()}
+    outcome: dict[str, dict[str, float]] = {name: {"nmse": np.median(values)} for name, values in errors.items()}
     for name, tracked in runs.items():
         rms, share = np.array(tracked).T
         sound = rms[np.isfinite(rms)] if np.isfinite(rms).any() else np.array([np.inf])
-        found[name] = {"rms_mrad_median": np.median(sound), "rms_mrad_worst": sound.max()}
-        found[name]["failures"] = float(np.sum(~np.isfinite(rms)))
+        outcome[name] = {"rms_mrad_median": np.median(sound), "rms_mrad_worst": sound.max()}
+        outcome[name]["failures"] = float(np.sum(~np.isfinite(rms)))
         if "trusted" in name or "judged" in name:
-            found[name]["share_trusted"] = np.mean(share)
-    return found
+            outcome[name]["share_trusted"] = np.mean(share)
+    return outcome
 
 
 def reference(t) -> np.ndarray:

@@ -228,16 +228,16 @@ def best_plan(
     motor: Motor, horizons: tuple[float, ...] = (1.6,), slope_weights: tuple[float, ...] = (1e-3,), guesses: int = 1
 ) -> Plan:
     """The plan with the best score over horizons, s, weights of the torque's slope and random guesses."""
-    best, found = -1.0, None
+    best, measured = -1.0, None
     for weight, seconds in itertools.product(slope_weights, horizons):
         solve = jax.jit(lambda guess, weight=weight: plan_of(motor, guess, weight))
         for seed in range(guesses):
             plan = solve(10.0 * np.random.default_rng(seed).normal(size=(round(seconds * RATE / EVERY), 1)))
             reached = judged(motor, follower(motor, plan))["score"]
             if reached > best:
-                best, found = reached, plan
-    assert found is not None
-    return found
+                best, measured = reached, plan
+    assert measured is not None
+    return measured
 
 
 def planned(

@@ -101,9 +101,9 @@ def known_models(*, plant: str, anywhere: bool = False, starts: int = 1000) -> N
         return run.x[:, 1]
 
     result = outcomes(jax.jit(jax.vmap(angle))(x), rate=RATE)
-    found = {"success_share": result.share, "no_number": float(result.failed.sum())}
+    measured = {"success_share": result.share, "no_number": float(result.failed.sum())}
     times = {"seconds_median": result.median, "seconds_worst": result.worst}
-    return {f"{'starts' if anywhere else 'swing-up'}/{plant}/known": {**found, **times}}
+    return {f"{'starts' if anywhere else 'swing-up'}/{plant}/known": {**measured, **times}}
 
 
 def learned(*, plant: str, model: str, seeds: int = 3, starts: int = 1000) -> Numbers:
@@ -184,7 +184,7 @@ def estimates(*, plant: str, model: str, starts: int = 1000, fewer: int = 100) -
         "unscented": by_filter(desk.layout, process, delay=delay, make=unscented),
         "exact-state": foreseeing,
     }
-    found: dict[str, dict[str, float]] = {}
+    measured: dict[str, dict[str, float]] = {}
     for name, make in estimators.items():
         count = starts if model == "known" and name in ("differences", "extended") else fewer
         x = hanging_starts(count, 0, position=desk.position)
@@ -192,10 +192,10 @@ def estimates(*, plant: str, model: str, starts: int = 1000, fewer: int = 100) -
             x, jax.random.split(jax.random.key(0), count)
         )
         rms, change, flips = (float(np.median(values)) for values in of_torque)
-        found[f"{near}/{name}"] = {
+        measured[f"{near}/{name}"] = {
             "success_share": outcomes(angle, rate=desk.rate).share,
             "torque_rms": rms,
-            "torque_rms_ratio": rms / found.get(f"{near}/differences", {"torque_rms": rms})["torque_rms"],
+            "torque_rms_ratio": rms / measured.get(f"{near}/differences", {"torque_rms": rms})["torque_rms"],
             "torque_change_rms": change,
             "reversals_per_second": flips,
         }
@@ -213,5 +213,5 @@ def estimates(*, plant: str, model: str, starts: int = 1000, fewer: int = 100) -
     for name, make in {"extended": extended, "unscented": unscented}.items():
         error = rms_of(jax.jit(lambda make=make: filtered(make(process), prior, y, u)[0][:, 2:])())
         for joint, off, other in zip(("driven", "pole"), error, rms_of(by_difference), strict=True):
-            found[f"{near}/{name}"] |= {f"{joint}_rate_error": off, f"{joint}_rate_error_ratio": off / other}
-    return found
+            measured[f"{near}/{name}"] |= {f"{joint}_rate_error": off, f"{joint}_rate_error_ratio": off / other}
+    return measured

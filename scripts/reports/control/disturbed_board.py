@@ -201,15 +201,15 @@ def shares(motor: Motor, controller: Controller, every: int) -> dict[str, float]
     joints = plant(motor)[0].needs.joints
     off = np.abs(jax.vmap(lambda x: error(x, GOAL, joints))(jnp.asarray(np.concatenate(ends)[: len(listed)])))
     # NaN compares as False, hence as a failure.
-    succeeded, found = np.all(off < NEAR, axis=1), {}
+    succeeded, outcome = np.all(off < NEAR, axis=1), {}
     for name, of_criterion in table.items():
         good, succeeded = np.split(succeeded, [len(of_criterion)])
         # Of ten runs with the same noise more than half must succeed.
         repeated = name.endswith("noise") and every == 1
-        found[f"share_{name}"] = np.mean(good.reshape(-1, REPETITIONS).mean(axis=1) > 0.5 if repeated else good)
+        outcome[f"share_{name}"] = np.mean(good.reshape(-1, REPETITIONS).mean(axis=1) > 0.5 if repeated else good)
     return {
-        **found,
-        "share_mean": float(np.mean(list(found.values()))),
+        **outcome,
+        "share_mean": float(np.mean(list(outcome.values()))),
         "score_undisturbed": judged(motor, controller)["score"],
     }
 

@@ -43,7 +43,7 @@ def laws_in_c(*, repeats: int = 9, calls: int = 1000, cold: int = 1000) -> Numbe
         "network_computed_torque": tracking(computed_torque(dynamics(random_network(D, 32, "f64")), stiff)),
         "value_policy": (hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem), (np.zeros(4),)),
     }
-    found = {}
+    measured = {}
     for name, function in functions.items():
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / name
@@ -51,5 +51,5 @@ def laws_in_c(*, repeats: int = 9, calls: int = 1000, cold: int = 1000) -> Numbe
             program = programs(folder, compiled(folder, folder), [name])[name]
             times = timed(program, repeats=repeats, calls=calls, cold=cold, mebibytes=max(evicting(), 32))
         p50, p999 = np.percentile(times.cold, [50, 99.9]) / 1e3
-        found[f"laws/{name}"] = {"warm_us": np.median(times.hot) / 1e3, "cold_p50_us": p50, "cold_p999_us": p999}
-    return found
+        measured[f"laws/{name}"] = {"warm_us": np.median(times.hot) / 1e3, "cold_p50_us": p50, "cold_p999_us": p999}
+    return measured

@@ -67,7 +67,7 @@ def between_knots(problem: Planned, planned: TrajectoryProblem, solution: Shooti
 
 def beside_ipopt(*, count: int = 12, names: tuple[str, ...] = tuple(one.name for one in problems())) -> Numbers:
     """Counts, iterations and times by problem, and the share of all plans that are as low as IPOPT's."""
-    found, every = {}, []
+    measured, every = {}, []
     for problem in (one for one in problems() if one.name in names):
         planned, rival, pairs, results = in_jax(problem), ipopt(problem), guesses(problem, count), []
         began = time.process_time()
@@ -102,7 +102,7 @@ def beside_ipopt(*, count: int = 12, names: tuple[str, ...] = tuple(one.name for
         every += results
         numbers = {key: np.array([one[key] for one in results]) for key in results[0]}
         ours, theirs = (1e3 * np.median(numbers[key]) for key in ("seconds", "ipopt_seconds"))
-        found[f"plans/{problem.name}"] = {
+        measured[f"plans/{problem.name}"] = {
             **{f"{key}_share": np.mean(numbers[key]) for key in ("converged", "as_low", "lower")},
             **{f"{key}_median": np.median(numbers[key]) for key in ("iterations", "ipopt_iterations")},
             "cpu_median_ms": ours,
@@ -112,10 +112,10 @@ def beside_ipopt(*, count: int = 12, names: tuple[str, ...] = tuple(one.name for
             "between_knots_violation_worst": np.max(numbers["between"]),
         }
     totals = {key: [one[key] for one in every] for key in ("as_low", "converged", "wrong", "infeasible")}
-    found["plans/all"] = {
+    measured["plans/all"] = {
         "as_low_share": np.mean(totals["as_low"]),
         "converged_share": np.mean(totals["converged"]),
         "wrongly_converged": float(np.sum(totals["wrong"])),
         "wrongly_infeasible": float(np.sum(totals["infeasible"])),
     }
-    return found
+    return measured

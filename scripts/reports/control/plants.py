@@ -241,8 +241,8 @@ def swing_up(*, plant: str, sizes: int, starts: int = 100) -> Numbers:
         return {case: {"success_share": 0.0}}
     trials, _ = try_plant(make, learned.tuned, starts=starts)
     tuned, explored = learned.tuned, learned.explored
-    found = {"tuning_worked": tuned.worked, "episodes_stopped": len(explored.stopped)}
-    return {case: {**success(trials, learned), **found, "learning_seconds": learned.seconds}}
+    measured = {"tuning_worked": tuned.worked, "episodes_stopped": len(explored.stopped)}
+    return {case: {**success(trials, learned), **measured, "learning_seconds": learned.seconds}}
 
 
 def success(trials: Trials, learned: Learned) -> dict[str, float]:

@@ -109,7 +109,7 @@ def beside_rivals(*, loops: int = 10, rival_loops: int = 2) -> Numbers:
     solve, settle = starting(problem)
     finer = jax.jit(integrated(lambda x, u: jnp.stack(planned.rates(jnp, x, u)), DT, substeps=4))
     functions, costs = in_c(problem, first_plan(problem, HANGING, np.zeros((STEPS, 1))), barrier=BARRIER)
-    makers: dict[str, Callable[[Plan], Controller]] = {
+    controllers: dict[str, Callable[[Plan], Controller]] = {
         "c": lambda plan: of_c(functions, settle(plan)),
         "ipopt": lambda plan: to_the_end("ipopt", planned, unknowns_of(plan.x, plan.u)),
         "fatrop": lambda plan: to_the_end("fatrop", planned, unknowns_of(plan.x, plan.u)),
@@ -117,8 +117,8 @@ def beside_rivals(*, loops: int = 10, rival_loops: int = 2) -> Numbers:
     }
     # As in the published evaluation.
     drawn = np.random.default_rng(0).normal(size=(loops, 4)) * np.sqrt([1e-3, 5e-2, 1e-6, 1e-6]) + HANGING
-    found: dict[str, dict[str, float]] = {}
-    for name, make in makers.items():
+    measured: dict[str, dict[str, float]] = {}
+    for name, make in controllers.items():
         states, paid, times = [], [], []
         for x in drawn if name == "c" else drawn[:rival_loops]:
             act, run, cost = make(solve(x)), [x], 0.0
@@ -131,7 +131,7 @@ def beside_rivals(*, loops: int = 10, rival_loops: int = 2) -> Numbers:
             states.append(run)
             paid.append(cost)
         x = np.array(states)
-        found[f"realtime/cart-pole/{name}"] = {
+        measured[f"realtime/cart-pole/{name}"] = {
             **quantiles_ms(times),
             "up_share": np.mean(np.all(np.cos(x[:, -20:, 1]) > np.cos(0.1), axis=1)),
             "closed_loop_cost_mean": np.mean(paid),
@@ -139,8 +139,8 @@ def beside_rivals(*, loops: int = 10, rival_loops: int = 2) -> Numbers:
             "largest_position": np.abs(x[..., 0]).max(),
         }
     for name, cost in costs.items():
-        found[f"realtime/cart-pole/c-{name}"] = {"operations": cost.operations, "stack_bytes": cost.stack_bytes}
-    return found
+        measured[f"realtime/cart-pole/c-{name}"] = {"operations": cost.operations, "stack_bytes": cost.stack_bytes}
+    return measured
 
 
 def with_gains(problem: TrajectoryProblem) -> Callable[[Plan], Plan]:
@@ -213,18 +213,18 @@ def on_a_rail(*, runs: int = 100) -> Numbers:
         "plan-and-gains": lambda x: along(regulate(plan(x)), top),
     }
     step, drawn = jax.jit(problem.step), np.random.default_rng(0).uniform(-1, 1, (runs, 4)) * [0.2, 0.3, 0.0, 0.0]
-    found = {}
+    measured = {}
     for way, make in ways.items():
         states, times = zip(
             *(swung_up(plant, make(x), step, x, seed) for seed, x in enumerate(HANGING + drawn)), strict=True
         )
         x = np.stack(states)
         scores, farthest = outcomes(x[..., 1], rate=1 / DT), np.abs(x[..., 0]).max(axis=1)
-        found[f"rail/{way}"] = {
+        measured[f"rail/{way}"] = {
             "success_share": np.mean(np.isfinite(scores.seconds) & (farthest <= RAIL)),
             "farthest_m": farthest.max(),
             "seconds_median": scores.median,
             "seconds_worst": scores.worst,
             "p99_ms": quantiles_ms(times)["p99_ms"],
         }
-    return found
+    return measured

@@ -66,12 +66,12 @@ def judged(
     plant: ValuePlant, values: Sequence[ValueAndGradient], seconds: Sequence[float], V: np.ndarray, truth: np.ndarray
 ) -> dict[str, float]:
     """Returns by kind of starts, training times, and errors of V [seeds, ...] over the states that count."""
-    found = {"train_seconds": np.median(seconds), "train_seconds_worst": max(seconds)}
+    measured = {"train_seconds": np.median(seconds), "train_seconds_worst": max(seconds)}
     for where in ("down", "uniform"):
         x = starts(plant, where)
         runs = [evaluate(plant, hjb_policy(value, plant.problem), x) for value in (*values, mean_value(values))]
         *means, together = (np.mean(run.returns) for run in runs)
-        found |= {
+        measured |= {
             f"{where}_return": np.median(means),
             f"{where}_up_share": min(np.mean(np.isfinite(run.settled)) for run in runs[:-1]),
             f"{where}_return_worst_seed": np.min(means),
@@ -80,7 +80,7 @@ def judged(
     counted = truth > LEAST * truth.max()
     off = off_by(V, truth)[:, counted]
     return {
-        **found,
+        **measured,
         "median_relative_error": np.median(np.median(off, axis=1)),
         "median_relative_error_worst_seed": np.median(off, axis=1).max(),
         "p90_relative_error": np.quantile(off, 0.9),
@@ -230,7 +230,7 @@ def equation(
     Robust values are trained against the worst change of mass and length by up to 15 %.
     """
     plant, rounds = PLANTS["pendulum"](), {"rounds": 6} if robust else {}
-    x, found = starts(plant, "down", starts_down), {}
+    x, measured = starts(plant, "down", starts_down), {}
     network = value_network(plant.problem, widths=(width, width), scale=30.0)
     for name in ("trusting", "robust") if robust else ("",):
         worst = worst_disturbance(rod, [1.0, 1.0], Bounds(parameters=0.15)) if name == "robust" else None
@@ -250,6 +250,6 @@ def equation(
             runs = [evaluate(plant._replace(problem=moved), law, x) for law in laws]
             returns, up = [np.mean(run.returns) for run in runs], [np.mean(np.isfinite(run.settled)) for run in runs]
             key = f"{name}_{where}_" if robust else ""
-            found |= {f"{key or 'down_'}return_median": np.median(returns), f"{key}up_share_worst": min(up)}
-            found |= {} if robust else {"down_return_worst": np.min(returns)}
-    return {f"equation/{'robust' if robust else 'pendulum'}": found}
+            measured |= {f"{key or 'down_'}return_median": np.median(returns), f"{key}up_share_worst": min(up)}
+            measured |= {} if robust else {"down_return_worst": np.min(returns)}
+    return {f"equation/{'robust' if robust else 'pendulum'}": measured}

@@ -52,7 +52,7 @@ def program(problem: Planned) -> tuple[dict[str, Any], dict[str, np.ndarray], An
         free = np.zeros(n, bool) if problem.free is None else np.asarray(problem.free)
         held = ~free if k == 0 else np.zeros(n, bool)
         low, high = (
-            [*found, *np.where(held, problem.x0, bound)] for found, bound in zip((low, high), bounds, strict=True)
+            [*measured, *np.where(held, problem.x0, bound)] for measured, bound in zip((low, high), bounds, strict=True)
         )
         more = [problem.states(ca, X[k])] if problem.states and k else []
         equal = [problem.end(ca, X[N])] if problem.end and k == N else []

@@ -89,14 +89,14 @@ def kernels(*, fits: Sequence[tuple[str, int, bool, bool]] = KERNELS, tests: int
         arm = ARMS[name]()
         train = lip_trajectories(arm, friction=friction, every=STRIDES[count])
         needs = arm.tree.needs._replace(joint_friction=FRICTION if friction else (), velocity_scale=VELOCITY_SCALE)
-        found = fit_kernel(needs, train, serial=serial)
-        model = CATALOGUE["trigonometric-kernel"].make(needs=needs, samples=found.samples, serial=serial)
-        errors = unseen_errors(arm, model.energies(found.parameters), friction, tests, every=50)
+        measured = fit_kernel(needs, train, serial=serial)
+        model = CATALOGUE["trigonometric-kernel"].make(needs=needs, samples=measured.samples, serial=serial)
+        errors = unseen_errors(arm, model.energies(measured.parameters), friction, tests, every=50)
         numbers[f"{case_name(name, count, friction)}/kernel{'' if serial else '-any-order'}"] = {
             "nmse_mean_median": np.median(errors.mean(axis=1)),
             "nmse_mean_worst": np.max(errors.mean(axis=1)),
             **{f"nmse_joint_{joint + 1}": error for joint, error in enumerate(np.median(errors, axis=0))},
-            "fit_seconds": found.seconds,
+            "fit_seconds": measured.seconds,
         }
     return numbers
 

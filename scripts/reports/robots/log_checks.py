@@ -58,12 +58,12 @@ def faults(*, faulty_logs: int = 10) -> Numbers:
     """The share of faulty logs whose fault is detected and named."""
     numbers = {}
     for place, (kind, check) in enumerate(FAULTS.items()):
-        found = []
+        measured = []
         for number in range(faulty_logs):
             robot, arrays, rates = drawn(1000 + 100 * place + number)
             robot, arrays = spoiled(kind, robot, arrays, rates, np.random.default_rng([SEED, number, 2]))
-            found.append(any(finding.check == check for finding in findings(arrays, robot)))
-        numbers[f"log-checks/{kind}"] = {"found": np.mean(found)}
+            measured.append(any(finding.check == check for finding in findings(arrays, robot)))
+        numbers[f"log-checks/{kind}"] = {"found": np.mean(measured)}
     return numbers
 
 

@@ -161,9 +161,9 @@ def faults(*, faulty_logs: int = 10) -> Numbers:
         "wraps": (wrapped, ("scara", "leg", "gimbals"), "wraps"),
     }
     numbers = {}
-    for name, (found, robots, recording) in kinds.items():
+    for name, (detects, robots, recording) in kinds.items():
         logs = [record(robots[k % len(robots)], recording, 7 + 100 * k) for k in range(faulty_logs)]
-        numbers[f"log-checks/{name}"] = {"found": np.mean([found(*log) for log in logs])}
+        numbers[f"log-checks/{name}"] = {"found": np.mean([detects(*log) for log in logs])}
     return numbers
 
 
@@ -174,8 +174,8 @@ def errors(arrays: Arrays, robot: Robot | None) -> list[tuple[int, ...]]:
 
 def all_reversed(arrays: Arrays, robot: Robot | None) -> bool:
     """All torques reversed are found."""
-    found = findings({**arrays, "tau": -arrays["tau"]}, robot)
-    return any(f.check == "tree-sign" and len(f.joints) == arrays["q"].shape[1] for f in found)
+    outcome = findings({**arrays, "tau": -arrays["tau"]}, robot)
+    return any(f.check == "tree-sign" and len(f.joints) == arrays["q"].shape[1] for f in outcome)
 
 
 def second_reversed(arrays: Arrays, robot: Robot | None) -> bool:
@@ -186,8 +186,8 @@ def second_reversed(arrays: Arrays, robot: Robot | None) -> bool:
 
 def delayed(arrays: Arrays, robot: Robot | None) -> bool:
     """Torques 200 ms late are found."""
-    found = findings({**arrays, "tau": late(arrays, 0.2)}, robot)
-    return any(finding.check == "delay" and "late" in finding.observation for finding in found)
+    outcome = findings({**arrays, "tau": late(arrays, 0.2)}, robot)
+    return any(finding.check == "delay" and "late" in finding.observation for finding in outcome)
 
 
 def gravity_free(arrays: Arrays, robot: Robot | None) -> bool:
@@ -283,12 +283,12 @@ def repeated_motions(*, sets: int = 20) -> Numbers:
         lambda random, d: through(np.stack([np.zeros(d), random.normal(size=d), np.zeros(d)])),
         swings,
     )
-    joined, found = [], []
+    joined, outcome = [], []
     for kind, make in enumerate(kinds):
         for d in (2, 3, 7):
             for number in range(sets):
                 random = np.random.default_rng([OTHER_SEED, kind, d, number])
                 joined.append(1 - count([make(random, d) for _ in range(recordings)]) / recordings)
                 repeated = (make(random, d) for _ in range(5))
-                found.append(count([again(random, q) for q in repeated for _ in range(4)]) <= 5)
-    return {"log-checks/repeated-motions": {"wrongly_joined": np.mean(joined), "found": np.mean(found)}}
+                outcome.append(count([again(random, q) for q in repeated for _ in range(4)]) <= 5)
+    return {"log-checks/repeated-motions": {"wrongly_joined": np.mean(joined), "found": np.mean(outcome)}}

@@ -76,7 +76,7 @@ def double_pendulum(*, double_pendulum: Path | None = None, splits: int = len(HE
         solved = {"chosen-scale": coarse, "low-passed": smoothed, "stacked": [*coarse, *smoothed]}
         return {
             "least-squares": (usual, with_vector(usual, solution(equations(usual, rest)))),
-            **{name: (model, with_vector(model, solution(found))) for name, found in solved.items()},
+            **{name: (model, with_vector(model, solution(measured))) for name, measured in solved.items()},
             "both": motions_and_torques(rest, scale),
         }
 
@@ -102,8 +102,8 @@ def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_O
         by_both = by_torques
         if choice.window is not None:
             by_both, *_ = fit_by("both", model, known, by_torques, rest[0], sets, choice.window)
-        found = {"torques": by_torques, "motions": by_motions, "both": by_both}
-        return {way: (model, parameters_of(solution.theta, known)) for way, solution in found.items()}
+        measured = {"torques": by_torques, "motions": by_motions, "both": by_both}
+        return {way: (model, parameters_of(solution.theta, known)) for way, solution in measured.items()}
 
     numbers = judged("identify-by", double_pendulum, splits, fits)
     times = {
@@ -124,7 +124,7 @@ def judged(name: str, path: Path | None, splits: int, fits: Any) -> dict[str, di
         return {}
     known = {"rate": BASE, "trim": 0.3, "decimate": round(BASE / RATE), "filter_torque": True}
     coarse, fine = (smooth(schema.load(path), cutoff, **known).data for cutoff in (CUTOFF, FINE))
-    found: dict[str, list[tuple[float, float]]] = {}
+    measured: dict[str, list[tuple[float, float]]] = {}
     for labels in HELD_OUT[:splits]:
         held = label_indices(fine, labels)
         others = np.setdiff1d(np.unique(fine.trajectory), held)
@@ -135,9 +135,9 @@ def judged(name: str, path: Path | None, splits: int, fits: Any) -> dict[str, di
             predicted = predict_measured(model, parameters, segments, fitted=WINDOW)
             times = valid_times(segments, predicted, fitted=WINDOW, variance=fine.q.var(axis=0))
             error = float(np.mean(off**2 / coarse.tau.var(axis=0)))
-            found.setdefault(f"{name}/{way}", []).append((error, float(np.mean(times))))
+            measured.setdefault(f"{name}/{way}", []).append((error, float(np.mean(times))))
     numbers: dict[str, dict[str, float]] = {}
-    for way, values in found.items():
+    for way, values in measured.items():
         for quantity, worst, of_splits in zip(
             ("torque_nmse", "vpt_mean_seconds"), (np.max, np.min), np.transpose(values), strict=True
         ):
@@ -275,7 +275,7 @@ def block_errors(squares: Mapping[str, list[np.ndarray]], variance: np.ndarray, 
         ("chosen-friction", "over_pinocchio", "pinocchio"),
     ):
         if other in squares:
-            own, rival = (numbers[f"recorded-arm/{each}"]["nmse"] for each in (name, other))
+            own, rival = (numbers[f"recorded-arm/{kind}"]["nmse"] for kind in (name, other))
             numbers[f"recorded-arm/{name}"][over] = own / rival
     return numbers
 
@@ -295,7 +295,7 @@ def arm_fits(tree: Tree, data: Trajectories) -> dict[str, Torque]:
     network = fit_residual(full.model, full.parameters, tree.needs, train, validation)
     needs = tree.needs._replace(friction=True)
     trees = [fit_tree(needs, train, validation, velocity_scale=scale) for scale in (0.01, 0.1)]
-    learned = tree_of(min(trees, key=lambda found: found.validation_error).parameters, needs)
+    learned = tree_of(min(trees, key=lambda measured: measured.validation_error).parameters, needs)
     frames = {"rotations": np.asarray(learned.rotations), "positions": np.asarray(learned.positions)}
     torques = {
         "usual-friction": torque_by(fit_friction(tree, data, LAWS[0])),

@@ -85,11 +85,11 @@ def beams(*, steps: int = 30) -> Numbers:
     for cells in ((40, 10), (80, 20)):
         scene = cantilever(cells)
         init, step = make_step(scene, DT)
-        program, given = motion(step, steps), (scene.params, init())
-        seconds = medians_in_turns({"": program}, given, repetitions=9)[""] / steps
+        program, arguments = motion(step, steps), (scene.params, init())
+        seconds = medians_in_turns({"": program}, arguments, repetitions=9)[""] / steps
         numbers[f"speed/beam-{scene.mesh.vertices.size}-unknowns"] = {
             "seconds_per_step": seconds,
-            "steps_not_converged": np.sum(~np.asarray(program(*given)[1])),
+            "steps_not_converged": np.sum(~np.asarray(program(*arguments)[1])),
         }
     return numbers
 
@@ -102,9 +102,9 @@ def stiffness(*, bars: int = 3) -> Numbers:
         init, step = make_step(bar_scene(mesh), dt, linear_solver=linear_solvers.sparse)
         run, seconds, solved = motion(step, 2), [], True
         for modulus, ratio in itertools.product((3e5, 1e7, 1e9), (0.3, 0.49)):
-            given = bar_scene(mesh, modulus, ratio).params, init()
-            seconds.append(processor_seconds(functools.partial(run, *given), 3) / 2)
-            solved &= bool(run(*given)[1].all())
+            arguments = bar_scene(mesh, modulus, ratio).params, init()
+            seconds.append(processor_seconds(functools.partial(run, *arguments), 3) / 2)
+            solved &= bool(run(*arguments)[1].all())
         numbers[f"speed/stiffness-{len(mesh.elements)}-tetrahedra"] = {
             "slowest_over_fastest_step": max(seconds) / min(seconds),
             "fastest_seconds_per_step": min(seconds),
@@ -195,7 +195,7 @@ def compilation(*, programs: tuple[str, ...] = ("box-on-ground", "self-contact",
             arguments = (example.scene.params, init())
         # With a constant of its own, the program is in no cache.
         stamp, began = time.time_ns(), time.perf_counter()
-        fresh = jax.jit(lambda *given, function=function, stamp=stamp: (function(*given), jnp.asarray(stamp)))
+        fresh = jax.jit(lambda *arguments, function=function, stamp=stamp: (function(*arguments), jnp.asarray(stamp)))
         lowered = fresh.trace(*arguments).lower()
         at_lower = time.perf_counter()
         lowered.compile()

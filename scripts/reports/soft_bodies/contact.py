@@ -132,15 +132,15 @@ def bounce(*, milliseconds: tuple[float, ...] = (10.0, 5.0, 2.0, 1.0, 0.5, 0.2))
     }
     numbers = {}
     for name, integrator in integrators.items():
-        for each in milliseconds:
-            dt = 1e-3 * each
+        for step_ms in milliseconds:
+            dt = 1e-3 * step_ms
             init, step = make_step(scene, dt, integrator, tolerance=1e-8)
             observe = lambda _, info: info.converged  # noqa: E731
             run = jax.jit(partial(rollout, partial(step, scene.params), steps=round(0.3 / dt), observe=observe))
             state, converged = run(init(v=[0.0, -2.0]))
             v = np.asarray(state.v)
             energy = 0.5 * float(masses @ np.sum(v**2, axis=1)) + float(potential(scene, state.x, scene.params))
-            numbers[f"bounce/{name}/{each:g}-ms"] = {
+            numbers[f"bounce/{name}/{step_ms:g}-ms"] = {
                 "lost_energy": 1 - energy / (0.5 * masses.sum() * 2.0**2),
                 "restitution": float(masses @ v[:, 1]) / masses.sum() / 2.0,
                 "steps_not_converged": int((~converged).sum()),

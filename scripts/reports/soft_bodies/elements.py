@@ -43,11 +43,11 @@ def locking(*, coarser: int = 1) -> Numbers:
     for kind, cells in CELLS.items():
         mesh, solve = clamped(cells // coarser, kind)
         for nu in RATIOS:
-            given = jnp.asarray(nu), jnp.asarray(forces(mesh, nu, kind))
-            x, converged = solve(*given)
+            arguments = jnp.asarray(nu), jnp.asarray(forces(mesh, nu, kind))
+            x, converged = solve(*arguments)
             numbers[f"locking/{kind}/nu={nu}"] = {
                 "error": error_of(mesh, np.asarray(x) - mesh.vertices, kind) if converged else np.nan,
-                "processor_seconds": processor_seconds(functools.partial(solve, *given), 5),
+                "processor_seconds": processor_seconds(functools.partial(solve, *arguments), 5),
             }
     return numbers
 

@@ -64,8 +64,8 @@ def creature(*, steps: int = 1000) -> Numbers:
     lanes = gait(100, muscles) * jnp.linspace(0.8, 1.0, LANES)[:, None, None]
     alone, together = jax.jit(run), jax.jit(jax.vmap(lambda controls: run(controls)[0][-1]))
     seconds, lanes_seconds = (
-        medians_in_turns({"": program}, (given,), repetitions=9)[""]
-        for program, given in ((alone, controls), (together, lanes))
+        medians_in_turns({"": program}, (inputs,), repetitions=9)[""]
+        for program, inputs in ((alone, controls), (together, lanes))
     )
     return {
         "speed/crawler": {

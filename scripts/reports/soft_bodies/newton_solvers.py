@@ -132,5 +132,5 @@ def explicit_gradient(body: Body, dt: float) -> tuple[Run, float]:
 
     end, change = body._replace(times=body.times[-1:]), 1e-2
     ends = (end._replace(modulus=factor * body.modulus) for factor in (1 + change, 1 - change))
-    up, down = (explicit_motion(each, dt).x[-1, :, 2].mean() for each in ends)
+    up, down = (explicit_motion(end, dt).x[-1, :, 2].mean() for end in ends)
     return measured(body, slope), float(up - down) / (2 * change * body.modulus)

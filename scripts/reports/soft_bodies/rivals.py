@@ -131,12 +131,12 @@ def hanging() -> Numbers:
     solve = jax.jit(lambda params: static_solve(scene, params)[0])
     ours = measured(body, lambda: jax.block_until_ready(solve(scene.params))[None])
     slope, _ = gradient(body, lambda params: static_solve(scene, params)[0][:, 2].mean())
-    found = {"dln_jax": (ours, slope)}
+    outcome = {"dln_jax": (ours, slope)}
     for name, module in (("torch-fem", "torch_fem"), ("tatva", "tatva_fem")):
         if fem := rival(module):
-            found[name] = fem.static(body)
+            outcome[name] = fem.static(body)
     numbers = {}
-    for name, (positions, derivative) in found.items():
+    for name, (positions, derivative) in outcome.items():
         numbers[f"rivals/hanging/{name}"] = {
             "solve_processor_seconds": positions.seconds,
             "gradient_processor_seconds": derivative.seconds,
@@ -168,8 +168,8 @@ def mesh_error(*, moments: int = 5) -> Numbers:
             continue
         finest = body(3, order=2)
         exact = common(finest, motion(finest, "midpoint", 0.005).x)
-        for key, (each, run) in runs.items():
-            error = float(np.linalg.norm(common(each, run.x) - exact) / np.linalg.norm(exact))
+        for key, (shape, run) in runs.items():
+            error = float(np.linalg.norm(common(shape, run.x) - exact) / np.linalg.norm(exact))
             numbers[f"rivals/mesh/{key}"] = {
                 "error": error if np.isfinite(error) else np.inf,
                 "processor_seconds_per_second": run.seconds,

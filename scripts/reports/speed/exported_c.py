@@ -164,7 +164,7 @@ def exported(
     """Times of all functions of all arms, of making them, and with `largest` of making the largest export."""
     from scripts.reports.robots.pinocchio import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
 
-    found: dict[str, dict[str, float]] = {}
+    measured: dict[str, dict[str, float]] = {}
     functions, rivals = {}, pinocchio_functions(rival_arm(ARMS[arms[-1]][2]))
     with tempfile.TemporaryDirectory() as place:
         for name in (*arms, *[LARGEST] * largest):
@@ -175,7 +175,7 @@ def exported(
             written = time.perf_counter()
             model = compiled(folder, folder)
             made = {"export_seconds": written - began, "compiler_seconds": time.perf_counter() - written}
-            found[f"c/{name}"] = {**made, "making_seconds": sum(made.values())}
+            measured[f"c/{name}"] = {**made, "making_seconds": sum(made.values())}
             if name == LARGEST:
                 continue
             times = in_turns(programs(folder, model, FUNCTIONS), turns, repeats=repeats, calls=calls, cold=cold)
@@ -183,24 +183,24 @@ def exported(
                 warm = [hot(one) for one in of_turns]
                 p50, p99, p999 = np.percentile([one.cold for one in of_turns], [50, 99, 99.9])
                 numbers = {"hot_ns": np.median(warm), "hot_spread_ns": np.ptp(warm)}
-                found[f"c/{name}/{function}"] = {
+                measured[f"c/{name}/{function}"] = {
                     **numbers,
                     "cold_p50_ns": p50,
                     "cold_p99_ns": p99,
                     "cold_p999_ns": p999,
                 }
-            found[f"c/{name}/{JACOBIAN}"]["over_inverse"] = ratio(times[JACOBIAN], times[INVERSE], hot)
+            measured[f"c/{name}/{JACOBIAN}"]["over_inverse"] = ratio(times[JACOBIAN], times[INVERSE], hot)
             loaded = load_c(folder)
             for function in RIVALS:
                 functions[f"c/{name}/{function}"] = Timed(getattr(loaded, function), d, data_type(precision))
     seconds = seconds_of_calls({**functions, **rivals}, repetitions=repetitions)
     for case in functions:
-        found[case]["python_us"] = 1e6 * seconds[case]
+        measured[case]["python_us"] = 1e6 * seconds[case]
     for function, rival in RIVALS.items():
         if rival in rivals:
             case = f"c/{arms[-1]}/{function}"
-            found[case] |= {"pinocchio_us": 1e6 * seconds[rival], f"over_{rival}": seconds[case] / seconds[rival]}
-    return found
+            measured[case] |= {"pinocchio_us": 1e6 * seconds[rival], f"over_{rival}": seconds[case] / seconds[rival]}
+    return measured
 
 
 def textbook_rates() -> Formula:
@@ -281,7 +281,7 @@ def beside_casadi(*, turns: int = 9, repeats: int = 15, calls: int = 2_000, cold
         times = in_turns(built, turns, repeats=repeats, calls=calls, cold=cold)
     warm = {name: np.median([hot(one) for one in of_turns]) for name, of_turns in times.items()}
     rival = min(("casadi", "casadi-shared"), key=lambda name: warm[name])
-    least, found = min(sum(kinds[name].values()) for name in ("casadi", "casadi-shared")), {}
+    least, measured = min(sum(kinds[name].values()) for name in ("casadi", "casadi-shared")), {}
     for name, of_turns in times.items():
         operations = sum(kinds[name].values())
         numbers: dict[str, float] = {**kinds[name], "operations": operations, "hot_ns": warm[name]}
@@ -293,5 +293,5 @@ def beside_casadi(*, turns: int = 9, repeats: int = 15, calls: int = 2_000, cold
                 "operations_over_casadi": operations / least,
                 "relative_difference": abs(of_turns[0].sum / times[rival][0].sum - 1),
             }
-        found[f"casadi/two-link-arm/{name}"] = numbers
-    return found
+        measured[f"casadi/two-link-arm/{name}"] = numbers
+    return measured

@@ -69,7 +69,7 @@ def throughput(
     repetitions: int = 40,
 ) -> Numbers:
     """Inverse and forward dynamics by batch; the full-Hessian method by number of joints. In float32."""
-    found: dict[str, dict[str, float]] = {}
+    measured: dict[str, dict[str, float]] = {}
     with jax.enable_x64(False):
         for batch in batches:
             energies, states = structured(2, batch)
@@ -78,21 +78,21 @@ def throughput(
             programs = {name: jax.jit(jax.vmap(way)) for name, way in ways.items()}
             medians = medians_in_turns(programs, states, repetitions=repetitions)
             rates = {f"{name}_states_per_second": batch / seconds for name, seconds in medians.items()}
-            found[f"throughput/structured-delan/batch-{batch}"] = rates
+            measured[f"throughput/structured-delan/batch-{batch}"] = rates
         for d in joints:
             energies, states = structured(d, BATCH)
             ways = {"ours": dynamics(energies).inverse_dynamics, "full": by_full_hessian(lagrangian(energies))}
             programs = {name: jax.jit(jax.vmap(way)) for name, way in ways.items()}
             medians = medians_in_turns(programs, states, repetitions=repetitions)
-            found[f"throughput/full-hessian/d-{d}"] = {"speedup": medians["full"] / medians["ours"]}
-    return found
+            measured[f"throughput/full-hessian/d-{d}"] = {"speedup": medians["full"] / medians["ours"]}
+    return measured
 
 
 def scaling(
     *, joints: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 10, 12, 30), calls: int = 4_000, repetitions: int = 30
 ) -> Numbers:
     """Single calls, a training step at batch 512 and its compilation, and their exponents of growth from 2 to 12."""
-    found: dict[str, dict[str, float]] = {}
+    measured: dict[str, dict[str, float]] = {}
     optimiser = optax.adam(1e-3)
     with jax.enable_x64(False):
         for d in joints:
@@ -116,13 +116,13 @@ def scaling(
             seconds = time.perf_counter() - began
             training = medians_in_turns({"step": compiled}, arguments, repetitions=repetitions)["step"]
             numbers = {"inverse_p50_us": single.p50_us, "training_step_ms": 1e3 * training}
-            found[f"scaling/structured-delan/d-{d}"] = {**numbers, "training_compile_seconds": seconds}
+            measured[f"scaling/structured-delan/d-{d}"] = {**numbers, "training_compile_seconds": seconds}
     fitted = [d for d in joints if 2 <= d <= 12]
     growth = {}
     for quantity in ("inverse_p50_us", "training_step_ms", "training_compile_seconds"):
-        values = [found[f"scaling/structured-delan/d-{d}"][quantity] for d in fitted]
+        values = [measured[f"scaling/structured-delan/d-{d}"][quantity] for d in fitted]
         growth[f"{quantity}_exponent"] = np.polyfit(np.log(fitted), np.log(values), 1)[0]
-    return {**found, "scaling/structured-delan/growth": growth}
+    return {**measured, "scaling/structured-delan/growth": growth}
 
 
 def single_calls(
@@ -134,7 +134,7 @@ def single_calls(
     steps: int = STEPS,
 ) -> Numbers:
     """Trains models of the arm, and times single calls; processes of both modes of dispatch take turns."""
-    sets, found, folders = published_split(), {}, []
+    sets, measured, folders = published_split(), {}, []
     with tempfile.TemporaryDirectory() as place, jax.enable_x64(False):
         for name in models:
             wide, folder = name == WIDE, Path(place) / name
@@ -150,7 +150,7 @@ def single_calls(
                 parameters = fit(problem(model, sets, objective_of(kind, sets.train)), optimiser).parameters
             save(folder, description, parameters)
             answers = predictions(load(folder).energies, sets.test, jnp.float64)
-            found[f"one-step/{name}"] = {"torque_mse": errors(answers, sets.test)["torque_mse"]}
+            measured[f"one-step/{name}"] = {"torque_mse": errors(answers, sets.test)["torque_mse"]}
             folders.append(folder)
         modes = ("default", "low-latency") * processes
         answers = [called(times_of_runs, folders, mode, calls) for mode in modes]
@@ -161,8 +161,8 @@ def single_calls(
             if "p50_us" in turns[0]:
                 numbers["inverse_p50_spread_us"] = np.ptp([turn["p50_us"] for turn in turns])
                 numbers["inverse_p99_over_p50"] = numbers["inverse_p99_us"] / numbers["inverse_p50_us"]
-            found[f"one-step/{name}/{path}"] = numbers
-    return found
+            measured[f"one-step/{name}/{path}"] = numbers
+    return measured
 
 
 def times_of_runs(folders: Sequence[str], dispatch: str, calls: int) -> dict[str, Any]:

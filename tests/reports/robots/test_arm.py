@@ -32,7 +32,7 @@ def test_fed_forward_torque_tracks(short):
     assert error(follow(robot, short, exact_torque(robot, short))) < 1e-2 * error(follow(robot, short))
 
 
-def test_links_are_bodies_that_exist():
+def test_links_are_physically_consistent():
     assert all(np.linalg.eigvalsh(pseudo_inertia(theta)).min() > 0 for theta in arm(coulomb=False).tree.inertias)
 
 

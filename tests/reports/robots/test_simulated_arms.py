@@ -28,7 +28,7 @@ def test_motions_stay_within_limits_and_rates_are_derivatives(make):
 
 
 @pytest.mark.parametrize("make", [skew_arm, sliding_arm])
-def test_links_of_our_own_are_bodies_that_exist(make):
+def test_links_of_our_own_are_physically_consistent(make):
     for theta in make().tree.inertias:
         assert np.linalg.eigvalsh(pseudo_inertia(theta)).min() > 0
 
