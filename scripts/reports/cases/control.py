@@ -1,5 +1,7 @@
 """Measure controllers: swing-ups, a board, learned models, foreign plants, value functions, tracking, plans, and C."""
 
+from typing import Any
+
 from dln_jax.control.optimal.plants import FITS
 from dln_jax.learning.kinematics import Search
 from scripts.reports.control import (
@@ -35,7 +37,7 @@ QUIET = {
 """The rms of the torque at the goal, as a share of that by differences."""
 
 
-def small(plant: str, **numbers: float):
+def small(plant: str, **numbers: Any):
     """Settings of a fit for a quick run."""
     fit = FITS[plant]
     return fit._replace(widths=(24, 24), numbers=fit.numbers._replace(starts=128, **numbers))

@@ -230,14 +230,14 @@ def test_steps_and_their_linearisations_are_those_of_the_integrators(rule):
         return tuple(map(jnp.concatenate, steps))
 
     @jax.jit
-    def both(x, u):
-        q, p, *blocks = free(*jnp.split(x, 2), DT).values()
-        ours = [*driven(x, u, DT).values(), jnp.concatenate([q, p]), jnp.block([blocks[:2], blocks[2:]])]
+    def both(x, u, dt):
+        q, p, *blocks = free(*jnp.split(x, 2), dt).values()
+        ours = [*driven(x, u, dt).values(), jnp.concatenate([q, p]), jnp.block([blocks[:2], blocks[2:]])]
         after, rested = by_integrator(x, u)
         slopes, free_slopes = jax.jacfwd(by_integrator, argnums=(0, 1))(x, u)
         return ours, [after, *slopes, rested, free_slopes[0]]
 
-    for ours, expected in zip(*both(0.1 * FAST, jnp.array([0.7])), strict=True):
+    for ours, expected in zip(*both(0.1 * FAST, jnp.array([0.7]), DT), strict=True):
         np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-10)
 
 
