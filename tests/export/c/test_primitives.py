@@ -142,7 +142,10 @@ MOVES = {
         *(x.sum(0), x.sum(1), x.sum(), x.prod(1), x.max(0), x.min((0, 1)), x.var(1), x[:, :2].sum(1)),
         *((x > 0).all(1), (x > 1).any(0), (x[..., None] * x[0]).max((0, 1))),
     ),
-    "arguments": lambda x: (jnp.argmax(x, 0), jnp.argmin(x, 1), jnp.argmax(x), jnp.nanargmin(x)),
+    "arguments": lambda x: (
+        *(jnp.argmax(x, 0), jnp.argmin(x, 1), jnp.argmax(x), jnp.nanargmin(x)),
+        jnp.argmax(jnp.where(x > 0, jnp.nan, x), 1),  # the first of several NaN
+    ),
     "cumulative": lambda x: (
         *(jnp.cumsum(x, 0), lax.cumsum(x, 1, reverse=True), jnp.cumprod(x, 1)),
         *(lax.cummax(x, 1), lax.cummin(x, 0, reverse=True)),
