@@ -19,7 +19,8 @@ def skew():
     """An arm of the first two links of the skew one."""
     arm = skew_arm()
     tree = make_tree(*(each[:2] for each in arm.tree[:6]), armature=arm.tree.armature[:2])
-    return arm._replace(tree=tree, **{name: getattr(arm, name)[:2] for name in arm._fields[2:]})
+    rows = {name: value[:2] for name, value in arm._asdict().items() if isinstance(value, np.ndarray)}
+    return arm._replace(tree=tree, **rows)
 
 
 SKEW = skew()
