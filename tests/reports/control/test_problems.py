@@ -52,7 +52,7 @@ def test_casadi_has_the_same_formulas():
 @pytest.mark.parametrize("name", plants.PLANTS)
 def test_plant_starts_near_hanging_and_stays_there(name):
     if "gymnasium" in name:
-        pytest.importorskip("gymnasium")
+        pytest.importorskip("gymnasium", reason="Gymnasium simulates the plant; it is in the extra [test]")
     plant, seen = plants.PLANTS[name](0, 1), []
     plant.reset()
     for _ in range(100):
