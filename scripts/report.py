@@ -7,7 +7,7 @@ from pathlib import Path
 from scripts.reports.run import report
 
 CASES = Path(__file__).parent / "reports" / "cases"
-NAMES = sorted(file.stem for file in CASES.glob("[a-z]*.py"))
+NAMES = sorted(file.stem for file in CASES.glob("*.py"))
 
 
 def main() -> None:

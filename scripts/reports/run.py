@@ -52,6 +52,12 @@ UNITS = {
 
 Numbers = Mapping[str, Mapping[str, float]]
 """Measured numbers by case of a row and quantity."""
+Stored = dict[str, dict[str, float | None]]
+"""The same in a file, where `None` is a number that is not finite."""
+NAMES = tuple[str, ...]
+KINDS: dict[Any, Any] = {kind: kind for kind in (int, float, str, Path)}
+KINDS |= {kind | None: kind for kind in KINDS} | {NAMES: str}
+"""Types of a function's keyword that is an option, and of the option: names have commas between them."""
 
 
 class AtLeast(NamedTuple):
@@ -107,42 +113,34 @@ def report(name: str, *usual: str) -> None:
     )
 
 
+def keywords_of(case: Case) -> dict[str, Any]:
+    """Types of the keywords of a case's function that are options."""
+    function = case.function
+    while isinstance(function, partial):
+        function = function.func
+    hints = typing.get_type_hints(function)
+    names = inspect.signature(case.function).parameters
+    return {name: hints[name] for name in names if name not in case.settings and hints.get(name) in KINDS}
+
+
 def arguments_of(cases: Sequence[Case]) -> type:
     """The options of a report: those of every run, and the keywords of its functions."""
     subjects = ",".join(dict.fromkeys(case.name.split("/")[0] for case in cases))
-    kinds: dict[str, Any] = {"only": str, "quick": bool}
-    texts = {
-        "only": f"Subjects, or whole names of cases, comma separated: {subjects} (default: all).",
-        "quick": "Less of everything, to try the command.",
+    options: dict[str, tuple[Any, str]] = {
+        "only": (str, f"Subjects, or whole names of cases, comma separated: {subjects} (default: all)."),
+        "quick": (bool, "Less of everything, to try the command."),
     }
     for case in cases:
-        for name, keyword in inspect.signature(case.function).parameters.items():
-            if name not in case.settings and (kind := kind_of(case.function, name)) is not None:
-                default = "none" if keyword.default is None else keyword.default
-                kinds.setdefault(name, kind)
-                texts.setdefault(name, f"Of {case.name.split('/')[0]} (default: {default}).")
+        for name, hint in keywords_of(case).items():
+            default = inspect.signature(case.function).parameters[name].default
+            text = f"Of {case.name.split('/')[0]} (default: {'none' if default is None else default})."
+            options.setdefault(name, (KINDS[hint], text))
     fields: list[Any] = [("MEASURES_COMPILATION", ClassVar[bool], True)]
-    for name, kind in kinds.items():
-        empty = False if kind is bool else None
-        shown = Annotated[bool if kind is bool else kind | None, tyro.conf.arg(help=texts[name], help_behavior_hint="")]
+    for name, (kind, text) in options.items():
+        empty, kind = (False, bool) if kind is bool else (None, kind | None)
+        shown = Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint="")]
         fields.append((name, shown, field(default=empty)))
     return make_dataclass("Arguments", fields, bases=(Resumable,), frozen=True)
-
-
-def kind_of(function: Callable[..., Numbers], keyword: str) -> Any:
-    """The type of a keyword as an option: a number, a text or a path; `None` if it is no option."""
-    annotation = annotation_of(function, keyword)
-    if annotation == tuple[str, ...]:
-        return str  # names with commas between them
-    members = {member for member in typing.get_args(annotation) if member is not type(None)} or {annotation}
-    return next((kind for kind in (int, float, str, Path) if members == {kind}), None)
-
-
-def annotation_of(function: Callable[..., Numbers], keyword: str) -> Any:
-    """The type of a function's keyword; the function may be partial."""
-    while isinstance(function, partial):
-        function = function.func
-    return typing.get_type_hints(function).get(keyword)
 
 
 def measure_report(name: str, cases: Sequence[Case], options: Any) -> None:
@@ -153,7 +151,10 @@ def measure_report(name: str, cases: Sequence[Case], options: Any) -> None:
         for number, case in enumerate(chosen, start=1):
             began = time.perf_counter()
             if case.name not in stored:
-                stored[case.name] = in_float64(case.function)(**settings_of(case, options))
+                numbers = in_float64(case.function)(**settings_of(case, options))
+                stored[case.name] = {
+                    row: {name: float(value) for name, value in of.items()} for row, of in numbers.items()
+                }
                 write_json(folder / JOBS, stored)
             rows = rows_of(case, stored[case.name])
             judged = [row.passed for row in rows if row.passed is not None]
@@ -186,16 +187,14 @@ def chosen_cases(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
 def settings_of(case: Case, options: Any) -> dict[str, Any]:
     """The keywords of a case's function: those that the user stated, before those of --quick and of the table."""
     stated = {}
-    for name in inspect.signature(case.function).parameters:
-        value = getattr(options, name, None)
-        if value is not None and name not in case.settings:
-            several = annotation_of(case.function, name) == tuple[str, ...]
-            stated[name] = names_listed(value) if several else value
+    for name, hint in keywords_of(case).items():
+        if (value := getattr(options, name)) is not None:
+            stated[name] = names_listed(value) if hint == NAMES else value
     return {**case.settings, **(case.quick if options.quick else {}), **stated}
 
 
-def rows_of(case: Case, numbers: Numbers) -> list[Row]:
-    """Rows of a report: numbers with their units, beside the published ones and the bounds."""
+def rows_of(case: Case, numbers: Stored) -> list[Row]:
+    """Rows of a report: numbers with their units, beside the published ones and the bounds; a null is NaN."""
     rows = []
     for name, values in numbers.items():
         for quantity, value in values.items():
@@ -203,8 +202,9 @@ def rows_of(case: Case, numbers: Numbers) -> list[Row]:
             reference = next((case.published[key] for key in keys if key in case.published), None)
             bound = next((case.bound[key] for key in keys if key in case.bound), None)
             at_least = isinstance(bound, AtLeast)
-            number = bound.number if isinstance(bound, AtLeast) else bound
-            rows.append(Row(name, quantity, float(value), unit_of(quantity), reference, number, at_least))
+            number = bound.number if at_least else bound
+            value = math.nan if value is None else value
+            rows.append(Row(name, quantity, value, unit_of(quantity), reference, number, at_least))
     return rows
 
 
@@ -213,22 +213,18 @@ def unit_of(quantity: str) -> str:
     return next((unit for words, unit in UNITS.items() if f"_{words}_" in f"_{quantity}_"), "1")
 
 
-def stored_numbers(folder: Path, cases: Sequence[Case]) -> dict[str, Numbers]:
-    """The numbers of these cases in a folder's jobs.json; empty if there is none. A null value becomes NaN.
+def stored_numbers(folder: Path, cases: Sequence[Case]) -> dict[str, Stored]:
+    """The numbers of these cases in a folder's jobs.json; empty if there is none.
 
     Raises:
         InputError: the file is damaged.
     """
     path = folder / JOBS
     values = read_json(path, remedy=REMEDY) if is_file(path) else {}
-    read = as_type(values, dict[str, dict[str, dict[str, float | None]]], name=str(path), remedy=REMEDY)
-    if unknown := [name for name in read if name not in {case.name for case in cases}]:
-        raise InputError(f"{path}: {unknown[0]!r:.60} is not a case of this run; {REMEDY}")
-
-    def numbers(row: Mapping[str, float | None]) -> dict[str, float]:
-        return {quantity: math.nan if value is None else value for quantity, value in row.items()}
-
-    return {name: {row: numbers(values) for row, values in rows.items()} for name, rows in read.items()}
+    read = as_type(values, dict[str, Stored], name=str(path), remedy=REMEDY)
+    if unknown := set(read) - {case.name for case in cases}:
+        raise InputError(f"{path}: {unknown.pop()!r:.60} is not a case of this run; {REMEDY}")
+    return read
 
 
 def publish(folder: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:

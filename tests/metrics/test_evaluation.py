@@ -11,7 +11,7 @@ from dln_jax.metrics.errors import errors
 from dln_jax.metrics.report import Row, conditions, write_report
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum, two_link_arm
-from scripts.reports.predictions import predictions
+from scripts.reports.arm.data import predictions
 from tests.calls import json_of
 
 

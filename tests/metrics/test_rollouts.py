@@ -20,8 +20,7 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_time,
     valid_prediction_times,
 )
-from scripts.reports.arm.data import STARTS, published_swings
-from scripts.reports.predictions import rollout_metrics
+from scripts.reports.arm.data import STARTS, published_swings, rollout_metrics
 from tests.calls import one_line
 
 FRICTION = 0.3

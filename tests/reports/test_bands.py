@@ -2,7 +2,7 @@
 
 import pytest
 
-from scripts.reports.uncertainty import simulated_arm
+from scripts.reports.cases.uncertainty import simulated_arm
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 
 from dln_jax.training import low_latency_calls
 from dln_jax.types import InputError
-from scripts.reports.process import called
+from scripts.reports.timing import called
 
 
 def test_a_function_is_called_in_a_process_of_its_own():

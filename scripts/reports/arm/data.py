@@ -1,4 +1,4 @@
-"""Data of the two-link arm: letters and random states, their splits, and the published free swings."""
+"""Data of the two-link arm: letters and random states, their splits, the published free swings, and errors on them."""
 
 import functools
 from pathlib import Path
@@ -6,17 +6,22 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, select, split
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import Driven
 from dln_jax.mechanics.integrators import rollout, symplectic_euler
+from dln_jax.metrics.errors import as_arrays, prediction_program, samples_of
+from dln_jax.metrics.rollouts import metrics_of_motions, motion_program, records_of
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.scene import closed_form_forward_dynamics
-from dln_jax.types import InputError
+from dln_jax.types import Hamiltonian, InputError
 
 STARTS = np.array([[np.pi / 4, np.pi / 4], [-np.pi, -np.pi / 2], [-np.pi / 4, np.pi / 2]])
 """Postures at rest of the published test, rad: q2 is relative to link 1, zero is horizontal."""
@@ -40,13 +45,11 @@ def published_split(path: Path | None = None, seed: int = 0) -> Split:
 
 
 @functools.cache
-def random_states(samples: int = 3_000) -> Split:
+def random_states() -> Split:
     """Random states of the arm for training, and the published free swings for the test."""
-    arm = two_link_arm()
-    data = generators.uniform(arm, samples=samples)._replace(needs=arm.needs)
-    permuted = np.random.default_rng(0).permutation(np.unique(data.trajectory))
-    validation = permuted[: min(HELD_OUT, max(1, len(permuted) // 10))]
-    return Split(select(data, np.setdiff1d(permuted, validation)), select(data, validation), published_swings())
+    data = generators.uniform(two_link_arm())._replace(needs=two_link_arm().needs)
+    permuted = np.random.default_rng(0).permutation(len(data.t))
+    return Split(select(data, permuted[HELD_OUT:]), select(data, permuted[:HELD_OUT]), published_swings())
 
 
 def whole_circle() -> Trajectories:
@@ -82,3 +85,22 @@ def published_swings() -> Trajectories:
     )
     motion = jax.jit(jax.vmap(lambda q, qd: rollout(step, (q, qd), jnp.asarray(t), substeps=10)))
     return generators.swings(scene, t, *map(np.asarray, motion(STARTS, np.zeros_like(STARTS))))
+
+
+def predictions(
+    system: Driven, data: Trajectories, dtype: DTypeLike, *, H: Hamiltonian | None = None
+) -> dict[str, np.ndarray]:
+    """Returns predictions of a system for every sample, in float64; `H` as for `prediction_program`."""
+    program = jax.jit(prediction_program(lambda _: system, H=H))
+    return as_arrays(program(None, samples_of(data, dtype)))
+
+
+def rollout_metrics(
+    dynamics: Dynamics | PlainDynamics, data: Trajectories, *, dtype: DTypeLike | None = None
+) -> dict[str, float]:
+    """Returns `metrics_of_motions` of a system's predictions from its first states and torques.
+
+    Raises InputError for a trajectory of a single sample, or a coordinate that never changes.
+    """
+    motions, energies = jax.jit(motion_program(lambda _: dynamics))(None, records_of(data, dtype))
+    return metrics_of_motions(motions, energies, data)

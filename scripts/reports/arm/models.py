@@ -17,17 +17,23 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.mechanics.equations import Driven, dynamics
 from dln_jax.mechanics.hamiltonian import legendre
-from dln_jax.metrics.definiteness import definiteness
 from dln_jax.metrics.errors import errors, mean_square
 from dln_jax.metrics.latency import one_step
+from dln_jax.models.model import Model
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import Hamiltonian
-from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.descriptions import build, describe_for
+from dln_jax.zoo.descriptions import Description, build, describe_for
 from dln_jax.zoo.run import compiled
-from scripts.reports.arm.data import letters, partition_labels, published_split, random_states, whole_circle
-from scripts.reports.predictions import predictions, rollout_metrics
+from scripts.reports.arm.data import (
+    letters,
+    partition_labels,
+    predictions,
+    published_split,
+    random_states,
+    rollout_metrics,
+    whole_circle,
+)
 from scripts.reports.run import Numbers
 
 WIDTHS = {"structured-delan": 8, "black-box-delan": 16, "structured-hnn": 8, "black-box-hnn": 16, "feed-forward": 16}
@@ -41,17 +47,6 @@ TARGETS = (1.35e-5, 1e-8, 1e-9, 1e-10)
 """Training is timed to these test errors, (N m)²; the published code reaches the first after 108 s."""
 
 
-def sets_named(name: str, data: Path | None) -> Split:
-    """The published split of the letters, or random states."""
-    return published_split(data) if name == "characters" else random_states()
-
-
-def described(kind: str, data: Trajectories, *, precision: str = "f64", **size: Any) -> dict[str, Any]:
-    """The description of a model of the arm; linear models have no size."""
-    stated: dict[str, Any] = {} if CATALOGUE[kind].properties.linear else {"activation": "tanh", "depth": 2, **size}
-    return describe_for(kind, data, two_link_arm().needs, precision=precision, **stated)
-
-
 def measure_plant(name: str, *, data: Path | None = None) -> Numbers:
     """The true plant on the test: the best possible motions, and what recorded momenta leave of its torques."""
     scene, sets = two_link_arm(), sets_named(name, data)
@@ -63,7 +58,7 @@ def measure_plant(name: str, *, data: Path | None = None) -> Numbers:
     return {
         f"plant/{name}": {
             **test_errors(scene.energies, sets, H=legendre(scene.lagrangian)),
-            "free_motion_inside_seconds": float(np.median(inside)),
+            "free_motion_inside_seconds": np.median(inside),
             "whole_circle_torque_mean_square": mean_square(whole_circle().tau),
         }
     }
@@ -76,15 +71,12 @@ def measure_trigonometric(name: str, *, data: Path | None = None) -> Numbers:
     fitted = fit_linear(model, sets.train)
     noise = TORQUE_NOISE * np.random.default_rng(0).standard_normal(sets.train.tau.shape)
     noisy = fit_linear(model, sets.train._replace(tau=sets.train.tau + noise))
-    energies = model.energies(fitted.parameters)
     return {
         f"{TRIGONOMETRIC}/{name}": {
-            **test_errors(energies, sets),
+            **test_numbers(model.energies(fitted.parameters), sets),
             "noisy_torque_mse": torque_mse(model.energies(noisy.parameters), sets.test),
-            "whole_circle_torque_mse": torque_mse(energies, whole_circle()),
             "train_seconds": fitted.seconds,
             "parameters": fitted.parameter_count,
-            "one_step_p50_us": call_us(energies, sets, jnp.float64),
         }
     }
 
@@ -92,24 +84,15 @@ def measure_trigonometric(name: str, *, data: Path | None = None) -> Numbers:
 def measure_network(kind: str, name: str, *, data: Path | None = None, seeds: int = 5, steps: int = STEPS) -> Numbers:
     """Several seeds in one program by Gauss-Newton: medians over seeds, and the largest torque error."""
     sets = sets_named(name, data)
-    training, energies = trained(kind, sets, seeds=seeds, steps=steps)
-    properties = CATALOGUE[kind].properties
-    of_seeds = []
-    for system in energies:
-        numbers = {**test_errors(system, sets), "whole_circle_torque_mse": torque_mse(system, whole_circle())}
-        if properties.energy and not properties.definite:
-            share = definiteness(compiled(dynamics(system), jnp.float64), sets.test.q, sets.test.qd)
-            numbers["share_not_definite"] = share.share_not_definite
-        of_seeds.append(numbers)
-    medians = {key: float(np.median([numbers[key] for numbers in of_seeds])) for key in of_seeds[0]}
+    model, training = trained(described(kind, sets.train), sets, GaussNewton(steps=steps), seeds=tuple(range(seeds)))
+    of_seeds = [test_numbers(energies, sets) for energies in each_seed(model, training, seeds)]
     return {
         f"{kind}/{name}": {
-            **medians,
+            **{key: np.median([numbers[key] for numbers in of_seeds]) for key in of_seeds[0]},
             "torque_mse_largest": max(numbers["torque_mse"] for numbers in of_seeds),
             "compile_seconds": training.compile_seconds,
             "train_seconds": (training.compile_seconds + training.train_seconds) / seeds,
             "parameters": sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
-            "one_step_p50_us": call_us(energies[0], sets, jnp.float64),
         }
     }
 
@@ -119,18 +102,21 @@ def measure_splits(
 ) -> Numbers:
     """Test torque errors of further splits, each letter in one test: their median, and that of the worst single run."""
     medians, largest = [], []
+    seeds = split_seeds if kind == "structured-delan" else 1
     for test in partition_labels(letters(data), splits):
         sets = split(letters(data), test=test)
         if kind == TRIGONOMETRIC:
             model = build(described(kind, sets.train))
             energies = [model.energies(fit_linear(model, sets.train).parameters)]
         else:
-            _, energies = trained(kind, sets, seeds=split_seeds if kind == "structured-delan" else 1, steps=steps)
+            optimiser = GaussNewton(steps=steps)
+            energies = each_seed(
+                *trained(described(kind, sets.train), sets, optimiser, seeds=tuple(range(seeds))), seeds
+            )
         torques = [torque_mse(system, sets.test) for system in energies]
-        medians.append(float(np.median(torques)))
+        medians.append(np.median(torques))
         largest.append(max(torques))
-    case = f"{kind}/characters/splits"
-    return {case: {"torque_mse_median": float(np.median(medians)), "torque_mse_worst": max(largest)}}
+    return {f"{kind}/characters/splits": {"torque_mse_median": np.median(medians), "torque_mse_worst": max(largest)}}
 
 
 def measure_one_by_one(*, data: Path | None = None, timed_seeds: int = 5, steps: int = STEPS) -> Numbers:
@@ -138,28 +124,27 @@ def measure_one_by_one(*, data: Path | None = None, timed_seeds: int = 5, steps:
 
     Also the cost of ten seeds in one program relative to a single run.
     """
-    sets = published_split(data)
-    model = build(described("structured-delan", sets.train, width=WIDTHS["structured-delan"]))
-    optimiser = GaussNewton(steps=steps)
+    sets, optimiser = published_split(data), GaussNewton(steps=steps)
+    description = described("structured-delan", sets.train)
     times: dict[float, list[float]] = {target: [] for target in TARGETS}
     final, singles = [], []
     for seed in range(timed_seeds):
         jax.clear_caches()
-        training = fit(problem(model, sets, seeds=seed), optimiser)
+        model, training = trained(description, sets, optimiser, seeds=seed)
         for target in TARGETS:
             reached = (training.compile_seconds + at.seconds for at in training.history if at.monitor <= target)
-            times[target].append(next(reached, float("inf")))
+            times[target].append(next(reached, np.inf))
         final.append(torque_mse(model.energies(training.parameters), sets.test))
         singles.append(training.compile_seconds + training.train_seconds)
     jax.clear_caches()
-    ten = fit(problem(model, sets, seeds=tuple(range(10))), optimiser)
+    _, ten = trained(description, sets, optimiser, seeds=tuple(range(10)))
     return {
         "structured-delan/characters/gauss-newton": {
-            **{f"seconds_to_{target:g}": float(np.median(values)) for target, values in times.items()},
-            "torque_mse": float(np.median(final)),
+            **{f"seconds_to_{target:g}": np.median(values) for target, values in times.items()},
+            "torque_mse": np.median(final),
             "torque_mse_largest": max(final),
-            "train_seconds": float(np.median(singles)),
-            "cost_of_ten_seeds": (ten.compile_seconds + ten.train_seconds) / float(np.median(singles)),
+            "train_seconds": np.median(singles),
+            "cost_of_ten_seeds": (ten.compile_seconds + ten.train_seconds) / np.median(singles),
         }
     }
 
@@ -171,8 +156,8 @@ def measure_published_protocol(
     numbers = {}
     for seed in range(seeds):
         sets = published_split(data, seed)
-        model = build(described(kind, sets.train, precision="f32", width=64))
-        training = fit(problem(model, sets, objective_of(kind, sets.train), seeds=seed), Adam(steps=steps))
+        description = described(kind, sets.train, precision="f32", width=64)
+        model, training = trained(description, sets, Adam(steps=steps), seeds=seed)
         energies = model.energies(training.parameters)
         numbers[case.format(seed=seed)] = {
             **test_errors(energies, sets, jnp.float32),
@@ -183,13 +168,39 @@ def measure_published_protocol(
     return numbers
 
 
-def trained(kind: str, sets: Split, *, seeds: int, steps: int) -> tuple[Training, list[Driven]]:
-    """Several seeds in one program by Gauss-Newton; returns the training and the energies per seed."""
-    model = build(described(kind, sets.train, width=WIDTHS[kind]))
-    task = problem(model, sets, objective_of(kind, sets.train), seeds=tuple(range(seeds)))
-    training = fit(task, GaussNewton(steps=steps))
-    of_seeds = [jax.tree.map(lambda leaf, index=index: leaf[index], training.parameters) for index in range(seeds)]
-    return training, [model.energies(parameters) for parameters in of_seeds]
+def sets_named(name: str, data: Path | None) -> Split:
+    """The published split of the letters, or random states."""
+    return published_split(data) if name == "characters" else random_states()
+
+
+def described(kind: str, data: Trajectories, *, precision: str = "f64", width: int | None = None) -> Description:
+    """The description of a model of the arm; the linear model has no size."""
+    size = {} if kind == TRIGONOMETRIC else {"activation": "tanh", "depth": 2, "width": width or WIDTHS[kind]}
+    return describe_for(kind, data, two_link_arm().needs, precision=precision, **size)
+
+
+def trained(
+    description: Description, sets: Split, optimiser: Adam | GaussNewton, *, seeds: int | tuple[int, ...] = 0
+) -> tuple[Model, Training]:
+    """A model and its training; several seeds train in one program."""
+    model = build(description)
+    task = problem(model, sets, objective_of(description["name"], sets.train), seeds=seeds)
+    return model, fit(task, optimiser)
+
+
+def each_seed(model: Model, training: Training, seeds: int) -> list[Driven]:
+    """The energies of every seed of a training."""
+    take = lambda seed: jax.tree.map(lambda leaf: leaf[seed], training.parameters)  # noqa: E731
+    return [model.energies(take(seed)) for seed in range(seeds)]
+
+
+def test_numbers(energies: Driven, sets: Split) -> dict[str, float]:
+    """Test errors in float64, the torque error on the whole circle, and the time of a call."""
+    return {
+        **test_errors(energies, sets),
+        "whole_circle_torque_mse": torque_mse(energies, whole_circle()),
+        "one_step_p50_us": call_us(energies, sets, jnp.float64),
+    }
 
 
 def test_errors(energies: Driven, sets: Split, dtype=jnp.float64, *, H: Hamiltonian | None = None) -> dict[str, float]:

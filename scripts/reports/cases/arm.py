@@ -8,7 +8,7 @@ seeds in one program, and on further splits of the letters. `published` trains t
 
 from functools import partial
 
-from scripts.reports.arm.letters import measure_letters
+from scripts.reports.arm.experiments import measure_letters, measure_online
 from scripts.reports.arm.models import (
     TRIGONOMETRIC,
     WIDTHS,
@@ -19,9 +19,8 @@ from scripts.reports.arm.models import (
     measure_splits,
     measure_trigonometric,
 )
-from scripts.reports.arm.online import measure_online
-from scripts.reports.networks import measure_derivatives
 from scripts.reports.run import AtLeast, Case
+from scripts.reports.speed.networks import derivatives
 
 PARTS = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse", "vpt_seconds")
 MOMENTA = ("torque_from_momenta_mse", *PARTS[1:])
@@ -126,5 +125,5 @@ CASES = (
             "online-noisy-encoders": {"encoder_noise": 3e-4},
         }.items()
     ),
-    Case("derivatives/structured-delan", measure_derivatives, quick={"repetitions": 2, "width": 8}),
+    Case("derivatives/structured-delan", derivatives, quick={"repetitions": 2, "width": 8}),
 )

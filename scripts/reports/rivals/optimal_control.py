@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from scripts.reports.control.problems import Formula, Planned
-from scripts.reports.rival_modules import casadi
+from scripts.reports.timing import casadi
 
 Controller = Callable[[np.ndarray], tuple[np.ndarray, float]]
 """Measured state -> control, and the CPU seconds of the call."""

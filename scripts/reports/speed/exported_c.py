@@ -9,7 +9,7 @@ import math
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
@@ -28,9 +28,9 @@ from dln_jax.precision import data_type
 from dln_jax.scenes.pendulums import chain, two_link_arm
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.control.problems import Formula
-from scripts.reports.rival_modules import casadi
-from scripts.reports.rivals import optimal_control
+from scripts.reports.rivals.optimal_control import runge_kutta as casadi_runge_kutta
 from scripts.reports.run import Numbers
+from scripts.reports.timing import casadi
 
 PROGRAM = Path(__file__).with_name("time_calls.c.in").read_text()
 ARMS = {
@@ -44,6 +44,8 @@ LARGEST = "structured-delan-64x64-f64-d-7"
 """An arm that is only exported and compiled."""
 FUNCTIONS = INVERSE, FORWARD, JACOBIAN = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian")
 STEP = "step_rk4_jacobian"
+KINDS = ("additions", "multiplications", "divisions", "functions")
+"""Operations that are counted."""
 WRAPPER = """#include "casadi.c"
 
 void model_step_rk4_jacobian(const double *x, const double *u, double dt, double *x_next, double *A, double *B)
@@ -58,13 +60,13 @@ HEADER = "void model_step_rk4_jacobian(const double *, const double *, double, d
 
 
 class Times(NamedTuple):
-    """Nanoseconds of calls of one function in one process."""
+    """Nanoseconds of calls of one function in one process; several processes add a leading axis."""
 
     hot: np.ndarray
     """Mean times of a call in a loop, one per repeat."""
     cold: np.ndarray
     """Times of single calls, without the clock's own time."""
-    sum: float
+    sum: Any
     """Sum of the magnitudes of all results, for comparing exports of one model; NaN if not finite."""
 
 
@@ -123,32 +125,21 @@ def timed(program: Path, *, repeats: int, calls: int, cold: int, mebibytes: int)
 
 
 def evicting() -> int:
-    """Memory to read to empty the caches, MiB: twice the last-level cache, if the system reports it, from 8 to 64."""
-    units = {"K": 2**10, "M": 2**20}
+    """Memory to read to empty the caches, MiB: twice the last-level cache, if Linux reports it, from 8 to 64."""
     texts = [path.read_text().strip() for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size")]
-    sizes = [int(text[:-1]) * units[text[-1]] >> 20 for text in texts if text[-1:] in units]
-    return min(max(2 * max(sizes, default=64), 8), 64)
+    sizes = [int(text[:-1]) for text in texts if text.endswith("K")]
+    return min(max(max(sizes, default=2**16) >> 9, 8), 64)
 
 
-def in_turns(built: dict[str, Path], turns: int, **effort: int) -> dict[str, list[Times]]:
+def in_turns(built: dict[str, Path], turns: int, **effort: int) -> dict[str, Times]:
     """Times of programs by turn."""
     rounds = [{key: timed(path, mebibytes=evicting(), **effort) for key, path in built.items()} for _ in range(turns)]
-    return {key: [one[key] for one in rounds] for key in built}
+    return {key: Times(*map(np.array, zip(*(one[key] for one in rounds), strict=True))) for key in built}
 
 
-def ratio(one: Sequence[Times], other: Sequence[Times], number: Callable[[Times], Any]) -> float:
-    """Ratio of the times of one and the other, median over turns."""
-    return float(np.median([number(a) / number(b) for a, b in zip(one, other, strict=True)]))
-
-
-def hot(times: Times):
-    """Time of a call in a loop, ns, median over repeats."""
-    return np.median(times.hot)
-
-
-def cold_median(times: Times):
-    """Median time of a cold call, ns."""
-    return np.median(times.cold)
+def ratio(one: np.ndarray, other: np.ndarray) -> float:
+    """Ratio of the median times in each turn, median over turns."""
+    return float(np.median(np.median(one, axis=1) / np.median(other, axis=1)))
 
 
 def exported(
@@ -179,17 +170,14 @@ def exported(
             if name == LARGEST:
                 continue
             times = in_turns(programs(folder, model, FUNCTIONS), turns, repeats=repeats, calls=calls, cold=cold)
-            for function, of_turns in times.items():
-                warm = [hot(one) for one in of_turns]
-                p50, p99, p999 = np.percentile([one.cold for one in of_turns], [50, 99, 99.9])
-                numbers = {"hot_ns": np.median(warm), "hot_spread_ns": np.ptp(warm)}
+            for function, (warm, at_first, _) in times.items():
+                quantiles = zip((50, 99, 999), np.percentile(at_first, [50, 99, 99.9]), strict=True)
                 measured[f"c/{name}/{function}"] = {
-                    **numbers,
-                    "cold_p50_ns": p50,
-                    "cold_p99_ns": p99,
-                    "cold_p999_ns": p999,
+                    "hot_ns": np.median(warm),
+                    "hot_spread_ns": np.ptp(np.median(warm, axis=1)),
+                    **{f"cold_p{quantile}_ns": value for quantile, value in quantiles},
                 }
-            measured[f"c/{name}/{JACOBIAN}"]["over_inverse"] = ratio(times[JACOBIAN], times[INVERSE], hot)
+            measured[f"c/{name}/{JACOBIAN}"]["over_inverse"] = ratio(times[JACOBIAN].hot, times[INVERSE].hot)
             loaded = load_c(folder)
             for function in RIVALS:
                 functions[f"c/{name}/{function}"] = Timed(getattr(loaded, function), d, data_type(precision))
@@ -243,7 +231,7 @@ def casadi_step(folder: Path, *, shared: bool) -> dict[str, int]:
     """
     ca = casadi()
     x, u, dt = ca.SX.sym("x", 4), ca.SX.sym("u", 2), ca.SX.sym("dt")
-    x_next = optimal_control.runge_kutta(textbook_rates(), dt)(x, u)
+    x_next = casadi_runge_kutta(textbook_rates(), dt)(x, u)
     # Transposed, because CasADi stores columns and C rows.
     results = [x_next, *(ca.densify(ca.jacobian(x_next, variable)).T for variable in (x, u))]
     step = ca.Function("step", [x, u, dt], results, {"cse": shared})
@@ -253,14 +241,9 @@ def casadi_step(folder: Path, *, shared: bool) -> dict[str, int]:
     generator.generate(f"{folder}/")
     (folder / "model.h").write_text(HEADER)
     (folder / "model.c").write_text(WRAPPER % (max(step.sz_w(), 1), max(step.sz_iw(), 1)))
-    kinds = {
-        "additions": (ca.OP_ADD, ca.OP_SUB, ca.OP_TWICE),
-        "multiplications": (ca.OP_MUL, ca.OP_SQ),
-        "divisions": (ca.OP_DIV, ca.OP_INV),
-        "functions": (ca.OP_SIN, ca.OP_COS),
-    }
+    kinds = (ca.OP_ADD, ca.OP_SUB, ca.OP_TWICE), (ca.OP_MUL, ca.OP_SQ), (ca.OP_DIV, ca.OP_INV), (ca.OP_SIN, ca.OP_COS)
     every = [step.instruction_id(k) for k in range(step.n_instructions())]
-    return {kind: sum(map(every.count, operations)) for kind, operations in kinds.items()}
+    return {kind: sum(map(every.count, operations)) for kind, operations in zip(KINDS, kinds, strict=True)}
 
 
 def beside_casadi(*, turns: int = 9, repeats: int = 15, calls: int = 2_000, cold: int = 200) -> Numbers:
@@ -270,8 +253,8 @@ def beside_casadi(*, turns: int = 9, repeats: int = 15, calls: int = 2_000, cold
         for origin, function in our_steps().items():
             for name, finite in ((origin, True), (f"{origin}-any-arguments", False)):
                 export_c({STEP: function}, root / name, finite=finite)
-                cost = stated_costs(root / name)[STEP]._asdict()
-                kinds[name] = {kind: cost[kind] for kind in ("additions", "multiplications", "divisions", "functions")}
+                cost = stated_costs(root / name)[STEP]
+                kinds[name] = {kind: getattr(cost, kind) for kind in KINDS}
         for name, shared in (("casadi", False), ("casadi-shared", True)):
             kinds[name] = casadi_step(root / name, shared=shared)
         for name in kinds:
@@ -279,19 +262,18 @@ def beside_casadi(*, turns: int = 9, repeats: int = 15, calls: int = 2_000, cold
             stated = root / "closed-form" if name.startswith("casadi") else folder
             built[name] = programs(folder, compiled(folder, folder), [STEP], stated)[STEP]
         times = in_turns(built, turns, repeats=repeats, calls=calls, cold=cold)
-    warm = {name: np.median([hot(one) for one in of_turns]) for name, of_turns in times.items()}
-    rival = min(("casadi", "casadi-shared"), key=lambda name: warm[name])
-    least, measured = min(sum(kinds[name].values()) for name in ("casadi", "casadi-shared")), {}
-    for name, of_turns in times.items():
+    rivals = "casadi", "casadi-shared"
+    rival = times[min(rivals, key=lambda name: np.median(times[name].hot))]
+    least, measured = min(sum(kinds[name].values()) for name in rivals), {}
+    for name, (hot, at_first, total) in times.items():
         operations = sum(kinds[name].values())
-        numbers: dict[str, float] = {**kinds[name], "operations": operations, "hot_ns": warm[name]}
-        numbers["cold_p50_ns"] = np.median([cold_median(one) for one in of_turns])
-        if not name.startswith("casadi"):
+        numbers = {"operations": operations, "hot_ns": np.median(hot), "cold_p50_ns": np.median(at_first)}
+        if name not in rivals:
             numbers |= {
-                "over_casadi": ratio(of_turns, times[rival], hot),
-                "cold_over_casadi": ratio(of_turns, times[rival], cold_median),
+                "over_casadi": ratio(hot, rival.hot),
+                "cold_over_casadi": ratio(at_first, rival.cold),
                 "operations_over_casadi": operations / least,
-                "relative_difference": abs(of_turns[0].sum / times[rival][0].sum - 1),
+                "relative_difference": abs(total[0] / rival.sum[0] - 1),
             }
-        measured[f"casadi/two-link-arm/{name}"] = numbers
+        measured[f"casadi/two-link-arm/{name}"] = {**kinds[name], **numbers}
     return measured

@@ -1,55 +1,75 @@
-"""Speed of networks: single calls against test error, batches, and growth with the number of joints."""
+"""Speed of networks: single calls against test error, batches, growth with the number of joints, and derivatives."""
 
-import json
-import re
-import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import Array
 
-from dln_jax.export.c.load import FLAGS, STANDARD, compile_c, load_c
+from dln_jax.data.schema import from_arrays
+from dln_jax.data.splits import Split, select
+from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.objectives import objective_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
-from dln_jax.metrics.errors import errors
 from dln_jax.metrics.latency import one_step
-from dln_jax.models.lagrangian import make_delan
-from dln_jax.precision import data_type
+from dln_jax.models.lagrangian import cholesky_factor, make_delan
+from dln_jax.models.model import Model
+from dln_jax.nn import differential_mlp
+from dln_jax.nn.activations import tanh
 from dln_jax.scenes.pendulums import chain
 from dln_jax.types import Lagrangian
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
 from scripts.reports.arm.data import published_split
-from scripts.reports.arm.models import STEPS, TRIGONOMETRIC, WIDTHS, described
-from scripts.reports.predictions import predictions
-from scripts.reports.process import called
+from scripts.reports.arm.models import STEPS, TRIGONOMETRIC, WIDTHS, described, torque_mse, trained
 from scripts.reports.run import Numbers
-from scripts.reports.timing import medians_in_turns
+from scripts.reports.speed.exported_c import compiled, programs, timed
+from scripts.reports.timing import called, medians_in_turns
 
 WIDE = "structured-delan-64x64"
 BATCH = 512
 
 
-def structured(d: int, batch: int) -> tuple[NaturalSystem, tuple[Array, ...]]:
-    """The energies of a structured DeLaN of two layers of 64, and states (q, qd, qdd), float32."""
-    model = make_delan(chain(d).needs, width=64, depth=2)
-    keys = jax.random.split(jax.random.key(0), 4)
-    states = tuple(jax.random.normal(key, (batch, d), jnp.float32) for key in keys[1:])
-    return model.energies(model.init(keys[0])), states
+def throughput(
+    *,
+    batches: tuple[int, ...] = (1, 10, 100, 1_000, 10_000, 100_000),
+    joints: tuple[int, ...] = (2, 4, 7, 12),
+    repetitions: int = 40,
+) -> Numbers:
+    """Inverse and forward dynamics by batch; the full-Hessian method by number of joints. In float32."""
+
+    def medians(d: int, batch: int, rival: Callable[[NaturalSystem], Callable]) -> dict[str, float]:
+        model = make_delan(chain(d).needs, width=64, depth=2)
+        keys = jax.random.split(jax.random.key(0), 4)
+        states = tuple(jax.random.normal(key, (batch, d), jnp.float32) for key in keys[1:])
+        energies = model.energies(model.init(keys[0]))
+        ways = {"inverse": dynamics(energies).inverse_dynamics, "rival": rival(energies)}
+        programs = {name: jax.jit(jax.vmap(way)) for name, way in ways.items()}
+        return medians_in_turns(programs, states, repetitions=repetitions)
+
+    measured: dict[str, dict[str, float]] = {}
+    with jax.enable_x64(False):
+        for batch in batches:
+            seconds = medians(2, batch, lambda energies: dynamics(energies).forward_dynamics)
+            rates = {"inverse": batch / seconds["inverse"], "forward": batch / seconds["rival"]}
+            measured[f"throughput/structured-delan/batch-{batch}"] = {
+                f"{name}_states_per_second": rate for name, rate in rates.items()
+            }
+        for d in joints:
+            seconds = medians(d, BATCH, lambda energies: by_full_hessian(lagrangian(energies)))
+            measured[f"throughput/full-hessian/d-{d}"] = {"speedup": seconds["rival"] / seconds["inverse"]}
+    return measured
 
 
 def by_full_hessian(L: Lagrangian) -> Callable[[Array, Array, Array], Array]:
@@ -62,66 +82,36 @@ def by_full_hessian(L: Lagrangian) -> Callable[[Array, Array, Array], Array]:
     return inverse_dynamics
 
 
-def throughput(
-    *,
-    batches: tuple[int, ...] = (1, 10, 100, 1_000, 10_000, 100_000),
-    joints: tuple[int, ...] = (2, 4, 7, 12),
-    repetitions: int = 40,
-) -> Numbers:
-    """Inverse and forward dynamics by batch; the full-Hessian method by number of joints. In float32."""
-    measured: dict[str, dict[str, float]] = {}
-    with jax.enable_x64(False):
-        for batch in batches:
-            energies, states = structured(2, batch)
-            model = dynamics(energies)
-            ways = {"inverse": model.inverse_dynamics, "forward": model.forward_dynamics}
-            programs = {name: jax.jit(jax.vmap(way)) for name, way in ways.items()}
-            medians = medians_in_turns(programs, states, repetitions=repetitions)
-            rates = {f"{name}_states_per_second": batch / seconds for name, seconds in medians.items()}
-            measured[f"throughput/structured-delan/batch-{batch}"] = rates
-        for d in joints:
-            energies, states = structured(d, BATCH)
-            ways = {"ours": dynamics(energies).inverse_dynamics, "full": by_full_hessian(lagrangian(energies))}
-            programs = {name: jax.jit(jax.vmap(way)) for name, way in ways.items()}
-            medians = medians_in_turns(programs, states, repetitions=repetitions)
-            measured[f"throughput/full-hessian/d-{d}"] = {"speedup": medians["full"] / medians["ours"]}
-    return measured
-
-
 def scaling(
-    *, joints: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 10, 12, 30), calls: int = 4_000, repetitions: int = 30
+    *, joints: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 10, 12, 30), calls: int = 4_000, repetitions: int = 200
 ) -> Numbers:
-    """Single calls, a training step at batch 512 and its compilation, and their exponents of growth from 2 to 12."""
+    """Single calls, a training step at batch 512 and its compilation, and their exponents of growth from 2 to 12.
+
+    Models and data are in float32; `repetitions` are the steps of a training.
+    """
     measured: dict[str, dict[str, float]] = {}
-    optimiser = optax.adam(1e-3)
-    with jax.enable_x64(False):
-        for d in joints:
-            model = make_delan(chain(d).needs, width=64, depth=2)
-            parameters = jax.jit(model.init)(jax.random.key(0))
-            arrays = jax.random.normal(jax.random.key(1), (4, BATCH, d), jnp.float32)
-            states = [tuple(arrays[:3, index]) for index in range(64)]
-            single = one_step(jax.jit(dynamics(model.energies(parameters)).inverse_dynamics), states, calls=calls)
-
-            def step(parameters, moments, arrays, model=model):
-                def loss(parameters):
-                    tau = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*arrays[:3])
-                    return jnp.mean((tau - arrays[3]) ** 2)
-
-                changes, moments = optimiser.update(jax.grad(loss)(parameters), moments)
-                return optax.apply_updates(parameters, changes), moments
-
-            arguments = (parameters, optimiser.init(parameters), arrays)
-            began = time.perf_counter()
-            compiled = jax.jit(step).lower(*arguments).compile()
-            seconds = time.perf_counter() - began
-            training = medians_in_turns({"step": compiled}, arguments, repetitions=repetitions)["step"]
-            numbers = {"inverse_p50_us": single.p50_us, "training_step_ms": 1e3 * training}
-            measured[f"scaling/structured-delan/d-{d}"] = {**numbers, "training_compile_seconds": seconds}
-    fitted = [d for d in joints if 2 <= d <= 12]
-    growth = {}
-    for quantity in ("inverse_p50_us", "training_step_ms", "training_compile_seconds"):
-        values = [measured[f"scaling/structured-delan/d-{d}"][quantity] for d in fitted]
-        growth[f"{quantity}_exponent"] = np.polyfit(np.log(fitted), np.log(values), 1)[0]
+    optimiser = Adam(steps=repetitions, batch=BATCH, steps_per_dispatch=repetitions)
+    for d in joints:
+        states = np.random.default_rng(0).normal(size=(4, 2 * BATCH, d))
+        places = {"t": np.zeros(2 * BATCH), "trajectory": np.arange(2 * BATCH)}
+        data = from_arrays({**places, **dict(zip(("q", "qd", "qdd", "tau"), states, strict=True))})
+        few = select(data, range(8))
+        model = make_delan(chain(d).needs, width=64, depth=2)
+        training = fit(problem(model, Split(data, few, few)), optimiser)
+        inverse = jax.jit(dynamics(model.energies(training.parameters)).inverse_dynamics)
+        single = list(zip(*jnp.asarray(states[:3, :64], jnp.float32), strict=True))
+        measured[f"scaling/structured-delan/d-{d}"] = {
+            "inverse_p50_us": one_step(inverse, single, calls=calls).p50_us,
+            "training_step_ms": 1e3 * training.train_seconds / repetitions,
+            "training_compile_seconds": training.compile_seconds,
+        }
+    fitted = {d: measured[f"scaling/structured-delan/d-{d}"] for d in joints if 2 <= d <= 12}
+    growth = {
+        f"{quantity}_exponent": np.polyfit(np.log(list(fitted)), np.log([row[quantity] for row in fitted.values()]), 1)[
+            0
+        ]
+        for quantity in next(iter(fitted.values()))
+    }
     return {**measured, "scaling/structured-delan/growth": growth}
 
 
@@ -135,31 +125,28 @@ def single_calls(
 ) -> Numbers:
     """Trains models of the arm, and times single calls; processes of both modes of dispatch take turns."""
     sets, measured, folders = published_split(), {}, []
-    with tempfile.TemporaryDirectory() as place, jax.enable_x64(False):
+    with tempfile.TemporaryDirectory() as place:
         for name in models:
-            wide, folder = name == WIDE, Path(place) / name
+            folder = Path(place) / name
             folder.mkdir()
-            kind, width = ("structured-delan", 64) if wide else (name, WIDTHS.get(name))
-            precision = "f32" if wide else "f64"
-            description = described(kind, sets.train, precision=precision, width=width)
-            model = build(description)
-            if name == TRIGONOMETRIC:
-                parameters = fit_linear(model, sets.train).parameters
+            if name == WIDE:
+                description = described("structured-delan", sets.train, precision="f32", width=64)
             else:
-                optimiser = Adam(steps=adam_steps) if wide else GaussNewton(steps=steps)
-                parameters = fit(problem(model, sets, objective_of(kind, sets.train)), optimiser).parameters
+                description = described(name, sets.train)
+            if name == TRIGONOMETRIC:
+                parameters = fit_linear(build(description), sets.train).parameters
+            else:
+                optimiser = Adam(steps=adam_steps) if name == WIDE else GaussNewton(steps=steps)
+                parameters = trained(description, sets, optimiser)[1].parameters
             save(folder, description, parameters)
-            answers = predictions(load(folder).energies, sets.test, jnp.float64)
-            measured[f"one-step/{name}"] = {"torque_mse": errors(answers, sets.test)["torque_mse"]}
+            measured[f"one-step/{name}"] = {"torque_mse": torque_mse(load(folder).energies, sets.test)}
             folders.append(folder)
-        modes = ("default", "low-latency") * processes
-        answers = [called(times_of_runs, folders, mode, calls) for mode in modes]
+        answers = [called(times_of_runs, folders, mode, calls) for mode in ("default", "low-latency") * processes]
     for name in models:
         for path in answers[0][name] | answers[1][name]:
             turns = [answer[name][path] for answer in answers if path in answer[name]]
             numbers = {f"inverse_{key}": np.median([turn[key] for turn in turns]) for key in turns[0]}
             if "p50_us" in turns[0]:
-                numbers["inverse_p50_spread_us"] = np.ptp([turn["p50_us"] for turn in turns])
                 numbers["inverse_p99_over_p50"] = numbers["inverse_p99_us"] / numbers["inverse_p50_us"]
             measured[f"one-step/{name}/{path}"] = numbers
     return measured
@@ -173,34 +160,99 @@ def times_of_runs(folders: Sequence[str], dispatch: str, calls: int) -> dict[str
     """
     if dispatch == "low-latency":
         enable_low_latency()
-    test = published_split().test
-    states = [array[:BATCH] for array in (test.q, test.qd, test.qdd)]
-    return {folder.name: times_of(folder, states, dispatch, calls) for folder in map(Path, folders)}
+    return {folder.name: times_of(folder, dispatch, calls) for folder in map(Path, folders)}
 
 
-def times_of(folder: Path, states: Sequence[np.ndarray], dispatch: str, calls: int) -> dict[str, dict[str, float]]:
+def times_of(folder: Path, dispatch: str, calls: int) -> dict[str, dict[str, float]]:
     """Times of one run by call path."""
-    precision = json.loads((folder / "model.json").read_text())["model"]["precision"]
-    jitted = jax.jit(load(folder).dynamics.inverse_dynamics)
-    host = list(zip(*(array.astype(data_type(precision)) for array in states), strict=True))
+    run, test = load(folder), published_split().test
+    jitted = jax.jit(run.dynamics.inverse_dynamics)
+    states = (array[:BATCH].astype(run.dtype) for array in (test.q, test.qd, test.qdd))
+    host = list(zip(*states, strict=True))
     device = [tuple(map(jnp.asarray, state)) for state in host]
 
-    def timed(function, states):
-        times = one_step(function, states, calls=calls)._asdict()
-        return {key: times[key] for key in ("p50_us", "p99_us", "p999_us", "worst_us")}
+    def times(function, states):
+        latency = one_step(function, states, calls=calls)
+        return {"p50_us": latency.p50_us, "p99_us": latency.p99_us}
 
     if dispatch == "default":
-        return {"default-jit": timed(jitted, device)}
+        return {"default-jit": times(jitted, device)}
     with tempfile.TemporaryDirectory() as place:
-        export_run(folder, Path(place), name="model", functions=("inverse_dynamics",))
-        demo = Path(place) / "demo"
-        compile_c([*FLAGS, *STANDARD, *map(str, Path(place).glob("*.c")), "-lm", "-o", str(demo)])
-        command = [demo, str(20 * calls)]
-        printed = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(3)]
-        rates = [float(rate) for text in printed for rate in re.findall(r"inverse_dynamics: (\d+) calls/s", text)]
+        export, name = Path(place), "inverse_dynamics"
+        export_run(folder, export, name="model", functions=(name,))
+        loop = timed(
+            programs(export, compiled(export, export), [name])[name], repeats=3, calls=20 * calls, cold=0, mebibytes=0
+        )
         return {
-            "low-latency-jit": timed(jitted, device),
-            "low-latency-numpy": timed(low_latency(jitted, *host[0], numpy=True), host),
-            "c-from-python": timed(load_c(place, name="model").inverse_dynamics, host),
-            "c-loop": {"calls_per_second": max(rates)},
+            "low-latency-jit": times(jitted, device),
+            "low-latency-numpy": times(low_latency(jitted, *host[0], numpy=True), host),
+            "c-from-python": times(load_c(place, name="model").inverse_dynamics, host),
+            "c-loop": {"calls_per_second": 1e9 / min(loop.hot)},
         }
+
+
+def derivatives(*, width: int = 64, repetitions: int = 40) -> Numbers:
+    """Two ways to the derivatives in a structured DeLaN's inverse dynamics, by number of joints, in float32.
+
+    The library's own, which `mechanics.natural` explains, and all partial derivatives of both networks in one pass.
+    """
+    numbers = {}
+    for d in (1, 2, 4, 7, 12):
+        model = make_delan(chain(d).needs, width=width, depth=2)
+        parameters = model.init(jax.random.key(0))
+        ways = {
+            "jvp_vjp_us": partial(by_jvp_and_vjp, model),
+            "one_pass_us": by_one_pass,
+        }
+        for batch, kind in {1: "single-call", BATCH: "training-step-batch-512"}.items():
+            states = jax.random.normal(jax.random.key(1), (4, batch, d), jnp.float32)
+            programs = {name: derivative_program(way, batch) for name, way in ways.items()}
+            answers = (jax.tree.leaves(program(parameters, states)) for program in programs.values())
+            for one, other in zip(*answers, strict=True):
+                np.testing.assert_allclose(one, other, rtol=1e-2, atol=1e-3 * float(jnp.max(jnp.abs(one))))
+            medians = medians_in_turns(programs, (parameters, states), repetitions=repetitions)
+            numbers[f"d-{d}/{kind}"] = {
+                **{name: 1e6 * value for name, value in medians.items()},
+                "one_pass_over_jvp_vjp": medians["one_pass_us"] / medians["jvp_vjp_us"],
+            }
+    return numbers
+
+
+def derivative_program(way: Callable, batch: int) -> Callable:
+    """A single call of the inverse dynamics, or the gradient of a torque loss, of (parameters, states)."""
+
+    def loss(parameters, states):
+        tau = jax.vmap(partial(way, parameters))(*states[:3])
+        return jnp.mean((tau - states[3]) ** 2)
+
+    if batch == 1:
+        return jax.jit(lambda parameters, states: way(parameters, *states[:3, 0]))
+    return jax.jit(jax.grad(loss))
+
+
+def by_jvp_and_vjp(model: Model, parameters: Any, *state: Array) -> Array:
+    """tau [d] by the library's own mechanics."""
+    return dynamics(model.energies(parameters)).inverse_dynamics(*state)
+
+
+def by_one_pass(parameters: Any, q: Array, qd: Array, qdd: Array) -> Array:
+    """tau [d] of a structured DeLaN from the networks' own Jacobians, chained by hand through features and factor."""
+
+    def features(q):
+        return jnp.concatenate([jnp.cos(q), jnp.sin(q)])
+
+    def value_and_jacobian(name):
+        modules = (parameters[f"{name}/~/linear_{layer}"] for layer in range(3))
+        layers = tuple((module["w"], module["b"]) for module in modules)
+        return differential_mlp.value_and_jacobian(layers, features(q), activation=tanh)
+
+    entries, entries_by_feature = value_and_jacobian("cholesky")
+    _, potential_by_feature = value_and_jacobian("potential")
+    feature_slopes = jax.jacfwd(features)(q)
+    factor, push = jax.linearize(lambda entries: cholesky_factor(entries, len(q), shift=2.0, floor=0.1), entries)
+    factor_slopes = jax.vmap(push, in_axes=1, out_axes=2)(entries_by_feature @ feature_slopes)
+    projected = factor.T @ qd
+    factor_rate = factor_slopes @ qd
+    momentum_rate = factor @ (factor.T @ qdd + factor_rate.T @ qd) + factor_rate @ projected
+    kinetic_force = jnp.einsum("ijk,i,j->k", factor_slopes, qd, projected)
+    return momentum_rate - kinetic_force + (potential_by_feature @ feature_slopes)[0]

@@ -1,1 +1,0 @@
-"""The two-link arm that writes letters."""
