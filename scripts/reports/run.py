@@ -159,9 +159,8 @@ def measure_report(name: str, cases: Sequence[Case], options: Any) -> None:
             rows = rows_of(case, stored[case.name])
             judged = [row.passed for row in rows if row.passed is not None]
             passed = f"{sum(judged)}/{len(judged)} pass  " if judged else ""
-            missed = "".join(f"  {row.quantity} {row.value:.4g}" for row in rows if row.passed is False)
             seconds = time.perf_counter() - began
-            print(f"{number:2d}/{len(chosen)}  {case.name:30s} {passed}{seconds:.1f} s{missed}", flush=True)
+            print(f"{number:2d}/{len(chosen)}  {case.name:30s} {passed}{seconds:.1f} s", flush=True)
         rows = [row for case in chosen for row in rows_of(case, stored[case.name])]
         publish(folder, rows, conditions(dtype="float64", quick=options.quick))
 

@@ -37,7 +37,7 @@ CASES = (
     Case(
         "scaling/structured-delan",
         networks.scaling,
-        quick={"joints": (2, 4), "calls": 500, "repetitions": 10},
+        quick={"joints": (2, 4), "calls": 500, "repetitions": 50},
         bound={"inverse_p50_us_exponent": 2.0},
     ),
     Case(

@@ -64,7 +64,8 @@ def measure_comparison(*, rivals: tuple[str, ...] = ("ppo",), seeds: int = 3, st
         needed[method] = min(median, max(of_seed[-1].steps for of_seed in records))
         rows["environment_steps_to_five_body_lengths"] = median
         rows["seconds_to_five_body_lengths"] = median_to_reach(records, GOAL, "seconds")
-        rows["environment_steps_ratio_to_gradient"] = needed[method] / needed["gradient"]
+        if method != "gradient":
+            rows["environment_steps_ratio_to_gradient"] = needed[method] / needed["gradient"]
         numbers[f"crawler/{method}"] = rows
     return numbers
 
