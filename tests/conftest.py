@@ -5,6 +5,7 @@ import gc
 import os
 import shutil
 import tempfile
+import time
 from pathlib import Path
 
 # As in the scripts: small factorisations on several threads burn the processor waiting for each other.
@@ -75,6 +76,7 @@ if jax.__version_info__ < (0, 11):  # later ones do not know it, and abort at wh
 def pytest_addoption(parser):
     parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
+    parser.addoption("--slow-within", type=float, metavar="S", help="begin no test marked slow after these seconds")
     parser.addoption("--pinned", action="store_true", help="compare the numbers of commands with those in tests/pinned")
     parser.addoption("--renew", action="store_true", help="store what tests/pinned measures, and compare nothing")
     parser.addoption("--every-export", action="store_true", help="compare all of every export with JAX, for minutes")
@@ -86,6 +88,16 @@ def pytest_configure(config):
         config.option.markexpr = ""
     if not config.getoption("--optimised"):
         os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICKLY])
+
+
+STARTED = time.monotonic()
+
+
+def pytest_runtest_setup(item):
+    """Leaves out the slow tests that a busy machine does not come to in the time stated, and says so."""
+    limit = item.config.getoption("--slow-within")
+    if limit and item.get_closest_marker("slow") and time.monotonic() - STARTED > limit:
+        pytest.skip(f"NOT REACHED: slow, and {limit:g} s had passed")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -105,15 +117,17 @@ def slow_among(values, is_slow):
 
 
 LONGEST = """
-    compilation readme examples families malformed fit measured_motions
-    mechanics delan learned_trees agreement functions checks train_models simulate train_delan
-    uncertainty hamiltonian_tasks command_line identify data soft_energies hnn_tasks trees
-    residual_networks differential_mlp excite projection rigid_tree hamiltonian design
+    compilation swing_up_command body_contact random_programs obstacles train_models train_delan soft_integrators
+    sharded_batches decompositions tuned_swing_ups soft_body_identification actuators ties simulate minimise locomotion
+    batches uncertainty_files train_diffnet checks processes identify own_plant_value
 """
 """Names of test files behind `test_`, the longest first."""
+LAST = ("readme", "examples")
+"""Two long files that end together: what a busy machine does not come to is a page's block before a property."""
 
 
 def pytest_collection_modifyitems(items):
-    """The files that take longest come first, so that no process ends with one of them."""
+    """The files that take longest come first, so that no process ends with one of them alone."""
     places = {f"test_{name}": place for place, name in enumerate(LONGEST.split())}
-    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
+    places |= {f"test_{name}": len(places) + 1 for name in LAST}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST.split())))

@@ -19,14 +19,7 @@ def compare_derivatives_with_differences(scene, v, *, steps, tolerance):
         state, info = jax.lax.scan(lambda state, _: step(params, state), init(v=v), None, length=steps)
         return jnp.sum(state.x[:, 0] ** 2) + jnp.sum(state.v[:, 1]), info.converged
 
-    at = jnp.array([1e5, 1e5, 0.3])
-    (_, converged), gradient = jax.jit(jax.value_and_grad(outcome, has_aux=True))(at)
-    assert converged.all()
-    value = jax.jit(lambda values: outcome(values)[0])
-    for place, change in enumerate((10.0, 10.0, 1e-5)):
-        moved = change * np.eye(3)[place]
-        difference = (value(at + moved) - value(at - moved)) / (2 * change)
-        assert float(gradient[place]) == pytest.approx(float(difference), rel=1e-6)
+    require_gradient_of_differences(outcome, np.array([1e5, 1e5, 0.3]), np.array([10.0, 10.0, 1e-5]))
 
 
 def require_gradient_of_differences(outcome, at, changes):

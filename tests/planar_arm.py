@@ -21,6 +21,16 @@ ARM = serial(
     gravity=(0, -9.81, 0),
     names=("shoulder", "elbow"),
 )
+URDF = """<robot name="arm"><link name="base"/>
+<link name="upper"><inertial><origin xyz="0.1 0.05 0.2"/><mass value="2"/>
+<inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="lower"><inertial><origin xyz="0.1 0.05 0.2"/><mass value="1"/>
+<inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
+<origin xyz="0.2 0 0.1" rpy="0.4 0 0"/><axis xyz="0 0 1"/><dynamics damping="0.2"/></joint>
+<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+<origin xyz="0.2 0 0.1" rpy="1.2 0 0"/><axis xyz="0 0 1"/><dynamics damping="0.2"/></joint></robot>"""
+"""A robot's file of two joints in space."""
 FRICTION = {"viscous": np.array([0.2, 0.1]), "coulomb": np.array([0.5, 0.3]), "offset": np.array([0.1, -0.2])}
 
 

@@ -3,6 +3,7 @@
 import ast
 import functools
 import io
+import os
 import re
 import subprocess
 import sys
@@ -10,6 +11,11 @@ import tokenize
 from pathlib import Path
 
 import pytest
+from calls import json_of
+from planar_arm import URDF, motions
+
+from dln_jax.data.robots import read_robot
+from dln_jax.data.schema import save
 
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = {
@@ -67,13 +73,52 @@ def test_classes_and_modules_stay_within_their_bounds():
     assert classes <= int(COUNTS["classes"]) and len(trees) <= int(COUNTS["modules"])
 
 
+WALK = """
+import atexit, json, pathlib, sys
+modules, moves, previous = set(), 0, None
+root, answer, *sys.argv = sys.argv[1:]
+
+def enter(code, _):
+    global moves, previous
+    # Bodies of modules and classes run when they are imported.
+    if not code.co_filename.startswith(root) or not code.co_flags & 1 or code.co_name == "<module>":
+        return sys.monitoring.DISABLE
+    modules.add(code.co_filename)
+    moves += code.co_filename != previous
+    previous = code.co_filename
+
+def store():
+    sys.monitoring.set_events(sys.monitoring.PROFILER_ID, 0)
+    loaded = sum(name.startswith("dln_jax") for name in sys.modules)
+    pathlib.Path(answer).write_text(json.dumps([len(modules), moves, loaded]))
+
+sys.monitoring.use_tool_id(sys.monitoring.PROFILER_ID, "walk")
+sys.monitoring.register_callback(sys.monitoring.PROFILER_ID, sys.monitoring.events.PY_START, enter)
+sys.monitoring.set_events(sys.monitoring.PROFILER_ID, sys.monitoring.events.PY_START)
+atexit.register(store)
+from dln_jax.__main__ import command
+command(sys.argv[0], sys.argv[0])
+"""
+"""Counts the modules that a command enters, its moves between them, and the modules that it loads."""
+BRIEF = ["--no-figures", "--no-uncertainty"]
+
+
 @pytest.mark.slow
-def test_a_training_loads_few_modules(tmp_path):
-    line = ["train_delan", "--steps", "5", "--no-figures", "--no-low-latency", "--out", str(tmp_path / "run")]
-    count = (
-        f"open({str(tmp_path / 'count')!r}, 'w').write(str(sum(name.startswith('dln_jax') for name in sys.modules)))"
-    )
-    program = f"import sys, atexit; sys.argv = {line!r}; atexit.register(exec, {count!r}, globals()); "
-    program += "from dln_jax.__main__ import command; command('train_delan', 'train_delan')"
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
-    assert int((tmp_path / "count").read_text()) <= int(COUNTS["modules that a training loads"])
+@pytest.mark.skipif(sys.version_info < (3, 12), reason="sys.monitoring is of Python 3.12")
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("a training", ["train_delan", "--steps", "5", "--no-low-latency", *BRIEF]),
+        ("identify", ["identify", "--robot", "arm.urdf", "--data", "log.npz", "--test", "last:30%", *BRIEF]),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_command_enters_few_modules_and_seldom_moves_between_them(name, words, tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    save(tmp_path / "log.npz", motions(0, noise=0.05, tree=read_robot(tmp_path / "arm.urdf").tree))
+    line = [sys.executable, "-c", WALK, str(ROOT / "dln_jax"), "counts.json", *words, "--out", "run"]
+    subprocess.run(line, check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    counts = json_of(tmp_path / "counts.json")
+    kinds = f"modules that {name} enters", f"moves of {name} between modules", f"modules that {name} loads"
+    for kind, count in zip(kinds, counts, strict=True):
+        assert count <= int(COUNTS[kind]), (kind, count)

@@ -9,10 +9,13 @@ import importlib
 import inspect
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import safetensors.numpy
 from calls import command
+from planar_arm import URDF
 
 import dln_jax
 from dln_jax.cli.commands import COMMANDS
@@ -22,14 +25,6 @@ from dln_jax.data.splits import split
 from dln_jax.scenes import cart_pole, pendulum, two_link_arm
 from dln_jax.scenes.datasets import generators
 
-BODY = """<link name="{}"><inertial><origin xyz="0.1 0.05 0.2"/><mass value="{}"/>
-<inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-JOINT = """<joint name="{}" type="continuous"><parent link="{}"/><child link="{}"/>
-<origin xyz="0.2 0 0.1" rpy="{} 0 0"/><axis xyz="0 0 1"/><dynamics damping="0.2"/></joint>"""
-ARM = '<robot name="arm"><link name="base"/>{}</robot>'.format(
-    BODY.format("upper", 2.0) + BODY.format("lower", 1.0)
-    + JOINT.format("shoulder", "base", "upper", 0.4) + JOINT.format("elbow", "upper", "lower", 1.2)
-)  # fmt: skip
 SMALL = "--width 4 --depth 1"
 BRIEF = "--no-figures --no-low-latency --no-uncertainty"
 LINES = {
@@ -78,11 +73,32 @@ LINES = {
         "data=arm.npz model=structured-delan steps=2 depth=1",
     ],
     "check_data": "check_data --data log.npz --no-figures",
+    "learned-tree": f"train_delan --data arm.npz --model learned-tree {BRIEF}",
 }
 """Command lines by name."""
 TIMES = re.compile(r"seconds|_us$|per_second|latency|calls|_ms$")
 """Entries of metrics.json that measure time."""
 LOGS = ("arm", "cart", "swings", "momenta", "log", "letters")
+SPOILED: dict[str, Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]] = {
+    "degrees": lambda log: log | {"q": np.degrees(log["q"])},
+    "late": lambda log: log | {"tau": np.roll(log["tau"], 5, axis=0)},
+    "crossed": lambda log: log | {"tau": log["tau"][:, ::-1]},
+    "reversed": lambda log: log | {"tau": log["tau"] * [1, -1]},
+    "frozen": lambda log: log | {"q": np.where(np.arange(len(log["q"]))[:, None] // 20 % 9, log["q"], log["q"][0])},
+    "repeated": lambda log: {key: np.concatenate([x, x + 4 * (key == "trajectory")]) for key, x in log.items()},
+}
+"""What may be wrong with a log that has the right shapes."""
+DAMAGED: dict[str, Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]] = {
+    "without q": lambda log: {key: x for key, x in log.items() if key != "q"},
+    "NaN": lambda log: log | {"q": np.where(log["t"][:, None] == 1.0, np.nan, log["q"])},
+    "short": lambda log: log | {"tau": log["tau"][:-1]},
+    "one joint less": lambda log: log | {"tau": log["tau"][:, :1]},
+    "text": lambda log: log | {"q": log["q"].astype(str)},
+    "objects": lambda log: log | {"q": log["q"].astype(object)},
+    "time backwards": lambda log: log | {"t": log["t"][::-1]},
+    "empty": lambda log: {key: x[:0] for key, x in log.items()},
+}
+"""What is wrong with a log that no command reads."""
 
 
 def make_files(folder):
@@ -94,7 +110,7 @@ def make_files(folder):
     np.savez(folder / "swings.npz", t=swings.t, q=swings.q, trajectory=swings.trajectory)
     np.savez(folder / "momenta.npz", t=swings.t, q=swings.q, p=swings.p, trajectory=swings.trajectory)
     schema.save(folder / "letters.npz", generators.characters(letters=("a", "b", "c", "d")))
-    (folder / "arm.urdf").write_text(ARM)
+    (folder / "arm.urdf").write_text(URDF)
     t = np.arange(0, 6, 0.02)
     amplitude, rate, phase = np.random.default_rng(0).uniform([0.2, 1, 0], [0.8, 4, 6], (2, 3, 3)).transpose(2, 0, 1)
     angle = rate[..., None] * t + phase[..., None]
@@ -106,7 +122,10 @@ def make_files(folder):
     true = read_tree(folder / "arm.urdf")
     tau = np.array([true(*row) for row in zip(q, qd, qdd, strict=True)])
     tau += 0.05 * np.random.default_rng(1).normal(size=tau.shape)
-    np.savez(folder / "log.npz", t=t, q=q, qd=qd, qdd=qdd, tau=tau, trajectory=np.repeat(np.arange(4), len(t) // 4))
+    log = {"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": np.repeat(np.arange(4), len(t) // 4)}
+    np.savez(folder / "log.npz", **log)
+    for name, spoil in {**SPOILED, **DAMAGED}.items():
+        np.savez(folder / f"{name}.npz", **spoil(log))
 
 
 def read_tree(path):
@@ -130,18 +149,23 @@ def masked(text):
     return [line for line in lines if line]
 
 
+def ended(capsys, script, *words):
+    """The exit status of a command, and what it prints."""
+    try:
+        command(importlib.import_module(f"dln_jax.cli.commands.{script}"), *words)
+        status = 0
+    except SystemExit as end:
+        status = end.code
+    told = capsys.readouterr()
+    return {"status": status, "printed": masked(told.out), "error": masked(told.err)}
+
+
 def measured(name, capsys):
     """What a command line leaves in the working folder and prints."""
     line = LINES[name]
     script, *words = line.split() if isinstance(line, str) else line
     folder = Path(name)
-    try:
-        command(importlib.import_module(f"dln_jax.cli.commands.{script}"), *words, "--out", folder)
-        status = 0
-    except SystemExit as ended:
-        status = ended.code
-    told = capsys.readouterr()
-    found = {"status": status, "printed": masked(told.out), "error": masked(told.err)}
+    found = ended(capsys, script, *words, "--out", folder)
     if (folder / "metrics.json").exists():
         metrics = json.loads((folder / "metrics.json").read_text())
         found["metrics"] = {key: value for key, value in metrics.items() if not TIMES.search(key)}
@@ -150,6 +174,11 @@ def measured(name, capsys):
     if (folder / "config.json").exists():
         config = json.loads((folder / "config.json").read_text())
         found["keys of config"] = sorted(config)
+    if (folder / "model.json").exists():
+        found["description"] = json.loads((folder / "model.json").read_text())["description"]
+        tensors = safetensors.numpy.load_file(folder / "model.safetensors")
+        # Norms rather than a digest, because rounding differs between processors.
+        found["parameters"] = {key: [*x.shape, float(np.linalg.norm(x))] for key, x in tensors.items()}
     return found
 
 

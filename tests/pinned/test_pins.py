@@ -60,9 +60,15 @@ def test_a_command_gives_what_it_gave(name, workplace, capsys, renewed, pytestco
     compare(name, lines.measured(name, capsys), renewed, pytestconfig)
 
 
-@pytest.mark.parametrize("name", lines.LOGS)
+@pytest.mark.parametrize("name", [*lines.LOGS, *lines.SPOILED])
 def test_a_log_is_split_and_checked_as_it_was(name, workplace, renewed, pytestconfig):
     compare(f"log {name}", lines.splits_and_findings(name), renewed, pytestconfig)
+
+
+@pytest.mark.parametrize("name", lines.DAMAGED)
+def test_a_damaged_log_is_refused_as_it_was(name, workplace, capsys, renewed, pytestconfig):
+    words = "--data", f"{name}.npz", "--out", f"refused {name}"
+    compare(f"damaged {name}", lines.ended(capsys, "train_delan", *words), renewed, pytestconfig)
 
 
 def test_public_names_have_their_signatures(renewed, pytestconfig):

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of, one_line
-from planar_arm import FRICTION, motions
+from planar_arm import FRICTION, URDF, motions
 
 from dln_jax.cli.commands import identify
 from dln_jax.data.robots import read_robot
@@ -15,15 +15,6 @@ from dln_jax.training.identification.task import noises, split
 from dln_jax.zoo.run import load
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
-URDF = """<robot name="arm"><link name="base"/>
-<link name="upper"><inertial><origin xyz="0.1 0.05 0.2"/><mass value="2"/>
-<inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="lower"><inertial><origin xyz="0.1 0.05 0.2"/><mass value="1"/>
-<inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
-<origin xyz="0.2 0 0.1" rpy="0.4 0 0"/><axis xyz="0 0 1"/><dynamics damping="0.2"/></joint>
-<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
-<origin xyz="0.2 0 0.1" rpy="1.2 0 0"/><axis xyz="0 0 1"/><dynamics damping="0.2"/></joint></robot>"""
 LOG = "--robot arm.urdf --data log.npz"
 QUICK = "--no-figures --no-uncertainty"
 

@@ -96,7 +96,7 @@ def test_held_vertices_push_a_body_ahead_and_stop_before_what_they_cannot_pass()
 def test_derivatives_through_an_impact_with_friction_agree_with_differences():
     mesh = blocks(0.1, 0.215)
     scene = scene_of(mesh, held=vertices_where(mesh, lambda x: x[:, 1] < 0.21), friction=0.3)
-    compare_derivatives_with_differences(scene, above(mesh, 0.21, [0.5, -0.5]), steps=6, tolerance=1e-10)
+    compare_derivatives_with_differences(scene, above(mesh, 0.21, [0.5, -0.5]), steps=4, tolerance=1e-10)
 
 
 @pytest.mark.slow
@@ -108,17 +108,24 @@ def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_
     barrier, errors = scene.contacts[0].energies[:1], []
     init, step = make_step(scene, dt, tolerance=1e-9, friction_iterations=12)
     step, state = jax.jit(step), init(v=above(mesh, 0.206, [2.0, -2.0]))
+
+    @jax.jit
+    def forces(x):
+        """Of the barrier on every vertex, and each pair's force and normal."""
+        data = prepare_contacts(scene, scene.params, x)[:1]
+        lists = lists_between(barrier, x, jnp.zeros_like(x), data)
+        pairs = jax.vmap(normal_force)(x[lists[0].indices], barrier[0].describe(x, lists[0], data[0]))
+        return moving_gradient(barrier, x, lists, data)[1], *pairs[:2]
+
     masses = np.asarray(scene.params.masses)[upper]
     for _ in range(8):
         before, (state, info) = state, step(scene.params, state)
         assert info.converged
-        x, data = state.x, prepare_contacts(scene, scene.params, state.x)[:1]
-        lists = lists_between(barrier, x, jnp.zeros_like(x), data)
-        pushed = -np.asarray(moving_gradient(barrier, x, lists, data)[1])[upper].sum(axis=0)
-        size, normal, _ = jax.vmap(normal_force)(x[lists[0].indices], barrier[0].describe(x, lists[0], data[0]))
+        gradient, size, normal = map(np.asarray, forces(state.x))
+        pushed = -gradient[upper].sum(axis=0)
         # The normal of a pair points from its edge to its vertex; the upper body slides to the right.
         turned = np.sign(normal[:, 1:]) * np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-        expected = mu * np.asarray(size) @ turned
+        expected = mu * size @ turned
         if (largest := np.linalg.norm(expected)) > 1.0:
             change = masses @ np.asarray(state.v - before.v)[upper] / dt
             errors.append(np.linalg.norm(change - pushed - expected) / largest)
@@ -127,7 +134,7 @@ def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_
 
 @pytest.mark.slow
 def test_two_boxes_in_space_come_to_rest_on_each_other():
-    mesh = joined(box((1.0, 1.0, 0.5), (2, 2, 1)), box((1.0, 1.0, 0.5), (2, 2, 1)), 0.1, 0.1, 0.515)
+    mesh = joined(box((1.0, 1.0, 0.5), (1, 1, 1)), box((1.0, 1.0, 0.5), (1, 1, 1)), 0.1, 0.1, 0.515)
     scene = scene_of(mesh, held=vertices_where(mesh, lambda x: x[:, 2] < 0.51), friction=0.3)
     init, step = make_step(scene, 0.02)
     step, state = jax.jit(step), init()
