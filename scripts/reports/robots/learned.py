@@ -19,7 +19,6 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.mechanics import equations, trees
 from dln_jax.models import make_delan, make_rigid_tree, make_serial_tree, make_trigonometric_kernel
 from dln_jax.types import FrictionLaw, Needs
-from dln_jax.zoo.catalogue import CATALOGUE
 from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm
 from scripts.reports.run import Numbers
 
@@ -90,7 +89,7 @@ def kernels(*, fits: Sequence[tuple[str, int, bool, bool]] = KERNELS, tests: int
         train = lip_trajectories(arm, friction=friction, every=STRIDES[count])
         needs = arm.tree.needs._replace(joint_friction=FRICTION if friction else (), velocity_scale=VELOCITY_SCALE)
         measured = fit_kernel(needs, train, serial=serial)
-        model = CATALOGUE["trigonometric-kernel"].make(needs=needs, samples=measured.samples, serial=serial)
+        model = make_trigonometric_kernel(needs, samples=measured.samples, serial=serial)
         errors = unseen_errors(arm, model.energies(measured.parameters), friction, tests, every=50)
         numbers[f"{case_name(name, count, friction)}/kernel{'' if serial else '-any-order'}"] = {
             "nmse_mean_median": np.median(errors.mean(axis=1)),

@@ -27,9 +27,8 @@ from dln_jax.models.serial_tree import tree_of
 from dln_jax.solvers import least_squares
 from dln_jax.training.identification.motions import MotionSets, fit_by
 from dln_jax.types import FrictionLaw, InputError, Needs
-from scripts.reports.robots.arm import Torque, error_of, torque_of
+from scripts.reports.robots.arm import Torque, error_of, regression, torque_of
 from scripts.reports.robots.known_kinematics import USUAL_SCALE
-from scripts.reports.robots.pinocchio import regression
 from scripts.reports.run import Numbers
 
 CUTOFF, FINE, BASE, RATE = 6.0, 30.0, 500.0, 100.0
@@ -97,12 +96,11 @@ def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_O
         return {way: (model, parameters_of(solution.theta, known)) for way, solution in measured.items()}
 
     numbers = judged("identify-by", double_pendulum, splits, fits)
-    times = {
-        way: [row[key] for key in row if key.startswith("vpt") and key[-1].isdigit()] for way, row in numbers.items()
-    }
-    for way in numbers:
-        ratios = np.divide(times[way], times["identify-by/torques"])
-        numbers[way] |= {"vpt_over_torques_worst": np.min(ratios), "vpt_over_torques_median": np.median(ratios)}
+    by_torques = numbers.get("identify-by/torques", {})
+    of_splits = [key for key in by_torques if key.startswith("vpt") and key[-1].isdigit()]
+    for row in numbers.values():
+        ratios = [row[key] / by_torques[key] for key in of_splits]
+        row |= {"vpt_over_torques_worst": np.min(ratios), "vpt_over_torques_median": np.median(ratios)}
     return numbers
 
 
