@@ -3,12 +3,12 @@
 import jax
 import numpy as np
 
-from dln_jax.identification.excitation.candidates import random_designs
+from dln_jax.identification.excitation.candidates import measured, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.mechanics import trees
 from dln_jax.models.rigid_tree import make_rigid_tree
-from scripts.reports.encoder_data import error_ratios
+from scripts.reports.robots.known_kinematics import error_ratios
 
 LINK = trees.inertial_parameters(1.0, [0.2, 0.0, 0.0], 0.01 * np.eye(3))
 ARM = trees.serial(*trees.dh_frames([[-np.pi / 2, 0, 0, 0]]), [LINK])
@@ -20,12 +20,12 @@ def test_a_wider_motion_errs_less_and_the_same_not_at_all():
     limits = MotionLimits(np.array([[-2.0, 2.0]]), np.array([3.0]), np.array([20.0]), FREE)
     task = make_task(model, model.init(jax.random.key(0)), limits, period=5.0, harmonics=3, noise=0.1)
     wide = random_designs(task, 2)
-    assert (error_ratios(task, wide, wide, samples=100, seeds=4) == 1.0).all()
+    assert (error_ratios(wide, wide, seeds=4) == 1.0).all()
     # Half as far: a sixteenth of the information of some parameters.
     narrow = [
-        design._replace(motion=design.motion._replace(coefficients=0.5 * np.asarray(design.motion.coefficients)))
+        measured(task, design.motion._replace(coefficients=0.5 * np.asarray(design.motion.coefficients)))
         for design in wide
     ]
-    ratios = error_ratios(task, wide, narrow, samples=100, seeds=20)
+    ratios = error_ratios(wide, narrow, seeds=20)
     assert np.median(ratios) < 0.8 and ratios.shape == (20,)
-    assert np.median(error_ratios(task, narrow, wide, samples=100, seeds=20)) > 1.2
+    assert np.median(error_ratios(narrow, wide, seeds=20)) > 1.2

@@ -10,7 +10,7 @@
 
 Torques are not filtered by default: least squares average out their noise, while filtered torques of a model with dry
 friction belong to no state, see `filters`. On a simulated seven-axis arm filtering them cost a factor of 1.6
-(`scripts.reports.encoder_data`).
+(`scripts.reports.robots.known_kinematics`).
 """
 
 from collections.abc import Sequence

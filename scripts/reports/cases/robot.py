@@ -4,32 +4,24 @@ Rivals are measured where they are installed: pip install 'dln-jax[reference]'. 
 given. Only `speed` depends on the machine.
 """
 
-from scripts.reports.encoder_data import cutoffs, encoders, excitation
-from scripts.reports.robots import learned, log_checks, other_logs, recordings
-from scripts.reports.robots.known_kinematics import added_terms, clean, noisy
-from scripts.reports.robots.pinocchio import speed
+from scripts.reports.robots import known_kinematics, learned, log_checks, recordings
+from scripts.reports.robots.arm import speed
 from scripts.reports.run import AtLeast, Case
 
 FEW = {"seeds": 1, "motions": 4, "unseen": 2}
 FLOOR = {"training_error_over_floor": 1.1, "share_of_seeds_at_floor": AtLeast(0.9), "fit_seconds": 180.0}
-LARGE = ("panda-6", "panda-7", "skew-arm", "sliding-arm")
-TARGETS = {
-    f"lip/{arm}/{friction}/500/learned-tree nmse_mean_median": 1e-3
-    for arm in LARGE
-    for friction in ("friction", "frictionless")
-}
+TARGETS = {**FLOOR, "nmse_mean_median": 1e-3}
 SMALLER = ("panda-3", "panda-4", "panda-5", "panda-6", "skew-arm", "sliding-arm")
 TINY = {"arms": ("panda-3",), "frictions": (False,), "seeds": 1, "tests": 2}
 # The LIP paper's kernel from 500 samples without friction: about 3 %, and below 10 %.
 KERNEL = {f"lip/panda-{d}/frictionless/500/kernel nmse_mean_median": error for d, error in ((6, 0.03), (7, 0.1))}
-ERRORS = {"found": AtLeast(0.9), "false_alarms": 0.02, "false_errors": 0.02, "wrongly_joined": 0.02}
+ERRORS = {"found": AtLeast(0.9), "false_alarms": 0.02, "wrongly_joined": 0.02}
 ONE_SPLIT = {"splits": 1}
 
 CASES = (
-    Case("arm/clean", clean, quick=FEW, bound={"nmse": 1e-12}),
     Case(
         "arm/noisy",
-        noisy,
+        known_kinematics.noisy,
         quick=FEW,
         bound={
             "arm/noisy-coulomb/ours nmse": 1.65e-3,
@@ -38,8 +30,8 @@ CASES = (
             "over_true_parameters": 1.1,
         },
     ),
-    Case("learned/seven-joints", learned.learned_trees, {"arms": ("panda-7",), "seeds": 10}, TINY, {}, FLOOR | TARGETS),
-    Case("learned/fewer-joints", learned.learned_trees, {"arms": SMALLER}, TINY, {}, FLOOR | TARGETS),
+    Case("learned/seven-joints", learned.learned_trees, {"arms": ("panda-7",), "seeds": 10}, TINY, {}, TARGETS),
+    Case("learned/fewer-joints", learned.learned_trees, {"arms": SMALLER}, TINY, {}, TARGETS),
     Case(
         "learned/fewer-samples",
         learned.learned_trees,
@@ -56,22 +48,19 @@ CASES = (
         bound=KERNEL,
     ),
     Case("learned/unknown-trees", learned.unknown_trees, quick={"plants": ("branched",), "fit_seconds": 5.0}),
-    Case("preparation/encoders", encoders, quick={"motions": 4, "unseen": 2, "parts": 1}),
-    Case("preparation/cutoffs", cutoffs, quick={"motions": 1, "strides": (1,), "tried": 4}),
+    Case("preparation/encoders", known_kinematics.encoders, quick={"motions": 4, "unseen": 2, "parts": 1}),
     Case(
         "preparation/excitation",
-        excitation,
+        known_kinematics.excitation,
         quick={"joints": 3, "designs": 2},
         bound={"excitation/information error_median": 1.0},
     ),
     Case("logs/sound", log_checks.sound, quick={"logs": 6}, bound=ERRORS),
     Case("logs/faults", log_checks.faults, quick={"faulty_logs": 1}, bound=ERRORS),
-    Case("logs/sound-of-other-robots", other_logs.sound, quick={"logs_of_each": 1}, bound=ERRORS),
-    Case("logs/faults-of-other-robots", other_logs.faults, quick={"faulty_logs": 1}, bound=ERRORS),
-    Case("logs/arrival", other_logs.arrival, quick={"stamped_logs": 3}, bound={**ERRORS, "error_left": 0.1}),
-    Case("logs/repeated-motions", other_logs.repeated_motions, quick={"sets": 1}, bound=ERRORS),
-    Case("terms/two-joints", added_terms, quick={"logs_without": 2, "logs_with": 2}),
-    Case("speed/seven-axis", speed, quick={"repetitions": 20, "batches": 3}, bound={"over_rnea": 2.0, "over_aba": 2.0}),
+    Case("logs/arrival", log_checks.arrival, quick={"stamped_logs": 3}, bound={**ERRORS, "error_left": 0.1}),
+    Case("logs/repeated-motions", log_checks.repeated_motions, quick={"sets": 1}, bound=ERRORS),
+    Case("terms/two-joints", known_kinematics.added_terms, quick={"logs_without": 2, "logs_with": 2}),
+    Case("speed/seven-axis", speed, quick={"repetitions": 20}, bound={"over_rnea": 2.0, "over_aba": 2.0}),
     Case(
         "recordings/arm",
         recordings.recorded_arm,

@@ -2,29 +2,55 @@
 
 The rival gets the same samples, filter and columns, and in a second run also our velocity scales. Errors are those on
 noise-free unseen motions of the true arm.
+
+Two ways to prepare data stand beside these. Filters derive the equations of a linear fit, of the same tree with
+friction, from a noisy log. Designed motions have the same period, samples and noise as random ones.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from dln_jax.data import Trajectories
+from dln_jax.data import Trajectories, select
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every
 from dln_jax.identification import identify, parameters_of
-from dln_jax.learning import fit_friction
+from dln_jax.identification.excitation import (
+    CRITERIA,
+    Design,
+    MotionLimits,
+    best_design,
+    make_optimiser,
+    make_task,
+    random_designs,
+)
+from dln_jax.learning import fit_friction, fit_linear
 from dln_jax.learning.friction_selection import choose_terms
 from dln_jax.learning.friction_terms import terms_of
+from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial, tree_system
 from dln_jax.models import make_rigid_tree
 from dln_jax.types import FrictionLaw
-from scripts.reports.robots.arm import D, arm, error_of, exact_torque, follow, logs, measured, motion, torque_of
-from scripts.reports.robots.pinocchio import regression
+from scripts.reports.robots.arm import (
+    D,
+    arm,
+    error_of,
+    exact_torque,
+    follow,
+    logs,
+    measured,
+    motion,
+    regression,
+    torque_of,
+)
+from scripts.reports.robots.simulated_arms import panda
 from scripts.reports.run import Numbers
 
 LAWS = ("viscous", "coulomb", "offset")
@@ -54,19 +80,6 @@ def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = Fal
     start = model.init(jax.random.key(0))._replace(viscous=jnp.full(D, 0.5), coulomb=jnp.full(D, 0.5))
     solution = identify(model, start, data, joints=tree.joints, robust=robust)
     return model, parameters_of(solution.theta, start)
-
-
-def clean(*, seeds: int = 5, motions: int = 15, unseen: int = 6) -> Numbers:
-    """Exact states of an arm with viscous friction: the worst error of the seeds."""
-    robot, errors = arm(coulomb=False), []
-    for seed in range(seeds):
-        random = np.random.default_rng(seed)
-        train, test = (logs(robot, random, count) for count in (motions, unseen))
-        model = make_rigid_tree(rough(robot.tree), friction=True)
-        start = model.init(jax.random.key(0))
-        solution = identify(model, start, every(train, DECIMATE), joints=robot.tree.joints, consistent=False)
-        errors.append(error_of(torque_of(model, parameters_of(solution.theta, start)), test).mean())
-    return {"arm/clean-viscous": {"nmse": max(errors)}}
 
 
 def noisy(*, seeds: int = 5, motions: int = 15, unseen: int = 6) -> Numbers:
@@ -124,10 +137,10 @@ PLANT_LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
 LINK = inertial_parameters(2.0, [0.05, 0.02, 0.1], np.diag([0.02, 0.03, 0.01]))
 ARM = serial(*dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0.1, 0, 0]]), [LINK] * 2, armature=[0.1, 0.05])
 PLANTS: dict[str, dict[str, Any]] = {
-    "none": {"friction": PLANT_LAWS},
-    "coupled": {"friction": PLANT_LAWS, "coupled": ((0, 1),)},
+    "none": {},
+    "coupled": {"coupled": ((0, 1),)},
     "load": {"friction": (*PLANT_LAWS, "load"), "load": (0.2, 0.1)},
-    "temperature": {"friction": PLANT_LAWS, "cooling": (0.02, 0.01), "reference_temperature": 25.0},
+    "temperature": {"cooling": (0.02, 0.01), "reference_temperature": 25.0},
 }
 
 
@@ -146,7 +159,7 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
     numbers = {}
     for plant, keywords in PLANTS.items():
         count = logs_without if plant == "none" else logs_with
-        model = make_rigid_tree(ARM, velocity_scale=0.02, **keywords)
+        model = make_rigid_tree(ARM, velocity_scale=0.02, **{"friction": PLANT_LAWS, **keywords})
         energies: Any = model.energies  # of a rigid tree, which takes a temperature too
         parameters = model.init(jax.random.key(0))._replace(viscous=np.array([0.4, 0.3]), coulomb=np.array([0.5, 0.3]))
         if plant == "coupled":
@@ -173,3 +186,81 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
                 kept[f"share_keeping_{tried.name}"] += tried.kept / count
         numbers[f"added-terms/{plant}"] = kept
     return numbers
+
+
+TOLERANCES: dict[str, Any] = {"negligible": 1e-9, "rank_tolerance": 1e-8}
+
+
+def encoders(*, motions: int = 15, unseen: int = 6, parts: int = 3) -> Numbers:
+    """Median and worst nMSE over disjoint parts of the motions, with viscous friction and with MuJoCo's dry friction.
+
+    Ways: exact rates; rates by differences; q filtered at the cut-off chosen from its spectra, with raw tau; tau
+    filtered like q; and momenta of windows, which need no accelerations.
+    """
+    numbers = {}
+    for name, robot in (("viscous", arm(coulomb=False)), ("coulomb", arm(coulomb=True))):
+        random = np.random.default_rng(0)
+        exact, test = (logs(robot, random, count) for count in (motions, unseen))
+        model = make_rigid_tree(robot.tree, friction=True, velocity_scale=0.01)
+        errors: dict[str, list[float]] = {}
+        for seed, part in enumerate(np.array_split(np.arange(motions), parts)):
+            clean = select(exact, part)
+            log = from_arrays(measured(clean, np.random.default_rng(seed)))
+            filtered = smooth(log)
+            twice = smooth(log, 2 * filtered.cutoff)
+            fits = {
+                "exact-rates": (fit_linear, clean._replace(tau=log.tau)),
+                "raw-differences": (fit_linear, log),
+                "acceleration": (fit_linear, filtered.data),
+                "acceleration-torque-filtered": (fit_linear, smooth(log, filter_torque=True).data),
+                "acceleration-twice-the-cutoff": (fit_linear, twice.data),
+                "momentum": (fit_momentum, filtered.data),
+                "momentum-twice-the-cutoff": (fit_momentum, twice.data),
+            }
+            for way, (fit, data) in fits.items():
+                torque = torque_of(model, fit(model, data, **TOLERANCES).parameters)
+                errors.setdefault(way, []).append(float(error_of(torque, test).mean()))
+        for way, values in errors.items():
+            numbers[f"encoders/{name}/{way}"] = {"nmse_median": np.median(values), "nmse_worst": np.max(values)}
+    return numbers
+
+
+def excitation(*, joints: int = 7, designs: int = 6, draws: int = 60) -> Numbers:
+    """Ratios of parameter errors after designed and random motions of the same series of a Panda, by criterion."""
+    robot = panda(joints)
+    model = make_rigid_tree(robot.tree, friction=True, velocity_scale=0.05)
+    free = np.tile([-np.inf, np.inf], (joints, 1))
+    limits = MotionLimits(robot.limits, robot.rates, robot.accelerations, free)
+    task = make_task(model, model.init(jax.random.key(0)), limits, period=20.0, harmonics=5)
+    drawn, starts = random_designs(task, designs), random_designs(task, designs, seed=1)
+    numbers = {"excitation/random": {"condition_median": np.median([design.condition for design in drawn])}}
+    for name, criterion in CRITERIA.items():
+        optimise = make_optimiser(task, criterion)
+        designed = [best_design(task, optimise, criterion, [start]) for start in starts]
+        ratios = error_ratios(designed, drawn, seeds=draws)
+        numbers[f"excitation/{name}"] = {
+            "condition_median": np.median([design.condition for design in designed]),
+            "error_worst": np.max(ratios),
+            "error_median": np.median(ratios),
+        }
+    return numbers
+
+
+def error_ratios(
+    designed: Sequence[Design], drawn: Sequence[Design], *, seeds: int = 50
+) -> Float[np.ndarray, " seeds"]:
+    """Errors of least squares after designed motions over those after random ones by seed.
+
+    They are root mean squares over parameters, in units of each parameter's standard deviation after random motions.
+    The motions are compared pair by pair, with new noise for every seed. Values below one favour designed motions.
+    """
+    scale = np.sqrt(np.mean([np.diag(np.linalg.inv(design.information)) for design in drawn], axis=0))
+    ratios = []
+    for seed in range(seeds):
+        noise = np.random.default_rng(seed).normal(size=len(scale))
+        sizes = []
+        for designs in (designed, drawn):
+            factor = np.linalg.cholesky(designs[seed % len(designs)].information)
+            sizes.append(np.sqrt(np.mean((np.linalg.solve(factor.T, noise) / scale) ** 2)))
+        ratios.append(sizes[0] / sizes[1])
+    return np.array(ratios)

@@ -19,7 +19,6 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.mechanics import equations, trees
 from dln_jax.models import make_delan, make_rigid_tree, make_serial_tree, make_trigonometric_kernel
 from dln_jax.types import FrictionLaw, Needs
-from dln_jax.zoo.catalogue import CATALOGUE
 from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm
 from scripts.reports.run import Numbers
 
@@ -34,7 +33,7 @@ VELOCITY_SCALE = 1e-3
 """Velocity scale of the models' dry friction, rad/s or m/s; the arms' own dry friction is discontinuous."""
 FRICTION: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
 STATES = 5_001
-"""Number of states per call of the inverse dynamics: the memory of a kernel grows with it."""
+"""Number of states that the inverse dynamics takes at once: the memory of a kernel grows with it."""
 KERNELS = (
     *itertools.product([f"panda-{d}" for d in range(3, 8)], (500,), (False, True), (True,)),
     *itertools.product(("panda-7",), (150, 50), (False, True), (True,)),
@@ -90,7 +89,7 @@ def kernels(*, fits: Sequence[tuple[str, int, bool, bool]] = KERNELS, tests: int
         train = lip_trajectories(arm, friction=friction, every=STRIDES[count])
         needs = arm.tree.needs._replace(joint_friction=FRICTION if friction else (), velocity_scale=VELOCITY_SCALE)
         measured = fit_kernel(needs, train, serial=serial)
-        model = CATALOGUE["trigonometric-kernel"].make(needs=needs, samples=measured.samples, serial=serial)
+        model = make_trigonometric_kernel(needs, samples=measured.samples, serial=serial)
         errors = unseen_errors(arm, model.energies(measured.parameters), friction, tests, every=50)
         numbers[f"{case_name(name, count, friction)}/kernel{'' if serial else '-any-order'}"] = {
             "nmse_mean_median": np.median(errors.mean(axis=1)),
@@ -116,9 +115,12 @@ def unseen_errors(arm: Arm, system: Any, friction: bool, tests: int, every: int 
 
 def torques_of(system: Any, data: Trajectories) -> Float[np.ndarray, "N d"]:
     """Torques of a system's inverse dynamics along the samples of the data."""
-    inverse = jax.jit(jax.vmap(equations.dynamics(system).inverse_dynamics), compiler_options=quick_compilation())
-    pieces = [slice(first, first + STATES) for first in range(0, len(data.q), STATES)]
-    return np.concatenate([inverse(data.q[piece], data.qd[piece], data.qdd[piece]) for piece in pieces])
+    inverse = equations.dynamics(system).inverse_dynamics
+    program = jax.jit(
+        lambda states: jax.lax.map(lambda state: inverse(*state), states, batch_size=STATES),
+        compiler_options=quick_compilation(),
+    )
+    return np.asarray(program((data.q, data.qd, data.qdd)))
 
 
 def unknown_trees(

@@ -1,10 +1,12 @@
 """Error rates of the log validation: false findings on sound logs, and planted faults that it misses.
 
 Arms have random frames and two to seven joints; some are branched, and one is the Panda. They move from point to point,
-wait, and shake. Torques have noise, friction with a Stribeck curve, or neither; encoders have steps and noise.
+wait, and shake. Torques have noise, friction with a Stribeck curve, or neither; encoders have steps and noise. Beside
+these stand the error rates of the detectors of stamps of arrival and of repeated motions.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,12 +16,14 @@ import numpy as np
 from dln_jax.compilation import quick_compilation
 from dln_jax.data import Robot, schema
 from dln_jax.data.checks import Finding, quick
+from dln_jax.data.encoders import source_clock
+from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.mechanics import trees
 from scripts.reports.robots.simulated_arms import panda
 from scripts.reports.run import Numbers
 
-SEED = 20_000
-"""First seed of the reported logs; thresholds were chosen on other arms, motions and seeds."""
+SEED, OTHER_SEED = 20_000, 30_000
+"""First seeds of the reported logs, and of other detectors; thresholds were chosen on other arms, motions and seeds."""
 STATEMENTS = {"split", "condition", "unexcited", "raw-differences", "gaps", "jitter", "quantisation", "rates"}
 """Checks that state how a log was recorded, not that it is wrong."""
 FAULTS = {
@@ -35,9 +39,11 @@ FAULTS = {
     "saturated-torque": "saturation-tau",
     "wrong-sampling-time": "clock",
     "tilted-base": "gravity",
+    "gravity-free": "no-gravity",
+    "all-torques-reversed": "tree-sign",
 }
 """Findings that name the faults."""
-WITH_ROBOT = ("millinewton-metres", "wrong-sampling-time", "tilted-base")
+WITH_ROBOT = ("millinewton-metres", "wrong-sampling-time", "tilted-base", "gravity-free", "all-torques-reversed")
 """Faults that a log without its robot cannot show."""
 Arrays = dict[str, Any]
 
@@ -86,7 +92,10 @@ def spoiled(
         case "flipped-sign":
             tau[:, random.integers(d)] *= -1
         case "delay":
-            tau = late(arrays, random.uniform(0.005, 0.05))
+            shift = max(1, round(random.uniform(0.005, 0.05) / float(t[1] - t[0])))
+            for index in np.unique(arrays["trajectory"]):
+                here = arrays["trajectory"] == index
+                tau[here] = np.concatenate([np.repeat(tau[here][:1], shift, 0), tau[here][:-shift]])
         case "degrees":
             q = np.degrees(q)
         case "millinewton-metres":
@@ -113,17 +122,12 @@ def spoiled(
             axis /= np.linalg.norm(axis)
             turned = np.cos(angle) * down + np.sin(angle) * np.cross(axis, down)
             robot = robot._replace(tree=robot.tree._replace(gravity=turned))
+        case "gravity-free":
+            weight = jax.vmap(lambda q: trees.newton_euler(robot.tree, q, 0 * q, 0 * q))
+            tau -= np.asarray(jax.jit(weight)(q))
+        case "all-torques-reversed":
+            tau *= -1
     return robot if kind in WITH_ROBOT else None, {**arrays, "t": t, "q": q, "tau": tau, **changed}
-
-
-def late(arrays: Arrays, seconds: float) -> np.ndarray:
-    """Torques that are late by whole samples, at least one."""
-    shift = max(1, round(seconds / float(arrays["t"][1] - arrays["t"][0])))
-    tau = arrays["tau"].copy()
-    for index in np.unique(arrays["trajectory"]):
-        here = arrays["trajectory"] == index
-        tau[here] = np.concatenate([np.repeat(tau[here][:1], shift, 0), tau[here][:-shift]])
-    return tau
 
 
 def repeat_rows(arrays: Arrays, random: np.random.Generator) -> Arrays:
@@ -161,14 +165,8 @@ def random_arm(seed: int, d: int) -> tuple[Robot, Callable[..., Any]]:
             armature=random.uniform(0.0, 0.1, d), gravity=gravity,
         )  # fmt: skip
     forces = jax.jit(jax.vmap(lambda *x: trees.newton_euler(tree, *x)), compiler_options=quick_compilation())
-    return without_friction(tree), forces
-
-
-def without_friction(tree: trees.Tree) -> Robot:
-    """A robot's file without friction and limits."""
-    d = tree.degrees_of_freedom
     unlimited = np.tile([-np.inf, np.inf], (d, 1))
-    return Robot(tree, np.zeros(d), np.zeros(d), unlimited, unlimited)
+    return Robot(tree, np.zeros(d), np.zeros(d), unlimited, unlimited), forces
 
 
 def drawn(number: int, *, repeats: bool = False) -> tuple[Robot, Arrays, tuple[np.ndarray, np.ndarray]]:
@@ -204,7 +202,10 @@ def motion(random: np.random.Generator, d: int, t: np.ndarray) -> np.ndarray:
         place = np.minimum(np.searchsorted(ends, t, side="right"), 199)
         began = np.where(place > 0, ends[place - 1], 0.0)
         length = ends[place] - began
-        total[:, :, joint] = quintic((t - began) / length, length, points[place], points[place + 1] - points[place])
+        x, step = (t - began) / length, points[place + 1] - points[place]
+        total[0, :, joint] = points[place] + step * x**3 * (10 - 15 * x + 6 * x**2)
+        total[1, :, joint] = step / length * 30 * x**2 * (1 - x) ** 2
+        total[2, :, joint] = step / length**2 * 60 * x * (1 - x) * (1 - 2 * x)
         for _ in range(2):
             w, phase, size = 2 * np.pi * random.uniform(0.4, 2.0), random.uniform(0, 6.3), random.uniform(0.02, 0.12)
             wave = np.stack([np.sin(w * t + phase), w * np.cos(w * t + phase), -(w**2) * np.sin(w * t + phase)])
@@ -212,12 +213,71 @@ def motion(random: np.random.Generator, d: int, t: np.ndarray) -> np.ndarray:
     return total
 
 
-def quintic(x: Any, length: Any, start: Any, step: Any) -> np.ndarray:
-    """Position, velocity and acceleration of a move from rest to rest, x in [0, 1] of its duration."""
-    return np.stack(
-        [
-            start + step * x**3 * (10 - 15 * x + 6 * x**2),
-            step / length * 30 * x**2 * (1 - x) ** 2,
-            step / length**2 * 60 * x * (1 - x) * (1 - 2 * x),
-        ]
+def arrival(*, stamped_logs: int = 60) -> Numbers:
+    """Logs of 1 to 7 joints at 60 to 1000 Hz, some rows lost: stamped on time, when measured, or when they arrive.
+
+    `error_left` is the remaining error of the times over the lateness of the stamps in the worst log.
+    """
+    alarms, left = [], []
+    for number in range(stamped_logs):
+        random = np.random.default_rng([OTHER_SEED, number])
+        rate, d = 10 ** random.uniform(np.log10(60), 3), int(random.integers(1, 8))
+        sines = [random.uniform(*ends, (4, d)) for ends in ((0.1, 1.5), (0, 6.3), (0.1, 0.5))]
+        regular = np.arange(int(random.uniform(15, 40) * rate)) / rate
+        lost = regular[random.random(len(regular)) > random.uniform(0, 0.1)]
+        uneven = np.sort(regular + random.uniform(-0.2, 0.2, len(regular)) / rate)
+        noise = 10 ** random.uniform(-6, -3.7)
+
+        def log(t: np.ndarray, stamps: np.ndarray, random=random, sines=sines, noise=noise) -> schema.Trajectories:
+            frequency, phase, size = sines
+            angle = 2 * np.pi * np.multiply.outer(t, frequency) + phase
+            q = np.sum(size * np.sin(angle), axis=1)
+            qd = np.sum(2 * np.pi * frequency * size * np.cos(angle), axis=1)
+            seen = {"q": q + noise * random.normal(size=q.shape), "qd": qd * (1 + 0.01 * random.normal(size=q.shape))}
+            return schema.from_arrays({**seen, "tau": 0 * q, "t": stamps, "trajectory": np.zeros(len(q), int)})
+
+        alarms += [source_clock(log(t, t)) is not None for t in (regular, lost, uneven)]
+        stamps = lost + random.exponential(random.uniform(0.1, 0.5) / rate, len(lost))
+        stamps = np.maximum.accumulate(stamps) + 1e-9 * np.arange(len(stamps))
+        late = log(lost, stamps)
+        if clock := source_clock(late):
+            speed = np.abs(late.qd).sum(axis=1)
+            moving = speed > 0.5 * speed.mean()
+            left.append(np.std((clock.t - lost)[moving]) / np.std((stamps - lost)[moving]))
+    share, worst = len(left) / stamped_logs, max(left, default=np.inf)
+    return {"log-checks/arrival": {"found": share, "error_left": worst, "false_alarms": np.mean(alarms)}}
+
+
+def repeated_motions(*, sets: int = 20) -> Numbers:
+    """The share of different motions that count as one, and of sets of five motions, each recorded four times.
+
+    Motions pass through random points, go out and back, or are small swings: modes of one body with random phases.
+    """
+    recordings, x = 20, np.linspace(0, 1, 400)
+
+    def count(motions: list[np.ndarray]) -> int:
+        trajectory = np.repeat(np.arange(len(motions)), [len(q) for q in motions])
+        return len(np.unique(motion_numbers(np.concatenate(motions), trajectory)))
+
+    def swings(random: np.random.Generator, d: int) -> np.ndarray:
+        modes = np.linalg.qr(np.random.default_rng(5).normal(size=(d, d)))[0]
+        angles = np.multiply.outer(8 * x, 3.0 + 4.0 * np.arange(d)) + random.uniform(0, 6.3, d)
+        return (random.normal(size=d) * np.cos(angles)) @ modes
+
+    def again(random: np.random.Generator, q: np.ndarray) -> np.ndarray:
+        """A recording of a motion: from a later start, off by 1 % of its size, with noise."""
+        part = q[random.integers(0, len(q) // 20) :]
+        return part + 0.01 * q.std(axis=0) * random.normal(size=q.shape[1]) + 1e-3 * random.normal(size=part.shape)
+
+    kinds: tuple[Callable[..., np.ndarray], ...] = (
+        lambda random, d: motion(random, d, 8 * x)[0],
+        lambda random, d: np.multiply.outer(np.sin(np.pi * x) ** 2, random.normal(size=d)),
+        swings,
     )
+    joined, outcome = [], []
+    for (kind, make), d, number in itertools.product(enumerate(kinds), (2, 3, 7), range(sets)):
+        random = np.random.default_rng([OTHER_SEED, kind, d, number])
+        joined.append(1 - count([make(random, d) for _ in range(recordings)]) / recordings)
+        repeated = (make(random, d) for _ in range(5))
+        outcome.append(count([again(random, q) for q in repeated for _ in range(4)]) <= 5)
+    return {"log-checks/repeated-motions": {"wrongly_joined": np.mean(joined), "found": np.mean(outcome)}}

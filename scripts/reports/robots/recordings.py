@@ -8,33 +8,27 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from dln_jax.data import Trajectories, read_robot, schema, select
 from dln_jax.data.encoders import low_pass, smooth
 from dln_jax.data.encoders.smoothing import TRIMMED
-from dln_jax.data.splits import in_blocks, label_indices, window_indices, with_joints
+from dln_jax.data.splits import in_blocks, label_indices, with_joints
 from dln_jax.identification import identify, parameters_of
 from dln_jax.identification.residual import fit_residual
-from dln_jax.learning import GaussNewton, Problem, fit, fit_friction, measured_motions
-from dln_jax.learning.engine.problem import mean_square, unmonitored
+from dln_jax.learning import fit_friction
 from dln_jax.learning.friction import FrictionFit
 from dln_jax.learning.kinematics import fit_tree
-from dln_jax.learning.linear import design
-from dln_jax.learning.measured_motions import Noise, cut_measured_windows
-from dln_jax.mechanics.equations import dynamics
+from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.trees import Tree, inertial_parameters, serial
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
-from dln_jax.models import Model, Parameters, make_planar_chain, make_rigid_tree, with_joint_friction
+from dln_jax.models import Model, Parameters, make_planar_chain, make_rigid_tree
 from dln_jax.models.serial_tree import tree_of
 from dln_jax.solvers import least_squares
 from dln_jax.training.identification.motions import MotionSets, fit_by
 from dln_jax.types import FrictionLaw, InputError, Needs
-from scripts.reports.robots.arm import Torque, error_of, torque_of
+from scripts.reports.robots.arm import Torque, error_of, regression, torque_of
 from scripts.reports.robots.known_kinematics import USUAL_SCALE
-from scripts.reports.robots.pinocchio import regression
 from scripts.reports.run import Numbers
 
 CUTOFF, FINE, BASE, RATE = 6.0, 30.0, 500.0, 100.0
@@ -63,7 +57,6 @@ def double_pendulum(*, double_pendulum: Path | None = None, splits: int = len(HE
         chosen-scale    the same, with the velocity scale that explains each recording best from the others
         low-passed      the regressor of less filtered motions is filtered, and tau with it
         stacked         the equations of both, with equal weights
-        both            motions and torques in one objective, with friction by load
 
     Recorded torques explain slow accelerations well and those above 3 Hz badly, because forces act that were not
     recorded. They draw least squares of torques to small inertias, which are best for torques and bad for predictions.
@@ -74,11 +67,8 @@ def double_pendulum(*, double_pendulum: Path | None = None, splits: int = len(HE
         model = chain(scale)
         coarse, smoothed = (equations(model, rest, filtered=filtered) for filtered in (False, True))
         solved = {"chosen-scale": coarse, "low-passed": smoothed, "stacked": [*coarse, *smoothed]}
-        return {
-            "least-squares": (usual, with_vector(usual, solution(equations(usual, rest)))),
-            **{name: (model, with_vector(model, solution(measured))) for name, measured in solved.items()},
-            "both": motions_and_torques(rest, scale),
-        }
+        chosen = {name: (model, with_vector(model, solution(measured))) for name, measured in solved.items()}
+        return {"least-squares": (usual, with_vector(usual, solution(equations(usual, rest)))), **chosen}
 
     return judged("double-pendulum", double_pendulum, splits, fits)
 
@@ -106,12 +96,11 @@ def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_O
         return {way: (model, parameters_of(solution.theta, known)) for way, solution in measured.items()}
 
     numbers = judged("identify-by", double_pendulum, splits, fits)
-    times = {
-        way: [row[key] for key in row if key.startswith("vpt") and key[-1].isdigit()] for way, row in numbers.items()
-    }
-    for way in numbers:
-        ratios = np.divide(times[way], times["identify-by/torques"])
-        numbers[way] |= {"vpt_over_torques_worst": np.min(ratios), "vpt_over_torques_median": np.median(ratios)}
+    by_torques = numbers.get("identify-by/torques", {})
+    of_splits = [key for key in by_torques if key.startswith("vpt") and key[-1].isdigit()]
+    for row in numbers.values():
+        ratios = [row[key] / by_torques[key] for key in of_splits]
+        row |= {"vpt_over_torques_worst": np.min(ratios), "vpt_over_torques_median": np.median(ratios)}
     return numbers
 
 
@@ -136,22 +125,23 @@ def judged(name: str, path: Path | None, splits: int, fits: Any) -> dict[str, di
             times = valid_times(segments, predicted, fitted=WINDOW, variance=fine.q.var(axis=0))
             error = float(np.mean(off**2 / coarse.tau.var(axis=0)))
             measured.setdefault(f"{name}/{way}", []).append((error, float(np.mean(times))))
-    numbers: dict[str, dict[str, float]] = {}
+    numbers = {}
     for way, values in measured.items():
-        for quantity, worst, of_splits in zip(
-            ("torque_nmse", "vpt_mean_seconds"), (np.max, np.min), np.transpose(values), strict=True
-        ):
-            row = {quantity: np.median(of_splits), f"{quantity}_worst": worst(of_splits)}
-            row |= {f"{quantity}_{'_'.join(key)}": value for key, value in zip(HELD_OUT, of_splits, strict=False)}
-            numbers.setdefault(way, {}).update(row)
+        errors, times = np.transpose(values)
+        numbers[way] = {
+            "torque_nmse": np.median(errors),
+            "torque_nmse_worst": np.max(errors),
+            "vpt_mean_seconds": np.median(times),
+            "vpt_mean_seconds_worst": np.min(times),
+            **{f"vpt_mean_seconds_{'_'.join(key)}": time for key, time in zip(HELD_OUT, times, strict=False)},
+        }
     return numbers
 
 
-def chain(velocity_scale: float, laws: tuple[FrictionLaw, ...] = ()) -> Model:
-    """The planar chain of two links with motors; additional friction laws add parameters."""
+def chain(velocity_scale: float) -> Model:
+    """The planar chain of two links with motors."""
     needs = Needs(joints=("revolute", "revolute"), friction=True, velocity_scale=velocity_scale)
-    rigid = make_planar_chain(needs, armature=True, velocity_scale=velocity_scale)
-    return with_joint_friction(rigid, needs._replace(joint_friction=laws), dtype=jnp.float64)
+    return make_planar_chain(needs, armature=True, velocity_scale=velocity_scale)
 
 
 def equations(model: Model, logs: Logs, *, filtered: bool = False) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -160,7 +150,7 @@ def equations(model: Model, logs: Logs, *, filtered: bool = False) -> list[tuple
     Ends of low-passed columns are dropped, where the filter has data on one side only.
     """
     data, scale = logs[int(filtered)], logs[0].tau.std(axis=0)
-    Phi = np.asarray(design(model)(zeros(model), data.q, data.qd, data.qdd)[0])
+    Phi = np.asarray(design(model)(model.init(jax.random.key(0)), data.q, data.qd, data.qdd)[0])
     ends, listed = round(TRIMMED * RATE / CUTOFF), []
     for index in np.unique(data.trajectory):
         both = np.concatenate([Phi, data.tau[:, :, None]], axis=2)[data.trajectory == index] / scale[:, None]
@@ -188,58 +178,9 @@ def best_scale(logs: Logs) -> float:
     return SCALES[int(np.argmin(errors))]
 
 
-def motions_and_torques(logs: Logs, scale: float) -> tuple[Model, Parameters]:
-    """Fits motions and torques in one objective, with load-dependent friction; the middle recording selects the step.
-
-        loss = mean over windows of |r_w|² + 3 * mean over samples of sum_j ((tau_hat_j - tau_j) / noise_j)²
-
-    r_w is that of `learning.measured_motions`, tau_hat belongs to filtered motions, and the noise is what low-passed
-    equations leave. The standard deviation of q, 2 mrad, is larger than the sensor noise, for unmodelled forces.
-    """
-    rigid, model, smoothed = chain(scale), chain(scale, ("load",)), equations(chain(scale), logs, filtered=True)
-    x = solution(smoothed)
-    off = np.concatenate([A @ x - b for A, b in smoothed]).reshape(-1, 2)
-    noise = logs[0].tau.std(axis=0) * np.sqrt(np.mean(off**2, axis=0))
-    present = np.unique(logs[0].trajectory)
-    middle = present[len(present) // 2]
-    coarse, fine = ([select(data, part) for part in (present[present != middle], [middle])] for data in logs)
-    windows = [cut_measured_windows(part, WINDOW) for part in fine]
-    start = model.init(jax.random.key(0)) | {"model": with_vector(rigid, x)}
-    task = measured_motions.problem(model, start, *windows, noise=Noise(2e-3, tau=tuple(noise.tolist())))
-    arrays, validation = (torque_windows(part) for part in coarse)
-    split, motion_residual = len(task.arrays), task.residual
-    assert motion_residual is not None
-
-    def torque_error(parameters: Parameters, q: Any, qd: Any, qdd: Any, tau: Any, weight: Any) -> Any:
-        missed = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(q, qd, qdd) - tau
-        return jnp.ravel(jnp.sqrt(3.0 * weight / jnp.sum(weight))[:, None] * missed / noise)
-
-    def residual(parameters: Parameters, *window: Any) -> Any:
-        motion, torque = motion_residual(parameters, *window[:split]), torque_error(parameters, *window[split:])
-        return jnp.concatenate([jnp.ravel(motion), torque])
-
-    def score(parameters: Parameters) -> tuple[Any, Any]:
-        torques = mean_square(lambda *window: torque_error(parameters, *window), validation)
-        return unmonitored(task.score(parameters)[0] + torques)
-
-    both: Problem = task._replace(residual=residual, arrays=(*task.arrays, *arrays), score=score)
-    return model, fit(both, GaussNewton(8, steps_per_dispatch=4)).parameters
-
-
-def torque_windows(data: Trajectories) -> tuple[Any, ...]:
-    """q, qd, qdd and tau [W, T, d] and weights [W, T] of the same windows as `cut_measured_windows`."""
-    indices, weight = window_indices(data, WINDOW)
-    return tuple(map(jnp.asarray, (*(array[indices] for array in (data.q, data.qd, data.qdd, data.tau)), weight)))
-
-
-def zeros(model: Model) -> Any:
-    """Parameters that are zero."""
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
-
-
-def with_vector(model: Model, x: np.ndarray) -> Any:
+def with_vector(model: Model, x: np.ndarray) -> Parameters:
     """Parameters from their vector."""
-    return ravel_pytree(zeros(model))[1](jnp.asarray(x))
+    return unravelled(x, model.init(jax.random.key(0)))
 
 
 def recorded_arm(*, log: Path | None = None, robot: Path | None = None, pairs: int = 5) -> Numbers:

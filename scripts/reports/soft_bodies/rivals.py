@@ -6,14 +6,11 @@ OPENBLAS_NUM_THREADS=1: waiting threads would count.
 """
 
 import functools
-import importlib
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.softbody import static_solve
 from dln_jax.softbody.contact import crossings
 from dln_jax.softbody.contact.distances import POINT_TRIANGLE, squared_distance
 from dln_jax.softbody.mesh import Mesh, boundary, box, lumped_masses, make_mesh, quadratic, vertices_where
@@ -29,34 +26,22 @@ from scripts.reports.soft_bodies.body import (
     Run,
     elastic_forces,
     gradient,
-    measured,
     motion,
     program,
     reference_motion,
     relative_error,
-    scene_of,
+)
+from scripts.reports.soft_bodies.simulators import (
+    explicit_gradient,
+    explicit_motion,
+    flex_motion,
+    simulator,
+    vbd_motion,
 )
 
 LENGTHS = (1.0, 0.25, 0.25)
-NEEDED = {
-    "mujoco_flex": "mujoco",
-    "newton_solvers": "newton",
-    "torch_fem": "torch-fem",
-    "tatva_fem": "tatva",
-}
-"""Modules of this package, and what they need."""
 STEP = 2e-3
 """Time step of blocks in contact, s."""
-
-
-@functools.cache
-def rival(name: str) -> Any:
-    """A module of this package; prints a line and returns `None` if its simulator is missing."""
-    try:
-        return importlib.import_module(f"scripts.reports.soft_bodies.{name}")
-    except ImportError:
-        print(f"{NEEDED[name]} is missing, and so are its rows; pip install 'dln-jax[rivals]'")
-        return None
 
 
 def cantilever(cells: int, *, moments: int = 5, order: int = 1, law: str = NEO_HOOKEAN) -> Body:
@@ -83,17 +68,16 @@ def swing(*, moments: int = 5) -> Numbers:
     """A cantilever released from rest; its tip falls by 0.38 m."""
     body, steps = cantilever(3, moments=moments), (0.02, 0.01, 0.005, 0.002)
     runs = {f"{rule}/{dt}": motion(body, rule, dt) for rule in ("backward-euler", "midpoint") for dt in steps}
-    flex, newton = rival("mujoco_flex"), rival("newton_solvers")
     kirchhoff, smith = body._replace(law=KIRCHHOFF), body._replace(law=SMITH)
     others: dict[str, tuple[Body, dict[str, Run]]] = {}
-    if flex:
-        runs |= {f"mujoco-discrete/{dt}": flex.motion(body, "discrete", dt) for dt in (0.01, 0.005, 0.002, 5e-4, 1e-4)}
-        own = {f"mujoco-euler/{dt}": flex.motion(kirchhoff, "Euler", dt) for dt in (1e-3, 5e-4, 1e-4)}
+    if simulator("mujoco"):
+        runs |= {f"mujoco-discrete/{dt}": flex_motion(body, "discrete", dt) for dt in (0.01, 0.005, 0.002, 5e-4, 1e-4)}
+        own = {f"mujoco-euler/{dt}": flex_motion(kirchhoff, "Euler", dt) for dt in (1e-3, 5e-4, 1e-4)}
         others["mujoco"] = kirchhoff, own
-    if newton:
+    if simulator("newton"):
         tried = ((10, 0.01), (10, 0.002), (10, 5e-4), (50, 0.01), (50, 0.002))
-        runs |= {f"newton-{sweeps}/{dt}": newton.vbd_motion(body, dt, sweeps) for sweeps, dt in tried}
-        others["newton"] = smith, {f"newton-explicit/{dt}": newton.explicit_motion(smith, dt) for dt in (1e-3, 5e-4)}
+        runs |= {f"newton-{sweeps}/{dt}": vbd_motion(body, dt, sweeps) for sweeps, dt in tried}
+        others["newton"] = smith, {f"newton-explicit/{dt}": explicit_motion(smith, dt) for dt in (1e-3, 5e-4)}
     numbers = errors_of("swing", body, runs, reference_motion(body, 2e-4))
     # Explicit methods of rivals run other laws only, and are compared with references of these.
     for other, own in others.values():
@@ -112,43 +96,21 @@ def drop(*, moments: int = 5) -> Numbers:
     body = Body(mesh, np.zeros(0, int), 1e5, 0.1 * np.arange(1, 1 + moments), floor=True)
     tried = (("backward-euler", (0.01, 0.002)), ("bdf2", (0.01, 0.005, 0.002)))
     runs = {f"{rule}/{dt}": motion(body, rule, dt) for rule, steps in tried for dt in steps}
-    if flex := rival("mujoco_flex"):
-        runs |= {f"mujoco-discrete/{dt}": flex.motion(body, "discrete", dt) for dt in (0.01, 0.002, 5e-4)}
-        stiff = {dt: flex.motion(body, "discrete", dt, (2 * dt, 1.0)) for dt in (0.002, 5e-4)}
+    if simulator("mujoco"):
+        runs |= {f"mujoco-discrete/{dt}": flex_motion(body, "discrete", dt) for dt in (0.01, 0.002, 5e-4)}
+        stiff = {dt: flex_motion(body, "discrete", dt, (2 * dt, 1.0)) for dt in (0.002, 5e-4)}
         runs |= {f"mujoco-stiff-contact/{dt}": run for dt, run in stiff.items()}
-    if newton := rival("newton_solvers"):
-        runs |= {f"newton-10/{dt}": newton.vbd_motion(body, dt, 10) for dt in (0.002, 5e-4)}
-        runs["newton-10-stiff-contact/0.002"] = newton.vbd_motion(body, 0.002, 10, 1e6)
+    if simulator("newton"):
+        runs |= {f"newton-10/{dt}": vbd_motion(body, dt, 10) for dt in (0.002, 5e-4)}
+        runs["newton-10-stiff-contact/0.002"] = vbd_motion(body, 0.002, 10, 1e6)
     reference = reference_motion(body, 1e-4, 1e7)
     softer = relative_error(body, reference_motion(body, 2e-4, 1e6), reference)
     return {**errors_of("drop", body, runs, reference), "rivals/drop/reference": {"by_floor": softer}}
 
 
-def hanging() -> Numbers:
-    """Equilibrium of the cantilever, E = 3e6 Pa, and the derivative of its mean height by Young's modulus."""
-    body = cantilever(3)._replace(modulus=3e6, times=np.ones(1))
-    scene = scene_of(body)
-    solve = jax.jit(lambda params: static_solve(scene, params)[0])
-    ours = measured(body, lambda: jax.block_until_ready(solve(scene.params))[None])
-    slope, _ = gradient(body, lambda params: static_solve(scene, params)[0][:, 2].mean())
-    outcome = {"dln_jax": (ours, slope)}
-    for name, module in (("torch-fem", "torch_fem"), ("tatva", "tatva_fem")):
-        if fem := rival(module):
-            outcome[name] = fem.static(body)
-    numbers = {}
-    for name, (positions, derivative) in outcome.items():
-        numbers[f"rivals/hanging/{name}"] = {
-            "solve_processor_seconds": positions.seconds,
-            "gradient_processor_seconds": derivative.seconds,
-            "difference": relative_error(body, positions.x, ours.x),
-            "gradient_difference": abs(float(derivative.x) / float(slope.x) - 1),
-        }
-    return numbers
-
-
 def mesh_error(*, moments: int = 5) -> Numbers:
     """Linear elements of all simulators and quadratic ones of this library, against a fine mesh in short steps."""
-    flex, newton, numbers = rival("mujoco_flex"), rival("newton_solvers"), {}
+    numbers = {}
     for law in (NEO_HOOKEAN, KIRCHHOFF):
         body = functools.partial(cantilever, moments=moments, law=law)
         runs: dict[str, tuple[Body, Run]] = {}
@@ -156,14 +118,14 @@ def mesh_error(*, moments: int = 5) -> Numbers:
             linear = body(cells)
             if law == NEO_HOOKEAN:
                 runs[f"dln_jax/linear/{cells}"] = linear, motion(linear, "midpoint", 0.01)
-                if flex:
-                    runs[f"mujoco-discrete/linear/{cells}"] = linear, flex.motion(linear, "discrete", 0.002)
-                if newton and cells == 3:
-                    runs[f"newton-10/linear/{cells}"] = linear, newton.vbd_motion(linear, 0.002, 10)
+                if simulator("mujoco"):
+                    runs[f"mujoco-discrete/linear/{cells}"] = linear, flex_motion(linear, "discrete", 0.002)
+                if simulator("newton") and cells == 3:
+                    runs[f"newton-10/linear/{cells}"] = linear, vbd_motion(linear, 0.002, 10)
                 fine = body(cells // 3, order=2)
                 runs[f"dln_jax/quadratic/{cells // 3}"] = fine, motion(fine, "midpoint", 0.01)
-            elif flex:
-                runs[f"mujoco-euler/linear/{cells}"] = linear, flex.motion(linear, "Euler", 0.003 / cells)
+            elif simulator("mujoco"):
+                runs[f"mujoco-euler/linear/{cells}"] = linear, flex_motion(linear, "Euler", 0.003 / cells)
         if not runs:
             continue
         finest = body(3, order=2)
@@ -196,8 +158,8 @@ def motion_gradient(*, moments: int = 5) -> Numbers:
         for rule, dt in (("midpoint", 0.01), ("midpoint", 0.002), ("backward-euler", 0.01))[: 1 if suffix else 3]:
             run = program(body, rule, dt)
             results[f"{rule}{suffix}/{dt}"] = gradient(body, lambda params, run=run: run(params)[-1, :, 2].mean())
-        if suffix and (newton := rival("newton_solvers")):
-            results |= {f"newton-explicit/{dt}": newton.explicit_gradient(body, dt) for dt in (1e-3, 5e-4)}
+        if suffix and simulator("newton"):
+            results |= {f"newton-explicit/{dt}": explicit_gradient(body, dt) for dt in (1e-3, 5e-4)}
         for key, (run, differences) in results.items():
             numbers[f"rivals/gradient/{key}"] = {
                 "error": abs(float(run.x) / exact - 1),
@@ -215,23 +177,20 @@ def blocks(*, rest_seconds: float = 1.0) -> Numbers:
     """
     numbers = {}
     for name, body in (("rest", resting(rest_seconds)), ("hit", hitting())):
-        once = {"repetitions": 1}
-        runs = {"dln_jax": motion(body, "backward-euler", STEP, **once)}
-        if flex := rival("mujoco_flex"):
-            runs["mujoco-discrete"] = flex.motion(body, "discrete", STEP, **once)
-            runs["mujoco-stiff-contact"] = flex.motion(body, "discrete", STEP, (2 * STEP, 1.0), **once)
-        if newton := rival("newton_solvers"):
-            runs["newton-10"] = newton.vbd_motion(body, STEP, 10, **once)
-            runs["newton-50-stiff-contact"] = newton.vbd_motion(body, STEP, 50, 1e5, **once)
+        runs = {"dln_jax": motion(body, "backward-euler", STEP, repetitions=1)}
+        if simulator("mujoco"):
+            runs["mujoco-discrete"] = flex_motion(body, "discrete", STEP, repetitions=1)
+            runs["mujoco-stiff-contact"] = flex_motion(body, "discrete", STEP, (2 * STEP, 1.0), repetitions=1)
+        if simulator("newton"):
+            runs["newton-10"] = vbd_motion(body, STEP, 10, repetitions=1)
+            runs["newton-50-stiff-contact"] = vbd_motion(body, STEP, 50, 1e5, repetitions=1)
         upper = np.unique(body.mesh.elements[components(body.mesh) != components(body.mesh)[0]])
         weight = GRAVITY * lumped_masses(body.mesh, DENSITY)[upper].sum()
         for key, run in runs.items():
-            deepest, nearest = np.transpose([depth(body.mesh, x) for x in run.x])
             finite = np.isfinite(run.x).all()
             row = {
                 "crossings": sum(bool(crossings(body.mesh, x)) for x in run.x) if finite else np.inf,
-                "deepest_metres": deepest.max(),
-                "nearest_metres": nearest.min(),
+                "deepest_metres": max(depth(body.mesh, x) for x in run.x),
                 "processor_seconds_per_step": run.seconds * STEP,
             }
             if name == "rest":  # in the last quarter
@@ -264,10 +223,9 @@ def two_blocks(times: np.ndarray, speed: float) -> Body:
     return Body(mesh, held, 1e5, np.round(times / STEP) * STEP, near=5e-3, v=v)
 
 
-def depth(mesh: Mesh, x: np.ndarray) -> tuple[float, float]:
-    """The largest depth of a vertex of one component in another, m, and the smallest distance of one outside, m."""
-    number_of, skin = components(mesh), boundary(mesh)
-    deepest, nearest = 0.0, np.inf
+def depth(mesh: Mesh, x: np.ndarray) -> float:
+    """The largest depth of a vertex of one component in another, m."""
+    number_of, skin, deepest = components(mesh), boundary(mesh), 0.0
     for part in range(number_of.max() + 1):
         mine = np.unique(mesh.elements[number_of == part])
         others, facets = mesh.elements[number_of != part], skin[~np.isin(skin[:, 0], mine)]
@@ -278,9 +236,8 @@ def depth(mesh: Mesh, x: np.ndarray) -> tuple[float, float]:
         edges = np.swapaxes(x[others[:, 1:]] - x[others[:, :1]], 1, 2)
         place = np.einsum("mij,pmj->pmi", np.linalg.inv(edges), x[points][:, None] - x[others[:, 0]])
         inside = ((place > 0).all(axis=2) & (place.sum(axis=2) < 1)).any(axis=1)
-        deepest = max(deepest, distances[inside].max(initial=0.0))
-        nearest = min(nearest, distances[~inside].min(initial=np.inf))
-    return float(deepest), float(nearest)
+        deepest = max(deepest, float(distances[inside].max(initial=0.0)))
+    return deepest
 
 
 squares = jax.jit(jax.vmap(jax.vmap(lambda pair: squared_distance(pair, jnp.asarray(POINT_TRIANGLE)))))

@@ -153,7 +153,7 @@ def exported(
     repetitions: int = 200,
 ) -> Numbers:
     """Times of all functions of all arms, of making them, and with `largest` of making the largest export."""
-    from scripts.reports.robots.pinocchio import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
+    from scripts.reports.robots.arm import RIVALS, Timed, pinocchio_functions, rival_arm, seconds_of_calls
 
     measured: dict[str, dict[str, float]] = {}
     functions, rivals = {}, pinocchio_functions(rival_arm(ARMS[arms[-1]][2]))

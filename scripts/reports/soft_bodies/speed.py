@@ -1,4 +1,4 @@
-"""Beams and bars: convergence over time steps and materials, times of steps, of factorisations and of compilation."""
+"""Times of steps, of reverse mode, of sparse factorisations and of compilation."""
 
 import functools
 import itertools
@@ -9,86 +9,104 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from scipy.sparse import coo_array, csc_array, tril
 from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay
 
 from dln_jax.rollout import rollout
-from dln_jax.softbody import SoftScene, examples, make_scene, make_step, with_parameters
-from dln_jax.softbody.mesh import Mesh, beam, make_mesh, vertices_where
+from dln_jax.softbody import examples, make_step, positions_and_convergence
+from dln_jax.softbody.mesh import Mesh, make_mesh
 from dln_jax.softbody.mesh.simplices import regularity
 from dln_jax.softbody.scene import element_energies, prepare
-from dln_jax.softbody.step import Step
-from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
 from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians
 from scripts.reports.run import Numbers
-from scripts.reports.soft_bodies.gradients import crawling
 from scripts.reports.timing import medians_in_turns
 
-DT = 1 / 30
+LANES = 64
 BARS = ((10, 4, 4), (17, 6, 6), (36, 13, 13))
 """Numbers of cells along the edges of bars with 1,000, 4,000 and 41,000 tetrahedra."""
 
 
-def cantilever(cells: tuple[int, int]) -> SoftScene:
-    """A beam of 4 m x 1 m and 1e6 Pa, held at x = 0, which sags by about its length."""
-    mesh = beam(4.0, 1.0, *cells)
-    material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e6)
-    return make_scene(mesh, [material, gravity(mesh, (0.0, -9.8))], held=vertices_where(mesh, lambda x: x[:, 0] == 0))
+def moving(example: examples.Example, steps: int, dt: float | None = None, **options: Any) -> tuple[Any, tuple]:
+    """(params, controls, state) -> (positions, convergence) of a number of steps, and these arguments."""
+    dt = example.dt if dt is None else dt
+    init, step = make_step(example.scene, dt, **options)
+    controls = None if example.control is None else jnp.asarray(example.control(dt * np.arange(steps)))
+
+    def run(params: Any, controls: Any, state: Any) -> Any:
+        observe = positions_and_convergence
+        return rollout(functools.partial(step, params), state, controls, steps=steps, observe=observe)[1]
+
+    return run, (example.scene.params, controls, init())
 
 
-def motion(step: Step, steps: int) -> Callable[..., tuple[Array, Array]]:
-    """(params, state) -> iterations and convergence of `steps` steps."""
-    observe = lambda state, info: (info.iterations, info.converged)  # noqa: E731
-    return jax.jit(
-        lambda params, state: rollout(functools.partial(step, params), state, steps=steps, observe=observe)[1]
-    )
+def crawler() -> examples.Example:
+    """The crawler of 28 vertices, with a wave of muscle lengths of 0.7 to 1 that runs along the body in 20 steps."""
+    example = examples.creature()
+    assert example.muscles is not None
+    muscles = len(example.muscles)
+
+    def control(t: np.ndarray) -> np.ndarray:
+        phase = t[:, None] / (20 * example.dt) - np.arange(muscles) / muscles
+        return 0.85 + 0.15 * np.sin(2 * np.pi * phase)
+
+    return example._replace(control=control)
 
 
-def seen(iterations: Any, converged: Any) -> dict[str, float]:
-    """Steps that did not converge, and the largest number of Newton iterations."""
-    return {"steps_not_converged": np.sum(~np.asarray(converged)), "most_iterations": np.max(np.asarray(iterations))}
+def creature(*, steps: int = 1000) -> Numbers:
+    """Steps per second of one crawler, and of many gaits side by side by vmap, 100 steps each."""
+    run, arguments = moving(crawler(), steps)
+    alone = jax.jit(run)
+    seconds = medians_in_turns({"": alone}, arguments, repetitions=9)[""]
+    run, (params, controls, state) = moving(crawler(), 100)
+    lanes = controls * jnp.linspace(0.8, 1.0, LANES)[:, None, None]
+    together = jax.jit(jax.vmap(lambda controls: run(params, controls, state)[0][-1]))
+    lanes_seconds = medians_in_turns({"": together}, (lanes,), repetitions=9)[""]
+    return {
+        "speed/crawler": {
+            "steps_per_second": steps / seconds,
+            "steps_not_converged": np.sum(~np.asarray(alone(*arguments)[1])),
+        },
+        f"speed/{LANES}-crawlers": {"environment_steps_per_second": 100 * LANES / lanes_seconds},
+    }
 
 
-def time_steps(
-    *, lengths: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0, 10.0), cells: tuple[int, int] = (40, 10)
-) -> Numbers:
-    """The first steps from rest, of 1 ms to 10 s, of a beam that falls under its weight."""
-    scene, numbers = cantilever(cells), {}
-    for dt in lengths:
-        init, step = make_step(scene, dt)
-        numbers[f"time-step/{dt:g}-s"] = seen(*motion(step, 3)(scene.params, init()))
-    return numbers
+def backward(*, repetitions: int = 30) -> Numbers:
+    """Time of reverse mode over that of the motion itself, 100 steps of the crawler.
+
+    Everything: actuation, all parameters of the scene, and positions and velocities at the start.
+    """
+    distance, arguments = crawling()
+    chosen = {"controls": 1, "everything": (0, 1, 2, 3)}
+    slopes = {name: jax.jit(jax.value_and_grad(distance, places)) for name, places in chosen.items()}
+    programs = {"motion": jax.jit(distance), **slopes}
+    seconds = medians_in_turns(programs, arguments, repetitions=repetitions)
+    return {
+        f"speed/gradient-by-{name}": {"backward_over_forward": seconds[name] / seconds["motion"] - 1} for name in chosen
+    }
 
 
-def materials(*, cells: tuple[int, int] = (40, 10)) -> Numbers:
-    """Two seconds of a beam from soft to stiff and from compressible to nearly incompressible, by one program."""
-    scene, numbers = cantilever(cells), {}
-    init, step = make_step(scene, DT)
-    run = motion(step, 60)
-    table = [(f"modulus/{modulus:.0e}", modulus, 0.3) for modulus in (1e4, 1e6, 1e8, 1e10)]
-    table += [(f"poisson/{ratio}", 1e6, ratio) for ratio in (0.4, 0.49, 0.4999)]
-    for name, modulus, ratio in table:
-        material = {"youngs_modulus": modulus, "poisson_ratio": ratio}
-        iterations, converged = run(with_parameters(scene.params, elastic=material), init())
-        at_first = np.max(np.asarray(iterations[:3]))
-        numbers[name] = seen(iterations, converged) | {"most_iterations_at_first": at_first}
-    return numbers
+def crawling() -> tuple[Callable[..., Any], tuple]:
+    """Distance of the crawler after 100 steps, m: a function of parameters, actuation, positions and velocities."""
+    run, (params, controls, state) = moving(crawler(), 100)
+
+    def distance(params: Any, controls: Any, x: Any, v: Any) -> Any:
+        return run(params, controls, state._replace(x=x, v=v))[0][-1, :, 0].mean()
+
+    return distance, (params, controls, state.x, state.v)
 
 
 def beams(*, steps: int = 30) -> Numbers:
-    """Time per step of cantilevers of 902 and 3402 unknowns that fall under their weight."""
+    """Time per step of 1/30 s of beams of 902 and 3402 unknowns, E = 1e6 Pa, that fall under their weight."""
     numbers = {}
-    for cells in ((40, 10), (80, 20)):
-        scene = cantilever(cells)
-        init, step = make_step(scene, DT)
-        program, arguments = motion(step, steps), (scene.params, init())
-        seconds = medians_in_turns({"": program}, arguments, repetitions=9)[""] / steps
-        numbers[f"speed/beam-{scene.mesh.vertices.size}-unknowns"] = {
-            "seconds_per_step": seconds,
+    for cells in (10, 20):
+        example = examples.beam(cells=cells, youngs_modulus=1e6)
+        run, arguments = moving(example, steps, dt=1 / 30)
+        program = jax.jit(run)
+        numbers[f"speed/beam-{example.scene.mesh.vertices.size}-unknowns"] = {
+            "seconds_per_step": medians_in_turns({"": program}, arguments, repetitions=9)[""] / steps,
             "steps_not_converged": np.sum(~np.asarray(program(*arguments)[1])),
         }
     return numbers
@@ -96,15 +114,16 @@ def beams(*, steps: int = 30) -> Numbers:
 
 def stiffness(*, bars: int = 3) -> Numbers:
     """Processor time per step over Young's modulus and Poisson's ratio, by the sparse factorisation."""
-    numbers, dt = {}, 1 / 60
+    numbers = {}
     for cells in BARS[:bars]:
-        mesh = unordered_bar(cells)
-        init, step = make_step(bar_scene(mesh), dt, linear_solver=linear_solvers.sparse)
-        run, seconds, solved = motion(step, 2), [], True
+        mesh, seconds, solved = unordered_bar(cells), [], True
+        run, (_, controls, state) = moving(examples.beam(mesh=mesh), 2, linear_solver=linear_solvers.sparse)
+        program = jax.jit(run)
         for modulus, ratio in itertools.product((3e5, 1e7, 1e9), (0.3, 0.49)):
-            arguments = bar_scene(mesh, modulus, ratio).params, init()
-            seconds.append(processor_seconds(functools.partial(run, *arguments), 3) / 2)
-            solved &= bool(run(*arguments)[1].all())
+            example = examples.beam(mesh=mesh, youngs_modulus=modulus, poisson_ratio=ratio)
+            arguments = example.scene.params, controls, state
+            seconds.append(processor_seconds(functools.partial(program, *arguments), 3) / 2)
+            solved &= bool(program(*arguments)[1].all())
         numbers[f"speed/stiffness-{len(mesh.elements)}-tetrahedra"] = {
             "slowest_over_fastest_step": max(seconds) / min(seconds),
             "fastest_seconds_per_step": min(seconds),
@@ -118,7 +137,7 @@ def factorisation(*, bars: int = 3) -> Numbers:
     """Processor time of a factorisation and solve beside SciPy's LU, whose order is the better of two."""
     numbers = {}
     for cells in BARS[:bars]:
-        scene = bar_scene(unordered_bar(cells))
+        scene = examples.beam(mesh=unordered_bar(cells), youngs_modulus=1e6).scene
         rest = scene.params.rest
 
         def inertia(x: Any, weight: Any) -> Any:
@@ -162,12 +181,6 @@ def unordered_bar(counts: tuple[int, int, int]) -> Mesh:
     return make_mesh(points, elements[np.abs(regularity(points, elements)) > 0.02])
 
 
-def bar_scene(mesh: Mesh, modulus: float = 1e6, ratio: float = 0.3) -> SoftScene:
-    """The bar, held on the left, under its weight."""
-    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus, poisson_ratio=ratio)
-    return make_scene(mesh, [solid, gravity(mesh)], held=np.flatnonzero(mesh.vertices[:, 0] < 1e-9))
-
-
 def processor_seconds(function: Callable[[], Any], repetitions: int) -> float:
     """Least processor time of a call after the first, which other programs on the machine affect less than its wall."""
     jax.block_until_ready(function())
@@ -187,8 +200,8 @@ def compilation(*, programs: tuple[str, ...] = ("box-on-ground", "self-contact",
     numbers = {}
     for name in programs:
         if name == "crawler-gradient":
-            loss, at = crawling(100, tolerance=1e-6)
-            function, arguments = jax.value_and_grad(loss), (at,)
+            distance, arguments = crawling()
+            function = jax.value_and_grad(distance, (0, 1, 2, 3))
         else:
             example = examples.drop(dimension=3) if name == "box-on-ground" else examples.twist(contact=True)
             init, function = make_step(example.scene, example.dt)

@@ -1,1 +1,0 @@
-"""Measurements of robots: identification, tracking, learned kinematics, real logs and speed."""

@@ -1,1 +1,0 @@
-"""Soft bodies: closed forms, hard cases, gradients and speed, compared with expected values."""
