@@ -154,7 +154,7 @@ def beside_ipopt(*, count: int = 12, names: tuple[str, ...] = tuple(one.name for
             "cpu_over_ipopt": seconds / rival_seconds,
             "between_knots_violation_worst": np.max(between),
         }
-    as_low, converged, wrong, infeasible = np.array(totals).T
+    as_low, converged, wrong, infeasible = np.array(totals, float).T
     shares = {"as_low_share": np.mean(as_low), "converged_share": np.mean(converged)}
     measured["plans/all"] = {**shares, "wrongly_converged": wrong.sum(), "wrongly_infeasible": infeasible.sum()}
     return measured

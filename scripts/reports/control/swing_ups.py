@@ -112,7 +112,8 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
     lower, upper, last = desk.hardware.lower, desk.hardware.upper, round(2.0 * desk.rate)
     system = obtain(desk, model, recording, seed=0).dynamics
     process = from_log(system, recording, actuation=layout.actuation, delay=delay).process
-    step = integrated(field_of(model_of_plant(desk), layout.actuation), 1 / desk.rate, substeps=desk.substeps)
+    law, field = law_of(desk, system).law, field_of(model_of_plant(desk), layout.actuation)
+    step = integrated(field, 1 / desk.rate, substeps=desk.substeps)
 
     def foreseeing(law):
         def act(u, t, x):
@@ -120,6 +121,19 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
             return u, u
 
         return Controller(jnp.zeros(1), act)
+
+    def trial(controller, hardware):
+        settings: Any = {"rate": desk.rate, "substeps": desk.substeps, "controls": 1, "hardware": hardware}
+
+        def one(x, key):
+            run = simulate(field, controller, x, seconds=SECONDS, key=key, **settings)
+            # Controls that acted have the motor's noise; those that were commanded are computed again.
+            again = lambda memory, row: controller.act(memory, *row)  # noqa: E731
+            u = saturated(jax.lax.scan(again, controller.start, (run.t[:-1], run.y))[1][-last:, 0], lower, upper)
+            flips = jnp.sum(jnp.sign(u[1:]) * jnp.sign(u[:-1]) < 0) / 2.0
+            return run.x[:, 1], jnp.sqrt(jnp.mean(u**2)), jnp.sqrt(jnp.mean(jnp.diff(u) ** 2)), flips
+
+        return jax.jit(jax.vmap(one))
 
     estimators: dict[str, Callable[..., Controller]] = {
         "differences": by_differences(layout),
@@ -130,23 +144,7 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
     x, keys = hanging_starts(starts, 0, position=desk.position), jax.random.split(jax.random.key(0), starts)
     for name, estimator in estimators.items():
         seen = {"encoder_step": 0.0, "sees_rates": True} if name == "exact-state" else {}
-        lab = desk._replace(hardware=desk.hardware._replace(**seen))
-        motion = motion_of(lab, system, estimator=estimator)
-        controller = law_of(lab, system, estimator).controller
-
-        @jax.jit
-        @jax.vmap
-        def trial(x, key, motion=motion, controller=controller):
-            run = motion(x, key)
-            # Those that acted have the motor's noise.
-            commands = jax.lax.scan(
-                lambda memory, row: controller.act(memory, *row), controller.start, (run.t[:-1], run.y)
-            )[1]
-            u = saturated(commands[-last:, 0], lower, upper)
-            flips = jnp.sum(jnp.sign(u[1:]) * jnp.sign(u[:-1]) < 0) / 2.0
-            return run.x[:, 1], jnp.sqrt(jnp.mean(u**2)), jnp.sqrt(jnp.mean(jnp.diff(u) ** 2)), flips
-
-        angle, *of_torque = trial(x, keys)
+        angle, *of_torque = trial(estimator(law), desk.hardware._replace(**seen))(x, keys)
         rms, change, flips = (float(np.median(values)) for values in of_torque)
         differences = rms if name == "differences" else differences
         measured[f"estimates/{plant}/{model}/{name}"] = {
@@ -241,6 +239,6 @@ def planned(
         solve = jax.jit(lambda guess, weight=weight: plan_of(motor, guess, weight))
         for seed in range(guesses):
             plan = solve(10.0 * np.random.default_rng(seed).normal(size=(round(seconds * RATE / EVERY), 1)))
-            found = criteria(motor, simulated(plan))
-            tried.append({"score": score(found), **found})
+            numbers = criteria(motor, simulated(plan))
+            tried.append({"score": score(numbers), **numbers})
     return {f"board/{two_link_pendulum(motor).name}/planned": max(tried, key=lambda numbers: numbers["score"])}
