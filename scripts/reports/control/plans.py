@@ -52,10 +52,13 @@ Acting = Callable[..., tuple[np.ndarray, float]]
 """Measured state, and the knots if the problem has some -> control, and the CPU seconds of the call."""
 QUIET = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes"}
 OPTIONS = {
-    "ipopt": {**QUIET, "ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3},
+    "ipopt": QUIET | {"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3},
     "fatrop": {
-        **{"print_time": 0, "fatrop.print_level": 0, "fatrop.mu_init": 1e-3},
-        **{"structure_detection": "auto", "expand": True},
+        "print_time": 0,
+        "fatrop.print_level": 0,
+        "fatrop.mu_init": 1e-3,
+        "structure_detection": "auto",
+        "expand": True,
     },
 }
 
@@ -109,7 +112,7 @@ def unknowns_of(x: Any, u: Any) -> np.ndarray:
 def ipopt(problem: Planned) -> Callable[[np.ndarray, np.ndarray], tuple[float, bool, int, float]]:
     """Returns (states, controls) -> cost, convergence, iterations and CPU seconds, with default settings."""
     nlp, limits, _ = program(problem)
-    solver = casadi().nlpsol("plan", "ipopt", nlp, {**QUIET, "ipopt.max_iter": 1000})
+    solver = casadi().nlpsol("plan", "ipopt", nlp, QUIET | {"ipopt.max_iter": 1000})
 
     def solve(x, u):
         began = time.process_time()
@@ -234,7 +237,7 @@ def to_the_end(name: str, problem: Planned, first: np.ndarray) -> Acting:
     n, m = len(problem.x0), len(problem.limit)
     nlp, limits, _ = program(problem)
     equality = {"equality": [True] * len(limits["lbg"])} if name == "fatrop" else {}
-    solver = casadi().nlpsol("solver", name, nlp, {"print_time": 0, **OPTIONS[name], **equality})
+    solver = casadi().nlpsol("solver", name, nlp, OPTIONS[name] | equality)
     guess: dict[str, np.ndarray] = {"x0": first}
 
     def act(x):
