@@ -236,13 +236,10 @@ def swing_up(*, plant: str, sizes: int, starts: int = 100) -> Numbers:
     make, case = partial(PLANTS[plant], sizes), f"{plant}/{sizes}"
     try:
         learned = learn_to_swing_up(make(0), seed=sizes)
-    except InputError as error:
-        print(error, flush=True)
+    except InputError as refusal:
+        print(refusal, flush=True)
         return {case: {"success_share": 0.0}}
-    trials, _ = try_plant(make, learned.tuned, starts=starts)
-    tuned, explored = learned.tuned, learned.explored
-    measured = {"tuning_worked": tuned.worked, "episodes_stopped": len(explored.stopped)}
-    return {case: {**success(trials, learned), **measured, "learning_seconds": learned.seconds}}
+    return {case: success(try_plant(make, learned.tuned, starts=starts)[0], learned)}
 
 
 def success(trials: Trials, learned: Learned) -> dict[str, float]:
@@ -253,26 +250,18 @@ def success(trials: Trials, learned: Learned) -> dict[str, float]:
         "stopped": len(trials.stopped),
         "delay": learned.prepared.delay,
         "tuning_margin": learned.tuned.margin,
+        "learning_seconds": learned.seconds,
     }
 
 
 def late_samples(*, milliseconds: int, starts: int = 20) -> Numbers:
     """The late pendulum, which is explored, learned and tried from one start after the other."""
-    late = LatePendulum(1e-3 * milliseconds)
-    described = layout(
-        ("revolute", "revolute"),
-        [0],
-        goal=(0, 0),
-        hanging=(0, np.pi),
-        rate=100.0,
-        control=LARGEST,
-        position=[[-2.5, 2.5], [-np.inf, np.inf]],
-        speed=(40.0, 60.0),
-    )
+    late, joints = LatePendulum(1e-3 * milliseconds), ("revolute", "revolute")
+    ranges: Any = {"position": [[-2.5, 2.5], [-np.inf, np.inf]], "speed": (40.0, 60.0)}
+    described = layout(joints, [0], goal=(0, 0), hanging=(0, np.pi), rate=100.0, control=LARGEST, **ranges)
     settings = {"reset": late.reset, "read": late.read, "write": late.write, "sleep": late.sleep}
     plant = hardware_plant(described, **settings, clock=lambda: late.now)
     learned = learn_to_swing_up(plant, seed=0)
-    controller = learned.tuned.controller
-    act, memory = compiled(controller, plant.layout), start_of(controller, 1)
+    act, memory = compiled(learned.tuned.controller, plant.layout), start_of(learned.tuned.controller, 1)
     runs = [run([plant], act, memory, seconds=SECONDS)[0] for _ in range(starts)]
     return {f"rig/late-by-{milliseconds}-ms": success(judged_runs(runs, plant.layout, seconds=SECONDS), learned)}

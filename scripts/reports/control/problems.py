@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.control import TrajectoryProblem, integrated
+from dln_jax.scenes.pendulums import Links
+from scripts.reports.timing import casadi
 
 GRAVITY = 9.81
 Formula = Callable[..., Any]
@@ -36,7 +38,6 @@ class Planned(NamedTuple):
     """Limits of the controls, of both signs."""
     lower_x: Any = -np.inf
     upper_x: Any = np.inf
-    path: Formula | None = None
     states: Callable[..., Any] | None = None
     end: Callable[..., Any] | None = None
     free: Any = None
@@ -76,12 +77,58 @@ def in_jax(problem: Planned) -> TrajectoryProblem:
         limit,
         np.asarray(problem.lower_x),
         np.asarray(problem.upper_x),
-        stacked(problem.path),
-        stacked(problem.states),
+        states=stacked(problem.states),
         end=stacked(problem.end),
         soft=None,
         free=problem.free,
     )
+
+
+def runge_kutta(rates: Formula, dt, substeps: int = 1) -> Callable[[Any, Any], Any]:
+    """The step (x, u) -> x of the classical method in CasADi."""
+    ca, h = casadi(), dt / substeps
+
+    def step(x, u):
+        for _ in range(substeps):
+            k1 = ca.vertcat(*rates(ca, x, u))
+            k2 = ca.vertcat(*rates(ca, x + h / 2 * k1, u))
+            k3 = ca.vertcat(*rates(ca, x + h / 2 * k2, u))
+            k4 = ca.vertcat(*rates(ca, x + h * k3, u))
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return x
+
+    return step
+
+
+def program(problem: Planned) -> tuple[dict[str, Any], dict[str, np.ndarray], Any]:
+    """The problem with unknowns x_0, u_0, x_1, ..., x_N, its bounds, and the roots of its cost, if it states them."""
+    ca, n, N, limit = casadi(), len(problem.x0), problem.steps, np.asarray(problem.limit)
+    X = [ca.SX.sym(f"x{k}", n) for k in range(N + 1)]
+    U = [ca.SX.sym(f"u{k}", len(limit)) for k in range(N)]
+    if problem.dt is None:
+        step = lambda x, u: ca.vertcat(*problem.rates(ca, x, u))  # noqa: E731
+    else:
+        step = runge_kutta(problem.rates, problem.dt, problem.substeps)
+    cost, roots, rows, least = 0.0, [], [], []
+    for k, (x, u) in enumerate(zip(X, [*U, None], strict=True)):
+        cost += problem.cost(ca, x, u)
+        roots += problem.roots(ca, x, u) if problem.roots else []
+        equal = problem.end(ca, x) if u is None and problem.end else []
+        if u is not None:
+            equal = ca.vertsplit(X[k + 1] - step(x, u))
+        below = problem.states(ca, x) if problem.states and k else []
+        rows += [*equal, *below]
+        least += [0.0] * len(equal) + [-np.inf] * len(below)
+    lower, upper = np.broadcast_to(problem.lower_x, n), np.broadcast_to(problem.upper_x, n)
+    free = np.zeros(n, bool) if problem.free is None else problem.free
+    limits = {
+        "lbx": np.concatenate([np.where(free, lower, problem.x0), *[-limit, lower] * N]),
+        "ubx": np.concatenate([np.where(free, upper, problem.x0), *[limit, upper] * N]),
+        "lbg": np.array(least),
+        "ubg": np.zeros(len(least)),
+    }
+    unknowns = ca.vertcat(*(part for pair in zip(X, U, strict=False) for part in pair), X[N])
+    return {"x": unknowns, "f": cost, "g": ca.vertcat(*rows)}, limits, ca.vertcat(*roots)
 
 
 def cart_pole_rates(sizes: Sizes) -> Formula:
@@ -101,8 +148,7 @@ def cart_pole_rates(sizes: Sizes) -> Formula:
 
 def two_links(motors: tuple[int, ...], gravity: float = GRAVITY) -> Formula:
     """The board's double pendulum (design C.1), hanging at zero, with motors at some joints."""
-    m1, m2, l1, r1, r2 = 0.5234602302310271, 0.6255677234174437, 0.2, 0.2, 0.25569305436052964
-    i1, i2 = 0.031887199591513114, 0.05086984812807257
+    (m1, m2), (l1, _), (r1, r2), (i1, i2) = Links()
 
     def rates(f, x, u):
         tau = [0.0, 0.0]
@@ -138,76 +184,6 @@ def rotor_rates(f, x, u) -> list[Any]:
     return [x[3], x[4], x[5], -lift * f.sin(x[2]), lift * f.cos(x[2]) - GRAVITY, 0.2 * (u[1] - u[0]) / 0.01]
 
 
-def placed_joints(f, q) -> list[tuple[Any, Any, Any]]:
-    """Rotation, position and axis of the joints of a seven-axis arm, whose axes alternate between z and y."""
-    about = {"z": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]), "y": np.array([[0.0, 0, 1], [0, 0, 0], [-1, 0, 0]])}
-    R, p, joints = np.eye(3) + 0 * q[0], np.zeros(3) + 0 * q[0], []
-    for i, axis in enumerate("zyzyzyz"):
-        p = p + (0.0, 0.34, 0.0, 0.40, 0.0, 0.40, 0.0)[i] * R[:, 2]
-        R = R @ (f.sin(q[i]) * about[axis] + (1 - f.cos(q[i])) * (about[axis] @ about[axis]) + np.eye(3))
-        joints.append((R, p, R[:, "xyz".index(axis)]))
-    return joints
-
-
-def arm_points(f, x) -> tuple[Any, Any, Any]:
-    """Elbow, wrist and tip of the arm."""
-    joints = placed_joints(f, x[:7])
-    elbow, wrist, tip = (joints[i][1] + length * joints[i][0][:, 2] for i, length in ((1, 0.40), (3, 0.40), (6, 0.126)))
-    return elbow, wrist, tip
-
-
-def arm_torques(f, x, qdd) -> list[Any]:
-    """Torques of accelerations of the arm by Newton's and Euler's equations; masses are points."""
-    masses = {1: (3.5, np.array([0, 0, 0.40])), 3: (3.0, np.array([0, 0, 0.40])), 6: (1.5, np.array([0.05, 0, 0.126]))}
-    w = dw = before = np.zeros(3) + 0 * x[0]
-    # The base accelerates upwards: that is weight.
-    a, bodies = np.array([0, 0, GRAVITY]) + 0 * x[0], []
-
-    def of_point(r):
-        return f.cross(dw, r) + f.cross(w, f.cross(w, r))
-
-    for i, (R, p, axis) in enumerate(placed_joints(f, x[:7])):
-        a = a + of_point(p - before)
-        w, dw, before = w + x[7 + i] * axis, dw + qdd[i] * axis + f.cross(w, x[7 + i] * axis), p
-        mass, centre = masses.get(i, (0.0, np.zeros(3)))
-        bodies.append((p, axis, R @ centre, mass * (a + of_point(R @ centre))))
-    force = moment = np.zeros(3) + 0 * x[0]
-    tau = []
-    for p, axis, r, one in reversed(bodies):
-        force, moment = force + one, moment + f.cross(p + r, one)
-        tau.append(f.dot(axis, moment - f.cross(p, force)))
-    return tau[::-1]
-
-
-def beyond_torques(f, x, qdd) -> list[Any]:
-    """Torques of the arm relative to their limits, less one, in both directions."""
-    limits = (3.0, 30.0, 12.0, 12.0, 2.0, 2.0, 0.6)
-    shares = [tau / limit for tau, limit in zip(arm_torques(f, x, qdd), limits, strict=True)]
-    return [sign * share - 1 for sign in (1, -1) for share in shares]
-
-
-def clear_of_sphere(f, x) -> list[Any]:
-    """Squared radius of an obstacle, less squared distances of the middle of the forearm, wrist and tip."""
-    elbow, wrist, tip = arm_points(f, x)
-    off = [point - np.array([0.55, 0.0, 0.45]) for point in ((elbow + wrist) / 2, wrist, tip)]
-    return [0.16**2 - f.dot(d, d) for d in off]
-
-
-def arm_cost(f, x, u):
-    """Accelerations and speeds; at the end the distance of the tip from its target, and speeds."""
-    speeds = sum(x[7 + i] ** 2 for i in range(7))
-    if u is not None:
-        return 0.05 * (0.02 * sum(u[i] ** 2 for i in range(7)) + 0.1 * speeds)
-    off = arm_points(f, x)[2] - np.array([0.5, 0.4, 0.4])
-    return 200.0 * f.dot(off, off) + 5.0 * speeds
-
-
-def accelerated(f, x, u) -> list[Any]:
-    """Steps of 50 ms of seven joints whose accelerations are the controls."""
-    h = 0.05
-    return [x[i] + h * x[7 + i] + h**2 / 2 * u[i] for i in range(7)] + [x[7 + i] + h * u[i] for i in range(7)]
-
-
 def squares(
     goal: Sequence[float], weights: Sequence[float], force: float, dt: float, last: float, angle: int | None = None
 ) -> Cost:
@@ -223,12 +199,10 @@ def squares(
 
 
 def problems() -> list[Planned]:
-    """The nine."""
+    """The eight."""
     pi, zero = math.pi, (0.0,) * 6
     up, hanging = (pi, 0.0, 0.0, 0.0), (0.0, pi, 0.0, 0.0)
     links, there, rail = (1.0, 1.0, 0.1, 0.1), (1.5, 1.0, 0.0, 0.0), np.array([0.5, *(np.inf,) * 3])
-    arm = np.array([-0.8, 0.9, 0.0, -1.2, 0.0, 0.8, 0.0, *(0.0,) * 7])
-    joints = np.append(np.radians([170, 120, 170, 120, 170, 120, 175]), np.full(7, 2.0))
     cart = cart_pole_rates(Sizes(1.0, 0.1, 0.5, 0.0, (0.0, 0.0)))
     return [
         Planned("cart-pole", hanging, zero[:4], 50, cart, 0.04, 1, squares(zero, links, 0.01, 0.04, 50.0, 1), (10.0,),
@@ -239,8 +213,6 @@ def problems() -> list[Planned]:
                 squares(there, links, 0.1, 0.02, 50.0), (2.0, 2.0)),
         Planned("flexible-cart-pole", (0.0, 0.0, pi, 0.0, 0.0, 0.0), zero, 50, flexible_rates, 0.04, 2,
                 squares(zero, (1.0, 0.0, 1.0, 0.02, 0.0, 0.001), 1e-3, 0.04, 50.0, 2), (15.0,)),
-        Planned("seven-axis-reach", arm, np.where(np.arange(14) == 0, 0.8, arm), 30, accelerated, None, 1, arm_cost,
-                (15.0,) * 7, -joints, joints, beyond_torques, clear_of_sphere),
         Planned("quadrotor-wall", (-2.0, *zero[1:]), (2.0, *zero[1:]), 50, rotor_rates, 0.05, 1,
                 squares((2.0, *zero[1:]), (1.0, 1.0, 0.1, 0.1, 0.1, 0.01), 0.1, 0.05, 50.0), (2.0, 2.0),
                 states=lambda f, x: [1.0 - (x[0] / 0.3) ** 2 - (x[1] + 0.4) ** 2]),

@@ -27,8 +27,7 @@ from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from dln_jax.precision import data_type
 from dln_jax.scenes.pendulums import chain, two_link_arm
 from dln_jax.zoo.descriptions import build, describe
-from scripts.reports.control.problems import Formula
-from scripts.reports.rivals.optimal_control import runge_kutta as casadi_runge_kutta
+from scripts.reports.control import problems
 from scripts.reports.run import Numbers
 from scripts.reports.timing import casadi
 
@@ -191,7 +190,7 @@ def exported(
     return measured
 
 
-def textbook_rates() -> Formula:
+def textbook_rates() -> problems.Formula:
     """Rates of the two-link arm by the textbook's formulas, for JAX and for CasADi, with the scene's parameters."""
     scene, rest = two_link_arm(), jnp.zeros(2)
     assert scene.gravity is not None
@@ -231,7 +230,7 @@ def casadi_step(folder: Path, *, shared: bool) -> dict[str, int]:
     """
     ca = casadi()
     x, u, dt = ca.SX.sym("x", 4), ca.SX.sym("u", 2), ca.SX.sym("dt")
-    x_next = casadi_runge_kutta(textbook_rates(), dt)(x, u)
+    x_next = problems.runge_kutta(textbook_rates(), dt)(x, u)
     # Transposed, because CasADi stores columns and C rows.
     results = [x_next, *(ca.densify(ca.jacobian(x_next, variable)).T for variable in (x, u))]
     step = ca.Function("step", [x, u, dt], results, {"cse": shared})

@@ -1,6 +1,5 @@
 """Problems and plants of the reports of control: their mechanics by another way, and rivals with the same equations."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from dln_jax.control import field_of
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import rates
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import inertial_parameters, serial, tree_system
 from dln_jax.scenes.poles import cart_pole
 from scripts.reports.control import plants, problems, values
 
@@ -22,19 +20,6 @@ def test_cart_pole_is_that_of_the_scenes():
     np.testing.assert_allclose(jnp.stack(free), expected, rtol=1e-10)
 
 
-def test_torques_of_the_arm_are_those_of_its_tree():
-    lengths, centres = np.array([0, 0.34, 0, 0.40, 0, 0.40, 0]), np.zeros((7, 3))
-    centres[[1, 3, 6]] = [0, 0, 0.40], [0, 0, 0.40], [0.05, 0, 0.126]
-    masses = np.array([0, 3.5, 0, 3.0, 0, 0, 1.5])
-    points = [inertial_parameters(m, c, np.zeros((3, 3))) for m, c in zip(masses, centres, strict=True)]
-    axes = [[0, 0, 1.0] if axis == "z" else [0, 1.0, 0] for axis in "zyzyzyz"]
-    tree = serial(np.tile(np.eye(3), (7, 1, 1)), lengths[:, None] * [0, 0, 1.0], points, axes=axes)
-    x, qdd = jnp.asarray(np.random.default_rng(0).normal(size=14)), jnp.asarray(np.random.default_rng(1).normal(size=7))
-    expected = jax.jit(dynamics(tree_system(tree)).inverse_dynamics)(x[:7], x[7:], qdd)
-    found = jax.jit(lambda: jnp.stack(problems.arm_torques(jnp, x, qdd)))()
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
 def test_casadi_has_the_same_formulas():
     ca = pytest.importorskip("casadi", reason="the formulas are compared in CasADi, of the extra [test]")
     random = np.random.default_rng(0)
@@ -42,9 +27,7 @@ def test_casadi_has_the_same_formulas():
         x, u = random.normal(size=len(problem.x0)), random.normal(size=len(problem.limit))
         X, U = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
         rows = [*problem.rates(ca, X, U), problem.cost(ca, X, U), problem.cost(ca, X, None)]
-        rows += problem.path(ca, X, U) if problem.path else []
         expected = [*problem.rates(np, x, u), problem.cost(np, x, u), problem.cost(np, x, None)]
-        expected += problem.path(np, x, u) if problem.path else []
         found = np.ravel(ca.Function("f", [X, U], [ca.vertcat(*rows)])(x, u))
         np.testing.assert_allclose(found, np.array(expected, float), rtol=1e-10, atol=1e-10, err_msg=problem.name)
 

@@ -1,10 +1,12 @@
-"""A seven-axis arm in closed loop: tracking in MuJoCo by known, identified and learned models, and predictive control.
+"""A seven-axis arm and a cart-pole in closed loop, by models that may be wrong, and their laws in C.
 
-Torques are limited and one sample of 1 kHz late. Only angles are measured, by 14-bit encoders before a 100:1 gear;
-rates are low-passed differences.
+MuJoCo simulates the tracking arm and the cart-pole, with torques that are limited and one sample late. Only positions
+are measured: those of the arm by 14-bit encoders before a 100:1 gear, at 1 kHz.
 """
 
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,24 +15,33 @@ import numpy as np
 
 from dln_jax.control import (
     Gains,
+    Hardware,
     Reference,
     TrajectoryProblem,
     computed_torque,
     feed_forward,
     field_of,
     first_plan,
-    improve,
+    following,
     integrated,
     judged,
+    regulated,
     trusted,
-    where_finite,
+    with_differences,
 )
-from dln_jax.control.state_space import saturated
+from dln_jax.control.closed_loop import outcomes
+from dln_jax.control.desktop_plants import desktop_plant, law_of, model_of_plant
+from dln_jax.control.mujoco_loop import simulate_in_mujoco
+from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.control.optimal.problem import hjb_policy
+from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.tracking import feedback
 from dln_jax.data.encoders import smooth
-from dln_jax.data.robots import Robot
+from dln_jax.data.robot_files import mjcf
+from dln_jax.data.robots import Robot, compiled_model
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import Split, drawn, every, hold_out, select
+from dln_jax.export.c.source import export_c
 from dln_jax.learning.dynamics import problem, suited_network
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
@@ -43,57 +54,30 @@ from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.zoo.descriptions import build, describe
-from scripts.reports.control.real_time import in_c, of_c, quantiles_ms
-from scripts.reports.robots.arm import (
-    DAMPING,
-    MIDDLE,
-    STEP,
-    STIFFNESS,
-    D,
-    Motion,
-    arm,
-    logs,
-    measured,
-    motion,
-    simulator,
-)
+from scripts.reports.control import plans
+from scripts.reports.control.problems import Sizes, in_jax
+from scripts.reports.robots.arm import DAMPING, MIDDLE, STEP, STIFFNESS, D, Motion, arm, logs, measured, motion
 from scripts.reports.run import Numbers
+from scripts.reports.speed.exported_c import compiled, evicting, programs, random_network, timed
 
 LIMITS = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
 """Torque limits, N m."""
 FRICTION = ("viscous", "coulomb", "offset")
 COMPUTED, AHEAD = Gains(np.full(D, 400.0), np.full(D, 40.0)), Gains(STIFFNESS, DAMPING)
 """Gains of computed torque, 1/s² and 1/s, and of feed-forward."""
+LAB = Hardware(-LIMITS, LIMITS, encoder_step=2 * np.pi / (2**14 * 100), delay=1, sees_rates=False)
 DT, RANGE = 0.02, 1.0
 """Time step of plans, s, and limit of joints about the middle, rad."""
 
 
-def track(robot: Robot, law: Callable[..., Any], wanted: Motion, samples: int) -> tuple[float, float]:
-    """Rms error along a motion, mrad, NaN for a run that diverges, and the share of samples that used the model."""
-
-    @jax.jit
-    def asked(q, qd, now):
-        answer = law(q, qd, now)
-        tau, usable = answer if isinstance(answer, tuple) else (answer, jnp.asarray(True))
-        return saturated(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
-
-    mujoco, model, data = simulator(robot)
-    data.qpos[:], data.qvel[:] = wanted.q[0], wanted.qd[0]
-    step, share = 2 * np.pi / (2**14 * 100), -np.expm1(-2 * np.pi * 100.0 * STEP)
-    qd, before, late, off, used = np.zeros(D), None, None, [], 0
-    for number in range(samples):
-        seen = step * np.round(data.qpos / step)
-        qd = qd if before is None else qd + share * ((seen - before) / STEP - qd)
-        before = seen
-        tau, usable = asked(seen, qd, Reference(*(values[number] for values in wanted)))
-        off.append(data.qpos - wanted.q[number])
-        used += bool(usable)
-        # Torques act one sample late; the first torque holds the arm at the start.
-        data.ctrl[:], late = np.asarray(tau) if late is None else late, np.asarray(tau)
-        mujoco.mj_step(model, data)
-        if not np.isfinite(data.qpos).all():
-            return np.nan, used / (number + 1)
-    return 1e3 * float(np.sqrt(np.mean(np.square(off)))), used / samples
+def track(robot: Robot, law: Callable[..., Any], wanted: Motion, samples: int) -> float:
+    """Rms error along a motion, mrad, NaN for a run that diverges."""
+    tracker = following(law, Reference(*(values[:samples] for values in wanted)), rate=1 / STEP)
+    controller = with_differences(tracker, D, rate=1 / STEP, cutoff=100.0)
+    settings: Any = {"seconds": STEP * samples, "rate": 1 / STEP, "hardware": LAB}
+    start = np.append(wanted.q[0], wanted.qd[0])
+    run = simulate_in_mujoco(mjcf(robot, time_step=STEP), controller, start, **settings)
+    return 1e3 * float(np.sqrt(np.mean(np.square(run.x[:-1, :D] - wanted.q[:samples]))))
 
 
 def network(robot: Robot, data: Trajectories, seed: int, scale: float, steps: int) -> Dynamics:
@@ -113,12 +97,7 @@ def within(data: Trajectories) -> Callable[..., Any]:
     """(q, qd, qdd) -> whether an angle or a rate lies outside the range of the data."""
     states = np.concatenate([data.q, data.qd], axis=1)
     low, high = states.min(axis=0), states.max(axis=0)
-
-    def out_of_distribution(q, qd, qdd):
-        x = jnp.concatenate([q, qd])
-        return jnp.any((x < low) | (x > high))
-
-    return out_of_distribution
+    return lambda q, qd, qdd: jnp.any((jnp.append(q, qd) < low) | (jnp.append(q, qd) > high))
 
 
 def tracking(
@@ -160,22 +139,51 @@ def tracking(
             ahead, computed = feed_forward(system, AHEAD), computed_torque(system, COMPUTED)
             laws |= {f"feed-forward/{name}": ahead, f"computed-torque/{name}": computed}
             if name.endswith("network"):
-                settings: Any = {"out_of_distribution": within(few if name == "bad-network" else seen)}
-                laws[f"trusted/{name}"] = trusted(system, computed, ahead, **settings)
-                usable = judged(system, held_out).usable
-                laws[f"judged/{name}"] = trusted(system, computed, ahead, **settings, usable=usable)
+                known = within(few if name == "bad-network" else seen)
+                for how, usable in (("trusted", True), ("judged", judged(system, held_out).usable)):
+                    law = trusted(system, computed, ahead, out_of_distribution=known, usable=usable)
+                    laws[f"{how}/{name}"] = lambda q, qd, now, law=law: law(q, qd, now)[0]
         for name, law in laws.items():
             tracked = [track(robot, law, motion, samples) for motion in wanted]
             runs.setdefault(f"tracking/{name}", []).extend(tracked)
     outcome: dict[str, dict[str, float]] = {name: {"nmse": np.median(values)} for name, values in errors.items()}
     for name, tracked in runs.items():
-        rms, share = np.array(tracked).T
-        sound = rms[np.isfinite(rms)] if np.isfinite(rms).any() else np.array([np.inf])
-        outcome[name] = {"rms_mrad_median": np.median(sound), "rms_mrad_worst": sound.max()}
-        outcome[name]["failures"] = float(np.sum(~np.isfinite(rms)))
-        if "trusted" in name or "judged" in name:
-            outcome[name]["share_trusted"] = np.mean(share)
+        rms = np.array(tracked)
+        sound = np.append(rms[np.isfinite(rms)], [] if np.isfinite(rms).any() else [np.inf])
+        failures = float(np.sum(~np.isfinite(rms)))
+        outcome[name] = {"rms_mrad_median": np.median(sound), "rms_mrad_worst": sound.max(), "failures": failures}
     return outcome
+
+
+def laws_in_c(*, repeats: int = 9, calls: int = 1000, cold: int = 1000) -> Numbers:
+    """Times of a call of laws as C: medians of warm calls, and quantiles of cold ones after reading 32 MiB or more."""
+    desk, problem = desktop_plant("rotary-pendulum"), PLANTS["cart-pole"]().problem
+    swing_up, joints = law_of(desk, model_of_plant(desk)), desk.scene.needs.joints
+    tree, network = dynamics(tree_system(arm(coulomb=False).tree)), value_network(problem, widths=(64, 64), scale=30.0)
+    parameters = network.init(jax.random.key(0))
+    of_states = {
+        "regulator": regulated(swing_up.regulator, swing_up.equilibrium, swing_up.controls, joints),
+        "swing_up": swing_up.law,
+        "value_policy": hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem),
+    }
+    trackers = {
+        "tree_feed_forward": feed_forward(tree, AHEAD),
+        "tree_computed_torque": computed_torque(tree, COMPUTED),
+        "network_computed_torque": computed_torque(dynamics(random_network(D, 32, "f64")), COMPUTED),
+    }
+    functions: dict[str, Any] = {name: (law, (np.array([0.0, np.pi, 0.0, 0.0]),)) for name, law in of_states.items()}
+    for name, law in trackers.items():
+        functions[name] = lambda q, qd, *now, law=law: law(q, qd, Reference(*now)), (np.zeros(D),) * 5
+    times = {}
+    for name, function in functions.items():
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / name
+            export_c({name: function}, folder, stack=2**21)
+            program = programs(folder, compiled(folder, folder), [name])[name]
+            spent = timed(program, repeats=repeats, calls=calls, cold=cold, mebibytes=max(evicting(), 32))
+        p50, p999 = np.percentile(spent.cold, [50, 99.9]) / 1e3
+        times[f"laws/{name}"] = {"warm_us": np.median(spent.hot) / 1e3, "cold_p50_us": p50, "cold_p999_us": p999}
+    return times
 
 
 def reference(t) -> np.ndarray:
@@ -233,11 +241,9 @@ def beyond_limits(*, knots: int = 10, seconds: float = 8.0) -> Numbers:
         soft=(100.0, 1000.0),
     )
     x, first = reference(0.0), planned._replace(knots=window(0)[:-1])
-    plan, settle = first_plan(first, x, np.zeros((knots, D))), jax.jit(lambda plan: improve(first, plan, barrier=3e-3))
-    for _ in range(10):
-        plan = settle(plan)
-    functions, costs = in_c(planned._replace(knots=window(0)), plan, barrier=3e-3, iterations=2)
-    act, states, shares, times = of_c(functions, plan), [x], [], []
+    plan = plans.settling(first, 3e-3)(first_plan(first, x, np.zeros((knots, D))))
+    controller, costs = plans.in_c(planned._replace(knots=window(0)), plan, barrier=3e-3, iterations=2)
+    act, states, shares, times = controller(plan), [x], [], []
     for k in range(round(seconds / DT)):
         u, spent = act(x, window(k))
         x, share = map(np.asarray, simulated(x, u))
@@ -247,7 +253,7 @@ def beyond_limits(*, knots: int = 10, seconds: float = 8.0) -> Numbers:
     q, wanted = np.stack(states)[:, :D], reference(DT * np.arange(len(states)))[:, :D]
     inside = np.abs(wanted - MIDDLE).max(axis=1) < room
     numbers = {
-        **quantiles_ms(times),
+        **plans.quantiles_ms(times),
         "operations": costs["renew"].operations,
         "stack_bytes": costs["renew"].stack_bytes,
         "reference_beyond_rad": np.abs(wanted - MIDDLE).max() - RANGE,
@@ -256,3 +262,57 @@ def beyond_limits(*, knots: int = 10, seconds: float = 8.0) -> Numbers:
         "rms_mrad": 1e3 * np.sqrt(np.mean((q - wanted)[inside] ** 2)),
     }
     return {"realtime/seven-axis": numbers}
+
+
+def swung_up(plant: tuple[Any, Any], act: plans.Acting, step, x: np.ndarray, seed: int) -> tuple[np.ndarray, Any]:
+    """True states and seconds of calls of one run of 5 s; `step` of the plan's model filters the measurements."""
+    mujoco, model = plant
+    data, random, tick = mujoco.MjData(model), np.random.default_rng([1, seed]), np.array([2.5e-5, 2 * np.pi / 4096])
+    data.qpos[:], data.qvel[:] = np.split(x, 2)
+    belief, acting, states, times = x, np.zeros(1), [x], []
+    for _ in range(500):
+        # The belief is of this sample, before the measurement.
+        off = tick * np.round((data.qpos + np.array([1e-4, 1e-3]) * random.normal(size=2)) / tick) - belief[:2]
+        belief = belief + np.append(0.5 * off, 0.15 / plans.DT * off)
+        belief = np.asarray(step(belief, acting))  # of the sample when the next force will act
+        following, seconds = act(belief)
+        data.ctrl[:] = acting
+        mujoco.mj_step(model, data, 10)
+        acting = np.clip(following, -plans.LIMIT, plans.LIMIT)
+        times.append(seconds)
+        states.append(np.concatenate([data.qpos, data.qvel]))
+    return np.stack(states), times
+
+
+def on_a_rail(*, runs: int = 100) -> Numbers:
+    """Swing-ups within the rail of a MuJoCo cart-pole with dry friction, noise and delay, whose sizes are 5 % wrong."""
+    cart, rod, length = 0.8, 0.15, 0.5
+    # Without ends of the rail: a cart beyond them is seen.
+    plant = compiled_model(f"""<mujoco><option timestep="{plans.DT / 10}" integrator="implicitfast"/>
+      <default><geom contype="0" conaffinity="0"/></default><worldbody><body>
+      <joint name="rail" type="slide" axis="1 0 0" damping="0.1" frictionloss="0.2"/>
+      <geom type="box" size=".05 .04 .03" mass="{cart}"/>
+      <body><joint name="hinge" axis="0 1 0" damping="1e-3" frictionloss="5e-4"/>
+      <geom type="capsule" fromto="0 0 0 0 0 {length}" size=".01" mass="{rod}"/></body>
+    </body></worldbody><actuator><motor joint="rail"/></actuator></mujoco>""")
+    known = Sizes(1.05 * cart, rod, 0.95 * length / 2, rod * (0.95 * length) ** 2 / 12)
+    planned = in_jax(plans.cart_pole(known, margin=0.03))
+    solve, settle = plans.starting(planned), plans.settling(planned, plans.BARRIER)
+    still = first_plan(planned, plans.HANGING, np.zeros((plans.STEPS, 1)))
+    controller, _ = plans.in_c(planned, still, barrier=plans.BARRIER)
+    drawn = np.random.default_rng(0).uniform(-1, 1, (runs, 4)) * [0.2, 0.3, 0.0, 0.0]
+    step, states, times = jax.jit(planned.step), [], []
+    for seed, x in enumerate(plans.HANGING + drawn):
+        motion, spent = swung_up(plant, controller(settle(solve(x))), step, x, seed)
+        states.append(motion)
+        times.append(spent)
+    x = np.stack(states)
+    scores, farthest = outcomes(x[..., 1], rate=1 / plans.DT), np.abs(x[..., 0]).max(axis=1)
+    numbers = {
+        "success_share": np.mean(np.isfinite(scores.seconds) & (farthest <= plans.RAIL)),
+        "farthest_m": farthest.max(),
+        "seconds_median": scores.median,
+        "seconds_worst": scores.worst,
+        "p99_ms": plans.quantiles_ms(times)["p99_ms"],
+    }
+    return {"rail/predictive-control": numbers}

@@ -1,1 +1,0 @@
-"""Rivals: other programs and methods on the same tasks, one file each."""
