@@ -85,7 +85,7 @@ SPOILED: dict[str, Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]] = {
     "crossed": lambda log: log | {"tau": log["tau"][:, ::-1]},
     "reversed": lambda log: log | {"tau": log["tau"] * [1, -1]},
     "frozen": lambda log: log | {"q": np.where(np.arange(len(log["q"]))[:, None] // 20 % 9, log["q"], log["q"][0])},
-    "repeated": lambda log: {key: np.concatenate([x, x + 4 * (key == "trajectory")]) for key, x in log.items()},
+    "noisy": lambda log: log | {"q": log["q"] + 0.01 * np.random.default_rng(2).normal(size=log["q"].shape)},
 }
 """What may be wrong with a log that has the right shapes."""
 DAMAGED: dict[str, Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]] = {
@@ -175,7 +175,7 @@ def measured(name, capsys):
         config = json.loads((folder / "config.json").read_text())
         found["keys of config"] = sorted(config)
     if (folder / "model.json").exists():
-        found["description"] = json.loads((folder / "model.json").read_text())["description"]
+        found["description"] = json.loads((folder / "model.json").read_text()).get("model")
         tensors = safetensors.numpy.load_file(folder / "model.safetensors")
         # Norms rather than a digest, because rounding differs between processors.
         found["parameters"] = {key: [*x.shape, float(np.linalg.norm(x))] for key, x in tensors.items()}
