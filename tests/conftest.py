@@ -76,7 +76,7 @@ if jax.__version_info__ < (0, 11):  # later ones do not know it, and abort at wh
 def pytest_addoption(parser):
     parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
-    parser.addoption("--slow-within", type=float, metavar="S", help="begin no test marked slow after these seconds")
+    parser.addoption("--slow-within", type=float, metavar="S", help="skip the slow tests not begun after S seconds")
     parser.addoption("--pinned", action="store_true", help="compare the numbers of commands with those in tests/pinned")
     parser.addoption("--renew", action="store_true", help="store what tests/pinned measures, and compare nothing")
     parser.addoption("--every-export", action="store_true", help="compare all of every export with JAX, for minutes")
@@ -94,10 +94,10 @@ STARTED = time.monotonic()
 
 
 def pytest_runtest_setup(item):
-    """Leaves out the slow tests that a busy machine does not come to in the time stated, and says so."""
+    """Skips a test marked slow that would begin after the limit of --slow-within; -rs prints each."""
     limit = item.config.getoption("--slow-within")
     if limit and item.get_closest_marker("slow") and time.monotonic() - STARTED > limit:
-        pytest.skip(f"NOT REACHED: slow, and {limit:g} s had passed")
+        pytest.skip(f"NOT REACHED: marked slow, and {limit:g} s had passed")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -123,11 +123,11 @@ LONGEST = """
 """
 """Names of test files behind `test_`, the longest first."""
 LAST = ("readme", "examples")
-"""Two long files that end together: what a busy machine does not come to is a page's block before a property."""
+"""The documentation's two long files, one for each process: a limit of time leaves out a page before a property."""
 
 
 def pytest_collection_modifyitems(items):
-    """The files that take longest come first, so that no process ends with one of them alone."""
+    """The files that take longest come first, so that no process ends with one of them alone, but for the last two."""
     places = {f"test_{name}": place for place, name in enumerate(LONGEST.split())}
     places |= {f"test_{name}": len(places) + 1 for name in LAST}
     items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST.split())))

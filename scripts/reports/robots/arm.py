@@ -228,7 +228,7 @@ def call_all(function: Callable[..., Any], states: Sequence[tuple[np.ndarray, ..
 def pinocchio() -> Any:
     """The package; prints a line and returns `None` if it is missing."""
     try:
-        import pinocchio as pin
+        import pinocchio as pin  # pyright: ignore[reportMissingImports]
     except ImportError:
         print("Pinocchio is missing, and so are its rows; pip install 'dln-jax[reference]'")
         return None
