@@ -84,7 +84,7 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Sets XLA's options before a device is first used: a test runs its programs less long than it compiles them."""
-    if config.getoption("--slow"):
+    if config.getoption("--slow") and config.option.markexpr == "not slow":  # and not what was asked for by -m
         config.option.markexpr = ""
     if not config.getoption("--optimised"):
         os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICKLY])

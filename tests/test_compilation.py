@@ -28,7 +28,8 @@ def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
 def test_what_users_run_is_right_as_they_compile_it(pytestconfig):
     if pytestconfig.getoption("--optimised"):
         pytest.skip("with --optimised every test is compiled with default flags, not only these")
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    # Options of this run, --slow above all, would select every test.
+    environment = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "PYTEST_ADDOPTS")}
     command = [sys.executable, "-m", "pytest", "-n", "0", "--optimised", "-m", "as_users_compile"]
     result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
