@@ -77,7 +77,9 @@ EVERY = [words for block in blocks("bash") for words in commands(block.text)]
 FIRST = ["python", "-m", "scripts.train_delan"]
 SCRIPTS = [list(words) for words in dict.fromkeys(map(tuple, EVERY)) if words[2:3] and words[2].startswith("scripts.")]
 INLINE = {
-    text.replace("\n", " ") for page in PROSE.values() for text in re.findall(r"`(python -m scripts\.[^`]*)`", page)
+    text.replace("\n", " ")
+    for page in PROSE.values()
+    for text in re.findall(r"`(python -m scripts\.(?!report --)[^`]*)`", page)
 }
 
 

@@ -162,7 +162,7 @@ def measure_report(name: str, cases: Sequence[Case], options: Any) -> None:
             seconds = time.perf_counter() - began
             print(f"{number:2d}/{len(chosen)}  {case.name:30s} {passed}{seconds:.1f} s", flush=True)
         rows = [row for case in chosen for row in rows_of(case, stored[case.name])]
-        publish(folder, rows, conditions(dtype="float64", quick=options.quick))
+        publish(folder, rows, conditions(report=name, dtype="float64", quick=options.quick))
 
 
 def chosen_cases(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:

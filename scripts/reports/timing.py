@@ -51,7 +51,7 @@ def medians_in_turns(
     return {name: float(np.median(values)) for name, values in seconds.items()}
 
 
-def called(function: Callable[..., Any], *arguments: Any, **environment: str) -> Any:
+def called(function: Callable[..., Any], *arguments, **environment: str):
     """The answer of a function of a module, in float64, computed by a new process on the CPU.
 
     JAX fixes its mode of dispatch and its threads when it starts.
@@ -73,7 +73,7 @@ def called(function: Callable[..., Any], *arguments: Any, **environment: str) ->
     return json.loads(last_line(done.stdout))
 
 
-def casadi() -> Any:
+def casadi():
     """The module of CasADi; `InputError` if it is not installed."""
     try:
         import casadi as ca

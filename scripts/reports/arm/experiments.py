@@ -84,7 +84,7 @@ def learners(*, rounds: int) -> dict[str, Learner]:
     scales = {"rate_scale": TYPICAL_RATE, "acceleration_scale": TYPICAL_ACCELERATION, "tau_scale": TYPICAL_TORQUE}
     both_sides = make_feed_forward(needs, **scales, **size["feed-forward"])
 
-    def inverse_side(key: Array) -> Parameters:
+    def inverse_side(key):
         return {name: layers for name, layers in both_sides.init(key).items() if name.startswith("inverse")}
 
     models = {
@@ -94,9 +94,9 @@ def learners(*, rounds: int) -> dict[str, Learner]:
         IDENTIFIED: make_planar_chain(needs._replace(friction=True), symmetric=False),
     }
 
-    def learner(name: str, model: Model) -> Learner:
+    def learner(name, model):
         @jax.jit
-        def torques(parameters: Parameters, *motion: Array) -> Array:
+        def torques(parameters, *motion: Array):
             return jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*motion)
 
         refit = make_linear_refit(model) if name == IDENTIFIED else make_refit(model, rounds=rounds)
@@ -206,7 +206,7 @@ def measure_online(
     replay = empty_replay(letters * (1 + int(np.ceil(RECORDED * speed * longest / RATE))), 2)
     gained = Gains(gains * GAINS.proportional, gains**0.5 * GAINS.derivative)
 
-    def learned(learner: Learner, parameters: Parameters) -> Any:
+    def learned(learner, parameters):
         return feed_forward(dynamics(learner.model.energies(parameters)), gained)
 
     fixed = lambda _: (), lambda parameters, _: parameters
@@ -269,7 +269,7 @@ def writing(law: Callable[[Any], Any], speed: float, encoder_noise: float) -> Wr
     field, tip, step = field_of(dynamics(arm.closed_form)), jax.vmap(arm.tip), round(RATE / (RECORDED * speed))
 
     @jax.jit
-    def run(parameters: Any, wanted: Reference, key: jax.Array) -> tuple[Any, ...]:
+    def run(parameters, wanted, key):
         controller = following(law(parameters), wanted, rate=RATE)
         if noisy:
             controller = with_differences(controller, 2, rate=RATE, cutoff=CUTOFF)
@@ -278,7 +278,7 @@ def writing(law: Callable[[Any], Any], speed: float, encoder_noise: float) -> Wr
         x = done.x[:-1]
         return done, jax.vmap(field)(x, done.u)[:, 2:], tip(x[:, :2]) - tip(wanted.q)
 
-    def write(parameters: Any, letter: tuple[Reference, int]) -> tuple[float, Any]:
+    def write(parameters, letter) -> tuple[float, Any]:
         wanted, samples = letter
         done, qdd, off_tip = jax.tree.map(np.asarray, run(parameters, wanted, jax.random.key(samples)))
         lost = np.flatnonzero(~(np.abs(done.x[:samples, :2] - wanted.q[:samples]).max(axis=1) <= LOST))

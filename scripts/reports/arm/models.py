@@ -1,7 +1,6 @@
 """All models of the two-link arm: trained, tested on published and further splits, and timed."""
 
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -149,17 +148,15 @@ def measure_one_by_one(*, data: Path | None = None, timed_seeds: int = 5, steps:
     }
 
 
-def measure_published_protocol(
-    kind: str, case: str, *, data: Path | None = None, seeds: int = 1, steps: int = 20_000
-) -> Numbers:
-    """Training by the published protocol: two layers of 64, Adam, batch 512, float32; a row per seed of `case`."""
+def measure_published_protocol(*, data: Path | None = None, seeds: int = 1, steps: int = 20_000) -> Numbers:
+    """The structured Lagrangian by the published protocol: two layers of 64, Adam, batch 512, float32."""
     numbers = {}
     for seed in range(seeds):
         sets = published_split(data, seed)
-        description = described(kind, sets.train, precision="f32", width=64)
+        description = described("structured-delan", sets.train, precision="f32", width=64)
         model, training = trained(description, sets, Adam(steps=steps), seeds=seed)
         energies = model.energies(training.parameters)
-        numbers[case.format(seed=seed)] = {
+        numbers[f"structured-delan/letters/seed-{seed}"] = {
             **test_errors(energies, sets, jnp.float32),
             "train_seconds": training.train_seconds,
             "compile_seconds": training.compile_seconds,
@@ -215,7 +212,7 @@ def torque_mse(energies: Driven, data: Trajectories) -> float:
     return mean_square(np.asarray(predicted) - data.tau)
 
 
-def call_us(energies: Driven, sets: Split, dtype: Any, *, calls: int = 2000) -> float:
+def call_us(energies: Driven, sets: Split, dtype, *, calls: int = 2000) -> float:
     """Median time of one inverse-dynamics call, µs."""
     states = list(zip(*(jnp.asarray(a[:400], dtype) for a in sets.test[1:4]), strict=True))
     return one_step(compiled(dynamics(energies), dtype).inverse_dynamics, states, calls=calls).p50_us

@@ -95,19 +95,9 @@ CASES = (
         quick={"timed_seeds": 1, "steps": 5},
         bound={**TIMES, "torque_mse_largest": 1e-8, "cost_of_ten_seeds": 8.0},
     ),
-    *(
-        Case(
-            f"table/{kind}/adam",
-            partial(measure_published_protocol, kind, f"{kind}/characters/adam"),
-            {"seeds": 1},
-            quick={"steps": 100},
-            published=LETTERS[kind],
-        )
-        for kind in WIDTHS
-    ),
     Case(
         "published/structured-delan",
-        partial(measure_published_protocol, "structured-delan", "structured-delan/letters/seed-{seed}"),
+        measure_published_protocol,
         quick={"steps": 500},
         published={**CODE, **LETTERS["structured-delan"]},
         bound={**PROTOCOL, "train_seconds": 45.0, "one_step_p50_us": 37.0},

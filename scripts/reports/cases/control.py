@@ -1,7 +1,5 @@
 """Measure controllers: swing-ups, a board, learned models, foreign plants, value functions, tracking, plans, and C."""
 
-from typing import Any
-
 from dln_jax.control.optimal.plants import FITS
 from dln_jax.learning.kinematics import Search
 from scripts.reports.control import closed_loops, plans, plants, swing_ups, values
@@ -14,7 +12,7 @@ RETURNS = {"pendulum": -30.96, "cart-pole": -25.05}
 UP = {"down_up_share": AtLeast(1.0), "uniform_up_share": AtLeast(1.0)}
 
 
-def small(plant: str, **numbers: Any):
+def small(plant: str, **numbers):
     """Settings of a fit for a quick run."""
     fit = FITS[plant]
     return fit._replace(widths=(24, 24), numbers=fit.numbers._replace(starts=128, **numbers))

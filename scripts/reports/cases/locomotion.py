@@ -82,7 +82,7 @@ def learn_by_ppo(task: LocomotionTask, seed: int, goal: Goal, *, lanes: int = 16
     began = time.perf_counter()
     one = CreatureEnvironment(task)
 
-    def lane() -> TransformReward:
+    def lane():
         # Copies share the compiled programs. Rewards in body lengths per second suit the critic.
         return TransformReward(copy.copy(one), lambda reward: float(reward) / TIME_STEP)
 
@@ -142,7 +142,7 @@ def published_biped(
     rest = (vertices - vertices[int(centre)]) @ np.array([[a[0], -a[1]], [a[1], a[0]]])
     count = rest.size
 
-    def apply(parameters: Parameters, seen: jax.Array) -> jax.Array:
+    def apply(parameters, seen):
         w1, b1, w2, b2 = parameters
         x, v = seen[:count] * (POSITION_UNIT * task.length) + rest.ravel(), seen[count : 2 * count] * task.length
         return jnp.tanh(w2 @ jax.nn.relu(w1 @ jnp.concatenate([x, v]) + b1) + b2)

@@ -30,7 +30,7 @@ from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.training.uncertainty import CHUNK, bands
 from scripts.reports.arm.data import partition_labels
-from scripts.reports.robots.simulated_arms import RIGHT, panda
+from scripts.reports.robots.simulated_arms import RIGHT, panda, waves
 from scripts.reports.run import AtLeast, Case, Numbers
 
 VELOCITY_SCALE = 0.05
@@ -38,8 +38,12 @@ VELOCITY_SCALE = 0.05
 TRIM, BLOCK = 0.5, 2.0
 """Time left out at both ends of a recording, and length of a block that counts as a trajectory, s."""
 UR10 = (
-    *((0, 0, 0.1273, 0), (RIGHT, 0, 0, 0), (0, -0.612, 0, 0)),
-    *((0, -0.5723, 0.163941, 0), (RIGHT, 0, 0.1157, 0), (-RIGHT, 0, 0.0922, 0)),
+    (0, 0, 0.1273, 0),
+    (RIGHT, 0, 0, 0),
+    (0, -0.612, 0, 0),
+    (0, -0.5723, 0.163941, 0),
+    (RIGHT, 0, 0.1157, 0),
+    (-RIGHT, 0, 0.0922, 0),
 )
 """Denavit-Hartenberg rows of the manufacturer, modified: alpha, a, d, theta; rad and m."""
 UR10_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -65,7 +69,7 @@ def simulated_arm(*, d: int, unmodelled: bool, splits: int = 5) -> Numbers:
     friction = joint_dissipation(np.full(d, 0.2), np.full(d, 0.5), offset, velocity_scale=VELOCITY_SCALE)
     plant = dynamics(tree_system(tree, friction))
 
-    def torque(q: Any, qd: Any, qdd: Any) -> Any:
+    def torque(q, qd, qdd):
         tau = plant.inverse_dynamics(q, qd, qdd)
         if not unmodelled:
             return tau
@@ -88,8 +92,7 @@ def motions(torque: Callable[..., Any], d: int, seed: int, *, further: float = 1
     size = further * random.uniform(0.1, 0.5, (count, 1, d, 4))
     phase = rate * t[:, None, None] + random.uniform(0, 2 * np.pi, (count, 1, d, 4))
     middle = random.uniform(-0.3, 0.3, (count, 1, d))
-    waves = size * np.sin(phase), size * rate * np.cos(phase), -size * rate**2 * np.sin(phase)
-    q, qd, qdd = (np.sum(wave, axis=-1) for wave in waves)
+    q, qd, qdd = waves(size, rate, phase, axis=-1)
     state = {key: x.reshape(-1, d) for key, x in {"q": middle + q, "qd": qd, "qdd": qdd}.items()}
     tau = np.asarray(torque(*state.values()))
     tau = tau + 0.3 * np.linspace(1, 0.3, d) * random.normal(size=tau.shape)

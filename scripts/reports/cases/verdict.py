@@ -24,13 +24,17 @@ from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.verdict import LEVELS
 from dln_jax.precision import in_float64
 from dln_jax.types import InputError
-from scripts.reports.robots.simulated_arms import Arm, arm_torques
+from scripts.reports.robots.simulated_arms import Arm, arm_torques, waves
 from scripts.reports.run import AtLeast, Case, Numbers
 
 JOINTS, NOISES = (2, 3, 4, 6), (0.0, 0.01, 0.05, 0.1)
 """Joints of successive arms, and standard deviations of the torque noise relative to the torque's own."""
 REFUSED = (
-    *("flipped-sign", "all-signs-flipped", "swapped-columns", "millinewton-metres", "torques-of-another-motion"),
+    "flipped-sign",
+    "all-signs-flipped",
+    "swapped-columns",
+    "millinewton-metres",
+    "torques-of-another-motion",
     "degrees",
 )
 """Faults that must be refused."""
@@ -56,7 +60,7 @@ def learned(*, learned: int = 2, seed: int = 100) -> Numbers:
 
 
 def shares(
-    command: Any, name: str, faults: Sequence[str], logs: Sequence[tuple[int, int]], **options: Any
+    command, name: str, faults: Sequence[str], logs: Sequence[tuple[int, int]], **options
 ) -> dict[str, dict[str, float]]:
     """Shares of each level over the logs, whose seeds and numbers of joints are stated."""
     numbers = {}
@@ -66,7 +70,7 @@ def shares(
     return numbers
 
 
-def verdict_of(command: Any, seed: int, d: int, fault: str, **options: Any) -> str:
+def verdict_of(command, seed: int, d: int, fault: str, **options) -> str:
     """The verdict that a command stores in its run folder; "refused" if it rejects the data."""
     arm, arrays = spoiled_log(seed, d, fault)
     with tempfile.TemporaryDirectory(prefix="dln_jax-") as name:
@@ -126,9 +130,7 @@ def spoiled_log(seed: int, d: int, fault: str) -> tuple[Arm, Arrays]:
     for _ in range(TRAJECTORIES):
         w = 2 * np.pi * random.uniform(0.1, 1.0, (5, d))
         a, phase = random.uniform(0.2, 0.8, (5, d)) / (1 + w), random.uniform(0, 2 * np.pi, (5, d))
-        angle = w * t[:, None, None] + phase
-        waves = a * np.sin(angle), a * w * np.cos(angle), -a * w**2 * np.sin(angle)
-        states.append([np.sum(wave, axis=1) for wave in waves])
+        states.append(waves(a, w, w * t[:, None, None] + phase, axis=1))
     q, qd, qdd = map(np.concatenate, zip(*states, strict=True))
     tau = arm_torques(arm, q, qd, qdd, friction=True)
     noise = NOISES[(3 * seed + seed // len(JOINTS)) % len(NOISES)]

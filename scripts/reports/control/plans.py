@@ -104,7 +104,7 @@ def between_knots(problem: Planned, planned: TrajectoryProblem, solution: Shooti
     return jnp.maximum(0.0, jnp.max(jax.vmap(excess)(solution.plan.x[:-1], solution.plan.u)))
 
 
-def unknowns_of(x: Any, u: Any) -> np.ndarray:
+def unknowns_of(x, u) -> np.ndarray:
     """x_0, u_0, x_1, ..., x_N."""
     return np.append(np.concatenate([x[:-1], u], axis=1).ravel(), x[-1])
 

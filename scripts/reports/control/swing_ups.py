@@ -180,7 +180,7 @@ def score(numbers: Mapping[str, float]) -> float:
     return 1 - float(np.mean([np.tanh(np.pi * numbers[name] / size) for name, size in SIZES.items()]))
 
 
-def plan_of(motor: Motor, guess: Any, slope_weight: float) -> Plan:
+def plan_of(motor: Motor, guess, slope_weight: float) -> Plan:
     """Optimises (q, qd, tau), with the torque's slope as control [N, 1], so that the cost can favour smooth torques."""
     scene, dt = two_link_pendulum(motor), 1.0 / RATE
     move = integrated(field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation)), dt)

@@ -48,7 +48,7 @@ def trained(plant: ValuePlant, fit: ValueSettings, seeds: int) -> tuple[list[Val
     return [in_double(one.parameters) for one in fits], [one.train_seconds for one in fits]
 
 
-def off_by(V: Any, truth: np.ndarray) -> np.ndarray:
+def off_by(V, truth: np.ndarray) -> np.ndarray:
     """Relative errors of the states that count."""
     counted = truth > LEAST * truth.max()
     return np.abs(np.asarray(V)[counted] / truth[counted] - 1)

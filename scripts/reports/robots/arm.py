@@ -35,8 +35,13 @@ from scripts.reports.timing import medians_in_turns
 
 D = 7
 SPREADS = (
-    *((0.08, 0.08, 0.04), (0.05, 0.05, 0.04), (0.06, 0.06, 0.04), (0.06, 0.06, 0.05)),
-    *((0.09, 0.08, 0.03), (0.04, 0.04, 0.04), (0.03, 0.03, 0.03)),
+    (0.08, 0.08, 0.04),
+    (0.05, 0.05, 0.04),
+    (0.06, 0.06, 0.04),
+    (0.06, 0.06, 0.05),
+    (0.09, 0.08, 0.03),
+    (0.04, 0.04, 0.04),
+    (0.03, 0.03, 0.03),
 )
 """Standard deviations of the mass along axes through the centre, m."""
 ARMATURE = (0.2, 0.2, 0.2, 0.2, 0.07, 0.07, 0.07)
@@ -225,7 +230,7 @@ def call_all(function: Callable[..., Any], states: Sequence[tuple[np.ndarray, ..
         function(*state)
 
 
-def pinocchio() -> Any:
+def pinocchio():
     """The package; prints a line and returns `None` if it is missing."""
     try:
         import pinocchio as pin  # pyright: ignore[reportMissingImports]
@@ -235,7 +240,7 @@ def pinocchio() -> Any:
     return pin
 
 
-def pinocchio_model(pin: Any, tree: Tree) -> Any:
+def pinocchio_model(pin, tree: Tree):
     """The same tree, without armature."""
     model = pin.Model()
     model.gravity.linear = np.asarray(tree.gravity)
@@ -277,7 +282,7 @@ def rival_arm(d: int) -> Tree:
     return serial(rotations, 0.3 * random.normal(size=(d, 3)), links)
 
 
-def regression(tree: Tree, data: Trajectories, velocity_scale: Any) -> Torque | None:
+def regression(tree: Tree, data: Trajectories, velocity_scale) -> Torque | None:
     """Least squares by Pinocchio's regressor with armature, viscous, dry friction and an offset of each joint.
 
     `velocity_scale` is that of `joint_dissipation`, by joint or one for all. `None` without Pinocchio.
@@ -287,7 +292,7 @@ def regression(tree: Tree, data: Trajectories, velocity_scale: Any) -> Torque | 
     model = pinocchio_model(pin, tree)
     of_states, d = model.createData(), tree.degrees_of_freedom
 
-    def stacked(*states: Any) -> np.ndarray:
+    def stacked(*states):
         rows = []
         for q, qd, qdd in zip(*map(np.asarray, states), strict=True):
             joints = (np.diag(rates) for rates in (qdd, qd, np.tanh(qd / velocity_scale), np.ones(d)))

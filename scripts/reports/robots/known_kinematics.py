@@ -50,7 +50,7 @@ from scripts.reports.robots.arm import (
     regression,
     torque_of,
 )
-from scripts.reports.robots.simulated_arms import panda
+from scripts.reports.robots.simulated_arms import panda, waves
 from scripts.reports.run import Numbers
 
 LAWS = ("viscous", "coulomb", "offset")
@@ -66,7 +66,7 @@ def rough(tree: Tree) -> Tree:
     return tree._replace(inertias=np.tile(ball, (tree.degrees_of_freedom, 1)), armature=np.full(D, 0.05))
 
 
-def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = False) -> tuple[Any, Any]:
+def identified(tree: Tree, data: Trajectories, scale, *, robust: bool = False):
     """Model and parameters of our identification: physically consistent, torques weighted by their noise.
 
     Args:
@@ -165,7 +165,7 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
         if plant == "coupled":
             parameters = parameters._replace(coupling={"1_2": np.array(0.03)})
 
-        def torque(q: Any, qd: Any, qdd: Any, temperature: Any, energies=energies, parameters=parameters) -> Any:
+        def torque(q, qd, qdd, temperature, energies=energies, parameters=parameters):
             return dynamics(energies(parameters, temperature)).inverse_dynamics(q, qd, qdd)
 
         program = jax.jit(jax.vmap(torque))
@@ -174,11 +174,8 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
             random, w = np.random.default_rng(seed), np.arange(1.0, 6.0)[:, None]
             t = STEP * np.arange(SAMPLES)
             sizes, phases = 0.7 * random.normal(size=(2, 5, 1)), random.uniform(0, 2 * np.pi, (2, 5, 1))
-            angles = w * t + phases
-            waves = np.sin(angles) / w, np.cos(angles), -w * np.sin(angles)
-            state: dict[str, np.ndarray] = dict(
-                zip(("q", "qd", "qdd"), (np.sum(sizes * wave, axis=1).T for wave in waves), strict=True)
-            )
+            q, qd, qdd = (wave.T for wave in waves(sizes / w, w, w * t + phases, axis=1))
+            state = {"q": q, "qd": qd, "qdd": qdd}
             state["temperature"] = np.stack([20 + 25 * (1 - np.exp(-t / 8))] * 2, axis=1)
             tau = np.asarray(program(**state)) + NOISE * random.normal(size=(SAMPLES, 2))
             log = from_arrays({"t": t, "trajectory": np.zeros(SAMPLES, int), "tau": tau, **state})

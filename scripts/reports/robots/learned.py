@@ -19,7 +19,7 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.mechanics import equations, trees
 from dln_jax.models import make_delan, make_rigid_tree, make_serial_tree, make_trigonometric_kernel
 from dln_jax.types import FrictionLaw, Needs
-from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm
+from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm, waves
 from scripts.reports.run import Numbers
 
 ARMS: dict[str, Callable[[], Arm]] = {
@@ -105,7 +105,7 @@ def case_name(name: str, samples: int, friction: bool) -> str:
     return f"lip/{name}/{'friction' if friction else 'frictionless'}/{5000 // STRIDES[samples]}"
 
 
-def unseen_errors(arm: Arm, system: Any, friction: bool, tests: int, every: int = 1) -> Float[np.ndarray, "T d"]:
+def unseen_errors(arm: Arm, system, friction: bool, tests: int, every: int = 1) -> Float[np.ndarray, "T d"]:
     """Mean square error over variance by test motion and joint; `every` is the stride of the test samples."""
     test = lip_trajectories(arm, range(101, 101 + tests), friction=friction, noise=0.0, every=every)
     errors = (torques_of(system, test) - test.tau) ** 2
@@ -113,7 +113,7 @@ def unseen_errors(arm: Arm, system: Any, friction: bool, tests: int, every: int 
     return np.array([errors[motion].mean(axis=0) / test.tau[motion].var(axis=0) for motion in motions])
 
 
-def torques_of(system: Any, data: Trajectories) -> Float[np.ndarray, "N d"]:
+def torques_of(system, data: Trajectories) -> Float[np.ndarray, "N d"]:
     """Torques of a system's inverse dynamics along the samples of the data."""
     inverse = equations.dynamics(system).inverse_dynamics
     program = jax.jit(
@@ -167,8 +167,7 @@ def recorded(plant: str, seed: int, first: int, count: int, *, every: int = 25, 
         a = random.uniform(-1, 1, size=(8, 1, D)) / np.sqrt(np.arange(1, 9))[:, None, None]
         phase = w * t[:, None] + random.uniform(0, 2 * np.pi, size=(8, D))[:, None]
         a = a * 1.4 * np.array(amplitudes) / np.abs(a).sum(axis=0)
-        waves = a * np.sin(phase), a * w * np.cos(phase), -a * w**2 * np.sin(phase)
-        motions.append([wave.sum(axis=0) for wave in waves])
+        motions.append(waves(a, w, phase, axis=0))
     q, qd, qdd = (np.concatenate(parts) for parts in zip(*motions, strict=True))
     tree = random_tree(parents, seed)
     tau = np.asarray(jax.jit(jax.vmap(lambda *state: trees.newton_euler(tree, *state)))(q, qd, qdd))

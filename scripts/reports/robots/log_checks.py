@@ -19,7 +19,7 @@ from dln_jax.data.checks import Finding, quick
 from dln_jax.data.encoders import source_clock
 from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.mechanics import trees
-from scripts.reports.robots.simulated_arms import panda
+from scripts.reports.robots.simulated_arms import panda, waves
 from scripts.reports.run import Numbers
 
 SEED, OTHER_SEED = 20_000, 30_000
@@ -228,11 +228,10 @@ def arrival(*, stamped_logs: int = 60) -> Numbers:
         uneven = np.sort(regular + random.uniform(-0.2, 0.2, len(regular)) / rate)
         noise = 10 ** random.uniform(-6, -3.7)
 
-        def log(t: np.ndarray, stamps: np.ndarray, random=random, sines=sines, noise=noise) -> schema.Trajectories:
+        def log(t, stamps, random=random, sines=sines, noise=noise):
             frequency, phase, size = sines
-            angle = 2 * np.pi * np.multiply.outer(t, frequency) + phase
-            q = np.sum(size * np.sin(angle), axis=1)
-            qd = np.sum(2 * np.pi * frequency * size * np.cos(angle), axis=1)
+            w = 2 * np.pi * frequency
+            q, qd, _ = waves(size, w, np.multiply.outer(t, w) + phase, axis=1)
             seen = {"q": q + noise * random.normal(size=q.shape), "qd": qd * (1 + 0.01 * random.normal(size=q.shape))}
             return schema.from_arrays({**seen, "tau": 0 * q, "t": stamps, "trajectory": np.zeros(len(q), int)})
 
@@ -255,16 +254,16 @@ def repeated_motions(*, sets: int = 20) -> Numbers:
     """
     recordings, x = 20, np.linspace(0, 1, 400)
 
-    def count(motions: list[np.ndarray]) -> int:
+    def count(motions):
         trajectory = np.repeat(np.arange(len(motions)), [len(q) for q in motions])
         return len(np.unique(motion_numbers(np.concatenate(motions), trajectory)))
 
-    def swings(random: np.random.Generator, d: int) -> np.ndarray:
+    def swings(random, d):
         modes = np.linalg.qr(np.random.default_rng(5).normal(size=(d, d)))[0]
         angles = np.multiply.outer(8 * x, 3.0 + 4.0 * np.arange(d)) + random.uniform(0, 6.3, d)
         return (random.normal(size=d) * np.cos(angles)) @ modes
 
-    def again(random: np.random.Generator, q: np.ndarray) -> np.ndarray:
+    def again(random, q):
         """A recording of a motion: from a later start, off by 1 % of its size, with noise."""
         part = q[random.integers(0, len(q) // 20) :]
         return part + 0.01 * q.std(axis=0) * random.normal(size=q.shape[1]) + 1e-3 * random.normal(size=part.shape)

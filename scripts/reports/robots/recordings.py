@@ -5,7 +5,6 @@ The double pendulum is `design_A.0` (DFKI, BSD 3-Clause): nine recordings of q, 
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -17,7 +16,6 @@ from dln_jax.data.splits import in_blocks, label_indices, with_joints
 from dln_jax.identification import identify, parameters_of
 from dln_jax.identification.residual import fit_residual
 from dln_jax.learning import fit_friction
-from dln_jax.learning.friction import FrictionFit
 from dln_jax.learning.kinematics import fit_tree
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.trees import Tree, inertial_parameters, serial
@@ -62,7 +60,7 @@ def double_pendulum(*, double_pendulum: Path | None = None, splits: int = len(HE
     recorded. They draw least squares of torques to small inertias, which are best for torques and bad for predictions.
     """
 
-    def fits(rest: Logs, held: Logs) -> dict[str, tuple[Model, Parameters]]:
+    def fits(rest, held):
         scale, usual = best_scale(rest), chain(PENDULUM_SCALE)
         model = chain(scale)
         coarse, smoothed = (equations(model, rest, filtered=filtered) for filtered in (False, True))
@@ -86,7 +84,7 @@ def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_O
     model = make_rigid_tree(tree, friction=LAWS[0], velocity_scale=PENDULUM_SCALE)
     known: Parameters = model.init(jax.random.key(0))
 
-    def fits(rest: Logs, held: Logs) -> dict[str, tuple[Model, Parameters]]:
+    def fits(rest, held):
         by_torques, sets = identify(model, known, rest[0]), MotionSets(rest[1], held[1])
         by_motions, _, choice = fit_by("motions", model, known, by_torques, rest[0], sets, None)
         by_both = by_torques
@@ -104,7 +102,7 @@ def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_O
     return numbers
 
 
-def judged(name: str, path: Path | None, splits: int, fits: Any) -> dict[str, dict[str, float]]:
+def judged(name: str, path: Path | None, splits: int, fits) -> dict[str, dict[str, float]]:
     """Torque errors of filtered motions and valid prediction times by way to fit: median, worst, and by split.
 
     Errors are relative to the variance over all recordings, times are means over segments of 2.2 s.
@@ -227,7 +225,7 @@ def arm_fits(tree: Tree, data: Trajectories) -> dict[str, Torque]:
     chosen = present[1::4]
     train, validation = select(data, np.setdiff1d(present, chosen)), select(data, chosen)
 
-    def torque_by(fitted: FrictionFit) -> Torque:
+    def torque_by(fitted):
         return torque_of(fitted.model, fitted.parameters)
 
     laws = min(LAWS, key=lambda laws: error_of(torque_by(fit_friction(tree, train, laws)), validation).mean())

@@ -11,7 +11,7 @@ not know the kinematics.
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -152,8 +152,13 @@ def sum_of_sines(arm: Arm, *, seed: int, duration: float = 50.0) -> tuple[np.nda
     return t, *np.array(joints).transpose(1, 2, 0)
 
 
+def waves(a, w, angle, axis: int) -> list[np.ndarray]:
+    """Sums over an axis of a sin(angle) and of its first two rates of change, for angles that grow at w."""
+    return [np.sum(wave, axis) for wave in (a * np.sin(angle), a * w * np.cos(angle), -a * w**2 * np.sin(angle))]
+
+
 @in_float64
-def arm_torques(arm: Arm, q: Any, qd: Any, qdd: Any, *, friction: bool) -> Float[np.ndarray, "N d"]:
+def arm_torques(arm: Arm, q, qd, qdd, *, friction: bool) -> Float[np.ndarray, "N d"]:
     """Noiseless tau of states [N, d]; dry friction has the sign of the rate."""
     tau = np.asarray(jax.jit(jax.vmap(lambda *state: newton_euler(arm.tree, *state)))(q, qd, qdd))
     return tau + arm.viscous * qd + arm.coulomb * np.sign(qd) + arm.offset if friction else tau

@@ -102,7 +102,7 @@ def elastic_forces(body: Body) -> Callable[[np.ndarray], np.ndarray]:
     inverse, volume = np.linalg.inv(edges), np.linalg.det(edges) / 6
     first, second = smith(mu, lam)
 
-    def stress(F: np.ndarray) -> np.ndarray:
+    def stress(F):
         if body.law == KIRCHHOFF:
             strain = 0.5 * (np.swapaxes(F, 1, 2) @ F - np.eye(3))
             return F @ (2 * mu * strain + lam * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3))
@@ -113,7 +113,7 @@ def elastic_forces(body: Body) -> Callable[[np.ndarray], np.ndarray]:
         shear = first * (1 - 1 / (1 + np.sum(F**2, axis=(1, 2))))[:, None, None] * F
         return shear + (second * (J - 1) - 0.75 * first) * cofactors
 
-    def forces(x: np.ndarray) -> np.ndarray:
+    def forces(x):
         F = np.swapaxes(x[mesh.elements[:, 1:]] - x[mesh.elements[:, :1]], 1, 2) @ inverse
         corners = -volume[:, None, None] * (stress(F) @ np.swapaxes(inverse, 1, 2))
         all_corners = np.concatenate([-corners.sum(axis=2, keepdims=True), corners], axis=2)
@@ -123,7 +123,7 @@ def elastic_forces(body: Body) -> Callable[[np.ndarray], np.ndarray]:
     return forces
 
 
-def smith(mu: Any, lam: Any) -> tuple[Any, Any]:
+def smith(mu, lam):
     """The parameters of Smith's law that has the Lame parameters mu and lambda at small strains, Pa."""
     return 4 / 3 * mu, lam + 5 / 6 * mu
 
@@ -134,7 +134,7 @@ def explicit(body: Body, dt: float, stiffness: float) -> np.ndarray:
     free = np.ones((len(rest), 1))
     free[body.held] = 0.0
 
-    def acceleration(x: np.ndarray) -> np.ndarray:
+    def acceleration(x):
         total = forces(x)
         if body.floor:
             total[:, 2] += stiffness * np.maximum(-x[:, 2], 0.0)
@@ -188,7 +188,7 @@ def program(body: Body, integrator: str, dt: float) -> Callable[[Params], Any]:
     observe = lambda state, info: (state.x, info.converged)  # noqa: E731
 
     @jax.jit
-    def run(params: Params) -> Any:
+    def run(params):
         x, converged = rollout(partial(step, params), init(v=body.v), steps=int(ends[-1]), observe=observe)[1]
         return jnp.where(converged.all(), x[ends - 1], jnp.nan)
 
@@ -199,7 +199,7 @@ def gradient(body: Body, height: Callable[[Params], Any]) -> tuple[Run, float]:
     """Time and value of the derivative of a height, m/Pa, by Young's modulus, and central differences of it."""
     params, at, change = scene_of(body).params, jnp.asarray(body.modulus), 1e-4
 
-    def of_modulus(modulus: Any) -> Any:
+    def of_modulus(modulus):
         return height(with_parameters(params, elastic={"youngs_modulus": modulus}))
 
     slope = jax.jit(jax.grad(of_modulus))

@@ -74,7 +74,7 @@ def flex_motion(
     mujoco, model = simulator("mujoco"), flex_model(body, integrator, dt, solref)
     free = np.setdiff1d(np.arange(len(body.mesh.vertices)), body.held)
 
-    def run() -> np.ndarray:
+    def run():
         data, out = mujoco.MjData(model), []
         data.qvel = (body.v + np.zeros_like(body.mesh.vertices))[free].ravel()
         for count in np.diff(body.ends(dt), prepend=0):
@@ -114,7 +114,7 @@ def newton_builder(body: Body, moduli: tuple[float, float]) -> Any:
 def stepped(model: Any, body: Body, dt: float, step: Callable[[Any, Any], None], repetitions: int = 2) -> Run:
     """A motion by Newton's step(now, after) with steps of dt in s."""
 
-    def run() -> np.ndarray:
+    def run():
         now, after, out = model.state(), model.state(), []
         for count in np.diff(body.ends(dt), prepend=0):
             for _ in range(count):
@@ -143,7 +143,7 @@ def vbd_motion(body: Body, dt: float, iterations: int, stiffness: float = 1e3, r
     pipeline = newton.CollisionPipeline(model)
     contacts, control = pipeline.contacts(), model.control()
 
-    def step(now: Any, after: Any) -> None:
+    def step(now, after):
         if body.floor or body.near:
             pipeline.collide(now, contacts)
         solver.step(now, after, control, contacts, dt)
@@ -169,7 +169,7 @@ def explicit_gradient(body: Body, dt: float) -> tuple[Run, float]:
     states = [model.state(requires_grad=True) for _ in range(int(body.ends(dt)[-1]) + 1)]
     mean = warp.array([(0.0, 0.0, 1.0 / model.particle_count)] * model.particle_count, dtype=warp.vec3)
 
-    def slope() -> Any:
+    def slope():
         with warp.Tape() as tape:
             for now, after in itertools.pairwise(states):
                 now.clear_forces()

@@ -29,13 +29,13 @@ BARS = ((10, 4, 4), (17, 6, 6), (36, 13, 13))
 """Numbers of cells along the edges of bars with 1,000, 4,000 and 41,000 tetrahedra."""
 
 
-def moving(example: examples.Example, steps: int, dt: float | None = None, **options: Any) -> tuple[Any, tuple]:
+def moving(example: examples.Example, steps: int, dt: float | None = None, **options) -> tuple[Any, tuple]:
     """(params, controls, state) -> (positions, convergence) of a number of steps, and these arguments."""
     dt = example.dt if dt is None else dt
     init, step = make_step(example.scene, dt, **options)
     controls = None if example.control is None else jnp.asarray(example.control(dt * np.arange(steps)))
 
-    def run(params: Any, controls: Any, state: Any) -> Any:
+    def run(params, controls, state):
         observe = positions_and_convergence
         return rollout(functools.partial(step, params), state, controls, steps=steps, observe=observe)[1]
 
@@ -48,7 +48,7 @@ def crawler() -> examples.Example:
     assert example.muscles is not None
     muscles = len(example.muscles)
 
-    def control(t: np.ndarray) -> np.ndarray:
+    def control(t):
         phase = t[:, None] / (20 * example.dt) - np.arange(muscles) / muscles
         return 0.85 + 0.15 * np.sin(2 * np.pi * phase)
 
@@ -92,7 +92,7 @@ def crawling() -> tuple[Callable[..., Any], tuple]:
     """Distance of the crawler after 100 steps, m: a function of parameters, actuation, positions and velocities."""
     run, (params, controls, state) = moving(crawler(), 100)
 
-    def distance(params: Any, controls: Any, x: Any, v: Any) -> Any:
+    def distance(params, controls, x, v):
         return run(params, controls, state._replace(x=x, v=v))[0][-1, :, 0].mean()
 
     return distance, (params, controls, state.x, state.v)
@@ -140,7 +140,7 @@ def factorisation(*, bars: int = 3) -> Numbers:
         scene = examples.beam(mesh=unordered_bar(cells), youngs_modulus=1e6).scene
         rest = scene.params.rest
 
-        def inertia(x: Any, weight: Any) -> Any:
+        def inertia(x, weight):
             return 0.5 * weight * sum(coordinate**2 for coordinate in x[0])
 
         # A step of backward Euler from rest.
@@ -156,7 +156,7 @@ def factorisation(*, bars: int = 3) -> Numbers:
         matrix = csc_array(csc_array(lower + tril(lower, -1).T)[free][:, free])
         right = np.ones(len(free))
 
-        def by_scipy(order: str, matrix: Any = matrix, right: Any = right) -> Any:
+        def by_scipy(order, matrix=matrix, right=right):
             symmetric = {"SymmetricMode": True}
             return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options=symmetric).solve(right)
 

@@ -49,7 +49,7 @@ def throughput(
 ) -> Numbers:
     """Inverse dynamics by batch; the full-Hessian method by number of joints. In float32."""
 
-    def seconds(d: int, batch: int, *ways: Callable[[NaturalSystem], Callable]) -> list[float]:
+    def seconds(d, batch, *ways: Callable[[NaturalSystem], Callable]):
         model = make_delan(chain(d).needs, width=64, depth=2)
         keys = jax.random.split(jax.random.key(0), 4)
         states = tuple(jax.random.normal(key, (batch, d), jnp.float32) for key in keys[1:])
@@ -57,7 +57,7 @@ def throughput(
         programs = {str(number): jax.jit(jax.vmap(way(energies))) for number, way in enumerate(ways)}
         return list(medians_in_turns(programs, states, repetitions=repetitions).values())
 
-    def ours(energies: NaturalSystem) -> Callable:
+    def ours(energies):
         return dynamics(energies).inverse_dynamics
 
     measured: dict[str, dict[str, float]] = {}
@@ -229,12 +229,12 @@ def derivative_program(way: Callable, batch: int) -> Callable:
     return jax.jit(jax.grad(loss))
 
 
-def by_jvp_and_vjp(model: Model, parameters: Any, *state: Array) -> Array:
+def by_jvp_and_vjp(model: Model, parameters, *state: Array) -> Array:
     """tau [d] by the library's own mechanics."""
     return dynamics(model.energies(parameters)).inverse_dynamics(*state)
 
 
-def by_one_pass(parameters: Any, q: Array, qd: Array, qdd: Array) -> Array:
+def by_one_pass(parameters, q: Array, qd: Array, qdd: Array) -> Array:
     """tau [d] of a structured DeLaN from the networks' own Jacobians, chained by hand through features and factor."""
 
     def features(q):
