@@ -2,10 +2,12 @@
 
 import atexit
 import gc
+import json
 import os
 import shutil
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 # As in the scripts: small factorisations on several threads burn the processor waiting for each other.
@@ -77,6 +79,7 @@ def pytest_addoption(parser):
     parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
     parser.addoption("--slow-within", type=float, metavar="S", help="skip the slow tests not begun after S seconds")
+    parser.addoption("--time-files", action="store_true", help="store the time of each file, which orders them")
     parser.addoption("--pinned", action="store_true", help="compare the numbers of commands with those in tests/pinned")
     parser.addoption("--renew", action="store_true", help="store what tests/pinned measures, and compare nothing")
     parser.addoption("--every-export", action="store_true", help="compare all of every export with JAX, for minutes")
@@ -116,18 +119,24 @@ def slow_among(values, is_slow):
     return [pytest.param(value, marks=[pytest.mark.slow] * is_slow(value)) for value in values]
 
 
-LONGEST = """
-    compilation swing_up_command body_contact random_programs obstacles train_models train_delan soft_integrators
-    sharded_batches decompositions tuned_swing_ups soft_body_identification actuators ties simulate minimise locomotion
-    batches uncertainty_files train_diffnet checks processes identify own_plant_value
-"""
-"""Names of test files behind `test_`, the longest first."""
-LAST = ("readme", "examples")
+DURATIONS = ROOT / "tests" / "durations.json"
+"""Seconds of each test file, as the last run with --time-files stored them."""
+SECONDS: Counter[str] = Counter()
+LAST = ("test_readme", "test_examples")
 """The documentation's two long files, one for each process: a limit of time leaves out a page before a property."""
 
 
+def pytest_runtest_logreport(report):
+    SECONDS[report.location[0]] += report.duration
+
+
+def pytest_sessionfinish(session):
+    """Stores the durations, in the process that has heard of all tests."""
+    if session.config.getoption("--time-files") and not hasattr(session.config, "workerinput"):
+        DURATIONS.write_text(json.dumps({file: round(SECONDS[file]) for file in sorted(SECONDS)}, indent=1) + "\n")
+
+
 def pytest_collection_modifyitems(items):
-    """The files that take longest come first, so that no process ends with one of them alone, but for the last two."""
-    places = {f"test_{name}": place for place, name in enumerate(LONGEST.split())}
-    places |= {f"test_{name}": len(places) + 1 for name in LAST}
-    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST.split())))
+    """The files that take longest come first, so that no process ends with one of them alone."""
+    stored = json.loads(DURATIONS.read_text())
+    items.sort(key=lambda item: (item.path.stem in LAST, -stored.get(item.location[0], 0)))
