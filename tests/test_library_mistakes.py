@@ -20,7 +20,9 @@ from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.sizes import memory, require_memory, require_network
+from dln_jax.softbody import make_scene, with_parameters
 from dln_jax.softbody.mesh import beam, box
+from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.types import InputError, Needs
 
 ARM = Needs(joints=("revolute", "prismatic"))
@@ -132,6 +134,14 @@ def test_states_of_another_size_than_the_system_are_refused():
 def test_an_array_of_words_is_refused():
     with pytest.raises(InputError, match=r"inertias .*expected real numbers"):
         make_tree((-1,), ("revolute",), np.eye(3)[None], np.zeros((1, 3)), np.eye(3)[:1], "heavy")
+
+
+def test_a_parameter_of_a_scene_that_is_no_number_is_refused():
+    mesh = beam(1.0, 1.0, 1, 1)
+    params = make_scene(mesh, [gravity(mesh)]).params
+    for wrong in ("down", [None, 1.0]):
+        with pytest.raises(InputError, match=r"acceleration is .*; expected numbers"):
+            with_parameters(params, gravity={"acceleration": wrong})
 
 
 def test_more_memory_than_there_is_is_refused_with_both_numbers():
