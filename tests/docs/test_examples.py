@@ -37,7 +37,7 @@ REDUCED = {
 """Constants of the examples, and what they are here."""
 
 
-def reduced(path: Path) -> str:
+def reduced(path):
     source = path.read_text()
     for name, value in REDUCED[path.stem].items():
         line = re.search(rf"^(.*\b{name}\b.*) = (.*)$", source, re.MULTILINE)

@@ -4,7 +4,6 @@ import ctypes
 import functools
 import platform
 import re
-from pathlib import Path
 
 import comparison
 import numpy as np
@@ -19,7 +18,7 @@ TYPES = {"f64": (np.float64, "double", ""), "f32": (np.float32, "float", "f")}
 by_precision = pytest.mark.parametrize("precision", TYPES)
 
 
-def source(precision: str) -> str:
+def source(precision):
     """`evaluate_NAME(n, x, y)` for each function, and for sines [n] and cosines [n] of the same numbers."""
     _, real, suffix = TYPES[precision]
     loops = "".join(
@@ -46,7 +45,7 @@ def source(precision: str) -> str:
 @pytest.fixture(scope="module")
 def evaluate(tmp_path_factory):
     """(name, x, fused) -> y of the compiled function, at the precision of x."""
-    folder: Path = tmp_path_factory.mktemp("elementary")
+    folder = tmp_path_factory.mktemp("elementary")
 
     @functools.cache
     def library(precision, fused):
@@ -64,7 +63,7 @@ def evaluate(tmp_path_factory):
     return call
 
 
-def points(name: str, precision: str) -> np.ndarray:
+def points(name, precision):
     """Random numbers of every third binade where the function is defined and not constant, and the hard ones."""
     real, random = TYPES[precision][0], np.random.default_rng(VECTORISED.index(name))
     limits, bound = np.finfo(real), BOUNDS.get(name, {}).get(precision, 1000)
@@ -86,7 +85,7 @@ def points(name: str, precision: str) -> np.ndarray:
     return x[(x > {"log": 0, "log1p": -1}.get(name, -np.inf)) & ((abs(x) <= bound) | (name in ("log", "log1p")))]
 
 
-def units_in_the_last_place(y, x, name: str) -> np.ndarray:
+def units_in_the_last_place(y, x, name):
     """|y - f(x)| in units of the last place of f(x); none where e^x is subnormal and y = 0, or both overflow."""
     limits = np.finfo(y.dtype)
     with np.errstate(all="ignore"):

@@ -67,7 +67,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 sys.path[:0] = sys.argv[1:]
 from test_random_programs import digest
-print(digest(range(12)))
+print(digest(range(8)))
 """
 
 
@@ -84,7 +84,7 @@ def test_the_text_is_the_same_in_every_process():
     command = [sys.executable, "-c", TEXT_OF, here, here.parents[1]]
     processes = [
         subprocess.Popen(command, env={**os.environ, "PYTHONHASHSEED": str(seed)}, stdout=subprocess.PIPE, text=True)
-        for seed in range(3)
+        for seed in range(2)
     ]
     digests = [process.communicate(timeout=1800)[0] for process in processes]
     assert all(process.returncode == 0 for process in processes)

@@ -68,7 +68,7 @@ def test_a_stated_bound_ends_a_loop_with_nan(tmp_path):
         np.testing.assert_allclose(load_c(tmp_path, flags=("-O1",)).f(900.0), root)
 
 
-def stack_of(graph: str, function: str) -> int:
+def stack_of(graph, function):
     """Largest sum of frames along calls from a function, in gcc's call graph."""
     frames = {
         title: int(size) for title, size in re.findall(r'node: { title: "([^"]*)" label: "[^"]*?(\d+) bytes', graph)
