@@ -155,7 +155,6 @@ INDEXED = {
     "gather_outside": lambda x, i: (
         [x.at[i].get(mode=mode) for mode in ("clip", "fill")] + [x.at[0, i].get(mode="fill", fill_value=-3.0)]
     ),
-    "gather_batched": lambda x, i: jax.vmap(lambda row, k: row[k])(x, i[:5]),
     "gather_known": lambda x, i: (x[np.array([0, 4, 4])], x[np.array([True, False, True, False, True])]),
     "scatter": lambda x, i: [
         getattr(x.at[i], name)(2.5 + x[0], mode=mode)
@@ -170,7 +169,6 @@ INDEXED = {
     "scatter_triangles": lambda x, i: jax.vmap(  # a loop cannot follow its places
         lambda row: jnp.zeros((4, 4), x.dtype).at[np.tril_indices(4)].add(jnp.tile(row, 2)[:10]).at[1].mul(row[1])
     )(x),
-    "scatter_batched": lambda x, i: jax.vmap(lambda row, k: row.at[k].add(2.0))(x, i[:5]),
     "dynamic_slice": lambda x, i: (
         lax.dynamic_slice(x, (i[0], i[1]), (2, 3)),
         lax.dynamic_update_slice(x, 2 * x[:2, :3], (i[0], i[1])),
@@ -367,11 +365,6 @@ INTERFACES = {
         lambda n, flags, x: {"n": n + 1, "flags": ~flags, "y": jnp.where(flags, x, n)},
         (np.array([3, -2]), np.array([True, False]), normal(2)),
     ),
-    "by_value": (
-        lambda a, k, flag, x: {"y": a * x, "z": jnp.where(flag, k, -k)},
-        (normal(), np.int64(4), np.bool_(True), normal(3)),
-    ),
-    "returned_integer": (lambda x: jnp.argmax(x), (normal(3),)),
     "returned_bool": (lambda x: jnp.all(x > 0), (normal(3),)),
     "trees": (
         lambda state, layers: {"next": {"qd": -state["qd"], "q": state["q"]}, "y": layers[0][0] @ state["q"]},
