@@ -149,7 +149,9 @@ HAMILTONIANS = ("black-box-hnn", "separable-hnn", "polynomial-hamiltonian")
 def pytest_generate_tests(metafunc):
     if "case" in metafunc.fixturenames:
         chosen = CASES if metafunc.config.getoption("--every-export") else DEFAULT
-        metafunc.parametrize("case", slow_among(chosen, lambda case: case not in ("feed-forward", "cart-pole")))
+        metafunc.parametrize(
+            "case", slow_among(chosen, (*HAMILTONIANS, "black-box-delan", "phase-network").__contains__)
+        )
 
 
 def test_functions_and_their_derivatives_are_those_of_the_mechanics(case):
