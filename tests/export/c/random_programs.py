@@ -206,7 +206,7 @@ def _indexed(random, known, depth):
         lambda: lax.dynamic_update_slice_in_dim(x, x[:1], first, 0),
         lambda: x.at[index].set(x[0], mode=mode),
         lambda: x.at[index].add(x[0], mode=mode) if x.dtype != bool else ~x,
-        lambda: x.at[index].apply(lambda v: ~v if v.dtype == bool else v * v, mode=mode),
+        lambda: x.at[index].apply(jnp.logical_not if x.dtype == bool else lambda v: v * v, mode=mode),
     ]
     return [_of_one(random, ways)()]
 
