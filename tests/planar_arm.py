@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from motions import sums_of_sines
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
@@ -39,13 +40,9 @@ def motions(seed, *, noise=0.0, trajectories=1, samples=120, friction=True, stil
     random, parts = np.random.default_rng(seed), []
     t = np.linspace(0, 6, samples)
     for index in range(trajectories):
-        a, w, p = random.uniform([0.1, 0.5, 0], [0.8, 3, 6], (2, 4, 3)).transpose(2, 0, 1)[:, :, :, None]
-        a = a * ~np.isin(np.arange(2), still)[:, None, None]
-        angle = w * t + p
-        state = [
-            np.sum(each, axis=1).T for each in (a * np.sin(angle), a * w * np.cos(angle), -a * w**2 * np.sin(angle))
-        ]
-        parts.append([t, *state, np.full(samples, index)])
+        sizes, rates, phases = random.uniform([0.1, 0.5, 0], [0.8, 3, 6], (2, 4, 3)).transpose(2, 0, 1)
+        sizes = sizes * ~np.isin(np.arange(2), still)[:, None]
+        parts.append([t, *sums_of_sines(t, sizes, rates, phases), np.full(samples, index)])
     t, q, qd, qdd, trajectory = (np.concatenate(each) for each in zip(*parts, strict=True))
     system = tree_system(tree, joint_dissipation(*FRICTION.values()) if friction else None)
     tau = np.asarray(jax.jit(jax.vmap(dynamics(system).inverse_dynamics))(q, qd, qdd))

@@ -3,11 +3,11 @@
 Greydanus, Dzamba and Yosinski (2019). Keys are those of the schema; q and p carry the published noise, their rates are
 exact at the noiseless states, and bodies are ordered axis by axis: x1, x2, .., y1, y2, .. as in the published arrays.
 
-`python -m tests.published_motions FOLDER --tasks spring,pendulum --seeds 101,102,103` writes TASK-SEED.npz files, which
+`python -m tests.published_motions FOLDER` writes TASK-SEED.npz files of three seeds, which
 `python -m scripts.hnn_table --own FOLDER` reads.
 """
 
-import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -15,16 +15,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-Rates = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-
 
 class Published(NamedTuple):
     """A system, how its motions start, and how they are recorded."""
 
-    rates: Rates
+    rates: Callable
     """(q, p) [.., d] -> (qd, pd)."""
-    energy: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    start: Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
+    energy: Callable
+    """(q, p) [.., d] -> energies [..]."""
+    start: Callable
+    """Random generator -> (q, p) [d]."""
     t: np.ndarray
     noise: float
     trajectories: int
@@ -32,46 +32,46 @@ class Published(NamedTuple):
     """Seconds over which predicted motions were judged."""
 
 
-def _oscillator(force: Callable, potential: Callable, radii: tuple[float, float], samples: int) -> Published:
-    def start(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _oscillator(force, potential, radii, samples):
+    def start(random):
         direction = random.uniform(-1, 1, 2)
         q, p = direction / np.linalg.norm(direction) * random.uniform(*radii)
         return np.array([q]), np.array([p])
 
-    def rates(q: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rates(q, p):
         return 2 * p, force(q)
 
-    def energy(q: np.ndarray, p: np.ndarray) -> np.ndarray:
+    def energy(q, p):
         return np.sum(potential(q) + p**2, axis=-1)
 
     return Published(rates, energy, start, np.linspace(0, 3, samples), 0.1, 50, 20.0)
 
 
-def _separations(q: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
+def _separations(q, bodies):
     """Vectors [.., 2, bodies, bodies] between bodies, and their lengths, infinite from a body to itself."""
     x = q.reshape(*q.shape[:-1], 2, bodies)
     apart = x[..., :, None] - x[..., None, :]
     return apart, np.sqrt(np.sum(apart**2, axis=-3)) + np.diag(np.full(bodies, np.inf))
 
 
-def _attracting(bodies: int, start: Callable, t: np.ndarray, trajectories: int, horizon: float) -> Published:
-    def rates(q: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _attracting(bodies, start, t, trajectories, horizon):
+    def rates(q, p):
         apart, distance = _separations(q, bodies)
         return p, -np.sum(apart / distance[..., None, :, :] ** 3, axis=-1).reshape(q.shape)
 
-    def energy(q: np.ndarray, p: np.ndarray) -> np.ndarray:
+    def energy(q, p):
         return 0.5 * np.sum(p**2, axis=-1) - 0.5 * np.sum(1 / _separations(q, bodies)[1], axis=(-1, -2))
 
     return Published(rates, energy, start, t, 0.0, trajectories, horizon)
 
 
-def _two(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _two(random):
     x = random.uniform(0.5, 1.5, 2)
     v = np.array([-x[1], x[0]]) / (2 * np.linalg.norm(x) ** 1.5) * (1 + 0.05 * random.normal())
     return np.stack([x, -x], axis=1).ravel(), np.stack([v, -v], axis=1).ravel()
 
 
-def _three(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _three(random):
     direction, radius = random.uniform(-1, 1, 2), random.uniform(0.9, 1.2)
     x = direction / np.linalg.norm(direction) * radius
     v = np.array([-x[1], x[0]]) / radius / np.sqrt(radius * np.sqrt(3))
@@ -90,11 +90,11 @@ PUBLISHED = {
 }
 
 
-def integrated(system: Published, q: np.ndarray, p: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def integrated(system, q, p, t):
     """States (q, p) [K, T, d] at the times t from starts [K, d]."""
     d = q.shape[1]
 
-    def rate(_, state: np.ndarray) -> np.ndarray:
+    def rate(_, state):
         return np.concatenate(system.rates(state[:d], state[d:]))
 
     options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-12, "method": "DOP853"}
@@ -103,7 +103,7 @@ def integrated(system: Published, q: np.ndarray, p: np.ndarray, t: np.ndarray) -
     return states[..., :d], states[..., d:]
 
 
-def published_arrays(name: str, seed: int, *, trajectories: int | None = None) -> dict[str, np.ndarray]:
+def published_arrays(name, seed, *, trajectories=None):
     """The arrays of a file: t, q, p, qd, pd, trajectory."""
     system, random = PUBLISHED[name], np.random.default_rng(seed)
     count = trajectories or system.trajectories
@@ -117,20 +117,9 @@ def published_arrays(name: str, seed: int, *, trajectories: int | None = None) -
     return flat | times
 
 
-def main() -> None:
-    """Writes the files that the command line names."""
-    parser = argparse.ArgumentParser(description="Write files of the published Hamiltonian tasks.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--tasks", default=",".join(PUBLISHED))
-    parser.add_argument("--seeds", default="101,102,103")
-    given = parser.parse_args()
-    given.folder.mkdir(parents=True, exist_ok=True)
-    for name in given.tasks.split(","):
-        for seed in given.seeds.split(","):
-            file = given.folder / f"{name}-{seed}.npz"
-            np.savez(file, **published_arrays(name, int(seed)))
-            print(file)
-
-
 if __name__ == "__main__":
-    main()
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in PUBLISHED:
+        for seed in (101, 102, 103):
+            np.savez(folder / f"{name}-{seed}.npz", **published_arrays(name, seed))

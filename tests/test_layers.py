@@ -41,14 +41,14 @@ LAYERS = {
 MODULES = sorted((ROOT / "dln_jax").rglob("*.py"))
 
 
-def package_of(parts: tuple[str, ...]) -> str:
+def package_of(parts):
     """The package that a module belongs to: the first name, or the first two where those have a layer of their own."""
     names = [part.removesuffix(".py") for part in parts]
     both = ".".join(names[:2])
     return both if both in LAYERS else names[0]
 
 
-def imported_packages(source: str) -> set[str]:
+def imported_packages(source):
     """Packages of dln_jax that a module imports, anywhere in its text."""
     packages = set()
     for node in ast.walk(ast.parse(source)):
@@ -68,7 +68,7 @@ def imported_packages(source: str) -> set[str]:
     return packages
 
 
-def faults(package: str, source: str) -> list[str]:
+def faults(package, source):
     return [
         other
         for other in imported_packages(source)

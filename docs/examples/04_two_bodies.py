@@ -53,10 +53,10 @@ flow = equations.flow(model.energies(training.parameters))
 start = jnp.asarray(task.test.clean.q[0]), jnp.asarray(task.test.clean.p[0])
 times = jnp.linspace(0, SECONDS, 20 * SECONDS + 1)
 step = gauss_legendre4(lambda t, state: flow.rates(*state))
-q, p = jax.jit(lambda start: rollout(step, start, times))(start)
+q, p = map(np.asarray, jax.jit(lambda start: rollout(step, start, times))(start))
 energy = np.asarray(jax.vmap(task.hamiltonian)(q, p))
 change = np.abs(energy - energy[0]).max() / abs(energy[0])
-momentum = np.asarray(p.reshape(-1, 2, 2).sum(axis=1))
+momentum = p.reshape(-1, 2, 2).sum(axis=1)
 print(f"largest change of the true energy {change:.1e}, of the total momentum {np.ptp(momentum, axis=0).max():.1e}")
 assert change < 1e-4 and np.ptp(momentum, axis=0).max() < 1e-10
 

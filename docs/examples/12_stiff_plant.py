@@ -59,7 +59,7 @@ problem = control.TrajectoryProblem(
 )
 guess, still = np.linspace(start, goal, STEPS + 1), np.zeros((STEPS, 1))
 solution = jax.jit(lambda: control.shoot(problem, start, guess, still))()
-plan = solution.plan
+plan = jax.tree.map(np.asarray, solution.plan)
 print(f"{solution.iterations} iterations, largest defect {solution.defect:.1e}, cost {plan.cost:.3f}")
 assert solution.converged
 
@@ -71,10 +71,10 @@ assert solution.converged
 
 many = jax.jit(control.integrated(field, DT, method=CLASSICAL, substeps=int(2000 * DT)))
 few = jax.jit(control.integrated(field, DT, method=CLASSICAL))
-true, forces, diverged = [jnp.asarray(start)], [], jnp.asarray(start)
+true, forces, diverged = [start], [], start
 for x, u, K in zip(plan.x, plan.u, plan.K, strict=False):
-    forces.append(jnp.clip(u + K @ (true[-1] - x), -LIMIT, LIMIT))
-    true.append(many(true[-1], forces[-1]))
+    forces.append(np.clip(u + K @ (true[-1] - x), -LIMIT, LIMIT))
+    true.append(np.asarray(many(true[-1], forces[-1])))
     diverged = few(diverged, u)
 apart = np.abs(np.stack(true) - plan.x)[:, [0, 2]].max()
 print(f"cart and pole stay within {apart:.3f} of the plan; explicit steps of {DT} s diverge")
@@ -84,7 +84,7 @@ assert apart < 0.2 and not np.abs(diverged).max() < 1e3
 # The first figure shows the true motion from top to bottom, with the driven cart, the spring, the second cart and its
 # pole.
 
-motion = np.asarray(jnp.stack(true))
+motion = np.stack(true)
 figure, axes = plt.subplots(figsize=(6, 6), layout="constrained")
 for row, index in enumerate((0, 4, 7, 9, 12, 40)):
     x, y, angle = motion[index, 0], -0.5 * row, motion[index, 2]

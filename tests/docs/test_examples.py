@@ -15,7 +15,7 @@ REDUCED = {
     "01_spherical_pendulum": {"SECONDS": 2},
     "02_train_the_arm": {"ITERATIONS": 15},
     "03_measured_pendulum": {"ITERATIONS": 7},
-    "04_two_bodies": {"TRAJECTORIES": 20, "SECONDS": 5},
+    "04_two_bodies": {"TRAJECTORIES": 20, "ITERATIONS": 25, "SECONDS": 5},
     "05_differential_network": {"SAMPLES": 500},
     "06_soft_body": {"STEPS": 30, "RINGS": 2},
     "07_gait": {"GOAL": 1.0},
@@ -37,7 +37,7 @@ REDUCED = {
 """Constants of the examples, and what they are here."""
 
 
-def reduced(path: Path) -> str:
+def reduced(path):
     source = path.read_text()
     for name, value in REDUCED[path.stem].items():
         line = re.search(rf"^(.*\b{name}\b.*) = (.*)$", source, re.MULTILINE)

@@ -2,9 +2,6 @@
 
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -23,10 +20,9 @@ needs_compiler = pytest.mark.skipif(
 needs_gcc = pytest.mark.skipif(
     not shutil.which("gcc") or "Free Software" not in subprocess.getoutput("gcc --version"), reason="there is no gcc"
 )
-Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
 
 
-def at_precision(tree: Any, precision: str) -> Any:
+def at_precision(tree, precision):
     """Real numbers of a tree as arrays of the precision; too large ones are infinite."""
 
     def cast(leaf):
@@ -37,9 +33,7 @@ def at_precision(tree: Any, precision: str) -> Any:
         return jax.tree.map(cast, tree)
 
 
-def in_c(
-    functions: Functions, states: Mapping[str, list[Any]], folder: Path, *, precision="f64", flags=("-O1",), **options
-):
+def in_c(functions, states, folder, *, precision="f64", flags=("-O1",), **options):
     """Leaves of the results of each function, [states, ...] each: exported at once, and compiled without a warning."""
     at = {name: (function, at_precision(examples, precision)) for name, (function, examples) in functions.items()}
     export_c(at, folder, precision=precision, **options)
@@ -56,7 +50,7 @@ def in_c(
     return results
 
 
-def in_jax(functions: Functions, states: Mapping[str, list[Any]], *, precision="f64"):
+def in_jax(functions, states, *, precision="f64"):
     """The same results from JAX: the functions are compiled together and mapped over the states."""
     stacked = {
         name: at_precision(jax.tree.map(lambda *leaves: np.stack(leaves), *states[name]), precision)

@@ -6,9 +6,6 @@ Each is drawn from a seed while it is traced, from the shapes and types of what 
 kept of order one and functions are smooth or compared far from ties, so that round-off stays small.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,15 +17,14 @@ SIZES = (1, 2, 3, 5, 8, 9, 17, 40, 65, 0)
 SHAPES = ((), *((size,) for size in SIZES), (2, 2), (3, 4), (4, 4), (7, 3), (2, 3, 4), (9, 8), (3, 0))
 LARGEST = 300
 """Elements of an array."""
-Arrays = list[Any]
 
 
-def program(seed: int, count: int) -> tuple[Callable[..., Any], list[tuple[np.ndarray, ...]]]:
+def program(seed, count):
     """A function of one to four arrays that gives a list of arrays, and some states of its arguments."""
     random = np.random.default_rng([seed, 0])
     like = [(_of_one(random, SHAPES), _of_one(random, TYPES)) for _ in range(random.integers(1, 5))]
 
-    def function(*arguments: Any) -> Arrays:
+    def function(*arguments):
         random = np.random.default_rng([seed, 1])
         known = _computed(random, [*arguments], steps=int(random.integers(4, 12)), depth=2)
         # The last is there, so that long chains are.
@@ -37,11 +33,11 @@ def program(seed: int, count: int) -> tuple[Callable[..., Any], list[tuple[np.nd
     return function, [tuple(_of(random, *one) for one in like) for _ in range(count)]
 
 
-def _of_one(random: np.random.Generator, choices: Any) -> Any:
+def _of_one(random, choices):
     return choices[random.integers(len(choices))]
 
 
-def _of(random: np.random.Generator, shape: Any, dtype: Any) -> np.ndarray:
+def _of(random, shape, dtype):
     dtype = np.dtype(dtype)
     if dtype.kind == "f":
         return np.asarray(random.normal(size=shape))
@@ -53,7 +49,7 @@ def _of(random: np.random.Generator, shape: Any, dtype: Any) -> np.ndarray:
     return np.asarray(np.where(random.random(size=shape) < 0.85, small.astype(dtype), edges))
 
 
-def _computed(random: np.random.Generator, known: Arrays, *, steps: int, depth: int) -> Arrays:
+def _computed(random, known, *, steps, depth):
     """Returns the known arrays and those that the steps add."""
     for _ in range(steps):
         step = STEPS[random.choice(len(STEPS), p=WEIGHTS)]
@@ -67,11 +63,11 @@ def _computed(random: np.random.Generator, known: Arrays, *, steps: int, depth: 
     return known
 
 
-def _kind(x: Any) -> str:
+def _kind(x):
     return jnp.dtype(x.dtype).kind
 
 
-def _chosen(random: np.random.Generator, known: Arrays, kinds: str = "fiub", rank: int = 0) -> Any:
+def _chosen(random, known, kinds="fiub", rank=0):
     """One of the arrays of a kind and least rank, late ones more often; a constant where there is none."""
     fitting = [array for array in known if _kind(array) in kinds and array.ndim >= rank]
     if not fitting or random.random() < 0.05:
@@ -81,7 +77,7 @@ def _chosen(random: np.random.Generator, known: Arrays, kinds: str = "fiub", ran
     return fitting[max(random.integers(len(fitting)), random.integers(len(fitting)))]
 
 
-def _partner(random: np.random.Generator, known: Arrays, x: Any) -> Any:
+def _partner(random, known, x):
     """Another of the type, of a shape that broadcasts to that of x."""
     fitting = [array for array in known if array.dtype == x.dtype and array.shape in ((), x.shape) and array is not x]
     if fitting and random.random() < 0.7:
@@ -89,7 +85,7 @@ def _partner(random: np.random.Generator, known: Arrays, x: Any) -> Any:
     return jnp.asarray(_of(random, x.shape, x.dtype))
 
 
-def _tame(x: Any) -> Any:
+def _tame(x):
     """A real array of order one; large numbers lose their digits in sines."""
     return jnp.clip(x, -50, 50) / (1 + 0.2 * jnp.abs(jnp.clip(x, -50, 50))) if _kind(x) == "f" else x
 
@@ -140,7 +136,7 @@ MORE = {
 COMPARED = (jnp.equal, jnp.not_equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
 
 
-def _function(random: np.random.Generator, x: Any, place: int) -> Any:
+def _function(random, x, place):
     kind = _kind(x) if _kind(x) in NAMES else "i"
     return _of_one(random, [*(getattr(jnp, name) for name in NAMES[kind][place].split()), *MORE[kind][place]])
 
@@ -210,12 +206,12 @@ def _indexed(random, known, depth):
         lambda: lax.dynamic_update_slice_in_dim(x, x[:1], first, 0),
         lambda: x.at[index].set(x[0], mode=mode),
         lambda: x.at[index].add(x[0], mode=mode) if x.dtype != bool else ~x,
-        lambda: x.at[index].apply(lambda v: ~v if v.dtype == bool else v * v, mode=mode),
+        lambda: x.at[index].apply(jnp.logical_not if x.dtype == bool else lambda v: v * v, mode=mode),
     ]
     return [_of_one(random, ways)()]
 
 
-def _drawn_inside(random: np.random.Generator, steps: int, depth: int) -> Callable[[Arrays], Arrays]:
+def _drawn_inside(random, steps, depth):
     """A function that continues arrays by the same steps each time."""
     seed = int(random.integers(1 << 30))
     return lambda known: _computed(np.random.default_rng(seed), known, steps=steps, depth=depth - 1)

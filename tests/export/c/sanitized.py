@@ -2,15 +2,12 @@
 
 import io
 import subprocess
-from collections.abc import Mapping
 from math import prod
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from comparison import STRICT, Functions
+from comparison import STRICT
 
-from dln_jax.export.c.interface import KINDS, Leaf, Signature, read_interface
+from dln_jax.export.c.interface import KINDS, read_interface
 from dln_jax.export.c.load import compile_c
 from dln_jax.export.c.source import export_c
 from dln_jax.export.c.text import NUMPY_TYPES
@@ -19,7 +16,7 @@ SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 FLAGS = ("-std=c99", "-pedantic", *STRICT, "-g", "-O1", *SANITIZERS)
 
 
-def in_sanitized_c(functions: Functions, states: Mapping[str, list[Any]], folder: Path, **options: Any) -> Any:
+def in_sanitized_c(functions, states, folder, **options):
     """Results of each function in each of its states, in double precision; fails at the first sanitizer report.
 
     Args:
@@ -43,7 +40,7 @@ def in_sanitized_c(functions: Functions, states: Mapping[str, list[Any]], folder
     assert ran.returncode == 0, ran.stderr.decode()[-3000:]
     written = io.BytesIO(ran.stdout)
 
-    def read(leaf: Leaf) -> np.ndarray:
+    def read(leaf):
         dtype = np.dtype(TYPES[leaf.kind])
         return np.frombuffer(written.read(prod(leaf.shape) * dtype.itemsize), dtype).reshape(leaf.shape)
 
@@ -68,7 +65,7 @@ int main(void)
 """
 
 
-def _calls(name: str, signature: Signature, count: int) -> str:
+def _calls(name, signature, count):
     """C that reads the arguments of every state and writes results."""
     text = f"    for (int k = 0; k < {count}; ++k) {{\n"
     passed = []

@@ -21,7 +21,6 @@ from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.scenes.registry import SCENES
-from dln_jax.zoo.run import Run
 
 STATES = 1000
 
@@ -64,14 +63,10 @@ def pytest_generate_tests(metafunc):
 
 
 def system_of(case, precision):
-    """Functions, the system that they are of, and its degrees of freedom.
-
-    A run's parameters are numbers that both precisions have.
-    """
+    """Functions, the system that they are of, and its degrees of freedom."""
     if case in MODELS:
         run = run_of(case)
-        rounded = jax.tree.map(lambda leaf: leaf.astype(np.float32).astype(float), run.parameters)
-        functions = functions_of_run(Run(run.model, rounded, run.description), precision=precision)
+        functions = functions_of_run(run, precision=precision)
         needs = MODELS[case].get("needs")
         return functions, needs and run.energies, needs.degrees_of_freedom if needs else 1
     if case in BY_HAND:

@@ -1,4 +1,7 @@
-"""Exported C through CasADi's `external`: values and derivatives equal JAX's, and a swing-up is solved with them."""
+"""Exported C through CasADi's `external`: values and derivatives equal JAX's, and its own generated C calls them.
+
+A page of the documentation solves a swing-up with them, which runs in the tests too.
+"""
 
 import ctypes
 
@@ -14,13 +17,11 @@ from dln_jax.export.c.body import Source
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import compile_c
 from dln_jax.export.c.source import export_c
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes import pendulum, two_link_arm
+from dln_jax.scenes import pendulum
 
 casadi = pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
 # What a loop leaves of each turn is kept even if nothing reads it.
 FLAGS = ("-std=c99", "-pedantic", *STRICT, "-Wno-unused-but-set-variable")
-ARM = [np.ones(2)] * 3
 BOUND = 1e-12
 
 
@@ -35,7 +36,6 @@ def root(x):
 
 
 FUNCTIONS = {
-    "forward_dynamics": (dynamics(two_link_arm().closed_form).forward_dynamics, ARM),
     "step": functions_of_system(pendulum().closed_form, 1, dtype=np.float64)["step_rk4"],
     "products": (products, [np.ones((3, 2)), np.ones(2), np.float64(1)]),
     "root": (root, [np.ones(3)]),
@@ -64,7 +64,6 @@ def of_a_vector(name):
     return flat, [(*shape, 1, 1)[:2] for shape in shapes]
 
 
-@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_values_and_derivatives_equal_jax(name, library):
@@ -107,27 +106,6 @@ def test_null_pointers_are_zeros_and_what_nobody_wants(library):
     assert call(arg, res, None, None, 0) == 0
     assert np.array_equal(written[wanted][:3], np.zeros(3)) and np.isnan(written[wanted][3:]).all()
     assert np.isnan(written[:wanted]).all()
-
-
-@needs_compiler
-def test_a_swing_up_is_solved_by_an_sqp(library):
-    step, steps, dt, goal = casadi.external("casadi_model_step", str(library)), 20, 0.05, np.array([np.pi, 0.0])
-    x, u = casadi.MX.sym("x", 2, steps + 1), casadi.MX.sym("u", 1, steps)
-    defects = [x[:, k + 1] - step(x[:, k], u[:, k], dt) for k in range(steps)]
-    ends = casadi.vertcat(x[:, 0], x[:, -1] - goal, *defects)
-    problem = {"x": casadi.veccat(x, u), "f": dt * casadi.sumsqr(u), "g": ends}
-    silent = {f"print_{part}": False for part in ("header", "iteration", "time", "status")}
-    quiet = {"print_iter": False, "print_header": False, "print_info": False}
-    options = {"qpsol": "qrqp", "qpsol_options": quiet, "tol_pr": 1e-10, **silent}
-    solver = casadi.nlpsol("solver", "sqpmethod", problem, options)
-    start = np.concatenate([np.linspace(0 * goal, goal, steps + 1).ravel(), np.zeros(steps)])
-    solution = solver(x0=start, lbg=0, ubg=0)
-    assert solver.stats()["success"] and solver.stats()["iter_count"] <= 5
-    assert float(solution["f"]) == pytest.approx(148.466897, rel=1e-6)
-    states, torques = np.split(np.array(solution["x"]).ravel(), [2 * (steps + 1)])
-    states, in_jax = states.reshape(-1, 2), FUNCTIONS["step"][0]
-    after = jax.jit(jax.vmap(lambda x, u: in_jax(x, u, jnp.array(dt))["x_next"]))(states[:-1], torques[:, None])
-    assert np.abs(after - states[1:]).max() < 1e-9
 
 
 @needs_compiler

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from comparison import needs_compiler, needs_gcc
+from conftest import slow_among
 from jax import lax
 
 from dln_jax.export.c.families import functions_of_system
@@ -67,7 +68,7 @@ def test_a_stated_bound_ends_a_loop_with_nan(tmp_path):
         np.testing.assert_allclose(load_c(tmp_path, flags=("-O1",)).f(900.0), root)
 
 
-def stack_of(graph: str, function: str) -> int:
+def stack_of(graph, function):
     """Largest sum of frames along calls from a function, in gcc's call graph."""
     frames = {
         title: int(size) for title, size in re.findall(r'node: { title: "([^"]*)" label: "[^"]*?(\d+) bytes', graph)
@@ -87,7 +88,7 @@ def network(x):
 
 STACKS = {
     "implicit": functions_of_system(cart_pole().closed_form, 2, dtype=np.float64)["step_implicit_midpoint_jacobian"],
-    "chain": functions_of_system(chain(4).closed_form, 4, dtype=np.float64)["forward_dynamics_jacobian"],
+    "chain": functions_of_system(chain(3).closed_form, 3, dtype=np.float64)["forward_dynamics_jacobian"],
     "network": (lambda x: (network(x), jax.jacfwd(lambda x: network(x)[0])(x)), (np.zeros(3),)),
     "scan": (lambda x: lax.scan(lambda c, w: (jnp.tanh(c @ w), c), x, np.ones((50, 20, 20)))[1], (np.zeros(20),)),
     "solve": (lambda a: (jnp.linalg.solve(a @ a.T + jnp.eye(9), a), jnp.linalg.qr(a)), (np.zeros((9, 9)),)),
@@ -96,7 +97,7 @@ STACKS = {
 
 
 @needs_gcc
-@pytest.mark.parametrize("finite", LEVELS)
+@pytest.mark.parametrize("finite", slow_among(LEVELS, bool))
 def test_no_function_takes_more_stack_than_it_states(finite, tmp_path):
     export_c(STACKS, tmp_path, finite=finite)
     for flags in LEVELS[finite]:

@@ -11,7 +11,7 @@ from jax import lax
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c, source_files
-from dln_jax.scenes import two_link_arm
+from dln_jax.scenes import pendulum
 
 BOUND = 1e-12
 SPARSE = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]])
@@ -61,14 +61,14 @@ def branches(x):
     return inside + jnp.sin(2 * x), 2 * x
 
 
-ARM = functions_of_system(two_link_arm().closed_form, 2, dtype=np.float64)
+STEP = functions_of_system(pendulum().closed_form, 1, dtype=np.float64)["step_rk4_jacobian"]
 PROGRAMS = {
     "tangents_in_a_scan": (tangents_in_a_scan, (np.zeros(3), np.zeros(4))),
     "powers_of_a_triangle": (powers_of_a_triangle, (np.zeros(()),)),
     "moved_output": (a_loop_after_a_loop_whose_output_is_moved, (np.zeros(()),)),
     "solved": (solved, (np.zeros(2),)),
     "branches": (branches, (np.zeros(3),)),
-    "step_rk4_jacobian": ARM["step_rk4_jacobian"],
+    "step_rk4_jacobian": STEP,
 }
 
 
@@ -95,7 +95,7 @@ def test_operations_are_those_that_the_pattern_needs():
     assert operations(lambda b: SPARSE @ b, np.zeros((4, 5))) <= 3 * 5
     assert operations(lambda b: SPARSE @ b, np.zeros((4, 5)), finite=False) >= 4 * 4 * 5
     assert operations(lambda x, u: jax.jacfwd(step, argnums=(0, 1))(x, u), np.zeros(6), np.zeros(3)) == 0
-    function, examples = ARM["step_rk4_jacobian"]
+    function, examples = STEP
     assert operations(function, *examples) < 0.9 * operations(function, *examples, finite=False)
 
 
