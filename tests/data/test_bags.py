@@ -5,9 +5,9 @@ import sys
 
 import numpy as np
 import pytest
+from calls import one_line
 
 from dln_jax.data import schema
-from tests.calls import one_line
 
 pytest.importorskip("rosbags", reason="rosbags reads bags; it is in the extra [bag]")
 from made_bags import state, write_bag

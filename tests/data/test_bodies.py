@@ -4,13 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
+from published_motions import published_arrays
 
+from dln_jax import Needs, flow
 from dln_jax.data.bodies import Bodies, find_bodies, imbalance
-from dln_jax.mechanics.equations import flow
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.types import Needs
-from tests.calls import one_line
-from tests.published_motions import published_arrays
 
 
 def by_body(x, count):

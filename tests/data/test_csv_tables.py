@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from calls import one_line
 
 from dln_jax.data import checks, csv_tables, schema
 from dln_jax.data.csv_tables import write_motion
-from tests.calls import one_line
 
 ROWS = "0,1,2,3,4\n0.1,5,6,7,8\n0.2,9,10,11,12\n"
 HEADER = "t [s],q1 [rad],q2 [rad],tau1 [N m],tau2 [N m]\n"

@@ -6,7 +6,9 @@ import pickle
 import jax
 import numpy as np
 import pytest
+from calls import one_line
 
+from dln_jax import Needs
 from dln_jax.data import schema
 from dln_jax.data.splits import PER_SAMPLE, merged, select, select_samples, split
 from dln_jax.data.stated_needs import needs_from_json
@@ -14,8 +16,6 @@ from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import double_pendulum, two_link_arm
 from dln_jax.scenes.poles import cart_pole
-from dln_jax.types import Needs
-from tests.calls import one_line
 
 
 def arrays(samples=12, d=2, trajectories=3):

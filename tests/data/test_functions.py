@@ -4,17 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
+from dln_jax import fit
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.learning import functions as regression
-from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.functions import Network, mean_loss, published_adam, targets
 from dln_jax.learning.standardisation import layers_in_own_units, standard_units, to_units
 from dln_jax.metrics.functions import errors, predictions, typical_spread
 from dln_jax.nn import ensembles
 from dln_jax.nn.activations import cos, tanh
-from tests.calls import one_line
 
 CASES = {
     "sine": (functions.sine, functions.sine_grid, 100, lambda x: jnp.sin(x[0])),

@@ -1,11 +1,11 @@
 """Joint names of logs: renamed, selected, and matched with a robot's where one replacement explains all."""
 
 import numpy as np
+from calls import one_line
 
 from dln_jax.data import schema
 from dln_jax.data.joint_names import chosen, factors, matched
 from dln_jax.data.splits import in_blocks, with_joints
-from tests.calls import one_line
 
 ARRAYS = {
     "t": np.arange(6.0),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from calls import one_line
 from scipy.spatial import ConvexHull, Delaunay
 
 from dln_jax.softbody.mesh.mesh import (
@@ -17,7 +18,6 @@ from dln_jax.softbody.mesh.mesh import (
 )
 from dln_jax.softbody.mesh.shapes import beam, biped, body_length, box, crawler, disc, lattice, quadruped
 from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
-from tests.calls import one_line
 
 BEAM = beam(4.0, 1.0, 8, 3)
 # A ring of cells: a hole, which has a boundary of its own.

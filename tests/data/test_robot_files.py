@@ -5,12 +5,10 @@ import xml.etree.ElementTree as ET
 import jax
 import numpy as np
 import pytest
+from calls import one_line
 
+from dln_jax import dynamics, read_robot, tree_system
 from dln_jax.data.robot_files import mjcf, write_robot
-from dln_jax.data.robots import read_robot
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import tree_system
-from tests.calls import one_line
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 INERTIAL = """<inertial><origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/><mass value="{mass}"/>

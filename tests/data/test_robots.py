@@ -6,11 +6,10 @@ import textwrap
 import jax
 import numpy as np
 import pytest
+from calls import one_line
 
-from dln_jax.data.robots import read_robot
-from dln_jax.mechanics.equations import dynamics
+from dln_jax import dynamics, read_robot
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
-from tests.calls import one_line
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is the reference; it is in the extra [robot]")
 LINK = """

@@ -1,13 +1,13 @@
 """Recordings of one motion are found and stay on one side of a split; held-out parts can be stated."""
 
 import numpy as np
+from calls import one_line
 
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import hold_out, in_blocks, split
 from dln_jax.data.stated_tests import stated_test
 from dln_jax.training.hamiltonian.measurements import parted
-from tests.calls import one_line
 
 
 def fourier(random, d=3):

@@ -1,6 +1,7 @@
 """Figures of closed loops show the limits, the failures and the whole run; films move in real time."""
 
 import numpy as np
+from calls import one_line
 from PIL import Image
 
 from dln_jax.control import ClosedLoopRun
@@ -12,7 +13,6 @@ from dln_jax.figures import (
     rotary_pendulum_drawing,
     write_closed_loop_gif,
 )
-from tests.calls import one_line
 
 T = np.linspace(0, 1, 51)
 Q = np.stack([0.1 * np.sin(3 * T), np.pi * (1 - T)], axis=1)

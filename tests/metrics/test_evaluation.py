@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import json_of
 
 from dln_jax import figures
 from dln_jax.learning.engine.problem import Progress, one_after_the_other
@@ -12,7 +13,6 @@ from dln_jax.metrics.report import Row, conditions, write_report
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from scripts.reports.arm.data import predictions
-from tests.calls import json_of
 
 
 def test_errors_are_sums_over_joints_and_means_over_samples():

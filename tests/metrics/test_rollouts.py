@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
+from dln_jax import LagrangianSystem, PlainDynamics, dynamics
 from dln_jax.data import schema
-from dln_jax.mechanics.dynamics import PlainDynamics
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.rollouts import (
     Motion,
     by_trajectory,
@@ -21,7 +20,6 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_times,
 )
 from scripts.reports.arm.data import STARTS, published_swings, rollout_metrics
-from tests.calls import one_line
 
 FRICTION = 0.3
 

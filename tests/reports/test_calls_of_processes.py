@@ -6,8 +6,8 @@ import subprocess
 import numpy as np
 import pytest
 
+from dln_jax import InputError
 from dln_jax.training import low_latency_calls
-from dln_jax.types import InputError
 from scripts.reports.timing import called
 
 

@@ -10,6 +10,7 @@ import pytest
 from calls import command, json_of
 from motions import sums_of_sines
 
+from dln_jax import Needs
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.data import schema
@@ -19,7 +20,6 @@ from dln_jax.mechanics import lagrangian
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.scenes.datasets.generators import characters
 from dln_jax.training.dynamics.run import prepare
-from dln_jax.types import Needs
 
 BRIEF = "--no-figures --no-low-latency --no-uncertainty"
 PARTS = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse")

@@ -13,13 +13,10 @@ import pytest
 from calls import one_line
 
 import dln_jax
+from dln_jax import InputError, Model, NaturalSystem, Needs, PhaseRates
 from dln_jax.data.schema import from_arrays
-from dln_jax.mechanics.dynamics import PhaseRates
 from dln_jax.mechanics.equations import Canonical, Energies
-from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
-from dln_jax.models.model import Model
-from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import LATER, build, describe, describe_for, typical_sizes
 from dln_jax.zoo.run import load, save

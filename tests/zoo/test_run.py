@@ -13,8 +13,7 @@ import pytest
 import safetensors.numpy
 from calls import json_of, one_line
 
-from dln_jax.types import Needs
-from dln_jax.zoo.descriptions import build, describe
+from dln_jax import Needs, build, describe
 from dln_jax.zoo.parameter_files import load_manifest, load_tree, save_tree
 from dln_jax.zoo.run import load, save
 

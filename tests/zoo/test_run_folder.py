@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
+from dln_jax import InputError
 from dln_jax.files import write_json
-from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK, run_folder
 
 

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from calls import one_line
 
+from dln_jax import Needs, build, describe, load_c
 from dln_jax.export.c.families import functions_of_run
-from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.models.uncertainty import Domain, Uncertainty, out_of_distribution, predictive
-from dln_jax.types import Needs
-from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import load, save
 from dln_jax.zoo.uncertainty_files import save_uncertainty
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import assert_refused, command, exit_status, json_of, refused
+from motions import sums_of_sines
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import check_data, train_delan
 from dln_jax.cli.encoders import prepare_log
 from dln_jax.data import schema
-from tests.calls import assert_refused, command, exit_status, json_of, refused
-from tests.motions import sums_of_sines
 
 RATE = 100.0
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from calls import assert_refused, command, json_of, refused
 
+from dln_jax import read_robot
 from dln_jax.cli.commands import excite
 from dln_jax.data import schema
-from dln_jax.data.robots import read_robot
 from dln_jax.identification.excitation.limits import limits_of_robot
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")

@@ -5,9 +5,9 @@ import pytest
 from calls import assert_refused, command, json_of
 from motions import quick_motion
 
+from dln_jax import Flow, load
 from dln_jax.cli.commands import train_hnn_task
 from dln_jax.data import schema
-from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.training.hamiltonian import measurements, predictions, stages
@@ -16,7 +16,6 @@ from dln_jax.training.hamiltonian import tasks as hnn_tasks
 from dln_jax.training.hamiltonian import training as hnn_models
 from dln_jax.training.hamiltonian.tasks import problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
-from dln_jax.zoo.run import load
 
 
 def quick_prediction(model, parameters, q, p, t):

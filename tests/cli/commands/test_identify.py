@@ -7,12 +7,10 @@ import pytest
 from calls import assert_refused, command, exit_status, json_of, one_line
 from planar_arm import FRICTION, URDF, motions
 
+from dln_jax import load, load_c, read_robot
 from dln_jax.cli.commands import identify
-from dln_jax.data.robots import read_robot
-from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.training.identification.task import noises, split
-from dln_jax.zoo.run import load
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 LOG = "--robot arm.urdf --data log.npz"

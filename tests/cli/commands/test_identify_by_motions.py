@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from calls import command, json_of, one_line
 
+from dln_jax import dynamics, joint_dissipation, read_robot, tree_system
 from dln_jax.cli.commands import identify
-from dln_jax.data.robots import read_robot
 from dln_jax.data.schema import from_arrays
 from dln_jax.identification.equations import columns_of, flat
 from dln_jax.identification.identify import parameters_of
 from dln_jax.identification.motions import cut_motions, fit_motions, linearise
 from dln_jax.learning.measured_motions import motion
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import tree_system
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.public import dynamics
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 URDF = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.2"/><mass value="1"/>

@@ -6,13 +6,10 @@ import pytest
 from calls import assert_refused, command, json_of
 from motions import sums_of_sines
 
+from dln_jax import dynamics, load, load_c, read_robot
 from dln_jax.cli.commands import identify
-from dln_jax.data.robots import read_robot
-from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.zoo.run import load
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 MJCF = """<mujoco><worldbody>

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from calls import json_of, one_line, refused
 
+from dln_jax import InputError
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
     simulate,
@@ -28,7 +29,6 @@ from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
-from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 
 STATES = {key: np.random.default_rng(0).normal(size=(20, 2)) for key in ("q", "qd", "qdd", "tau")}

@@ -5,16 +5,15 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from calls import command, exit_status, json_of, refused
+from published_motions import PUBLISHED, integrated, published_arrays
 
-from dln_jax import load
+from dln_jax import Needs, load
 from dln_jax.cli.commands import train_hnn, train_hnn_task
 from dln_jax.training.hamiltonian import recipes
 from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.results import units_of_judgement
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
-from dln_jax.types import Needs
-from tests.calls import command, exit_status, json_of, refused
-from tests.published_motions import PUBLISHED, integrated, published_arrays
 
 TASK = "--task measured --no-low-latency --no-figures --data"
 SLIDING = Needs(joints=("prismatic",))

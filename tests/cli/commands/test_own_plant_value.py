@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of
 
+from dln_jax import InputError
 from dln_jax.cli.commands import train_value
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration
@@ -16,7 +17,6 @@ from dln_jax.training.value_checkpoints import Kept
 from dln_jax.training.value_plants import Wishes, of_file, of_run, with_factors
 from dln_jax.training.value_training import verdict_of
 from dln_jax.training.values import ValueRun, load_value, value_error
-from dln_jax.types import InputError
 from dln_jax.zoo.run import save
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")

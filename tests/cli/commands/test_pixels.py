@@ -7,13 +7,11 @@ import pytest
 from calls import assert_refused, command, json_of
 from motions import quick_motion
 
+from dln_jax import HamiltonianSystem, InputError, Model, PlainFlow, flow, load
 from dln_jax.cli.commands import train_hnn_pixels
 from dln_jax.figures import animations
 from dln_jax.learning import frames as learning_frames
 from dln_jax.learning.frames import Matching, TermWeights, problem, terms, windows
-from dln_jax.mechanics.dynamics import PlainFlow
-from dln_jax.mechanics.equations import flow
-from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics import frames as frame_metrics
 from dln_jax.metrics.phase_space import Motions
@@ -26,14 +24,11 @@ from dln_jax.models.latent_phase import (
     principal_components,
     through_components,
 )
-from dln_jax.models.model import Model
 from dln_jax.precision import with_float64
 from dln_jax.scenes.datasets import pendulum_frames
 from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, split, swinging_rod
 from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.training.hamiltonian import pixels as pixel_task
-from dln_jax.types import InputError
-from dln_jax.zoo.run import load
 
 STATES = np.array([[0.0, 0.0], [0.3, -1.2], [-0.55, 0.7], [1.4, 3.0], [-2.9, 4.0], [3.1, -2.0]])
 """q in rad and qd in rad/s, around the whole circle."""

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of, refused
 
+from dln_jax import InputError, build, describe
 from dln_jax.cli.commands import swing_up
 from dln_jax.control.plants.exploring import Explored, recording_of
 from dln_jax.control.plants.runs import PlantRun, Trials
@@ -13,8 +14,6 @@ from dln_jax.control.regulators import Regulator
 from dln_jax.data import schema
 from dln_jax.learning.recordings import FittedPlant
 from dln_jax.training.swing_ups.any_plant import Learned
-from dln_jax.types import InputError
-from dln_jax.zoo.descriptions import build, describe
 
 MOTOR = "--actuated elbow --control 5"
 

@@ -9,20 +9,14 @@ import pytest
 from calls import assert_refused, json_of, refused
 from planar_arm import ARM, FRICTION, motions
 
-from dln_jax import load
+from dln_jax import InputError, Robot, build, dynamics, joint_dissipation, load, tree_system
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.data.robot_files import mjcf
-from dln_jax.data.robots import Robot
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import tree_system
 from dln_jax.training.dynamics.methods import learned_tree, selection
 from dln_jax.training.dynamics.recorded import read
 from dln_jax.training.dynamics.run import prepare
-from dln_jax.types import InputError
-from dln_jax.zoo.descriptions import build
 
 TREE = "--model learned-tree --data rigid.npz"
 PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'

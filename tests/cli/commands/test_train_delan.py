@@ -12,9 +12,9 @@ import pytest
 from calls import assert_refused, command, exit_status, json_of, refused
 from motions import sums_of_sines
 
+from dln_jax import load
 from dln_jax.cli.commands import make_data, train_delan
 from dln_jax.data import schema
-from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[3]
 TINY = "--optimizer adam --steps 40 --batch 64 --width 4 --depth 1 --precision f64 --no-low-latency"

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from calls import command, json_of
 
+from dln_jax import PlainDynamics, load
 from dln_jax.cli.commands import train_delan, train_hnn
 from dln_jax.data import schema
-from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 from dln_jax.training import low_latency_calls
 from dln_jax.training.dynamics.methods import growth as dynamics_growth
-from dln_jax.zoo.run import load
 
 BRIEF = "--no-figures --no-low-latency --no-uncertainty"
 QUICK = f"--data swing.npz --width 3 --depth 1 --steps 6 {BRIEF}"

@@ -6,7 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
+from motions import sums_of_sines
 
+from dln_jax import Robot
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.cli.encoders import FILTERED, prepare_log
@@ -18,12 +21,9 @@ from dln_jax.data.checks.energies import STRONGEST, WEAKEST, covariances
 from dln_jax.data.checks.evidence import Explanation
 from dln_jax.data.checks.hypotheses import decisive
 from dln_jax.data.encoders.smoothing import smooth
-from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.poles import cart_pole
-from tests.calls import one_line
-from tests.motions import sums_of_sines
 
 SAMPLES, RUNS = 700, 4
 RIGHT = np.pi / 2

@@ -1,10 +1,10 @@
 """Rates of noisy, unevenly sampled motions: better than differences, noise found, gaps respected."""
 
 import numpy as np
+from calls import one_line
 
 from dln_jax.data import schema
 from dln_jax.data.encoders import smooth_locally
-from tests.calls import one_line
 
 NOISE = np.array([1e-3, 1e-2])
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from calls import one_line
+from motions import sums_of_sines
 
 from dln_jax.data import schema
 from dln_jax.data.encoders import (
@@ -18,8 +20,6 @@ from dln_jax.data.encoders import (
 )
 from dln_jax.data.encoders.filters import gain
 from dln_jax.data.splits import every
-from tests.calls import one_line
-from tests.motions import sums_of_sines
 
 RATE, SECONDS = 125.0, 10.0
 NOISE_Q, NOISE_TAU = 1e-4, 0.2

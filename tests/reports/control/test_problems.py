@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dln_jax import dynamics
 from dln_jax.control import field_of
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import rates
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole
 from scripts.reports.control import plants, problems, values
 

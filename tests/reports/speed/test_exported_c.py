@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dln_jax import dynamics, export_c
 from dln_jax.export.c.interface import Leaf, Signature
-from dln_jax.export.c.source import export_c
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
 from dln_jax.scenes import closed_form_forward_dynamics, two_link_arm
 from scripts.reports.speed import exported_c
