@@ -134,7 +134,7 @@ def with_repeats(arrays):
 # Torques take most of the time to check and have no part in faults of t and q.
 SILENT = {"tau": None}
 RATELESS = {"qd": None}
-LOG_FAULTS = {
+FAULTS = {
     "q in degrees": (lambda a: {"q": np.degrees(a["q"])}, "qd-unit", (0, 1, 2), "q from degrees"),
     "all in degrees": (lambda a: {"q": np.degrees(a["q"]), **RATELESS}, "q-unit", None, "degrees"),
     "qd of a motor": (of_joint("qd", 1, lambda x: 50 * x), "qd-unit", (1,), "50"),
@@ -170,6 +170,16 @@ LOG_FAULTS = {
         *("hidden-torque", (2,), "exactly zero in up to"),
     ),
     "friction not stated": (lambda a: {"needs": None}, "friction", None, "friction is seen"),
+    # Against the robot.
+    "all torques turned round": (lambda a: {"tau": -a["tau"]}, "tree-sign", (0, 1, 2), "", arm()),
+    "motor's torque": (lambda a: {"tau": a["tau"] / 100}, "gear", (0, 1, 2), "", arm()),
+    "columns exchanged": (lambda a: {key: a[key][:, [0, 2, 1]] for key in ("q", "qd", "tau")}, "order", (), "", arm()),
+    "upside down": (lambda a: {}, "gravity", (), "-9.", arm(gravity=(0.0, 0.0, 9.81))),
+    "torques later than the robot's": (lambda a: {"tau": late(a["tau"], 2)}, "delay", (), "20 ms", arm()),
+    "beyond limits": (
+        lambda a: {}, "limits", (0, 1, 2), "", arm()._replace(position_limits=np.tile([-0.5, 0.5], (3, 1)))
+    ),
+    "dead torque": (of_joint("tau", 1, np.zeros_like), "dead-torque", (1,), "", arm()),  # which overflowed once
 }  # fmt: skip
 
 
@@ -180,40 +190,14 @@ def test_nothing_is_found_in_clean_logs(clean):
     assert quick(generators.characters()) == []
 
 
-@pytest.mark.parametrize("name", LOG_FAULTS)
+@pytest.mark.parametrize("name", FAULTS)
 def test_a_planted_fault_is_found(clean, name):
-    plant, check, joints, word = LOG_FAULTS[name]
-    findings = quick(spoiled(clean, plant))
+    plant, check, joints, word, *robot = FAULTS[name]
+    findings = quick(spoiled(clean, plant), *robot)
     found = [finding for finding in findings if finding.check == check]
     assert found, f"{check} is not among {[finding.line for finding in findings]}"
     assert word in found[0].line and "\n" not in found[0].line and found[0].remedy
     assert joints is None or found[0].joints == joints
-
-
-TREE_FAULTS = {
-    "all torques turned round": (lambda a: {"tau": -a["tau"]}, arm(), "tree-sign", (0, 1, 2)),
-    "motor's torque": (lambda a: {"tau": a["tau"] / 100}, arm(), "gear", (0, 1, 2)),
-    "columns exchanged": (lambda a: {key: a[key][:, [0, 2, 1]] for key in ("q", "qd", "tau")}, arm(), "order", ()),
-    "upside down": (lambda a: {}, arm(gravity=(0.0, 0.0, 9.81)), "gravity", ()),
-    "torques late": (lambda a: {"tau": late(a["tau"], 2)}, arm(), "delay", ()),
-    "beyond limits": (
-        lambda a: {}, arm()._replace(position_limits=np.tile([-0.5, 0.5], (3, 1))), "limits", (0, 1, 2)
-    ),
-    "dead torque": (of_joint("tau", 1, np.zeros_like), arm(), "dead-torque", (1,)),  # which overflowed once
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", TREE_FAULTS)
-def test_a_fault_against_the_robot_is_found(clean, name):
-    plant, robot, check, joints = TREE_FAULTS[name]
-    examined = examine(as_recording(spoiled(clean, plant)), robot)
-    found = [finding for finding in examined.findings if finding.check == check]
-    assert found, f"{check} is not among {[finding.line for finding in examined.findings]}"
-    assert found[0].joints == joints and "\n" not in found[0].line
-    if name == "upside down":
-        assert "-9." in found[0].observation
-    if name == "torques late":
-        assert examined.on_tree.torques.log.delay == pytest.approx(2, abs=0.3)
 
 
 def test_a_clean_log_suits_its_robot(clean):
