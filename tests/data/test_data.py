@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import Needs
 from dln_jax.data import schema
@@ -98,7 +99,7 @@ def test_saving_and_loading_is_the_identity(tmp_path):
     again = schema.load(path)
     assert again.needs == data.needs
     for key in (*PER_SAMPLE, "label"):
-        np.testing.assert_array_equal(getattr(again, key), getattr(data, key))
+        assert_array_equal(getattr(again, key), getattr(data, key))
     nowhere = tmp_path / "nowhere" / "data.npz"
     for other, words in ((path, "exists"), (nowhere, "no such folder"), (path.with_suffix(".csv"), r"end in \.npz")):
         with one_line(words):
@@ -125,10 +126,10 @@ def test_split_is_by_trajectory_disjoint_complete_and_seeded():
     sets, again, other = (split(data, test=["state-3", "state-7"], seed=seed) for seed in (1, 1, 2))
     held = [part.trajectory.tolist() for part in sets]
     assert held[2] == [3, 7] and len(held[1]) == 6 and sorted(held[0] + held[1]) == [*{*range(60)} - {3, 7}]
-    np.testing.assert_array_equal(again.validation.q, sets.validation.q)
+    assert_array_equal(again.validation.q, sets.validation.q)
     assert not np.array_equal(other.validation.q, sets.validation.q)
     for key in ("t", "q", "tau", "trajectory", "tau_gravity"):
-        np.testing.assert_array_equal(getattr(merged(sets), key), getattr(data, key))
+        assert_array_equal(getattr(merged(sets), key), getattr(data, key))
 
 
 def test_splits_that_cannot_be_made_are_refused():
@@ -148,7 +149,7 @@ def test_letters_have_exact_rates_and_momenta_and_torques_that_are_sums():
     errors = []
     for dt in (0.02, 0.01):
         data = generators.characters(letters="e", dt=dt)
-        np.testing.assert_allclose(data.tau_inertial + data.tau_coriolis + data.tau_gravity, data.tau, atol=1e-12)
+        assert_allclose(data.tau_inertial + data.tau_coriolis + data.tau_gravity, data.tau, atol=1e-12)
         for rate, source in (("qd", "q"), ("qdd", "qd"), ("pd", "p")):
             estimate = time_derivative(data.t, getattr(data, source), data.trajectory, name=rate)
             errors.append(np.abs(estimate - getattr(data, rate))[2:-2].max())
@@ -160,7 +161,7 @@ def test_uniform_states_fill_their_box_and_underactuated_scenes_are_driven_by_th
     data = generators.uniform(cart_pole(), samples=2000, position_bound=2.0, rate_bound=3.0)
     for states, bound in ((data.q, 2.0), (data.qd, 3.0)):
         assert 0.95 * bound < np.abs(states).max() <= bound and np.abs(states.mean(axis=0)).max() < 0.1 * bound
-    np.testing.assert_allclose(data.tau[:, 1], 0.0, atol=1e-12)
+    assert_allclose(data.tau[:, 1], 0.0, atol=1e-12)
     assert np.abs(data.tau[:, 0]).max() > 1
     for bound in ("samples", "position_bound", "rate_bound"):
         with one_line(f"{bound} is 0"):
@@ -170,17 +171,17 @@ def test_uniform_states_fill_their_box_and_underactuated_scenes_are_driven_by_th
 def test_free_swings_keep_their_energy():
     scene = double_pendulum()
     data = generators.free_swing(scene, trajectories=2, steps=200)
-    np.testing.assert_array_equal(data.tau, 0.0)
+    assert_array_equal(data.tau, 0.0)
     energy = 0.5 * np.sum(data.qd * data.p, axis=1) + jax.jit(jax.vmap(scene.potential))(data.q)
-    np.testing.assert_allclose(energy, np.repeat(energy[::200], 200), rtol=1e-8)
+    assert_allclose(energy, np.repeat(energy[::200], 200), rtol=1e-8)
 
 
 def test_temperature_is_one_for_all_joints_or_one_for_each():
     log = {"t": np.arange(3.0), "q": np.zeros((3, 2)), "trajectory": np.zeros(3, int)}
     common = schema.from_arrays({**log, "temperature": np.array([20.0, 21, 22])})
-    np.testing.assert_array_equal(common.temperature, [[20, 20], [21, 21], [22, 22]])
+    assert_array_equal(common.temperature, [[20, 20], [21, 21], [22, 22]])
     own = schema.from_arrays({**log, "temperature": common.temperature + np.array([0.0, 5.0])})
-    np.testing.assert_array_equal(select_samples(own, np.array([2])).temperature, [[22, 27]])
+    assert_array_equal(select_samples(own, np.array([2])).temperature, [[22, 27]])
 
 
 def test_angles_that_wrap_are_unwrapped_and_nothing_else_is():
@@ -195,9 +196,9 @@ def test_angles_that_wrap_are_unwrapped_and_nothing_else_is():
     wrapped = (true + np.pi) % (2 * np.pi) - np.pi
     data = read(wrapped)
     turns = (data.q - true) / (2 * np.pi)
-    np.testing.assert_allclose(turns, np.tile(np.round(turns[:1]), (600, 1)), atol=1e-12)
+    assert_allclose(turns, np.tile(np.round(turns[:1]), (600, 1)), atol=1e-12)
     assert "column 1, 2 of q wrap by 2 pi" in data.remarks[0] and np.abs(data.qd[:, 0]).max() < 3.1
     slides = read(wrapped, needs=np.array('{"joints": ["prismatic", "revolute", "revolute"]}'))
     assert "in column 2 of q" in slides.remarks[0]
     noise = np.random.default_rng(0).uniform(-np.pi, np.pi, (600, 3))
-    np.testing.assert_array_equal(read(noise).q, noise)
+    assert_array_equal(read(noise).q, noise)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import ConvexHull, Delaunay
 
 from dln_jax.softbody.mesh.mesh import (
@@ -68,15 +69,15 @@ def same_simplices(one, other):
 def test_volume_boundary_and_centre(shape):
     mesh, volume, surface, centre = SHAPES[shape]
     assert volumes(mesh).min() > 0
-    np.testing.assert_allclose(volumes(mesh).sum(), volume, rtol=1e-13)
+    assert_allclose(volumes(mesh).sum(), volume, rtol=1e-13)
     normals = outward_normals(mesh.vertices, boundary(mesh))
     # Conforming: a facet that is not shared would lie inside and add to the surface.
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1).sum(), surface, rtol=1e-13)
-    np.testing.assert_allclose(normals.sum(axis=0), 0.0, atol=1e-13 * surface)
-    np.testing.assert_allclose(flux(mesh.vertices, boundary(mesh)), mesh.dimension * volume, rtol=1e-13)
+    assert_allclose(np.linalg.norm(normals, axis=1).sum(), surface, rtol=1e-13)
+    assert_allclose(normals.sum(axis=0), 0.0, atol=1e-13 * surface)
+    assert_allclose(flux(mesh.vertices, boundary(mesh)), mesh.dimension * volume, rtol=1e-13)
     # Equal shares reproduce the first moment of each simplex.
     masses = lumped_masses(mesh, 700.0)
-    np.testing.assert_allclose(masses @ mesh.vertices, 700.0 * volume * np.array(centre), atol=1e-10 * volume)
+    assert_allclose(masses @ mesh.vertices, 700.0 * volume * np.array(centre), atol=1e-10 * volume)
     assert masses.min() > 0
     assert shape != "disc" or regularity(mesh.vertices, mesh.elements).min() > 0.6
     assert euler_characteristic(mesh) == (0 if shape == "ring" else 1)
@@ -85,10 +86,10 @@ def test_volume_boundary_and_centre(shape):
 def test_vertices_of_a_beam_are_numbered_along_its_short_side():
     mesh = beam(4.0, 1.0, 40, 10)
     inside = ((mesh.vertices > 0) & (mesh.vertices < [4.0, 1.0])).all(axis=1)
-    np.testing.assert_array_equal(boundary_vertices(mesh), np.flatnonzero(~inside))
+    assert_array_equal(boundary_vertices(mesh), np.flatnonzero(~inside))
     assert (len(mesh.vertices), len(mesh.elements)) == (451, 800)
     assert np.ptp(mesh.elements, axis=1).max() == 12  # a narrow band
-    np.testing.assert_array_equal(vertices_where(mesh, lambda x: x[:, 0] < 1e-9), np.arange(11))
+    assert_array_equal(vertices_where(mesh, lambda x: x[:, 0] < 1e-9), np.arange(11))
     assert mesh.elements.dtype == np.int32 and mesh.vertices.dtype == np.float64
 
 
@@ -105,7 +106,7 @@ def test_regularity_is_one_for_regular_simplices_of_any_size():
         elements = np.array([corners, [1, 0, *corners[2:]], [0, *corners[1:-1], 0]])
         for scale in (1e-150, 1e150):
             found = regularity(scale * np.array(vertices), elements)
-            np.testing.assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-12)
+            assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-12)
 
 
 SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
@@ -164,10 +165,10 @@ def test_inverted_elements_are_turned_and_counted(dimension):
     assert mesh.turned == (simplex_volumes(points, elements) < 0).sum()
     assert 0.25 < mesh.turned / len(elements) < 0.75
     assert volumes(mesh).min() > 0 and make_mesh(points, mesh.elements).turned == 0
-    np.testing.assert_array_equal(np.sort(mesh.elements, axis=1), np.sort(elements, axis=1))
+    assert_array_equal(np.sort(mesh.elements, axis=1), np.sort(elements, axis=1))
     hull = ConvexHull(points)
     assert same_simplices(boundary(mesh), hull.simplices) and len(overlaps(mesh)) == 0
-    np.testing.assert_allclose(flux(points, boundary(mesh)), dimension * hull.volume, rtol=1e-12)
+    assert_allclose(flux(points, boundary(mesh)), dimension * hull.volume, rtol=1e-12)
 
 
 def test_overlapping_elements_are_accepted_and_named():

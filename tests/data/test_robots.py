@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import dynamics, read_robot
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
@@ -89,13 +90,13 @@ def test_forces_are_those_of_mujoco(name, tmp_path):
         wanted = np.array(data.qacc)
         mujoco.mj_inverse(model, data)
         tau, qdd, origins = map(np.asarray, moved(data.qpos, data.qvel, wanted))
-        np.testing.assert_allclose(tau, data.qfrc_inverse, rtol=1e-10, atol=1e-10)
+        assert_allclose(tau, data.qfrc_inverse, rtol=1e-10, atol=1e-10)
         data.qfrc_applied = tau
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(qdd, data.qacc, rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(qdd, wanted, rtol=1e-9, atol=1e-9)
+        assert_allclose(qdd, data.qacc, rtol=1e-8, atol=1e-8)
+        assert_allclose(qdd, wanted, rtol=1e-9, atol=1e-9)
         turning = np.array(robot.tree.joints) == "revolute"  # MuJoCo's anchor of a slide stays behind
-        np.testing.assert_allclose(origins[turning], data.xanchor[turning], atol=1e-12)
+        assert_allclose(origins[turning], data.xanchor[turning], atol=1e-12)
 
 
 def test_what_a_file_states_of_its_joints(tmp_path):
@@ -103,11 +104,11 @@ def test_what_a_file_states_of_its_joints(tmp_path):
     robot = read_robot(written(tmp_path, "arm.urdf", in_namespace))
     assert robot.tree.names == ("shoulder", "elbow", "slide")
     assert robot.tree.joints == ("revolute", "revolute", "prismatic")
-    np.testing.assert_array_equal(robot.damping, [0.2] * 3)
-    np.testing.assert_array_equal(robot.coulomb, [0.1] * 3)
-    np.testing.assert_array_equal(robot.position_limits, [[-1, 2], [-np.inf, np.inf], [-1, 2]])
-    np.testing.assert_array_equal(robot.force_limits, [[-30, 30]] * 3)
-    np.testing.assert_array_equal(robot.tree.gravity, [0, 0, -9.81])
+    assert_array_equal(robot.damping, [0.2] * 3)
+    assert_array_equal(robot.coulomb, [0.1] * 3)
+    assert_array_equal(robot.position_limits, [[-1, 2], [-np.inf, np.inf], [-1, 2]])
+    assert_array_equal(robot.force_limits, [[-30, 30]] * 3)
+    assert_array_equal(robot.tree.gravity, [0, 0, -9.81])
 
 
 @pytest.mark.parametrize(
@@ -125,7 +126,7 @@ def test_joints_are_locked_at_their_positions(file, lock, tmp_path):
         jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*states)
         for robot, states in ((free, state), (locked, state[:, place]))
     )
-    np.testing.assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
+    assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
 
 
 def test_a_gripper_whose_fingers_are_tied_and_a_free_base_can_be_locked(tmp_path):
@@ -147,7 +148,7 @@ def test_inertias_that_no_body_has_are_read_as_they_are(tmp_path):
     tree = read_robot(written(tmp_path, "flat.urdf", flat)).tree
     true = read_robot(written(tmp_path, "arm.urdf", ARM)).tree
     assert np.linalg.eigvalsh(pseudo_inertia(tree.inertias[0]))[0] < 0
-    np.testing.assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)
+    assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)
 
 
 ONE = LINK.format(name="one", mass=1.0)
@@ -244,7 +245,7 @@ def test_limits_that_are_switched_off_or_zero_are_not_stated(tmp_path):
     zeros = limited('effort="30" velocity="3"', 'effort="0" velocity="0"')
     robot = read_robot(written(tmp_path, "arm.urdf", zeros))
     assert np.isinf(robot.velocity_limits[0]) and np.isinf(robot.force_limits[0]).all()
-    np.testing.assert_array_equal(robot.position_limits[0], [-1, 2])
+    assert_array_equal(robot.position_limits[0], [-1, 2])
     swapped = read_robot(written(tmp_path, "arm.urdf", limited('lower="-1"', 'lower="3"')), lock=["shoulder"])
     assert swapped.tree.names == ("elbow", "slide")
 

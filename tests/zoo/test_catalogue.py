@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 import dln_jax
 from dln_jax import InputError, Model, NaturalSystem, Needs, PhaseRates
@@ -109,7 +110,7 @@ def test_a_stored_model_is_the_same_after_every_default_has_changed(name, tmp_pa
     monkeypatch.setitem(CATALOGUE, name, entry._replace(factory=remembers(entry.factory), additions=additions))
     again = load(tmp_path)
     assert {"name", "precision", *received} - {"dtype"} == set(description)
-    jax.tree.map(np.testing.assert_array_equal, run.parameters, again.parameters)
+    jax.tree.map(assert_array_equal, run.parameters, again.parameters)
 
 
 def test_missing_keywords_are_refused_and_never_filled_in():
@@ -150,7 +151,7 @@ def test_functions_are_made_once_and_compute_in_the_precision_of_the_training(tm
     with pytest.raises(InputError, match="has a model already"):
         dln_jax.save(tmp_path, run.description, tuned)
     dln_jax.save(tmp_path, run.description, tuned, overwrite=True)
-    jax.tree.map(np.testing.assert_array_equal, dln_jax.load(tmp_path).parameters, tuned)
+    jax.tree.map(assert_array_equal, dln_jax.load(tmp_path).parameters, tuned)
 
 
 # one's own models
@@ -184,7 +185,7 @@ def test_a_model_of_ones_own_is_loaded_with_its_factory(tmp_path):
     with pytest.raises(InputError, match="give it as factory="):
         load(tmp_path, trust=True)
     run = load(tmp_path, factory=make_rod)
-    np.testing.assert_allclose(run.dynamics.mass_matrix([0.1]), [[12.0]])
+    assert_allclose(run.dynamics.mass_matrix([0.1]), [[12.0]])
     assert run.flow.energy([0.1], [0.0]) == -3 * jnp.cos(0.1)
     with pytest.raises(InputError, match="lacks length"):
         altered(tmp_path, lambda model: model.pop("length"))
@@ -197,7 +198,7 @@ def test_a_factory_is_imported_by_name_only_when_it_is_trusted(tmp_path, module)
     with pytest.raises(InputError, match="made by rods:make_rod, which is not code of this package; give"):
         load(tmp_path)
     assert load(tmp_path, factory=make_rod) and not module()
-    np.testing.assert_allclose(load(tmp_path, trust=True).dynamics.mass_matrix([0.1]), [[12.0]])
+    assert_allclose(load(tmp_path, trust=True).dynamics.mass_matrix([0.1]), [[12.0]])
     assert module()
     for name in ("rods:number", "rods:nothing", "no.such.module:make", ":", "rods:", "..rods:make_rod"):
         altered(tmp_path, lambda model, name=name: model.update(name=name))
@@ -221,9 +222,9 @@ def test_typical_sizes_are_those_of_the_data():
     times = {"t": np.arange(50.0), "trajectory": np.zeros(50, int)}
     data = from_arrays({**times, "q": qd, "qd": qd, "qdd": qd, "tau": tau, "p": p, "pd": pd})
     pooled = typical_sizes("phase-network", data, pooled=True)
-    np.testing.assert_allclose(typical_sizes("feed-forward", data)["tau_scale"], tau.std(axis=0), rtol=5e-3)
-    np.testing.assert_allclose(pooled["rate_scale"], np.std([qd, pd]), rtol=5e-3)
-    np.testing.assert_allclose(pooled["momentum_scale"], p.std(), rtol=5e-3)
+    assert_allclose(typical_sizes("feed-forward", data)["tau_scale"], tau.std(axis=0), rtol=5e-3)
+    assert_allclose(pooled["rate_scale"], np.std([qd, pd]), rtol=5e-3)
+    assert_allclose(pooled["momentum_scale"], p.std(), rtol=5e-3)
     without, needs = data._replace(p=None, pd=None), Needs(joints=("prismatic",) * 2)
     with pytest.raises(InputError, match="no momenta p"):
         typical_sizes("black-box-hnn", without, pooled=True)

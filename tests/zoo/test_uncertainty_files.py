@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from calls import one_line
+from numpy.testing import assert_allclose
 
 from dln_jax import Needs, build, describe, load_c
 from dln_jax.export.c.families import functions_of_run
@@ -45,7 +46,7 @@ def test_it_comes_back_with_the_run(folder):
         std = jax.jit(predictive(MODEL, PARAMETERS, *stored[:3]))
         flag = jax.jit(out_of_distribution(MODEL, PARAMETERS, stored))
         for state in STATES[:3]:
-            np.testing.assert_allclose(run.torque_std(*state), std(*state), rtol=1e-12)
+            assert_allclose(run.torque_std(*state), std(*state), rtol=1e-12)
             assert run.out_of_distribution(*state.tolist()) == flag(*state)
     # Other parameters do not inherit it.
     save(folder, DESCRIPTION, PARAMETERS)
@@ -87,7 +88,7 @@ def test_c_is_equal(folder, tmp_path):
         in_c, flags = load_c(out), set()
         for state in STATES:
             rounded = state.astype(dtype)
-            np.testing.assert_allclose(in_c.torque_std(*rounded), run.torque_std(*state), rtol=tolerance)
+            assert_allclose(in_c.torque_std(*rounded), run.torque_std(*state), rtol=tolerance)
             flags.add(bool(run.out_of_distribution(*state)))
             assert bool(in_c.out_of_distribution(*rounded)) == bool(run.out_of_distribution(*state))
         assert flags == ({True} if undetermined else {True, False})

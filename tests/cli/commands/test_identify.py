@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of, one_line
+from numpy.testing import assert_allclose, assert_array_equal
 from planar_arm import FRICTION, URDF, motions
 
 from dln_jax import load, load_c, read_robot
@@ -56,13 +57,13 @@ def test_sound_log_gives_a_good_run_folder_like_every_other(identified):
 def test_the_model_is_loaded_and_exported_and_the_file_has_what_was_identified(identified, tmp_path):
     run = load(identified)
     state = np.random.default_rng(1).normal(size=(3, 2))
-    np.testing.assert_allclose(run.parameters.coulomb, FRICTION["coulomb"], atol=0.05)
+    assert_allclose(run.parameters.coulomb, FRICTION["coulomb"], atol=0.05)
     export_run(identified, tmp_path / "c", functions=("inverse_dynamics",))
     in_c = load_c(tmp_path / "c").inverse_dynamics
-    np.testing.assert_allclose(in_c(*state), run.dynamics.inverse_dynamics(*state), rtol=1e-12)
+    assert_allclose(in_c(*state), run.dynamics.inverse_dynamics(*state), rtol=1e-12)
     robot = read_robot(identified / "arm_identified.urdf")
-    np.testing.assert_allclose(robot.tree.inertias, run.parameters.inertias, rtol=1e-12, atol=1e-14)
-    np.testing.assert_array_equal(robot.damping, run.parameters.viscous)
+    assert_allclose(robot.tree.inertias, run.parameters.inertias, rtol=1e-12, atol=1e-14)
+    assert_array_equal(robot.damping, run.parameters.viscous)
     assert re.search(r"Armature, .*: shoulder 0\.\d+, elbow 0\.\d+", (identified / "arm_identified.urdf").read_text())
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from calls import assert_refused, command, json_of
 from motions import sums_of_sines
+from numpy.testing import assert_allclose
 
 from dln_jax import dynamics, load, load_c, read_robot
 from dln_jax.cli.commands import identify
@@ -58,18 +59,18 @@ def test_all_terms_are_identified_and_written(place, capsys):
     state = np.random.default_rng(1).normal(size=(3, 2))
     with jax.enable_x64(True):
         run = load("run")
-        np.testing.assert_allclose(run.description["load"], TERMS["load"], atol=0.04)
-        np.testing.assert_allclose(run.description["cooling"], TERMS["cooling"], atol=3e-3)
-        np.testing.assert_allclose(run.parameters.coulomb, [0.4, 0.3], atol=0.05)
+        assert_allclose(run.description["load"], TERMS["load"], atol=0.04)
+        assert_allclose(run.description["cooling"], TERMS["cooling"], atol=3e-3)
+        assert_allclose(run.parameters.coulomb, [0.4, 0.3], atol=0.05)
         # Hot grease: the same functions in C at a stated temperature.
         export_run("run", "c", functions=("inverse_dynamics",), temperature=60.0)
         hot = dynamics(run.model.energies(run.parameters, 60.0)).inverse_dynamics(*state)
-        np.testing.assert_allclose(load_c("c").inverse_dynamics(*state), hot, rtol=1e-10)
+        assert_allclose(load_c("c").inverse_dynamics(*state), hot, rtol=1e-10)
         assert np.abs(hot - run.dynamics.inverse_dynamics(*state)).max() > 0.05
     # The file has the coupled motor.
     S = np.array(TERMS["motors"])
     armature = S.T @ np.diag(run.parameters.armature) @ S
-    np.testing.assert_allclose(read_robot("run/arm_identified.xml").tree.armature, armature)
+    assert_allclose(read_robot("run/arm_identified.xml").tree.armature, armature)
 
 
 def test_terms_that_are_none_are_refused(place, capsys):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import json_of, one_line, refused
+from numpy.testing import assert_array_equal, assert_equal
 
 from dln_jax import InputError
 from dln_jax.cli.arguments import arguments_of
@@ -132,7 +133,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     """A key that nobody reads may be anything; those that are read are counted before they are."""
     members = {key: npy(array) for key, array in TRAJECTORIES.items()}
     zipped("data.npz", **members, notes=header(SHAPE % "(1000000000000,)"))
-    np.testing.assert_array_equal(schema.load("data.npz").tau, TRAJECTORIES["tau"])
+    assert_array_equal(schema.load("data.npz").tau, TRAJECTORIES["tau"])
     with pytest.raises(InputError, match=r"'x' is missing.*not read: t, q, .*notes"):
         functions.load("data.npz")
     monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
@@ -242,8 +243,8 @@ def test_damaged_histories_are_refused(here):
     rows = [Progress(1, 2.0, float("nan"), 3.0, 0.5)]
     store(checkpoint, state, rows)
     found, history = restore(checkpoint, state)
-    np.testing.assert_array_equal(found["w"], state["w"])
-    np.testing.assert_equal(history, rows)
+    assert_array_equal(found["w"], state["w"])
+    assert_equal(history, rows)
     path = here / "checkpoint.json"
     stored = json_of(path)
     for damaged in HISTORIES:

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from calls import command, exit_status, json_of, refused
+from numpy.testing import assert_allclose
 from published_motions import PUBLISHED, integrated, published_arrays
 
 from dln_jax import Needs, load
@@ -39,8 +40,8 @@ def test_noise_of_states_and_rates_weighs_motions(files):
     problem = own_problem("spring")
     weights, named = problem.trust.weights, recipes.RECIPES["spring"].weights
     assert not problem.trust.free_of_noise and named.rate == 0.01
-    np.testing.assert_allclose(weights.state, 0.1, rtol=0.15)
-    np.testing.assert_allclose(units_of_judgement(problem)["noise"], 0.1, rtol=0.15)
+    assert_allclose(weights.state, 0.1, rtol=0.15)
+    assert_allclose(units_of_judgement(problem)["noise"], 0.1, rtol=0.15)
     assert np.all(np.abs(np.log2(np.divide(weights.rate, named.rate))) < 1)
 
 

@@ -175,7 +175,7 @@ FAULTS = {
     "motor's torque": (lambda a: {"tau": a["tau"] / 100}, "gear", (0, 1, 2), "", arm()),
     "columns exchanged": (lambda a: {key: a[key][:, [0, 2, 1]] for key in ("q", "qd", "tau")}, "order", (), "", arm()),
     "upside down": (lambda a: {}, "gravity", (), "-9.", arm(gravity=(0.0, 0.0, 9.81))),
-    "torques later than the robot's": (lambda a: {"tau": late(a["tau"], 2)}, "delay", (), "20 ms", arm()),
+    "torques later than the robot's": (lambda a: {"tau": late(a["tau"], 2)}, "delay", (), "20.", arm()),
     "beyond limits": (
         lambda a: {}, "limits", (0, 1, 2), "", arm()._replace(position_limits=np.tile([-0.5, 0.5], (3, 1)))
     ),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from calls import one_line
 from motions import sums_of_sines
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.data import schema
 from dln_jax.data.encoders import (
@@ -156,14 +157,14 @@ def test_commands_of_uneven_samples_keep_their_impulse_at_equal_steps():
     u = random.choice([-1.0, 1.0], (300, 1))
     data = one_channel(t, np.sin(3 * t), u)
     even = sampling.held_at_equal_steps(data, 100.0)
-    np.testing.assert_allclose(even.q, np.sin(3 * even.t)[:, None], atol=1e-5)
+    assert_allclose(even.q, np.sin(3 * even.t)[:, None], atol=1e-5)
     first = np.flatnonzero(np.diff(even.t) > 0.015)[0]
-    np.testing.assert_allclose(np.diff(even.t[: first + 1]), 0.01, atol=1e-12)
+    assert_allclose(np.diff(even.t[: first + 1]), 0.01, atol=1e-12)
     fine = even.t[0] + 1e-5 * (np.arange(1000 * first) + 0.5)
     held = u[np.searchsorted(t, fine, side="right") - 1].reshape(-1, 1000).mean(axis=1)
-    np.testing.assert_allclose(even.tau[:first, 0], held, atol=4e-3)
+    assert_allclose(even.tau[:first, 0], held, atol=4e-3)
     already = data._replace(t=np.arange(300) / 100.0)
-    np.testing.assert_array_equal(sampling.held_at_equal_steps(already).tau, u)
+    assert_array_equal(sampling.held_at_equal_steps(already).tau, u)
 
 
 def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
@@ -190,7 +191,7 @@ def test_uneven_samples_come_to_equal_steps():
     t = (np.arange(1250) + np.random.default_rng(1).uniform(-0.3, 0.3, 1250)) / RATE
     smoothed = smooth(schema.from_arrays(log(t=t, noise=1e-5)[0]), trim=0.5)
     even = smoothed.data
-    np.testing.assert_allclose(np.diff(even.t)[np.diff(even.trajectory) == 0], 1 / smoothed.rate, rtol=1e-9)
+    assert_allclose(np.diff(even.t)[np.diff(even.trajectory) == 0], 1 / smoothed.rate, rtol=1e-9)
     _, qd, qdd = motion(even.t + SECONDS * even.trajectory)
     assert np.all(np.std(even.qd - qd, axis=0) < 2e-3 * np.std(qd, axis=0))
     assert np.all(np.std(even.qdd - qdd, axis=0) < 0.03 * np.std(qdd, axis=0))
@@ -237,7 +238,7 @@ def test_noise_of_torques_is_told_only_from_samples_close_together():
     data = one_channel(
         t, np.sin(3 * t), 5 * np.sin(2 * t)[:, None] + 0.1 * np.random.default_rng(0).normal(size=(2000, 1))
     )
-    np.testing.assert_allclose(torque_noise(data), 0.1, rtol=0.1)
+    assert_allclose(torque_noise(data), 0.1, rtol=0.1)
     assert torque_noise(every(data, 60)) is None
     assert torque_noise(data._replace(trajectory=np.arange(len(t)))) is None
 
