@@ -12,7 +12,6 @@ import pytest
 from calls import json_of, one_line, refused
 from numpy.testing import assert_array_equal, assert_equal
 
-from dln_jax import InputError
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
     simulate,
@@ -134,10 +133,10 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     members = {key: npy(array) for key, array in TRAJECTORIES.items()}
     zipped("data.npz", **members, notes=header(SHAPE % "(1000000000000,)"))
     assert_array_equal(schema.load("data.npz").tau, TRAJECTORIES["tau"])
-    with pytest.raises(InputError, match=r"'x' is missing.*not read: t, q, .*notes"):
+    with one_line(r"'x' is missing.*not read: t, q, .*notes"):
         functions.load("data.npz")
     monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
-    with pytest.raises(InputError, match="holds more than"):
+    with one_line("holds more than"):
         schema.load("data.npz")
 
 

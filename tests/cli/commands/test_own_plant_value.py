@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calls import assert_refused, command, exit_status, json_of
+from calls import assert_refused, command, exit_status, json_of, one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax import InputError
 from dln_jax.cli.commands import train_value
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration
@@ -138,5 +137,5 @@ def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
     # A body of 1.2 times the mass is accelerated by the motor 1 / 1.2 as much.
     heavy, light = (plant.actuation(x)[1, 0] for plant in (with_factors(known, [1.2, 1.0]), known.plant.problem))
     assert float(heavy / light) == pytest.approx(1 / 1.2, rel=1e-9)
-    with pytest.raises(InputError, match="states no limits of the motors"):
+    with one_line("states no limits of the motors"):
         of_run(tmp_path, Wishes())
