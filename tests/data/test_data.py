@@ -1,11 +1,8 @@
 """The schema, its refusals, splits by trajectory, and the generators' exactness."""
 
 import json
-import pickle
 
-import jax
 import numpy as np
-import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -15,7 +12,7 @@ from dln_jax.data.splits import PER_SAMPLE, merged, select, select_samples, spli
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulums import double_pendulum, two_link_arm
+from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.scenes.poles import cart_pole
 
 
@@ -73,24 +70,6 @@ def test_what_breaks_the_schema_is_named():
             schema.from_arrays(content)
 
 
-def test_files_that_are_no_archive_are_refused_and_nothing_is_unpickled(tmp_path):
-    path = tmp_path / "data.npz"
-    with one_line("no such file"):
-        schema.load(path)
-
-    class Bomb:
-        def __reduce__(self):
-            return (pytest.fail, ("a pickle was executed",))
-
-    np.savez(path, **arrays())
-    cut = path.read_bytes()[:-200]
-    np.savez(path, **{**arrays(), "q": np.array([Bomb()], dtype=object)})
-    for content in (pickle.dumps(Bomb()), cut, path.read_bytes()):
-        path.write_bytes(content)
-        with one_line(f"{path}.*without pickled objects"):
-            schema.load(path)
-
-
 def test_saving_and_loading_is_the_identity(tmp_path):
     path = tmp_path / "data.npz"
     laws = {"joint_friction": ("viscous", "stribeck"), "joint_map": ((1.0, 0.0), (-1.0, 1.0)), "velocity_scale": 0.02}
@@ -100,10 +79,9 @@ def test_saving_and_loading_is_the_identity(tmp_path):
     assert again.needs == data.needs
     for key in (*PER_SAMPLE, "label"):
         assert_array_equal(getattr(again, key), getattr(data, key))
-    nowhere = tmp_path / "nowhere" / "data.npz"
-    for other, words in ((path, "exists"), (nowhere, "no such folder"), (path.with_suffix(".csv"), r"end in \.npz")):
+    for name, words in (("data.npz", "exists"), ("a/b.npz", "no such folder"), ("a.csv", r"end in \.npz")):
         with one_line(words):
-            schema.save(other, data)
+            schema.save(tmp_path / name, data)
     older = {"joints": ["revolute"], "gravity": True, "friction": False, "actuation": None}
     assert needs_from_json(older) == Needs(("revolute",))
 
@@ -159,8 +137,8 @@ def test_letters_have_exact_rates_and_momenta_and_torques_that_are_sums():
 
 def test_uniform_states_fill_their_box_and_underactuated_scenes_are_driven_by_their_motors():
     data = generators.uniform(cart_pole(), samples=2000, position_bound=2.0, rate_bound=3.0)
-    for states, bound in ((data.q, 2.0), (data.qd, 3.0)):
-        assert 0.95 * bound < np.abs(states).max() <= bound and np.abs(states.mean(axis=0)).max() < 0.1 * bound
+    for states in (data.q / 2, data.qd / 3):
+        assert 0.95 < np.abs(states).max() <= 1 and np.abs(states.mean(axis=0)).max() < 0.1
     assert_allclose(data.tau[:, 1], 0.0, atol=1e-12)
     assert np.abs(data.tau[:, 0]).max() > 1
     for bound in ("samples", "position_bound", "rate_bound"):
@@ -169,11 +147,10 @@ def test_uniform_states_fill_their_box_and_underactuated_scenes_are_driven_by_th
 
 
 def test_free_swings_keep_their_energy():
-    scene = double_pendulum()
-    data = generators.free_swing(scene, trajectories=2, steps=200)
+    data = generators.free_swing(pendulum(), trajectories=2, steps=200)
     assert_array_equal(data.tau, 0.0)
-    energy = 0.5 * np.sum(data.qd * data.p, axis=1) + jax.jit(jax.vmap(scene.potential))(data.q)
-    assert_allclose(energy, np.repeat(energy[::200], 200), rtol=1e-8)
+    energy = 0.5 * data.qd * data.p - 9.81 * np.cos(data.q)
+    assert_allclose(energy, np.repeat(energy[::200], 200, axis=0), rtol=1e-8)
 
 
 def test_temperature_is_one_for_all_joints_or_one_for_each():

@@ -87,6 +87,11 @@ def garbled(arrays):
     return bytes(data)
 
 
+class Bomb:
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was executed",))
+
+
 SHAPE = "{'descr': '<f8', 'fortran_order': False, 'shape': %s, }"
 TYPE = "{'descr': %s, 'fortran_order': False, 'shape': (20,), }"
 VERTICES = [
@@ -99,7 +104,7 @@ VERTICES = [
     *map(header, ("[1, 2]", "{'descr': '<f8', (((", "(" * 5000)),
     *(header(SHAPE % shape) for shape in ("(1000000000000000,)", "(-20, -1)", "'20'", "(20.0,)")),
     *(header(TYPE % kind) for kind in ("'x9'", "[('a', '<f8')]", "'|O'")),
-    *map(npy, (np.array(["a", "b"]), np.ones((3, 2)) * 1j, np.array([{"a": 1}]), np.full((3, 2), np.nan))),
+    *map(npy, (np.array(["a", "b"]), np.ones((3, 2)) * 1j, np.array([Bomb()]), np.full((3, 2), np.nan))),
 ]
 """Contents of a member that no reader takes."""
 
