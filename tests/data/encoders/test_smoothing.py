@@ -10,10 +10,10 @@ from dln_jax.data import schema
 from dln_jax.data.encoders import (
     derivatives,
     find_repeats,
+    held_at_equal_steps,
     labels_of_parts,
     low_pass,
     noise_of,
-    sampling,
     smooth,
     step_of,
     torque_noise,
@@ -57,7 +57,7 @@ def one_channel(t, q, tau=0.0):
 
 
 def rms(x):
-    return float(np.sqrt(np.mean(np.square(x))))
+    return np.sqrt(np.mean(np.square(x)))
 
 
 def within(data, ends):
@@ -78,9 +78,10 @@ def assert_nearly_best(data, key, truth, trim, cutoffs):
 def test_noise_is_found_whatever_its_size_and_jumps_are_none():
     for noise in (0.0, 1e-6, 1e-2):
         arrays, _, _ = log(noise=noise)
-        jumps = arrays["q"] + 0.5 * np.sign(np.sin(3 * arrays["t"]))[:, None]
-        for values in (arrays["q"], jumps):
-            assert noise_of(values, arrays["trajectory"]) == pytest.approx([noise, noise], rel=0.1, abs=1e-7)
+        for size in (0.0, 0.5):
+            jumps = size * np.sign(np.sin(3 * arrays["t"]))[:, None]
+            found = noise_of(arrays["q"] + jumps, arrays["trajectory"])
+            assert found == pytest.approx([noise, noise], rel=0.1, abs=1e-7)
     # Noise is filtered in spite of jumps.
     arrays["q"][50::97, 0] += 0.05
     assert np.isfinite(smooth(schema.from_arrays(arrays)).cutoff)
@@ -156,15 +157,14 @@ def test_commands_of_uneven_samples_keep_their_impulse_at_equal_steps():
     t[200:] += 0.1  # a gap
     u = random.choice([-1.0, 1.0], (300, 1))
     data = one_channel(t, np.sin(3 * t), u)
-    even = sampling.held_at_equal_steps(data, 100.0)
+    even = held_at_equal_steps(data, 100.0)
     assert_allclose(even.q, np.sin(3 * even.t)[:, None], atol=1e-5)
-    first = np.flatnonzero(np.diff(even.t) > 0.015)[0]
+    first = np.argmax(np.diff(even.t) > 0.015)
     assert_allclose(np.diff(even.t[: first + 1]), 0.01, atol=1e-12)
     fine = even.t[0] + 1e-5 * (np.arange(1000 * first) + 0.5)
-    held = u[np.searchsorted(t, fine, side="right") - 1].reshape(-1, 1000).mean(axis=1)
+    held = u[np.searchsorted(t, fine) - 1].reshape(-1, 1000).mean(axis=1)
     assert_allclose(even.tau[:first, 0], held, atol=4e-3)
-    already = data._replace(t=np.arange(300) / 100.0)
-    assert_array_equal(sampling.held_at_equal_steps(already).tau, u)
+    assert_array_equal(held_at_equal_steps(data._replace(t=np.arange(300) / 100.0)).tau, u)
 
 
 def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
@@ -219,18 +219,19 @@ def test_decimated_torques_are_filtered_and_others_are_not():
 
 
 def test_what_cannot_be_filtered_is_one_line():
-    arrays, _, _ = log()
-    noise = {**arrays, "q": 1e-4 * np.random.default_rng(0).normal(size=arrays["q"].shape)}
-    for given, settings, message in (
-        (arrays, {"cutoff": 80.0}, "expected less than 62.5 Hz"),
-        (arrays, {"cutoff": -1.0}, "cutoff is -1.0"),
-        (arrays, {"cutoff": 10.0, "decimate": 8}, "more than twice the cut-off"),
-        (arrays, {"cutoff": 0.1}, "longer motions"),
-        (arrays, {"trim": -0.1}, "trim is -0.1"),
-        (noise, {}, "moves by more than its noise"),
-    ):
+    data = schema.from_arrays(log()[0])
+    noise = 1e-4 * np.random.default_rng(0).normal(size=data.q.shape)
+    for message, settings in {
+        "expected less than 62.5 Hz": {"cutoff": 80.0},
+        "cutoff is -1.0": {"cutoff": -1.0},
+        "more than twice the cut-off": {"cutoff": 10.0, "decimate": 8},
+        "longer motions": {"cutoff": 0.1},
+        "trim is -0.1": {"trim": -0.1},
+    }.items():
         with one_line(message):
-            smooth(schema.from_arrays(given), **settings)
+            smooth(data, **settings)
+    with one_line("moves by more than its noise"):
+        smooth(data._replace(q=noise))
 
 
 def test_noise_of_torques_is_told_only_from_samples_close_together():
