@@ -48,12 +48,10 @@ def test_statements_about_joints_are_checked():
             call()
 
 
-def test_columns_take_the_robots_order(tmp_path):
-    schema.save(tmp_path / "log.npz", NAMED)
-    data = schema.load(tmp_path / "log.npz")
-    ordered = with_joints(data, ("slide", "elbow"))
+def test_columns_take_the_robots_order():
+    ordered = with_joints(NAMED, ("slide", "elbow"))
     for key in ("q", "qd", "qdd", "tau"):
-        assert_array_equal(getattr(ordered, key), getattr(data, key)[:, ::-1])
+        assert_array_equal(getattr(ordered, key), getattr(NAMED, key)[:, ::-1])
     assert ordered.joint_names.tolist() == ["slide", "elbow"] and ordered.needs.joints == ("prismatic", "revolute")
     unnamed = schema.from_arrays(ARRAYS)
     assert with_joints(unnamed, ("a", "b")) is unnamed
