@@ -24,9 +24,8 @@ def quick_prediction(model, parameters, q, p, t):
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
+def workplace(folder):
     """A damped pendulum with gaps in place of the measured one, and recipes that take a moment."""
-    folder = tmp_path_factory.mktemp("tasks")
     t = np.arange(160) / 6
     t[40:] += 1 / 6
     q = (2 * np.exp(-0.02 * t) * np.cos(2 * t))[:, None]
@@ -35,7 +34,6 @@ def workplace(tmp_path_factory):
     small = {name: recipe._replace(**sizes, trajectory_steps=1) for name, recipe in RECIPES.items()}
     window = dict.fromkeys(hnn_tasks.WINDOW, 6)
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
         for module in (hnn_models, stages, choice):
             patch.setattr(module, "RECIPES", small)
         for module in (hnn_tasks, measurements):

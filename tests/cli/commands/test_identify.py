@@ -19,18 +19,15 @@ QUICK = "--no-figures --no-uncertainty"
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
+def workplace(folder):
     """A robot's file with masses that are too small, and a log of the true one, columns the other way round."""
-    folder = tmp_path_factory.mktemp("workplace")
     (folder / "arm.urdf").write_text(URDF)
     tree = read_robot(folder / "arm.urdf").tree
     tree = tree._replace(inertias=1.5 * tree.inertias, armature=np.array([0.1, 0.2]))
     log = motions(0, noise=0.05, samples=400, tree=tree)
     swapped = {key: getattr(log, key)[:, ::-1] for key in ("q", "qd", "qdd", "tau")}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        np.savez("log.npz", t=log.t, trajectory=log.trajectory, joint_names=["elbow", "shoulder"], **swapped)
-        yield folder
+    np.savez("log.npz", t=log.t, trajectory=log.trajectory, joint_names=["elbow", "shoulder"], **swapped)
+    return folder
 
 
 @pytest.fixture(scope="module")

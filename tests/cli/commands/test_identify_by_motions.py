@@ -23,19 +23,16 @@ STEP = 0.01
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def place(folder):
     """A pendulum with twice the stated mass, viscous friction and armature, driven by noisy torques; log of q alone."""
-    folder = tmp_path_factory.mktemp("pendulum")
     (folder / "rod.urdf").write_text(URDF)
     tree = read_robot(folder / "rod.urdf").tree
     true = tree._replace(inertias=2 * tree.inertias, armature=np.array([0.02]))
     random = np.random.default_rng(0)
     t, tau, states = moved(tree_system(true, joint_dissipation([0.1], [0.0])), 20, substeps=4)
     q = states[:, :1] + 2e-4 * random.normal(size=tau.shape)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        np.savez("log.npz", t=t, q=q, tau=tau + 0.05 * random.normal(size=tau.shape), joint_names=["hinge"])
-        yield folder
+    np.savez("log.npz", t=t, q=q, tau=tau + 0.05 * random.normal(size=tau.shape), joint_names=["hinge"])
+    return folder
 
 
 def moved(system, seconds, **options):

@@ -22,8 +22,7 @@ TERMS = {"motors": ((1.0, 0.0), (1.0, 1.0)), "cooling": (0.02, 0.01), "load": (0
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("terms")
+def place(folder):
     (folder / "arm.xml").write_text(MJCF)
     tree = read_robot(folder / "arm.xml").tree
     heavier = tree._replace(inertias=1.2 * tree.inertias)
@@ -41,11 +40,8 @@ def place(tmp_path_factory):
 
     tau = np.asarray(torque(*states, temperature)) + 0.02 * random.normal(size=(len(t), 2))
     log = {"t": t, **dict(zip(("q", "qd", "qdd"), states, strict=True)), "tau": tau}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        np.savez("log.npz", temperature=temperature, **log)
-        np.savez("cold.npz", **log)
-        yield folder
+    np.savez("log.npz", temperature=temperature, **log)
+    return folder
 
 
 @pytest.mark.slow
@@ -73,7 +69,10 @@ def test_all_terms_are_identified_and_written(place, capsys):
     assert_allclose(read_robot("run/arm_identified.xml").tree.armature, armature)
 
 
-def test_terms_that_are_none_are_refused(place, capsys):
+def test_terms_that_are_none_are_refused(folder, capsys):
+    (folder / "arm.xml").write_text(MJCF)
+    waves = np.random.default_rng(0).normal(size=(4, 50, 2))
+    np.savez("cold.npz", t=np.arange(50.0), **dict(zip(("q", "qd", "qdd", "tau"), waves, strict=True)))
     rows = [
         ("--motors 1,0", "--motors has 1 rows; expected 2"),
         ("--motors 1,1;1,1", "that can be inverted"),
@@ -82,4 +81,4 @@ def test_terms_that_are_none_are_refused(place, capsys):
         ("--temperature --friction coulomb", "--temperature changes viscous friction"),
         ("--temperature", "friction is to depend on temperature, which the data do not have"),
     ]
-    assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=place / "none")
+    assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=folder / "none")

@@ -270,27 +270,26 @@ def test_covariance_of_torques_is_that_of_an_energy():
     states, others = random.normal(size=(2, 3, 2, 2))
     ranges = np.ptp(states[0], axis=0)
 
+    strengths = np.clip(STRONGEST * np.sqrt(sizes), WEAKEST, STRONGEST)
+
     def kernel(q, other, power):
         turning = ((1 + strengths[0] * jnp.cos(q[0] - other[0])) / (1 + strengths[0])) ** power
         return turning * jnp.exp(-0.5 * ((q[1] - other[1]) / (2 * ranges[1])) ** 2)
 
     def torque(energy, q, qd, qdd):
-        return jax.jvp(jax.grad(energy, 1), (q, qd), (qd, qdd))[1] - jax.grad(energy)(q, qd)
+        return jax.jvp(jax.jacfwd(energy, 1), (q, qd), (qd, qdd))[1] - jax.jacfwd(energy)(q, qd)
 
-    def torques_of(state, other):
-        """Covariance of the kinetic and the potential torques [2, 2] of two states."""
+    def covariance(energy):
+        """Of the torques [2, 2] of two states, where that of the energies is a function of both (q, qd)."""
+        of_state = lambda *other: torque(lambda *state: energy(*state, *other), *states[:, 0])  # noqa: E731
+        return jax.jit(lambda: torque(of_state, *others[:, 1]))()
 
-        def by_state(p, v):
-            return torque(lambda q, u: kernel(q, p, 2) * (u * sizes @ v) ** 2, *state)
-
-        kinetic = jnp.stack([torque(lambda p, v, i=i: by_state(p, v)[i], *other) for i in range(2)])
-        return kinetic, jax.jacfwd(jax.grad(lambda q, p: kernel(q, p, 1)), 1)(state[0], other[0])
-
-    strengths = np.clip(STRONGEST * np.sqrt(sizes), WEAKEST, STRONGEST)
     found = covariances(tuple(states), tuple(others), ("revolute", "prismatic"), sizes)[0]
-    blocks = jax.jit(torques_of)(states[:, 0], others[:, 1])
-    for closed, block in zip((found.kinetic, found.potential), blocks, strict=True):
-        assert closed[:2, 2:] == pytest.approx(np.asarray(block), abs=1e-12)
+    for closed, energy in (
+        (found.kinetic, lambda q, u, p, v: kernel(q, p, 2) * (u * sizes @ v) ** 2),
+        (found.potential, lambda q, u, p, v: kernel(q, p, 1)),
+    ):
+        assert closed[:2, 2:] == pytest.approx(np.asarray(covariance(energy)), abs=1e-12)
 
 
 def test_a_repair_is_judged_by_the_joints_that_it_concerns():
@@ -333,6 +332,7 @@ def errors(arrays, robot=None):
     return [(finding.check, finding.joints) for finding in findings if finding.severity == "error"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "check"), [(planar(LYING), "tree-sign"), (None, "torque-sign")])
 def test_the_joint_of_a_scara_whose_torque_is_reversed_is_blamed(robot, check):
     """Turning the other joint's torque explains it as well, with a negative definite inertia."""
@@ -371,6 +371,7 @@ def test_torques_without_gravity_are_named_and_fitted_so():
     assert prepare_log(options, data, options.data, robot=robot)[-1] is robot
 
 
+@pytest.mark.slow
 def test_torques_late_by_200_ms_are_found_at_20_hz():
     slow = log(lambda q, qd, qdd: np.array([2.0, 1.0]) * qdd + 3 * np.sin(q), pace=5.0)
     findings = quick(schema.from_arrays({**slow, "tau": late(slow["tau"], 4)}))
