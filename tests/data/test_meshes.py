@@ -199,19 +199,16 @@ def test_arguments_that_make_no_sense_are_named():
             call()
 
 
-@pytest.mark.parametrize(
-    ("creature", "muscles", "legs", "length"),
-    [(crawler(), 24, 4, 2.88), (biped(), 24, 2, 1.6), (quadruped(), 32, 4, 3.2)],
-    ids=["crawler", "biped", "quadruped"],
-)
-def test_creatures_are_symmetric_bodies_with_muscles_on_either_side_of_each_leg(creature, muscles, legs, length):
+@pytest.mark.parametrize(("drawn", "legs", "length"), [(crawler, 4, 2.88), (biped, 2, 1.6), (quadruped, 4, 3.2)])
+def test_creatures_are_symmetric_bodies_with_muscles_on_either_side_of_each_leg(drawn, legs, length):
+    creature = drawn()
     mesh, pairs = creature.mesh, creature.muscles
     assert mesh.vertices[:, 1].min() == 0.0 and body_length(creature) == pytest.approx(length)
     assert regularity(mesh.vertices, mesh.elements).min() > 0.5
     assert euler_characteristic(mesh) == 1  # in one piece, without holes
     # Distinct pairs that are edges of the mesh, none on the ground, ordered along the body.
     distinct = {tuple(sorted(pair)) for pair in pairs.tolist()}
-    assert len(distinct) == len(pairs) == muscles and distinct <= {*map(tuple, edges(mesh).tolist())}
+    assert len(distinct) == len(pairs) and distinct <= {*map(tuple, edges(mesh).tolist())}
     middles = mesh.vertices[pairs].mean(axis=1)
     assert (middles[:, 1] > 0).all() and (np.diff(middles[:, 0]) > -1e-12).all()
     # Symmetric about the vertical axis: neither direction is easier.

@@ -28,9 +28,10 @@ SMALL = {"width": 3, "depth": 1}
 PENDULUM = serial(
     [np.eye(3)], [[0, 0, 0]], [inertial_parameters(1.0, [0.3, 0, 0], 0.1 * np.eye(3))], gravity=(0, -9.81, 0)
 )
+NETWORK = {"needs": SWING, **SMALL}
 MODELS = {
-    "structured-delan": {"needs": SWING, **SMALL, "shared_trunk": True},
-    "black-box-delan": {"needs": SWING, **SMALL, "rate_scale": [2.0]},
+    "structured-delan": {**NETWORK, "shared_trunk": True},
+    "black-box-delan": {**NETWORK, "rate_scale": [2.0]},
     "trigonometric": {"needs": SWING, "degree": [2]},
     "trigonometric-kernel": {"needs": SWING, "samples": 4},
     "trigonometric-residual": {"needs": SWING, "degree": [2], "terms": ["inertia"], **SMALL},
@@ -39,14 +40,14 @@ MODELS = {
     "rigid-tree-residual": {"needs": SWING, "tree": tree_to_json(PENDULUM), "terms": ["dissipation"], **SMALL},
     "planar-chain": {"needs": SWING},
     "learned-tree": {"needs": SWING},
-    "feed-forward": {"needs": FREE, **SMALL},
-    "structured-hnn": {"needs": SWING, **SMALL},
-    "black-box-hnn": {"needs": SWING, **SMALL},
-    "separable-hnn": {"needs": SWING, **SMALL},
+    "feed-forward": {**NETWORK, "needs": FREE},
+    "structured-hnn": NETWORK,
+    "black-box-hnn": NETWORK,
+    "separable-hnn": NETWORK,
     "pairwise-hnn": {"needs": Needs(joints=("prismatic",) * 4), **SMALL},
     "polynomial-hamiltonian": {"needs": FREE, "degree": 3},
-    "phase-network": {"needs": FREE, **SMALL},
-    "helmholtz-hnn": {"needs": FREE, **SMALL},
+    "phase-network": {**NETWORK, "needs": FREE},
+    "helmholtz-hnn": {**NETWORK, "needs": FREE},
     "differential-network": {"sizes": [2, 3, 1], "activation": "cos", "members": 2},
     "latent-phase": {"field": "black-box-hnn", "pixels": 6, "components": 2, "width": 3, "field_width": 3},
 }

@@ -6,6 +6,7 @@ import pytest
 from calls import assert_refused, command, json_of
 from motions import sums_of_sines
 from numpy.testing import assert_allclose
+from small_logs import small_log
 
 from dln_jax import dynamics, load, load_c, read_robot
 from dln_jax.cli.commands import identify
@@ -71,8 +72,7 @@ def test_all_terms_are_identified_and_written(place, capsys):
 
 def test_terms_that_are_none_are_refused(folder, capsys):
     (folder / "arm.xml").write_text(MJCF)
-    waves = np.random.default_rng(0).normal(size=(4, 50, 2))
-    np.savez("cold.npz", t=np.arange(50.0), **dict(zip(("q", "qd", "qdd", "tau"), waves, strict=True)))
+    np.savez("cold.npz", **small_log(2))
     rows = [
         ("--motors 1,0", "--motors has 1 rows; expected 2"),
         ("--motors 1,1;1,1", "that can be inverted"),

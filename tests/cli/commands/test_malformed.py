@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from calls import json_of, one_line, refused
 from numpy.testing import assert_array_equal, assert_equal
+from small_logs import STATES, small_log
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
@@ -31,8 +32,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 
-STATES = {key: np.random.default_rng(0).normal(size=(20, 2)) for key in ("q", "qd", "qdd", "tau")}
-TRAJECTORIES = {"t": np.tile(np.arange(4.0), 5), **STATES, "trajectory": np.repeat(np.arange(5), 4)}
+TRAJECTORIES = small_log(2)
 MESH = {"vertices": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), "elements": np.array([[0, 1, 2]])}
 
 
@@ -138,7 +138,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     members = {key: npy(array) for key, array in TRAJECTORIES.items()}
     zipped("data.npz", **members, notes=header(SHAPE % "(1000000000000,)"))
     assert_array_equal(schema.load("data.npz").tau, TRAJECTORIES["tau"])
-    with one_line(r"'x' is missing.*not read: t, q, .*notes"):
+    with one_line(r"'x' is missing.*not read: t, .*notes"):
         functions.load("data.npz")
     monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
     with one_line("holds more than"):
@@ -149,7 +149,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
 
 
 def test_a_copy_of_a_trajectory_in_the_test_is_refused(here, capsys):
-    copied = {key: np.concatenate([values[:16], values[4:8]]) for key, values in STATES.items()}
+    copied = {key: TRAJECTORIES[key][[*range(16), *range(4, 8)]] for key in STATES}
     np.savez("copied.npz", **{**TRAJECTORIES, **copied})
     for script in (train_delan, train_hnn):
         assert "'4' is a copy of '1'" in refuse(capsys, script, "--data copied.npz --out run")

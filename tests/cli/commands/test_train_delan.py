@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of, refused
-from motions import sums_of_sines
+from planar_arm import motions
+from small_logs import small_log
 
 from dln_jax import load
 from dln_jax.cli.commands import make_data, train_delan
@@ -105,12 +106,7 @@ def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(folder, c
     assert json_of(folder / "late" / "metrics.json")["steps"] == 2 * early["steps"]
 
 
-ANGLES = np.random.default_rng(0).normal(size=(4, 20, 2))
-GOOD = {
-    "t": np.tile(np.arange(4.0), 5),
-    **dict(zip(("q", "qd", "qdd", "tau"), ANGLES, strict=True)),
-    "trajectory": np.repeat(np.arange(5), 4),
-}
+GOOD = small_log(2)
 
 
 def marked(key, mark):
@@ -172,16 +168,12 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(folder, capsys):
 
 @pytest.mark.slow
 def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(folder, capsys):
-    """One CSV file without t, trajectory and needs: two coupled joints, viscous and dry friction, springs."""
-    random, t = np.random.default_rng(0), 0.02 * np.arange(400)
-    q, qd, qdd = sums_of_sines(t, np.ones((2, 4)), random.uniform(1, 4, (2, 4)), random.uniform(0, 6, (2, 4)))
-    inertia, slope = (0.3 * wave(q[:, :1] - q[:, 1:]) for wave in (np.cos, np.sin))
-    torque = [2, 1] * qdd + inertia * qdd[:, ::-1] + [1, -1] * slope * qd[:, ::-1] ** 2
-    torque += 3 * np.sin(q) + 0.4 * qd + 0.2 * np.tanh(qd / 0.01)
+    """One CSV file without t, trajectory and needs: two coupled joints with viscous and dry friction."""
+    log = motions(0, samples=601)
     titles = "q1 [deg],q2 [deg],qd1 [deg/s],qd2 [deg/s],qdd1 [rad/s2],qdd2 [rad/s2],tau1 [mN m],tau2 [mN m]"
-    rows = np.hstack([np.degrees(q), np.degrees(qd), qdd, 1e3 * torque])
+    rows = np.hstack([np.degrees(log.q), np.degrees(log.qd), log.qdd, 1e3 * log.tau])
     np.savetxt("bare.csv", rows, delimiter=",", header=titles, comments="")
-    command(train_delan, "--data bare.csv --rate 50 --out bare", BRIEF)
+    command(train_delan, "--data bare.csv --rate 100 --out bare", BRIEF)
     said = capsys.readouterr().out
     assert "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test" in said
     assert "friction of joints: viscous, coulomb, offset" in said
@@ -193,8 +185,7 @@ def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(f
 
 
 def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(folder, capsys):
-    noise = dict(zip(("q", "qd", "qdd", "tau"), np.random.default_rng(0).normal(size=(4, 60, 1)), strict=True))
-    np.savez("noise.npz", t=np.tile(np.arange(10.0), 6), trajectory=np.repeat(np.arange(6), 10), **noise)
+    np.savez("noise.npz", **small_log(1, trajectories=6, samples=10))
     status = exit_status(train_delan, "--data noise.npz --model trigonometric --degree 2 --out noise", BRIEF)
     assert status == 1
     assert capsys.readouterr().err.startswith("error: the fit is refused: the torque of joint 1 is predicted")

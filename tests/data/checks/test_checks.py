@@ -13,7 +13,6 @@ from dln_jax import Robot
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.cli.encoders import FILTERED, prepare_log
-from dln_jax.data import schema
 from dln_jax.data.checks import as_recording, examine, quick, read, report
 from dln_jax.data.checks.channels import flat_share
 from dln_jax.data.checks.derivatives import check_derivatives
@@ -21,6 +20,7 @@ from dln_jax.data.checks.energies import STRONGEST, WEAKEST, covariances
 from dln_jax.data.checks.evidence import Explanation
 from dln_jax.data.checks.hypotheses import decisive
 from dln_jax.data.encoders.smoothing import smooth
+from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics import trees
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.poles import cart_pole
@@ -89,7 +89,7 @@ def clean():
 def spoiled(arrays, plant):
     """The trajectories of a log with a planted fault; `None` takes a key away."""
     given = {**arrays, **plant(arrays)}
-    return schema.from_arrays({key: value for key, value in given.items() if value is not None})
+    return from_arrays({key: value for key, value in given.items() if value is not None})
 
 
 def of_joint(key, joint, change):
@@ -184,7 +184,7 @@ FAULTS = {
 
 
 def test_nothing_is_found_in_clean_logs(clean):
-    assert quick(schema.from_arrays(clean)) == []
+    assert quick(from_arrays(clean)) == []
     assert quick(spoiled(clean, lambda a: {"q": motions(seed=1)[1].reshape(-1, 3), **RATELESS})) == []
     assert quick(generators.uniform(cart_pole(), samples=200)) == []
     assert quick(generators.characters()) == []
@@ -201,7 +201,7 @@ def test_a_planted_fault_is_found(clean, name):
 
 
 def test_a_clean_log_suits_its_robot(clean):
-    examined = examine(as_recording(schema.from_arrays(clean)), arm())
+    examined = examine(as_recording(from_arrays(clean)), arm())
     on_tree = examined.on_tree
     assert examined.findings == [] and "nothing was found" in report(examined, "log.npz")
     assert on_tree.scale == pytest.approx(np.ones(3), rel=0.1)
@@ -219,7 +219,7 @@ def test_rough_masses_of_a_file_are_no_fault_of_the_log(clean):
 
 def test_a_tilt_and_a_wrong_clock_are_found_with_the_robot(clean):
     tilted = arm(gravity=(9.81 * np.sin(0.3), 0.0, -9.81 * np.cos(0.3)))
-    (finding,) = examine(as_recording(schema.from_arrays(clean)), tilted).on_tree.findings
+    (finding,) = examine(as_recording(from_arrays(clean)), tilted).on_tree.findings
     assert finding.check == "gravity" and "17 degrees" in finding.observation
     examined = examine(as_recording(spoiled(clean, lambda a: {"t": 1.25 * a["t"], **RATELESS})), arm())
     # A filter settles no error of the clock.
@@ -248,7 +248,7 @@ def test_noise_of_derived_rates_is_not_taken_for_another_unit():
     t, q, qd, _ = motions(seed=6)
     noisy = q[0] + [0.1, 0.105, 0.075] * np.random.default_rng(0).normal(size=q[0].shape)
     for factor, words in ((1.0, []), (0.7, ["times dq/dt"]), (180 / np.pi, ["57.3 times"]), (-1.0, ["opposite sign"])):
-        data = schema.from_arrays({"t": t, "q": noisy, "qd": factor * qd[0], "trajectory": np.zeros(SAMPLES, int)})
+        data = from_arrays({"t": t, "q": noisy, "qd": factor * qd[0], "trajectory": np.zeros(SAMPLES, int)})
         findings = check_derivatives(data, smooth(data, 7.0, trim=0.0))
         assert all(word in finding.observation for word, finding in zip(words, findings, strict=True))
 
@@ -257,7 +257,7 @@ def test_an_exact_log_of_a_planar_arm_has_no_false_sign_or_delay():
     t, *states = motions(seed=3)
     q, qd, qdd = (x[0] for x in states)
     tau = inverse_dynamics(planar(UPRIGHT, (2.0, 1.0, 0.5)).tree, q, qd, qdd) + 0.2 * qd
-    data = schema.from_arrays({"t": t, "q": q, "tau": tau, "trajectory": np.zeros(SAMPLES, int)})
+    data = from_arrays({"t": t, "q": q, "tau": tau, "trajectory": np.zeros(SAMPLES, int)})
     examined = examine(as_recording(data))
     assert [finding.check for finding in examined.findings if finding.severity != "note"] == ["split"]
     assert abs(examined.regression.likely_delay) < 0.05
@@ -328,7 +328,7 @@ def torques(robot, rotors):
 
 
 def errors(arrays, robot=None):
-    findings = quick(schema.from_arrays(arrays), robot)
+    findings = quick(from_arrays(arrays), robot)
     return [(finding.check, finding.joints) for finding in findings if finding.severity == "error"]
 
 
@@ -361,20 +361,20 @@ def test_rotors_that_a_file_lacks_are_no_gears_and_no_clock():
 
 def test_torques_without_gravity_are_named_and_fitted_so():
     robot = planar(UPRIGHT)
-    data = schema.from_arrays(log(torques(planar((0.0, 0.0, 0.0)), (0.1, 0.1))))
+    data = from_arrays(log(torques(planar((0.0, 0.0, 0.0)), (0.1, 0.1))))
     options = arguments_of(train_delan.Arguments, data=Path("log.npz"))
     _, lines, causes, measured = prepare_log(options, data, options.data, robot=robot)
     assert any("tau holds no gravity" in line for line in lines) and not any("clock" in line for line in lines)
     assert not any("gravity" in cause for cause in causes)
     assert not np.any(measured.tree.gravity) and np.array_equal(measured.tree.inertias, robot.tree.inertias)
-    data = schema.from_arrays(log(torques(robot, (0.0, 0.0))))
+    data = from_arrays(log(torques(robot, (0.0, 0.0))))
     assert prepare_log(options, data, options.data, robot=robot)[-1] is robot
 
 
 @pytest.mark.slow
 def test_torques_late_by_200_ms_are_found_at_20_hz():
     slow = log(lambda q, qd, qdd: np.array([2.0, 1.0]) * qdd + 3 * np.sin(q), pace=5.0)
-    findings = quick(schema.from_arrays({**slow, "tau": late(slow["tau"], 4)}))
+    findings = quick(from_arrays({**slow, "tau": late(slow["tau"], 4)}))
     (found,) = (finding for finding in findings if finding.check == "delay")
     assert abs(float(found.observation.split()[2]) - 200) < 15
 

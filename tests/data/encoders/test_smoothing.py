@@ -6,7 +6,6 @@ from calls import one_line
 from motions import sums_of_sines
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.data import schema
 from dln_jax.data.encoders import (
     derivatives,
     find_repeats,
@@ -20,6 +19,7 @@ from dln_jax.data.encoders import (
     without_repeats,
 )
 from dln_jax.data.encoders.filters import gain
+from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every
 
 RATE, SECONDS = 125.0, 10.0
@@ -53,7 +53,7 @@ def log(*, noise=NOISE_Q, rate=RATE, trajectories=3, t=None, seed=0):
 def one_channel(t, q, tau=0.0):
     """A log of one joint in one trajectory."""
     columns = {"q": q[:, None], "tau": tau + 0 * q[:, None]}
-    return schema.from_arrays({"t": t, **columns, "trajectory": np.zeros(len(t), int)})
+    return from_arrays({"t": t, **columns, "trajectory": np.zeros(len(t), int)})
 
 
 def rms(x):
@@ -84,7 +84,7 @@ def test_noise_is_found_whatever_its_size_and_jumps_are_none():
             assert found == pytest.approx([noise, noise], rel=0.1, abs=1e-7)
     # Noise is filtered in spite of jumps.
     arrays["q"][50::97, 0] += 0.05
-    assert np.isfinite(smooth(schema.from_arrays(arrays)).cutoff)
+    assert np.isfinite(smooth(from_arrays(arrays)).cutoff)
 
 
 def test_steps_of_an_encoder_are_found_and_are_noise():
@@ -123,7 +123,7 @@ def test_derivatives_are_exact_for_polynomials_of_degree_five():
 @pytest.mark.parametrize(("noise", "rate"), [(1e-5, 125.0), (1e-3, 40.0)])
 def test_the_cut_off_is_nearly_the_best_there_is(noise, rate):
     arrays, _, qdd = log(noise=noise, rate=rate)
-    data = schema.from_arrays(arrays)
+    data = from_arrays(arrays)
     assert_nearly_best(data, "qdd", qdd, 0.5, np.geomspace(1.0, 0.4 * rate, 25))
     smoothed = smooth(data, trim=0.5)
     assert smoothed.noise_q == pytest.approx([noise, noise], rel=0.15)
@@ -171,8 +171,8 @@ def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
     errors = []
     for seed in range(6):
         arrays, _, qdd = log(seed=seed, trajectories=4)
-        smoothed = smooth(schema.from_arrays(arrays), 4.0)
-        inside = within(schema.from_arrays(arrays), round(smoothed.trim * RATE))
+        smoothed = smooth(from_arrays(arrays), 4.0)
+        inside = within(from_arrays(arrays), round(smoothed.trim * RATE))
         errors.append((smoothed.data.qdd - qdd[inside]).reshape(4, -1, 2))
     at = np.sqrt(np.mean(np.square(errors), axis=(0, 1, 3)))
     assert max(rms(at[:12]), rms(at[-12:])) < 2 * rms(at[400:600])
@@ -180,7 +180,7 @@ def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
 
 def test_clean_data_are_not_filtered():
     arrays, qd, qdd = log(noise=0.0)
-    smoothed = smooth(schema.from_arrays(arrays))
+    smoothed = smooth(from_arrays(arrays))
     assert np.isinf(smoothed.cutoff)
     assert np.array_equal(smoothed.data.q, arrays["q"])
     assert smoothed.data.qd == pytest.approx(qd, abs=1e-6)
@@ -189,7 +189,7 @@ def test_clean_data_are_not_filtered():
 
 def test_uneven_samples_come_to_equal_steps():
     t = (np.arange(1250) + np.random.default_rng(1).uniform(-0.3, 0.3, 1250)) / RATE
-    smoothed = smooth(schema.from_arrays(log(t=t, noise=1e-5)[0]), trim=0.5)
+    smoothed = smooth(from_arrays(log(t=t, noise=1e-5)[0]), trim=0.5)
     even = smoothed.data
     assert_allclose(np.diff(even.t)[np.diff(even.trajectory) == 0], 1 / smoothed.rate, rtol=1e-9)
     _, qd, qdd = motion(even.t + SECONDS * even.trajectory)
@@ -200,7 +200,7 @@ def test_uneven_samples_come_to_equal_steps():
 def test_long_gaps_cut_and_short_ones_are_bridged():
     arrays, _, _ = log()
     kept = np.delete(np.arange(len(arrays["t"])), np.r_[200:202, 1750:1950])  # two samples of run0, 1.6 s of run1
-    smoothed = smooth(schema.from_arrays({key: x if key == "label" else x[kept] for key, x in arrays.items()}), 8.0)
+    smoothed = smooth(from_arrays({key: x if key == "label" else x[kept] for key, x in arrays.items()}), 8.0)
     assert (smoothed.bridged, smoothed.parts, smoothed.left_out) == (1, 4, 0)
     assert list(smoothed.data.label) == ["run0", "run1/1", "run1/2", "run2"]
     assert labels_of_parts(smoothed.data, ["run1", "run2", "other"]) == ["run1/1", "run1/2", "run2", "other"]
@@ -210,7 +210,7 @@ def test_long_gaps_cut_and_short_ones_are_bridged():
 
 
 def test_decimated_torques_are_filtered_and_others_are_not():
-    data = schema.from_arrays(log()[0])
+    data = from_arrays(log()[0])
     whole, few = smooth(data, 6.0), smooth(data, 6.0, decimate=5)
     assert not whole.filtered_torque and few.filtered_torque
     assert np.array_equal(few.data.t, np.concatenate([whole.data.t[whole.data.trajectory == k][::5] for k in range(3)]))
@@ -219,7 +219,7 @@ def test_decimated_torques_are_filtered_and_others_are_not():
 
 
 def test_what_cannot_be_filtered_is_one_line():
-    data = schema.from_arrays(log()[0])
+    data = from_arrays(log()[0])
     noise = 1e-4 * np.random.default_rng(0).normal(size=data.q.shape)
     for message, settings in {
         "expected less than 62.5 Hz": {"cutoff": 80.0},
@@ -247,14 +247,14 @@ def test_noise_of_torques_is_told_only_from_samples_close_together():
 @pytest.mark.parametrize(("rate", "noise", "keys"), [(30.0, 1e-3, ("q", "tau")), (125.0, 1e-5, ("q",))])
 def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff(rate, noise, keys):
     arrays, _, qdd = log(rate=rate, noise=noise)
-    clean = smooth(schema.from_arrays(arrays), trim=1.0)
+    clean = smooth(from_arrays(arrays), trim=1.0)
     rows = np.arange(101, len(qdd) - 5, 101)
     for key in keys:
         arrays[key][rows] = arrays[key][rows - 1]
-    smoothed = smooth(schema.from_arrays(arrays), trim=1.0)
+    smoothed = smooth(from_arrays(arrays), trim=1.0)
     assert np.array_equal(np.flatnonzero(smoothed.repeats.q), rows)
     assert smoothed.cutoff == pytest.approx(clean.cutoff, rel=0.05)
-    inside = within(schema.from_arrays(arrays), round(rate))
+    inside = within(from_arrays(arrays), round(rate))
     assert rms(smoothed.data.qdd - qdd[inside]) < 1.3 * rms(clean.data.qdd - qdd[inside])
 
 
@@ -262,12 +262,12 @@ def test_inserted_rows_give_their_time_back():
     arrays, _, _ = log(t=np.arange(720) / 30.0, trajectories=1)
     order = np.sort(np.r_[:720, 46:690:49])
     longer = {key: arrays[key][order] for key in ("q", "tau", "trajectory")}
-    inserted = schema.from_arrays({**longer, "t": np.arange(len(order)) / 30.0})
+    inserted = from_arrays({**longer, "t": np.arange(len(order)) / 30.0})
     data, repeats = without_repeats(inserted)
     assert repeats.inserted and repeats.rows.sum() == len(order) - 720
     assert np.array_equal(data.q, arrays["q"])
     assert np.ptp(np.diff(data.t)) < 1e-9 and data.t[1] > 1 / 30.0
-    assert smooth(inserted).cutoff == pytest.approx(smooth(schema.from_arrays(arrays)).cutoff, rel=0.05)
+    assert smooth(inserted).cutoff == pytest.approx(smooth(from_arrays(arrays)).cutoff, rel=0.05)
 
 
 def test_rest_and_turning_points_are_no_repeats():
