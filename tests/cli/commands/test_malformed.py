@@ -38,11 +38,13 @@ MESH = {"vertices": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), "elements": 
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A working folder with data."""
-    monkeypatch.chdir(tmp_path)
+    """A working folder with data, beside the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
     np.savez("data.npz", **TRAJECTORIES)
-    return tmp_path
+    return here
 
 
 def listing():
