@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from calls import one_line
 from published_motions import published_arrays
 
@@ -17,14 +16,14 @@ def by_body(x, count):
     return x.reshape(-1, 2, count).swapaxes(1, 2).reshape(x.shape)
 
 
-@pytest.mark.parametrize(("task", "count"), [("two-body", 2), ("three-body", 3)])
-def test_order_is_read_off_forces(task, count):
-    force = published_arrays(task, 7, trajectories=4)["pd"]
-    assert find_bodies(force) == Bodies(2, "axes")
-    assert find_bodies(by_body(force, count)) == Bodies(2, "bodies")
-    assert imbalance(force, Bodies(2, "axes")) < 1e-12 < 0.3 < imbalance(force, Bodies(2, "bodies"))
-    noisy = force + 0.05 * force.std() * np.random.default_rng(0).normal(size=force.shape)
-    assert find_bodies(noisy) == Bodies(2, "axes") and find_bodies(force, order="bodies").order == "bodies"
+def test_order_is_read_off_forces():
+    for task, count in (("two-body", 2), ("three-body", 3)):
+        force = published_arrays(task, 7, trajectories=4)["pd"]
+        assert find_bodies(force) == Bodies(2, "axes")
+        assert find_bodies(by_body(force, count)) == Bodies(2, "bodies")
+        assert imbalance(force, Bodies(2, "axes")) < 1e-12 < 0.3 < imbalance(force, Bodies(2, "bodies"))
+        noisy = force + 0.05 * force.std() * np.random.default_rng(0).normal(size=force.shape)
+        assert find_bodies(noisy) == Bodies(2, "axes") and find_bodies(force, order="bodies").order == "bodies"
 
 
 def test_bodies_in_space_are_told_from_bodies_in_a_plane_and_forces_without_balance_name_none():

@@ -37,26 +37,25 @@ def exact(function, x):
     return FunctionSamples(x, *(np.asarray(part)[:, None] for part in parts))
 
 
-@pytest.mark.parametrize("case", CASES, ids=["sine", "cosine_sine"])
-def test_grids_are_exact_and_samples_have_the_published_noise_on_everything(case):
-    generate, grid, points, function = case
-    test = grid()
-    assert len(test.x) == points
-    assert_allclose([test.x.min(), test.x.max()], [-np.pi, np.pi])
-    for ours, theirs in zip(test, exact(function, test.x), strict=True):
-        assert_allclose(ours, theirs, atol=1e-14)
-    noisy, clean = generate(), generate(noise=0.0)
-    assert noisy.x.shape == (25_600, test.x.shape[1])
-    true = exact(function, clean.x)
-    for key, ours, truth in zip(FunctionSamples._fields, noisy, true, strict=True):
-        error = ours - truth
-        assert_allclose(error.std(), 1e-3, rtol=0.02, err_msg=key)
-        assert_allclose(error.mean(), 0, atol=2e-5, err_msg=key)
-    # The noise on x is not that on the value: residuals of the truth at the stored x have both.
-    residuals = noisy.dy - exact(function, noisy.x).dy
-    expected = 1e-6 + 1e-6 * np.mean(np.sum(true.d2y**2, axis=-1))
-    assert_allclose(np.mean(residuals**2), expected, rtol=0.03)
-    assert_array_equal(noisy.d2y, np.swapaxes(noisy.d2y, -1, -2))
+def test_grids_are_exact_and_samples_have_the_published_noise_on_everything():
+    for generate, grid, points, function in CASES:
+        test = grid()
+        assert len(test.x) == points
+        assert_allclose([test.x.min(), test.x.max()], [-np.pi, np.pi])
+        for ours, theirs in zip(test, exact(function, test.x), strict=True):
+            assert_allclose(ours, theirs, atol=1e-14)
+        noisy, clean = generate(), generate(noise=0.0)
+        assert noisy.x.shape == (25_600, test.x.shape[1])
+        true = exact(function, clean.x)
+        for key, ours, truth in zip(FunctionSamples._fields, noisy, true, strict=True):
+            error = ours - truth
+            assert_allclose(error.std(), 1e-3, rtol=0.02, err_msg=key)
+            assert_allclose(error.mean(), 0, atol=2e-5, err_msg=key)
+        # The noise on x is not that on the value: residuals of the truth at the stored x have both.
+        residuals = noisy.dy - exact(function, noisy.x).dy
+        expected = 1e-6 + 1e-6 * np.mean(np.sum(true.d2y**2, axis=-1))
+        assert_allclose(np.mean(residuals**2), expected, rtol=0.03)
+        assert_array_equal(noisy.d2y, np.swapaxes(noisy.d2y, -1, -2))
 
 
 def test_generators_follow_their_seed_and_bound():
@@ -106,15 +105,15 @@ SINE = ((jnp.ones((1, 1)), jnp.array([-jnp.pi / 2])), (jnp.ones((1, 1)), jnp.zer
 """sin x = cos(x - π/2) as a network."""
 
 
-@pytest.mark.parametrize(("loss", "derivative"), [("type1", 1), ("type1", 2), ("type2", 2)])
-def test_an_exact_model_has_no_loss_and_a_wrong_one_that_of_its_terms(loss, derivative):
-    grid = functions.sine_grid(points=50)
-    batch = targets(grid, Network(loss=loss, derivative=derivative, precision="f64"))
-    assert float(mean_loss(SINE, batch, activation=cos)) < 1e-30
-    double = (SINE[0], (2 * SINE[1][0], SINE[1][1]))
-    read = [grid.y, *([grid.dy] if loss == "type1" else []), *([grid.d2y] if derivative == 2 else [])]
-    expected = sum(np.mean(each**2) for each in read)
-    assert_allclose(mean_loss(double, batch, activation=cos), expected, rtol=1e-12)
+def test_an_exact_model_has_no_loss_and_a_wrong_one_that_of_its_terms():
+    for loss, derivative in (("type1", 1), ("type1", 2), ("type2", 2)):
+        grid = functions.sine_grid(points=50)
+        batch = targets(grid, Network(loss=loss, derivative=derivative, precision="f64"))
+        assert float(mean_loss(SINE, batch, activation=cos)) < 1e-30
+        double = (SINE[0], (2 * SINE[1][0], SINE[1][1]))
+        read = [grid.y, *([grid.dy] if loss == "type1" else []), *([grid.d2y] if derivative == 2 else [])]
+        expected = sum(np.mean(each**2) for each in read)
+        assert_allclose(mean_loss(double, batch, activation=cos), expected, rtol=1e-12)
 
 
 def test_a_network_of_standard_units_is_the_same_in_the_users_units():

@@ -63,22 +63,21 @@ def same_simplices(one, other):
     return {frozenset(row) for row in one.tolist()} == {frozenset(row) for row in other.tolist()}
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_volume_boundary_and_centre(shape):
-    mesh, volume, surface, centre = SHAPES[shape]
-    assert volumes(mesh).min() > 0
-    assert_allclose(volumes(mesh).sum(), volume, rtol=1e-13)
-    normals = outward_normals(mesh.vertices, boundary(mesh))
-    # Conforming: a facet that is not shared would lie inside and add to the surface.
-    assert_allclose(np.linalg.norm(normals, axis=1).sum(), surface, rtol=1e-13)
-    assert_allclose(normals.sum(axis=0), 0.0, atol=1e-13 * surface)
-    assert_allclose(flux(mesh.vertices, boundary(mesh)), mesh.dimension * volume, rtol=1e-13)
-    # Equal shares reproduce the first moment of each simplex.
-    masses = lumped_masses(mesh, 700.0)
-    assert_allclose(masses @ mesh.vertices, 700.0 * volume * np.array(centre), atol=1e-10 * volume)
-    assert masses.min() > 0
-    assert shape != "disc" or regularity(mesh.vertices, mesh.elements).min() > 0.6
-    assert euler_characteristic(mesh) == (0 if shape == "ring" else 1)
+def test_volume_boundary_and_centre():
+    for shape, (mesh, volume, surface, centre) in SHAPES.items():
+        assert volumes(mesh).min() > 0
+        assert_allclose(volumes(mesh).sum(), volume, rtol=1e-13)
+        normals = outward_normals(mesh.vertices, boundary(mesh))
+        # Conforming: a facet that is not shared would lie inside and add to the surface.
+        assert_allclose(np.linalg.norm(normals, axis=1).sum(), surface, rtol=1e-13)
+        assert_allclose(normals.sum(axis=0), 0.0, atol=1e-13 * surface)
+        assert_allclose(flux(mesh.vertices, boundary(mesh)), mesh.dimension * volume, rtol=1e-13)
+        # Equal shares reproduce the first moment of each simplex.
+        masses = lumped_masses(mesh, 700.0)
+        assert_allclose(masses @ mesh.vertices, 700.0 * volume * np.array(centre), atol=1e-10 * volume)
+        assert masses.min() > 0
+        assert shape != "disc" or regularity(mesh.vertices, mesh.elements).min() > 0.6
+        assert euler_characteristic(mesh) == (0 if shape == "ring" else 1)
 
 
 def test_vertices_of_a_beam_are_numbered_along_its_short_side():
@@ -153,20 +152,20 @@ def test_what_is_left_when_the_nonsense_is_removed():
     assert components(apart).tolist() == [0, 1] and components(hinged).tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_inverted_elements_are_turned_and_counted(dimension):
+def test_inverted_elements_are_turned_and_counted():
     """Delaunay meshes of scipy, whose orientations are drawn."""
-    random = np.random.default_rng(dimension)
-    points = random.uniform(-1.0, 1.0, (60, dimension))
-    elements = random.permuted(Delaunay(points).simplices, axis=1)
-    mesh = make_mesh(points, elements)
-    assert mesh.turned == (simplex_volumes(points, elements) < 0).sum()
-    assert 0.25 < mesh.turned / len(elements) < 0.75
-    assert volumes(mesh).min() > 0 and make_mesh(points, mesh.elements).turned == 0
-    assert_array_equal(np.sort(mesh.elements, axis=1), np.sort(elements, axis=1))
-    hull = ConvexHull(points)
-    assert same_simplices(boundary(mesh), hull.simplices) and len(overlaps(mesh)) == 0
-    assert_allclose(flux(points, boundary(mesh)), dimension * hull.volume, rtol=1e-12)
+    for dimension in (2, 3):
+        random = np.random.default_rng(dimension)
+        points = random.uniform(-1.0, 1.0, (60, dimension))
+        elements = random.permuted(Delaunay(points).simplices, axis=1)
+        mesh = make_mesh(points, elements)
+        assert mesh.turned == (simplex_volumes(points, elements) < 0).sum()
+        assert 0.25 < mesh.turned / len(elements) < 0.75
+        assert volumes(mesh).min() > 0 and make_mesh(points, mesh.elements).turned == 0
+        assert_array_equal(np.sort(mesh.elements, axis=1), np.sort(elements, axis=1))
+        hull = ConvexHull(points)
+        assert same_simplices(boundary(mesh), hull.simplices) and len(overlaps(mesh)) == 0
+        assert_allclose(flux(points, boundary(mesh)), dimension * hull.volume, rtol=1e-12)
 
 
 def test_overlapping_elements_are_accepted_and_named():
@@ -199,23 +198,22 @@ def test_arguments_that_make_no_sense_are_named():
             call()
 
 
-@pytest.mark.parametrize(("drawn", "legs", "length"), [(crawler, 4, 2.88), (biped, 2, 1.6), (quadruped, 4, 3.2)])
-def test_creatures_are_symmetric_bodies_with_muscles_on_either_side_of_each_leg(drawn, legs, length):
-    creature = drawn()
-    mesh, pairs = creature.mesh, creature.muscles
-    assert mesh.vertices[:, 1].min() == 0.0 and body_length(creature) == pytest.approx(length)
-    assert regularity(mesh.vertices, mesh.elements).min() > 0.5
-    assert euler_characteristic(mesh) == 1  # in one piece, without holes
-    # Distinct pairs that are edges of the mesh, none on the ground, ordered along the body.
-    distinct = {tuple(sorted(pair)) for pair in pairs.tolist()}
-    assert len(distinct) == len(pairs) and distinct <= {*map(tuple, edges(mesh).tolist())}
-    middles = mesh.vertices[pairs].mean(axis=1)
-    assert (middles[:, 1] > 0).all() and (np.diff(middles[:, 0]) > -1e-12).all()
-    # Symmetric about the vertical axis: neither direction is easier.
-    image = mirrored(mesh, 0)
-    assert same_simplices(image[mesh.elements], mesh.elements) and same_simplices(image[pairs], pairs)
-    # Each sole is the end of a leg with a muscle on either side.
-    skin = boundary(mesh)
-    soles = skin[(mesh.vertices[skin, 1] == 0).all(axis=1)]
-    corners, used = np.unique([*soles.flat, *pairs.flat], return_counts=True)
-    assert len(soles) == legs and (used[np.isin(corners, soles)] == 2).all()
+def test_creatures_are_symmetric_bodies_with_muscles_on_either_side_of_each_leg():
+    for creature, legs, length in ((crawler(), 4, 2.88), (biped(), 2, 1.6), (quadruped(), 4, 3.2)):
+        mesh, pairs = creature.mesh, creature.muscles
+        assert mesh.vertices[:, 1].min() == 0.0 and body_length(creature) == pytest.approx(length)
+        assert regularity(mesh.vertices, mesh.elements).min() > 0.5
+        assert euler_characteristic(mesh) == 1  # in one piece, without holes
+        # Distinct pairs that are edges of the mesh, none on the ground, ordered along the body.
+        distinct = {tuple(sorted(pair)) for pair in pairs.tolist()}
+        assert len(distinct) == len(pairs) and distinct <= {*map(tuple, edges(mesh).tolist())}
+        middles = mesh.vertices[pairs].mean(axis=1)
+        assert (middles[:, 1] > 0).all() and (np.diff(middles[:, 0]) > -1e-12).all()
+        # Symmetric about the vertical axis: neither direction is easier.
+        image = mirrored(mesh, 0)
+        assert same_simplices(image[mesh.elements], mesh.elements) and same_simplices(image[pairs], pairs)
+        # Each sole is the end of a leg with a muscle on either side.
+        skin = boundary(mesh)
+        soles = skin[(mesh.vertices[skin, 1] == 0).all(axis=1)]
+        corners, used = np.unique([*soles.flat, *pairs.flat], return_counts=True)
+        assert len(soles) == legs and (used[np.isin(corners, soles)] == 2).all()

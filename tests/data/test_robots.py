@@ -111,22 +111,23 @@ def test_what_a_file_states_of_its_joints(tmp_path):
     assert_array_equal(robot.tree.gravity, [0, 0, -9.81])
 
 
-@pytest.mark.parametrize(
-    ("file", "lock"),
-    [("branched.xml", {"z": 0.7, "w": -0.4}), ("referenced.xml", {"x": 0.7, "y": 0.2}), ("arm.urdf", {"slide": 0.2})],
-)
-def test_joints_are_locked_at_their_positions(file, lock, tmp_path):
-    path = written(tmp_path, file, FILES[file])
-    free, locked = read_robot(path), read_robot(path, lock=lock)
-    place = np.array([free.tree.names.index(name) for name in locked.tree.names])
-    state = np.zeros((3, free.tree.degrees_of_freedom))
-    state[0] = [lock.get(name, 0.0) for name in free.tree.names]
-    state[:, place] = np.random.default_rng(0).normal(size=(3, len(place)))
-    every, fewer = (
-        jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*states)
-        for robot, states in ((free, state), (locked, state[:, place]))
-    )
-    assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
+def test_joints_are_locked_at_their_positions(tmp_path):
+    for file, lock in (
+        ("branched.xml", {"z": 0.7, "w": -0.4}),
+        ("referenced.xml", {"x": 0.7, "y": 0.2}),
+        ("arm.urdf", {"slide": 0.2}),
+    ):
+        path = written(tmp_path, file, FILES[file])
+        free, locked = read_robot(path), read_robot(path, lock=lock)
+        place = np.array([free.tree.names.index(name) for name in locked.tree.names])
+        state = np.zeros((3, free.tree.degrees_of_freedom))
+        state[0] = [lock.get(name, 0.0) for name in free.tree.names]
+        state[:, place] = np.random.default_rng(0).normal(size=(3, len(place)))
+        every, fewer = (
+            jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*states)
+            for robot, states in ((free, state), (locked, state[:, place]))
+        )
+        assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
 
 
 def test_a_gripper_whose_fingers_are_tied_and_a_free_base_can_be_locked(tmp_path):
@@ -224,14 +225,16 @@ def test_what_is_no_tree_is_refused_in_one_line(tmp_path, monkeypatch):
     assert [each.name for each in tmp_path.iterdir()] == ["robot.xml"]
 
 
-@pytest.mark.parametrize("stated", ["1 -1", "0 0"])
-def test_limits_are_checked_in_files_of_files(tmp_path, stated):
-    (tmp_path / "part.xml").write_text(HINGE.format(f'range="{stated}"'))
-    (tmp_path / "nested.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
-    attached = '<asset><model name="m" file="part.xml"/></asset><worldbody><body><attach model="m" body="arm" prefix="'
-    for text in ('<include file="nested.xml"/>', attached + 'the_"/></body></worldbody>'):
-        with one_line(f"elbow' has limits of position {stated.split()[0]}"):
-            read_robot(written(tmp_path, "arm.xml", f"<mujoco>{text}</mujoco>"))
+def test_limits_are_checked_in_files_of_files(tmp_path):
+    for stated in ("1 -1", "0 0"):
+        (tmp_path / "part.xml").write_text(HINGE.format(f'range="{stated}"'))
+        (tmp_path / "nested.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+        attached = (
+            '<asset><model name="m" file="part.xml"/></asset><worldbody><body><attach model="m" body="arm" prefix="'
+        )
+        for text in ('<include file="nested.xml"/>', attached + 'the_"/></body></worldbody>'):
+            with one_line(f"elbow' has limits of position {stated.split()[0]}"):
+                read_robot(written(tmp_path, "arm.xml", f"<mujoco>{text}</mujoco>"))
 
 
 def test_limits_that_are_switched_off_or_zero_are_not_stated(tmp_path):

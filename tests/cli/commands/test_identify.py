@@ -36,6 +36,7 @@ def identified(workplace):
     return workplace / "run"
 
 
+@pytest.mark.slow
 def test_sound_log_gives_a_good_run_folder_like_every_other(identified):
     assert {path.name for path in identified.iterdir()} == {
         *(".lock", "config.json", "metrics.json", "model.json", "model.safetensors", "parameters.json", "report.txt"),
@@ -51,6 +52,7 @@ def test_sound_log_gives_a_good_run_folder_like_every_other(identified):
     assert metrics["verdict"] == 0 and verdict["level"] == "good" and "the robot's file" in verdict["reason"]
 
 
+@pytest.mark.slow
 def test_the_model_is_loaded_and_exported_and_the_file_has_what_was_identified(identified, tmp_path):
     run = load(identified)
     state = np.random.default_rng(1).normal(size=(3, 2))

@@ -43,6 +43,7 @@ def trained(folder):
     return folder / "runs" / "train_delan-1"
 
 
+@pytest.mark.slow
 def test_a_run_writes_all_its_files(trained):
     names = {path.name for path in trained.iterdir()}
     (checkpoint,) = names - FILES
@@ -55,6 +56,7 @@ def test_a_run_writes_all_its_files(trained):
     assert config["width"] == 4 and "out" not in config
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_never_overwritten_and_resumes_to_itself(trained, folder, capsys):
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in (

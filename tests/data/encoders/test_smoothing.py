@@ -120,14 +120,14 @@ def test_derivatives_are_exact_for_polynomials_of_degree_five():
     assert qdd[:, 0] == pytest.approx(polynomial.deriv(2)(t), abs=1e-6)
 
 
-@pytest.mark.parametrize(("noise", "rate"), [(1e-5, 125.0), (1e-3, 40.0)])
-def test_the_cut_off_is_nearly_the_best_there_is(noise, rate):
-    arrays, _, qdd = log(noise=noise, rate=rate)
-    data = from_arrays(arrays)
-    assert_nearly_best(data, "qdd", qdd, 0.5, np.geomspace(1.0, 0.4 * rate, 25))
-    smoothed = smooth(data, trim=0.5)
-    assert smoothed.noise_q == pytest.approx([noise, noise], rel=0.15)
-    assert smoothed.noise_tau == pytest.approx([NOISE_TAU, NOISE_TAU], rel=0.15)
+def test_the_cut_off_is_nearly_the_best_there_is():
+    for noise, rate in ((1e-5, 125.0), (1e-3, 40.0)):
+        arrays, _, qdd = log(noise=noise, rate=rate)
+        data = from_arrays(arrays)
+        assert_nearly_best(data, "qdd", qdd, 0.5, np.geomspace(1.0, 0.4 * rate, 25))
+        smoothed = smooth(data, trim=0.5)
+        assert smoothed.noise_q == pytest.approx([noise, noise], rel=0.15)
+        assert smoothed.noise_tau == pytest.approx([NOISE_TAU, NOISE_TAU], rel=0.15)
 
 
 def test_lines_of_a_periodic_motion_are_not_cut_off_though_only_noise_is_between_them():
@@ -244,18 +244,18 @@ def test_noise_of_torques_is_told_only_from_samples_close_together():
     assert torque_noise(data._replace(trajectory=np.arange(len(t)))) is None
 
 
-@pytest.mark.parametrize(("rate", "noise", "keys"), [(30.0, 1e-3, ("q", "tau")), (125.0, 1e-5, ("q",))])
-def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff(rate, noise, keys):
-    arrays, _, qdd = log(rate=rate, noise=noise)
-    clean = smooth(from_arrays(arrays), trim=1.0)
-    rows = np.arange(101, len(qdd) - 5, 101)
-    for key in keys:
-        arrays[key][rows] = arrays[key][rows - 1]
-    smoothed = smooth(from_arrays(arrays), trim=1.0)
-    assert np.array_equal(np.flatnonzero(smoothed.repeats.q), rows)
-    assert smoothed.cutoff == pytest.approx(clean.cutoff, rel=0.05)
-    inside = within(from_arrays(arrays), round(rate))
-    assert rms(smoothed.data.qdd - qdd[inside]) < 1.3 * rms(clean.data.qdd - qdd[inside])
+def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff():
+    for rate, noise, keys in ((30.0, 1e-3, ("q", "tau")), (125.0, 1e-5, ("q",))):
+        arrays, _, qdd = log(rate=rate, noise=noise)
+        clean = smooth(from_arrays(arrays), trim=1.0)
+        rows = np.arange(101, len(qdd) - 5, 101)
+        for key in keys:
+            arrays[key][rows] = arrays[key][rows - 1]
+        smoothed = smooth(from_arrays(arrays), trim=1.0)
+        assert np.array_equal(np.flatnonzero(smoothed.repeats.q), rows)
+        assert smoothed.cutoff == pytest.approx(clean.cutoff, rel=0.05)
+        inside = within(from_arrays(arrays), round(rate))
+        assert rms(smoothed.data.qdd - qdd[inside]) < 1.3 * rms(clean.data.qdd - qdd[inside])
 
 
 def test_inserted_rows_give_their_time_back():
