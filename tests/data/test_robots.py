@@ -14,16 +14,16 @@ from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is the reference; it is in the extra [robot]")
 LINK = """
-<link name="{name}">
+<link name="{0}">
   <inertial>
-    <origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/> <mass value="{mass}"/>
+    <origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/> <mass value="{1}"/>
     <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0.004" ixz="-0.002" iyz="0.001"/>
   </inertial>
-  <visual><geometry><mesh filename="nowhere/{name}.stl"/></geometry></visual>
+  <visual><geometry><mesh filename="nowhere/{0}.stl"/></geometry></visual>
 </link>"""
 JOINT = """
-<joint name="{name}" type="{kind}">
-  <parent link="{parent}"/> <child link="{child}"/> <origin xyz="{xyz}" rpy="0.4 -0.3 0.2"/> <axis xyz="{axis}"/>
+<joint name="{}" type="{}">
+  <parent link="{}"/> <child link="{}"/> <origin xyz="{}" rpy="0.4 -0.3 0.2"/> <axis xyz="{}"/>
   <limit lower="-1" upper="2" effort="30" velocity="3"/> <dynamics damping="0.2" friction="0.1"/>
 </joint>"""
 
@@ -33,12 +33,12 @@ def urdf(*parts):
 
 
 def joint(name, kind, parent, child, xyz="0 0 1", axis="0 0 1"):
-    return JOINT.format(name=name, kind=kind, parent=parent, child=child, xyz=xyz, axis=axis)
+    return JOINT.format(name, kind, parent, child, xyz, axis)
 
 
 SHOULDER = joint("shoulder", "revolute", "base", "one", xyz="0 0 0.3")
 ARM = urdf(
-    *(LINK.format(name=name, mass=mass) for name, mass in (("one", 2.0), ("two", 1.5), ("three", 0.7), ("hand", 0.4))),
+    *(LINK.format(*link) for link in (("one", 2.0), ("two", 1.5), ("three", 0.7), ("hand", 0.4))),
     SHOULDER,
     joint("elbow", "continuous", "one", "two", xyz="0.2 0 0.1", axis="0.6 0 0.8"),
     joint("slide", "prismatic", "two", "three", xyz="0 0.3 0", axis="0 1 0"),
@@ -152,7 +152,7 @@ def test_inertias_that_no_body_has_are_read_as_they_are(tmp_path):
     assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)
 
 
-ONE = LINK.format(name="one", mass=1.0)
+ONE = LINK.format("one", 1.0)
 HINGE = """<mujoco><worldbody><body name="arm"><inertial mass="1" pos="0.1 0 0" diaginertia="1 1 1"/>
 <joint name="elbow" axis="0 1 0" {}/></body></worldbody></mujoco>"""
 BOMB = '<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><robot name="&b;"/>'
@@ -165,7 +165,7 @@ def nested(depth):
 
 
 def chain(count):
-    parts = [LINK.format(name=f"l{k}", mass=1.0) for k in range(count)]
+    parts = [LINK.format(f"l{k}", 1.0) for k in range(count)]
     return urdf(*parts, *(joint(f"j{k}", "revolute", f"l{k - 1}" if k else "base", f"l{k}") for k in range(count)))
 
 

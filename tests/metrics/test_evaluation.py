@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dln_jax import figures
-from dln_jax.learning.engine.problem import Progress, one_after_the_other
+from dln_jax.learning.engine.problem import Progress
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors
 from dln_jax.scenes.datasets import generators
@@ -28,6 +28,7 @@ def test_errors_are_sums_over_joints_and_means_over_samples():
     assert "gravity_mse" not in without_truth and "coriolis_mse" in without_truth
 
 
+@pytest.mark.slow
 def test_torques_from_momenta_are_as_wrong_as_recorded_rates():
     """The true plant, damped: exact momenta give exact torques, and difference quotients their own error."""
     scene = pendulum(friction=0.3)
@@ -45,11 +46,9 @@ def test_torques_from_momenta_are_as_wrong_as_recorded_rates():
 
 
 def test_a_training_figure_names_every_stage_and_has_a_line_where_it_ends():
-    def stage(name, steps):
-        return [Progress(step, 1.0 / step, 2.0 / step, float("nan"), 0.0, name) for step in steps]
-
-    history = one_after_the_other([stage("rates", range(1, 6)), stage("motions", (5, 10))])
-    (axis,) = figures.training_curve(history, best_step=history[-1].step).axes
+    stages = ["rates"] * 5 + ["motions"] * 2
+    history = [Progress(step, 1.0 / step, 2.0 / step, np.nan, 0.0, name) for step, name in enumerate(stages, 1)]
+    (axis,) = figures.training_curve(history, best_step=7).axes
     assert [text.get_text() for text in axis.texts] == ["rates", "motions"]
     drawn = [(min(x), max(x)) for x in (line.get_xdata() for line in axis.lines)]
     # Training and validation of each stage: no curve crosses the line.

@@ -113,6 +113,6 @@ def test_terms_of_a_lagrangian_linear_in_the_rates_take_no_power():
 @pytest.mark.parametrize("model", ["auto", "structured-delan", "black-box-delan"])
 def test_letters_come_apart_for_every_model(workplace, model):
     """The published two-link arm, of which only the total torque is fitted."""
-    command(train_delan, "--data", LETTERS, "--test e,q,v --model", model, BRIEF, "--out", model)
+    command(train_delan, "--data", LETTERS, "--test e,q,v --seed 3 --model", model, BRIEF, "--out", model)
     metrics = metrics_of(workplace / model)
     assert max(metrics[part] for part in PARTS) < 1e-8 and metrics["gravity_determined"] == 1

@@ -42,16 +42,11 @@ def folder(tmp_path):
 def test_it_comes_back_with_the_run(folder):
     stored = known(3)
     run = load_with(folder, stored)
-    known_of = jax.jit(
-        lambda *state: (
-            predictive(MODEL, PARAMETERS, *stored[:3])(*state),
-            out_of_distribution(MODEL, PARAMETERS, stored)(*state),
-        )
-    )
+    std = jax.jit(predictive(MODEL, PARAMETERS, *stored[:3]))
+    flag = jax.jit(out_of_distribution(MODEL, PARAMETERS, stored))
     for state in STATES[:3]:
-        std, flag = known_of(*state)
-        np.testing.assert_allclose(run.torque_std(*state), std, rtol=1e-12)
-        assert run.out_of_distribution(*state.tolist()) == flag
+        np.testing.assert_allclose(run.torque_std(*state), std(*state), rtol=1e-12)
+        assert run.out_of_distribution(*state.tolist()) == flag(*state)
     # Other parameters do not inherit it.
     save(folder, DESCRIPTION, PARAMETERS)
     run = load(folder)

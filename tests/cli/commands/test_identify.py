@@ -75,18 +75,17 @@ def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "words"), [(-1, ""), (1000, "times the tree's; check the unit of tau")])
-def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys, factor, words):
+def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys):
     log = dict(np.load("log.npz"))
-    np.savez(f"ruined{factor}.npz", **{**log, "tau": factor * log["tau"]})
-    # The check of the log sees some of them before.
-    given = ("--robot arm.urdf --accept-log --data", f"ruined{factor}.npz", "--out", f"ruined{factor}", QUICK)
-    status = exit_status(identify, *given)
-    told = capsys.readouterr()
-    assert status == 1 and told.err.startswith("error: the fit is refused: ") and words in told.err
-    assert "no arm_identified.urdf: the fit is refused" in told.out
-    folder = workplace / f"ruined{factor}"
-    assert json_of(folder / "metrics.json")["verdict"] == 2 and not list(folder.glob("*.urdf"))
+    for name, factor, words in (("turned", -1, ""), ("milli", 1000, "times the tree's; check the unit of tau")):
+        np.savez("ruined.npz", **{**log, "tau": factor * log["tau"]})
+        # The check of the log sees some of them before.
+        status = exit_status(identify, "--robot arm.urdf --accept-log --data ruined.npz --out", name, QUICK)
+        told = capsys.readouterr()
+        assert status == 1 and told.err.startswith("error: the fit is refused: ") and words in told.err
+        assert "no arm_identified.urdf: the fit is refused" in told.out
+        folder = workplace / name
+        assert json_of(folder / "metrics.json")["verdict"] == 2 and not list(folder.glob("*.urdf"))
 
 
 def test_mistakes_are_one_line(workplace, capsys):

@@ -44,6 +44,7 @@ def moved(system, seconds, **options):
     return t, tau, np.asarray(states)
 
 
+@pytest.mark.slow
 def test_the_slope_of_windows_is_that_of_finite_differences(place):
     """Where all samples are noise-free, residuals vanish, so that Kaufman's derivative is exact."""
     model = make_rigid_tree(read_robot("rod.urdf").tree, friction=("viscous",))

@@ -264,12 +264,7 @@ def test_damaged_histories_are_refused(here):
 
 def test_places_that_cannot_be_written_to_are_refused(here, capsys, monkeypatch):
     Path("file").touch()
-    for script, *options in (
-        (train_delan, "--data data.npz"),
-        (train_diffnet, "--samples 20"),
-        (train_locomotion,),
-        (simulate,),
-    ):
-        assert "--out" in refuse(capsys, script, *options, "--out file")
+    for script in (train_locomotion, simulate):
+        assert "--out" in refuse(capsys, script, "--out file")
     monkeypatch.setenv("XDG_CACHE_HOME", "file")
     assert "XDG_CACHE_HOME" in refuse(capsys, train_delan, "--out run")

@@ -125,6 +125,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
     assert_refused(capsys, train_value, rows.items(), out=tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
     known = of_file(rod, Wishes())
     save(tmp_path, known.own.description, known.own.parameters)

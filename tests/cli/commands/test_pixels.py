@@ -182,6 +182,7 @@ def test_components_keep_the_images(data):
     assert_allclose(system.decode(jnp.zeros(1), jnp.zeros(1)), kept[0, :2].ravel(), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_latent_motions_keep_the_energy(data):
     model = make_latent_phase(latent_field("black-box-hnn", width=6, depth=1), PIXELS, width=6)
     parameters = jax.jit(model.init)(jax.random.key(0))

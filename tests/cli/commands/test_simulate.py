@@ -147,6 +147,7 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(tmp_path, capsys):
         "--cells 0": "number of cells along x is 0",
         "--order 3": "order is 3; expected 1",
         "--mixed": "--mixed needs --order 2",
+        "--scene slope --contact": "has no --contact",
         "--scene creature --order 2": "the creature scene has no --order",
         "--mesh absent.npz": "absent.npz: no such file",
     }
@@ -157,6 +158,7 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(tmp_path, capsys):
         ([9], ["held names vertex 9"]),
         (np.arange(4), ["held"]),
         ([-1], ["held"]),
+        ([0], ["--scene drop --contact --integrator midpoint", "use BACKWARD_EULER, BDF2"]),
         ([0], ["--cells 2", "--cells sets the scene's own mesh"]),
     ):
         np.savez(path, vertices=mesh.vertices, elements=mesh.elements, held=held)
@@ -174,28 +176,15 @@ def test_commands_factorise_on_one_thread_unless_told(monkeypatch):
         monkeypatch.delenv("OPENBLAS_NUM_THREADS")
 
 
-@pytest.fixture
-def two_blocks(tmp_path):
+@pytest.mark.slow
+def test_blocks_that_fall_on_each_other_stay_apart(tmp_path):
     """One block above another, 0.15 m apart."""
     block = beam_mesh(1.0, 0.3, 4, 2)
     vertices = np.concatenate([block.vertices, block.vertices + np.array([0.3, 0.45])])
     elements = np.concatenate([block.elements, block.elements + len(block.vertices)])
     np.savez(tmp_path / "two.npz", vertices=vertices, elements=elements)
-    return tmp_path / "two.npz"
-
-
-def test_contact_is_refused_where_it_cannot_hold(capsys, two_blocks, tmp_path):
-    rows = [
-        ("--scene drop --integrator midpoint --mesh", two_blocks, "use BACKWARD_EULER, BDF2"),
-        ("--scene slope", "has no --contact"),
-    ]
-    assert_refused(capsys, simulate, rows, "--contact", out=tmp_path / "run")
-
-
-@pytest.mark.slow
-def test_blocks_that_fall_on_each_other_stay_apart(two_blocks, tmp_path):
     options = "--scene drop --contact --youngs-modulus 1e5 --seconds 0.5 --no-figures"
-    command(simulate, options, "--mesh", two_blocks, "--out", tmp_path / "run")
+    command(simulate, options, "--mesh", tmp_path / "two.npz", "--out", tmp_path / "run")
     numbers = json_of(tmp_path / "run" / "metrics.json")
     # Their surfaces act on each other within 15 mm, a tenth of the shortest edge.
     assert numbers["steps_not_converged"] == 0 and 0 < numbers["least_distance_of_surfaces"] < 0.0149

@@ -103,6 +103,7 @@ def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(wo
     assert np.sqrt(np.mean(((answers.jacobian - data["dy"]) * units) ** 2)) < 0.1
 
 
+@pytest.mark.slow
 def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
     quick = "--loss type2 --no-figures"
     command(train_diffnet, ADAM, quick, "--activation relu --derivative 2 --out run")
