@@ -5,9 +5,10 @@ import sys
 
 import numpy as np
 import pytest
+from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.data import schema
-from tests.calls import one_line
 
 pytest.importorskip("rosbags", reason="rosbags reads bags; it is in the extra [bag]")
 from made_bags import state, write_bag
@@ -48,9 +49,9 @@ def test_both_storages_give_the_same_table(bag):
         folder = bag(rows(), mcap=mcap)
         for path in (folder, next(folder.glob(pattern))):
             data = schema.load(path)
-            np.testing.assert_allclose(data.t, T, atol=1e-12)
+            assert_allclose(data.t, T, atol=1e-12)
             for ours, expected in zip((data.q, data.qd, data.tau), table(T), strict=True):
-                np.testing.assert_array_equal(ours, expected)
+                assert_array_equal(ours, expected)
             assert data.joint_names.tolist() == NAMES
             assert data.remarks == () and data.estimated == ("qdd",)
 
@@ -60,14 +61,14 @@ def test_names_may_be_shuffled_and_missing_in_some_messages(bag):
     made[1::2] = rows(T[1::2], joints=slice(None, None, -1))
     made[10:11] = rows(T[10:11], joints=slice(1, 2))
     data = schema.load(bag(made))
-    np.testing.assert_allclose(data.t, np.delete(T, 10), atol=1e-12)
-    np.testing.assert_array_equal(data.q, next(table(np.delete(T, 10))))
+    assert_allclose(data.t, np.delete(T, 10), atol=1e-12)
+    assert_array_equal(data.q, next(table(np.delete(T, 10))))
 
 
 def test_two_publishers_on_one_topic_are_merged(bag):
     data = schema.load(bag(rows(joints=slice(1)) + rows(T + 0.003, joints=slice(1, 2))))
     assert len(data.t) == 39  # the shoulder's first message comes after the elbow's
-    np.testing.assert_allclose(data.q, next(table(data.t + 0.01)), atol=1e-5)  # cubic splines: of fourth order
+    assert_allclose(data.q, next(table(data.t + 0.01)), atol=1e-5)  # cubic splines: of fourth order
     assert any(": clock: " in remark for remark in data.remarks)
 
 
@@ -76,10 +77,10 @@ def test_topics_of_different_rates_are_put_on_the_slower_clock(bag):
     efforts = [state(t, NAMES[::-1], tau=motion(t)[2][::-1]) for t in slow]
     path = bag({"/states": rows(fast, tau=False), "/currents": efforts})
     data = schema.load(path, topics=["/states", "/currents"], torque_factor={"elbow": 0.5})
-    np.testing.assert_allclose(data.t, slow - slow[0], atol=1e-12)
+    assert_allclose(data.t, slow - slow[0], atol=1e-12)
     q, qd, tau = table(slow)
-    np.testing.assert_allclose([data.q, data.qd], [q, qd], atol=1e-7)
-    np.testing.assert_allclose(data.tau, tau * [0.5, 1], atol=1e-12)
+    assert_allclose([data.q, data.qd], [q, qd], atol=1e-7)
+    assert_allclose(data.tau, tau * [0.5, 1], atol=1e-12)
     assert "effort of elbow in /currents, 100 Hz; q and qd by cubic splines" in data.remarks[0]
     assert data.remarks[1] == "tau is that of the log times elbow 0.5, shoulder 1"
 
@@ -89,7 +90,7 @@ def test_gaps_of_one_topic_are_left_out(bag):
     path = bag({"/states": rows(T + 0.002, tau=False), "/efforts": efforts})
     data = schema.load(path, topics=["/states", "/efforts"])
     assert np.diff(data.t).max() > 0.19 and "left out" in data.remarks[0]
-    np.testing.assert_allclose(data.tau, [*table(data.t + 0.01)][2], atol=1e-12)
+    assert_allclose(data.tau, [*table(data.t + 0.01)][2], atol=1e-12)
 
 
 def test_repeated_and_reversed_stamps_are_repaired_and_said(bag):
@@ -97,7 +98,7 @@ def test_repeated_and_reversed_stamps_are_repaired_and_said(bag):
     made[5], made[6] = made[6][:-1] + made[5][-1:], made[5][:-1] + made[6][-1:]  # received the other way round
     made.append(state(T[9], NAMES, [9, 9], [9, 9], [9, 9], receipt=T[9] + 0.001))
     data = schema.load(bag(made))
-    np.testing.assert_array_equal(data.q, next(table(T)))
+    assert_array_equal(data.q, next(table(T)))
     assert "1 messages repeat a stamp (the first is kept)" in data.remarks[0]
     assert "1 messages are earlier than the one before (sorted by stamp)" in data.remarks[1]
 
@@ -106,7 +107,7 @@ def test_times_of_receipt_stand_in_for_stamps_that_are_missing_or_set_back(bag):
     made = [state(now - 100 * (now > 0.15), NAMES, *motion(now), receipt=now) for now in T]
     for stamped in (True, False):
         data = schema.load(bag(made, stamped=stamped))
-        np.testing.assert_allclose(data.t, T, atol=1e-12)
+        assert_allclose(data.t, T, atol=1e-12)
         assert "times of receipt are used" in data.remarks[0]
 
 
@@ -117,7 +118,7 @@ def test_joints_are_selected_ordered_and_renamed(bag):
     assert len(data.t) == 40 and data.joint_names.tolist() == ["shoulder", "elbow"]
     both = schema.load(path, joints=["shoulder", "elbow=forearm"])
     assert both.joint_names.tolist() == ["shoulder", "forearm"]
-    np.testing.assert_array_equal(both.q, data.q)
+    assert_array_equal(both.q, data.q)
     assert "joints left out: finger" in both.remarks[0]
 
 
@@ -125,7 +126,7 @@ def test_a_folder_of_bags_is_a_trajectory_each(bag, tmp_path):
     bag(rows()), bag(rows(), mcap=True)
     data = schema.load(tmp_path)
     assert data.label.tolist() == ["bag0", "bag1"]
-    np.testing.assert_array_equal(np.bincount(data.trajectory), [40, 40])
+    assert_array_equal(np.bincount(data.trajectory), [40, 40])
     bag(rows(tau=False))
     with one_line(r"bag0 and bag2 differ \(tau only in one\)"):
         schema.load(tmp_path)

@@ -3,14 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from calls import one_line
+from published_motions import published_arrays
 
+from dln_jax import Needs, flow
 from dln_jax.data.bodies import Bodies, find_bodies, imbalance
-from dln_jax.mechanics.equations import flow
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.types import Needs
-from tests.calls import one_line
-from tests.published_motions import published_arrays
 
 
 def by_body(x, count):
@@ -18,14 +16,14 @@ def by_body(x, count):
     return x.reshape(-1, 2, count).swapaxes(1, 2).reshape(x.shape)
 
 
-@pytest.mark.parametrize(("task", "count"), [("two-body", 2), ("three-body", 3)])
-def test_order_is_read_off_forces(task, count):
-    force = published_arrays(task, 7, trajectories=4)["pd"]
-    assert find_bodies(force) == Bodies(2, "axes")
-    assert find_bodies(by_body(force, count)) == Bodies(2, "bodies")
-    assert imbalance(force, Bodies(2, "axes")) < 1e-12 < 0.3 < imbalance(force, Bodies(2, "bodies"))
-    noisy = force + 0.05 * force.std() * np.random.default_rng(0).normal(size=force.shape)
-    assert find_bodies(noisy) == Bodies(2, "axes") and find_bodies(force, order="bodies").order == "bodies"
+def test_order_is_read_off_forces():
+    for task, count in (("two-body", 2), ("three-body", 3)):
+        force = published_arrays(task, 7, trajectories=4)["pd"]
+        assert find_bodies(force) == Bodies(2, "axes")
+        assert find_bodies(by_body(force, count)) == Bodies(2, "bodies")
+        assert imbalance(force, Bodies(2, "axes")) < 1e-12 < 0.3 < imbalance(force, Bodies(2, "bodies"))
+        noisy = force + 0.05 * force.std() * np.random.default_rng(0).normal(size=force.shape)
+        assert find_bodies(noisy) == Bodies(2, "axes") and find_bodies(force, order="bodies").order == "bodies"
 
 
 def test_bodies_in_space_are_told_from_bodies_in_a_plane_and_forces_without_balance_name_none():
@@ -38,13 +36,12 @@ def test_bodies_in_space_are_told_from_bodies_in_a_plane_and_forces_without_bala
 
 
 def test_a_pairwise_model_is_the_same_in_both_orders():
-    needs = Needs(("prismatic",) * 6)
-    q, p = np.random.default_rng(0).normal(size=(2, 5, 6))
-    rates = []
+    needs, rates = Needs(("prismatic",) * 6), []
+    q, p = np.random.default_rng(0).normal(size=(2, 6))
     for order, states in (("axes", (q, p)), ("bodies", (by_body(q, 3), by_body(p, 3)))):
         model = make_pairwise_hamiltonian(needs, order=order, width=2, depth=1, alike=False, dtype=jnp.float64)
-        parameters = model.init(jax.random.key(0))
-        rates.append(np.stack(jax.jit(jax.vmap(flow(model.energies(parameters)).rates))(*states)))
-    np.testing.assert_allclose(by_body(rates[0].reshape(-1, 6), 3), rates[1].reshape(-1, 6), rtol=1e-12)
+        rates.append(jax.jit(flow(model.energies(model.init(jax.random.key(0)))).rates)(*states))
+    for by_axis, of_bodies in zip(*rates, strict=True):
+        np.testing.assert_allclose(by_body(by_axis, 3), of_bodies, rtol=1e-12)
     with one_line("order is 'columns'"):
         make_pairwise_hamiltonian(needs, order="columns")  # pyright: ignore[reportArgumentType]

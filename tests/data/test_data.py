@@ -1,21 +1,19 @@
 """The schema, its refusals, splits by trajectory, and the generators' exactness."""
 
 import json
-import pickle
 
-import jax
 import numpy as np
-import pytest
+from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
+from dln_jax import Needs
 from dln_jax.data import schema
-from dln_jax.data.splits import PER_SAMPLE, merged, select, select_samples, split
+from dln_jax.data.splits import PER_SAMPLE, merged, select, split
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulums import double_pendulum, two_link_arm
+from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.scenes.poles import cart_pole
-from dln_jax.types import Needs
-from tests.calls import one_line
 
 
 def arrays(samples=12, d=2, trajectories=3):
@@ -52,13 +50,8 @@ REFUSED = [
     (changed(temperature=np.zeros((12, 3))), r"temperature has shape \(12, 3\)"),
     (changed(temperature=np.full(12, -300.0)), "below absolute zero"),
     *((changed(joint_names=np.array(names)), "expected 2 different strings") for names in (["a"], ["a", "a"], [1, 2])),
-    (changed(needs=np.array("{not json")), "needs is not JSON"),
     (changed(needs=np.array('{"joints": [], "friction": true, "friction": false}')), "needs names 'friction' twice"),
-    (needing(joints=["ball"]), "expected a tuple of revolute, prismatic"),
     (needing(joints=["revolute"]), "states 1 joints, but q has 2"),
-    (needing(wind=True), "expected the fields joints"),
-    (needing(actuation=[[1]]), "actuation is"),
-    (needing(joint_friction=["viscous", "rust"]), "joint_friction has 'rust'; expected some of viscous, coulomb"),
     (needing(joint_friction=["asymmetric", "coulomb"]), "which no data can tell apart"),
     (needing(joint_map=[[1, 0]]), "joint_map is"),
     (needing(joint_map=[[1, 1], [1, 1]]), "an invertible matrix"),
@@ -72,24 +65,6 @@ def test_what_breaks_the_schema_is_named():
             schema.from_arrays(content)
 
 
-def test_files_that_are_no_archive_are_refused_and_nothing_is_unpickled(tmp_path):
-    path = tmp_path / "data.npz"
-    with one_line("no such file"):
-        schema.load(path)
-
-    class Bomb:
-        def __reduce__(self):
-            return (pytest.fail, ("a pickle was executed",))
-
-    np.savez(path, **arrays())
-    cut = path.read_bytes()[:-200]
-    np.savez(path, **{**arrays(), "q": np.array([Bomb()], dtype=object)})
-    for content in (pickle.dumps(Bomb()), cut, path.read_bytes()):
-        path.write_bytes(content)
-        with one_line(f"{path}.*without pickled objects"):
-            schema.load(path)
-
-
 def test_saving_and_loading_is_the_identity(tmp_path):
     path = tmp_path / "data.npz"
     laws = {"joint_friction": ("viscous", "stribeck"), "joint_map": ((1.0, 0.0), (-1.0, 1.0)), "velocity_scale": 0.02}
@@ -98,11 +73,10 @@ def test_saving_and_loading_is_the_identity(tmp_path):
     again = schema.load(path)
     assert again.needs == data.needs
     for key in (*PER_SAMPLE, "label"):
-        np.testing.assert_array_equal(getattr(again, key), getattr(data, key))
-    nowhere = tmp_path / "nowhere" / "data.npz"
-    for other, words in ((path, "exists"), (nowhere, "no such folder"), (path.with_suffix(".csv"), r"end in \.npz")):
+        assert_array_equal(getattr(again, key), getattr(data, key))
+    for name, words in (("data.npz", "exists"), ("a/b.npz", "no such folder"), ("a.csv", r"end in \.npz")):
         with one_line(words):
-            schema.save(other, data)
+            schema.save(tmp_path / name, data)
     older = {"joints": ["revolute"], "gravity": True, "friction": False, "actuation": None}
     assert needs_from_json(older) == Needs(("revolute",))
 
@@ -125,10 +99,10 @@ def test_split_is_by_trajectory_disjoint_complete_and_seeded():
     sets, again, other = (split(data, test=["state-3", "state-7"], seed=seed) for seed in (1, 1, 2))
     held = [part.trajectory.tolist() for part in sets]
     assert held[2] == [3, 7] and len(held[1]) == 6 and sorted(held[0] + held[1]) == [*{*range(60)} - {3, 7}]
-    np.testing.assert_array_equal(again.validation.q, sets.validation.q)
+    assert_array_equal(again.validation.q, sets.validation.q)
     assert not np.array_equal(other.validation.q, sets.validation.q)
     for key in ("t", "q", "tau", "trajectory", "tau_gravity"):
-        np.testing.assert_array_equal(getattr(merged(sets), key), getattr(data, key))
+        assert_array_equal(getattr(merged(sets), key), getattr(data, key))
 
 
 def test_splits_that_cannot_be_made_are_refused():
@@ -148,7 +122,7 @@ def test_letters_have_exact_rates_and_momenta_and_torques_that_are_sums():
     errors = []
     for dt in (0.02, 0.01):
         data = generators.characters(letters="e", dt=dt)
-        np.testing.assert_allclose(data.tau_inertial + data.tau_coriolis + data.tau_gravity, data.tau, atol=1e-12)
+        assert_allclose(data.tau_inertial + data.tau_coriolis + data.tau_gravity, data.tau, atol=1e-12)
         for rate, source in (("qd", "q"), ("qdd", "qd"), ("pd", "p")):
             estimate = time_derivative(data.t, getattr(data, source), data.trajectory, name=rate)
             errors.append(np.abs(estimate - getattr(data, rate))[2:-2].max())
@@ -158,9 +132,9 @@ def test_letters_have_exact_rates_and_momenta_and_torques_that_are_sums():
 
 def test_uniform_states_fill_their_box_and_underactuated_scenes_are_driven_by_their_motors():
     data = generators.uniform(cart_pole(), samples=2000, position_bound=2.0, rate_bound=3.0)
-    for states, bound in ((data.q, 2.0), (data.qd, 3.0)):
-        assert 0.95 * bound < np.abs(states).max() <= bound and np.abs(states.mean(axis=0)).max() < 0.1 * bound
-    np.testing.assert_allclose(data.tau[:, 1], 0.0, atol=1e-12)
+    for states in (data.q / 2, data.qd / 3):
+        assert 0.95 < np.abs(states).max() <= 1 and np.abs(states.mean(axis=0)).max() < 0.1
+    assert_allclose(data.tau[:, 1], 0.0, atol=1e-12)
     assert np.abs(data.tau[:, 0]).max() > 1
     for bound in ("samples", "position_bound", "rate_bound"):
         with one_line(f"{bound} is 0"):
@@ -168,19 +142,10 @@ def test_uniform_states_fill_their_box_and_underactuated_scenes_are_driven_by_th
 
 
 def test_free_swings_keep_their_energy():
-    scene = double_pendulum()
-    data = generators.free_swing(scene, trajectories=2, steps=200)
-    np.testing.assert_array_equal(data.tau, 0.0)
-    energy = 0.5 * np.sum(data.qd * data.p, axis=1) + jax.jit(jax.vmap(scene.potential))(data.q)
-    np.testing.assert_allclose(energy, np.repeat(energy[::200], 200), rtol=1e-8)
-
-
-def test_temperature_is_one_for_all_joints_or_one_for_each():
-    log = {"t": np.arange(3.0), "q": np.zeros((3, 2)), "trajectory": np.zeros(3, int)}
-    common = schema.from_arrays({**log, "temperature": np.array([20.0, 21, 22])})
-    np.testing.assert_array_equal(common.temperature, [[20, 20], [21, 21], [22, 22]])
-    own = schema.from_arrays({**log, "temperature": common.temperature + np.array([0.0, 5.0])})
-    np.testing.assert_array_equal(select_samples(own, np.array([2])).temperature, [[22, 27]])
+    data = generators.free_swing(pendulum(), trajectories=2, steps=200)
+    assert_array_equal(data.tau, 0.0)
+    energy = 0.5 * data.qd * data.p - 9.81 * np.cos(data.q)
+    assert_allclose(energy, np.repeat(energy[::200], 200, axis=0), rtol=1e-8)
 
 
 def test_angles_that_wrap_are_unwrapped_and_nothing_else_is():
@@ -195,9 +160,9 @@ def test_angles_that_wrap_are_unwrapped_and_nothing_else_is():
     wrapped = (true + np.pi) % (2 * np.pi) - np.pi
     data = read(wrapped)
     turns = (data.q - true) / (2 * np.pi)
-    np.testing.assert_allclose(turns, np.tile(np.round(turns[:1]), (600, 1)), atol=1e-12)
+    assert_allclose(turns, np.tile(np.round(turns[:1]), (600, 1)), atol=1e-12)
     assert "column 1, 2 of q wrap by 2 pi" in data.remarks[0] and np.abs(data.qd[:, 0]).max() < 3.1
     slides = read(wrapped, needs=np.array('{"joints": ["prismatic", "revolute", "revolute"]}'))
     assert "in column 2 of q" in slides.remarks[0]
     noise = np.random.default_rng(0).uniform(-np.pi, np.pi, (600, 3))
-    np.testing.assert_array_equal(read(noise).q, noise)
+    assert_array_equal(read(noise).q, noise)

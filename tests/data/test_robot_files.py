@@ -5,12 +5,11 @@ import xml.etree.ElementTree as ET
 import jax
 import numpy as np
 import pytest
+from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
+from dln_jax import dynamics, read_robot, tree_system
 from dln_jax.data.robot_files import mjcf, write_robot
-from dln_jax.data.robots import read_robot
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import tree_system
-from tests.calls import one_line
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 INERTIAL = """<inertial><origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/><mass value="{mass}"/>
@@ -58,9 +57,9 @@ def test_what_is_written_is_read_again_and_mistakes_are_one_line(original):
     again = read_robot(path)
     assert again.tree.parents == tree.parents and again.tree.names == tree.names
     for name in ("rotations", "positions", "axes", "inertias", "armature"):
-        np.testing.assert_allclose(getattr(again.tree, name), getattr(tree, name), rtol=1e-12, atol=1e-14)
+        assert_allclose(getattr(again.tree, name), getattr(tree, name), rtol=1e-12, atol=1e-14)
     for ours, expected in zip(again[1:4], (damping, coulomb, robot.position_limits), strict=True):
-        np.testing.assert_array_equal(ours, expected)
+        assert_array_equal(ours, expected)
     assert original.read_text() == FILES[original.name] and "Identified - - once." in path.read_text()
     hollow = np.where(np.arange(10) == 4, -1.0, heavier)
     if original.suffix == ".xml":
@@ -86,7 +85,7 @@ def test_a_file_keeps_what_is_not_identified(tmp_path):
         assert words in path.read_text()
     masses = {link.get("name"): link.find("inertial/mass") for link in ET.parse(path).getroot().findall("link")}
     assert masses["base"].get("value") == "9" and masses["hand"] is masses["finger"] is None
-    np.testing.assert_allclose(float(masses["two"].get("value")), 0.75)
+    assert_allclose(float(masses["two"].get("value")), 0.75)
 
 
 def test_a_robot_survives_as_mjcf(tmp_path):
@@ -99,10 +98,10 @@ def test_a_robot_survives_as_mjcf(tmp_path):
     again = read_robot(path)
     assert (again.tree.names, again.tree.parents, again.tree.joints) == (robot.tree.names, *robot.tree[:2])
     for numbers, expected in zip(again[1:5], robot[1:5], strict=True):
-        np.testing.assert_array_equal(numbers, expected)
+        assert_array_equal(numbers, expected)
     state = np.random.default_rng(0).normal(size=(3, len(robot.damping)))
     forces = (jax.jit(dynamics(tree_system(each.tree)).inverse_dynamics)(*state) for each in (again, robot))
-    np.testing.assert_allclose(*forces, rtol=1e-12, atol=1e-12)
+    assert_allclose(*forces, rtol=1e-12, atol=1e-12)
     massless = robot.tree._replace(inertias=0 * robot.tree.inertias)
     with one_line(f"the link of joint '{robot.tree.names[0]}' has a mass of 0 kg"):
         mjcf(robot._replace(tree=massless))

@@ -6,24 +6,24 @@ import textwrap
 import jax
 import numpy as np
 import pytest
+from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.data.robots import read_robot
-from dln_jax.mechanics.equations import dynamics
+from dln_jax import dynamics, read_robot
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
-from tests.calls import one_line
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is the reference; it is in the extra [robot]")
 LINK = """
-<link name="{name}">
+<link name="{0}">
   <inertial>
-    <origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/> <mass value="{mass}"/>
+    <origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/> <mass value="{1}"/>
     <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0.004" ixz="-0.002" iyz="0.001"/>
   </inertial>
-  <visual><geometry><mesh filename="nowhere/{name}.stl"/></geometry></visual>
+  <visual><geometry><mesh filename="nowhere/{0}.stl"/></geometry></visual>
 </link>"""
 JOINT = """
-<joint name="{name}" type="{kind}">
-  <parent link="{parent}"/> <child link="{child}"/> <origin xyz="{xyz}" rpy="0.4 -0.3 0.2"/> <axis xyz="{axis}"/>
+<joint name="{}" type="{}">
+  <parent link="{}"/> <child link="{}"/> <origin xyz="{}" rpy="0.4 -0.3 0.2"/> <axis xyz="{}"/>
   <limit lower="-1" upper="2" effort="30" velocity="3"/> <dynamics damping="0.2" friction="0.1"/>
 </joint>"""
 
@@ -33,12 +33,12 @@ def urdf(*parts):
 
 
 def joint(name, kind, parent, child, xyz="0 0 1", axis="0 0 1"):
-    return JOINT.format(name=name, kind=kind, parent=parent, child=child, xyz=xyz, axis=axis)
+    return JOINT.format(name, kind, parent, child, xyz, axis)
 
 
 SHOULDER = joint("shoulder", "revolute", "base", "one", xyz="0 0 0.3")
 ARM = urdf(
-    *(LINK.format(name=name, mass=mass) for name, mass in (("one", 2.0), ("two", 1.5), ("three", 0.7), ("hand", 0.4))),
+    *(LINK.format(*link) for link in (("one", 2.0), ("two", 1.5), ("three", 0.7), ("hand", 0.4))),
     SHOULDER,
     joint("elbow", "continuous", "one", "two", xyz="0.2 0 0.1", axis="0.6 0 0.8"),
     joint("slide", "prismatic", "two", "three", xyz="0 0.3 0", axis="0 1 0"),
@@ -90,13 +90,13 @@ def test_forces_are_those_of_mujoco(name, tmp_path):
         wanted = np.array(data.qacc)
         mujoco.mj_inverse(model, data)
         tau, qdd, origins = map(np.asarray, moved(data.qpos, data.qvel, wanted))
-        np.testing.assert_allclose(tau, data.qfrc_inverse, rtol=1e-10, atol=1e-10)
+        assert_allclose(tau, data.qfrc_inverse, rtol=1e-10, atol=1e-10)
         data.qfrc_applied = tau
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(qdd, data.qacc, rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(qdd, wanted, rtol=1e-9, atol=1e-9)
+        assert_allclose(qdd, data.qacc, rtol=1e-8, atol=1e-8)
+        assert_allclose(qdd, wanted, rtol=1e-9, atol=1e-9)
         turning = np.array(robot.tree.joints) == "revolute"  # MuJoCo's anchor of a slide stays behind
-        np.testing.assert_allclose(origins[turning], data.xanchor[turning], atol=1e-12)
+        assert_allclose(origins[turning], data.xanchor[turning], atol=1e-12)
 
 
 def test_what_a_file_states_of_its_joints(tmp_path):
@@ -104,29 +104,30 @@ def test_what_a_file_states_of_its_joints(tmp_path):
     robot = read_robot(written(tmp_path, "arm.urdf", in_namespace))
     assert robot.tree.names == ("shoulder", "elbow", "slide")
     assert robot.tree.joints == ("revolute", "revolute", "prismatic")
-    np.testing.assert_array_equal(robot.damping, [0.2] * 3)
-    np.testing.assert_array_equal(robot.coulomb, [0.1] * 3)
-    np.testing.assert_array_equal(robot.position_limits, [[-1, 2], [-np.inf, np.inf], [-1, 2]])
-    np.testing.assert_array_equal(robot.force_limits, [[-30, 30]] * 3)
-    np.testing.assert_array_equal(robot.tree.gravity, [0, 0, -9.81])
+    assert_array_equal(robot.damping, [0.2] * 3)
+    assert_array_equal(robot.coulomb, [0.1] * 3)
+    assert_array_equal(robot.position_limits, [[-1, 2], [-np.inf, np.inf], [-1, 2]])
+    assert_array_equal(robot.force_limits, [[-30, 30]] * 3)
+    assert_array_equal(robot.tree.gravity, [0, 0, -9.81])
 
 
-@pytest.mark.parametrize(
-    ("file", "lock"),
-    [("branched.xml", {"z": 0.7, "w": -0.4}), ("referenced.xml", {"x": 0.7, "y": 0.2}), ("arm.urdf", {"slide": 0.2})],
-)
-def test_joints_are_locked_at_their_positions(file, lock, tmp_path):
-    path = written(tmp_path, file, FILES[file])
-    free, locked = read_robot(path), read_robot(path, lock=lock)
-    place = np.array([free.tree.names.index(name) for name in locked.tree.names])
-    state = np.zeros((3, free.tree.degrees_of_freedom))
-    state[0] = [lock.get(name, 0.0) for name in free.tree.names]
-    state[:, place] = np.random.default_rng(0).normal(size=(3, len(place)))
-    every, fewer = (
-        jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*states)
-        for robot, states in ((free, state), (locked, state[:, place]))
-    )
-    np.testing.assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
+def test_joints_are_locked_at_their_positions(tmp_path):
+    for file, lock in (
+        ("branched.xml", {"z": 0.7, "w": -0.4}),
+        ("referenced.xml", {"x": 0.7, "y": 0.2}),
+        ("arm.urdf", {"slide": 0.2}),
+    ):
+        path = written(tmp_path, file, FILES[file])
+        free, locked = read_robot(path), read_robot(path, lock=lock)
+        place = np.array([free.tree.names.index(name) for name in locked.tree.names])
+        state = np.zeros((3, free.tree.degrees_of_freedom))
+        state[0] = [lock.get(name, 0.0) for name in free.tree.names]
+        state[:, place] = np.random.default_rng(0).normal(size=(3, len(place)))
+        every, fewer = (
+            jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*states)
+            for robot, states in ((free, state), (locked, state[:, place]))
+        )
+        assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
 
 
 def test_a_gripper_whose_fingers_are_tied_and_a_free_base_can_be_locked(tmp_path):
@@ -148,10 +149,10 @@ def test_inertias_that_no_body_has_are_read_as_they_are(tmp_path):
     tree = read_robot(written(tmp_path, "flat.urdf", flat)).tree
     true = read_robot(written(tmp_path, "arm.urdf", ARM)).tree
     assert np.linalg.eigvalsh(pseudo_inertia(tree.inertias[0]))[0] < 0
-    np.testing.assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)
+    assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)
 
 
-ONE = LINK.format(name="one", mass=1.0)
+ONE = LINK.format("one", 1.0)
 HINGE = """<mujoco><worldbody><body name="arm"><inertial mass="1" pos="0.1 0 0" diaginertia="1 1 1"/>
 <joint name="elbow" axis="0 1 0" {}/></body></worldbody></mujoco>"""
 BOMB = '<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><robot name="&b;"/>'
@@ -164,7 +165,7 @@ def nested(depth):
 
 
 def chain(count):
-    parts = [LINK.format(name=f"l{k}", mass=1.0) for k in range(count)]
+    parts = [LINK.format(f"l{k}", 1.0) for k in range(count)]
     return urdf(*parts, *(joint(f"j{k}", "revolute", f"l{k - 1}" if k else "base", f"l{k}") for k in range(count)))
 
 
@@ -224,14 +225,16 @@ def test_what_is_no_tree_is_refused_in_one_line(tmp_path, monkeypatch):
     assert [each.name for each in tmp_path.iterdir()] == ["robot.xml"]
 
 
-@pytest.mark.parametrize("stated", ["1 -1", "0 0"])
-def test_limits_are_checked_in_files_of_files(tmp_path, stated):
-    (tmp_path / "part.xml").write_text(HINGE.format(f'range="{stated}"'))
-    (tmp_path / "nested.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
-    attached = '<asset><model name="m" file="part.xml"/></asset><worldbody><body><attach model="m" body="arm" prefix="'
-    for text in ('<include file="nested.xml"/>', attached + 'the_"/></body></worldbody>'):
-        with one_line(f"elbow' has limits of position {stated.split()[0]}"):
-            read_robot(written(tmp_path, "arm.xml", f"<mujoco>{text}</mujoco>"))
+def test_limits_are_checked_in_files_of_files(tmp_path):
+    for stated in ("1 -1", "0 0"):
+        (tmp_path / "part.xml").write_text(HINGE.format(f'range="{stated}"'))
+        (tmp_path / "nested.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+        attached = (
+            '<asset><model name="m" file="part.xml"/></asset><worldbody><body><attach model="m" body="arm" prefix="'
+        )
+        for text in ('<include file="nested.xml"/>', attached + 'the_"/></body></worldbody>'):
+            with one_line(f"elbow' has limits of position {stated.split()[0]}"):
+                read_robot(written(tmp_path, "arm.xml", f"<mujoco>{text}</mujoco>"))
 
 
 def test_limits_that_are_switched_off_or_zero_are_not_stated(tmp_path):
@@ -245,7 +248,7 @@ def test_limits_that_are_switched_off_or_zero_are_not_stated(tmp_path):
     zeros = limited('effort="30" velocity="3"', 'effort="0" velocity="0"')
     robot = read_robot(written(tmp_path, "arm.urdf", zeros))
     assert np.isinf(robot.velocity_limits[0]) and np.isinf(robot.force_limits[0]).all()
-    np.testing.assert_array_equal(robot.position_limits[0], [-1, 2])
+    assert_array_equal(robot.position_limits[0], [-1, 2])
     swapped = read_robot(written(tmp_path, "arm.urdf", limited('lower="-1"', 'lower="3"')), lock=["shoulder"])
     assert swapped.tree.names == ("elbow", "slide")
 

@@ -1,13 +1,14 @@
 """Recordings of one motion are found and stay on one side of a split; held-out parts can be stated."""
 
 import numpy as np
+from calls import one_line
+from numpy.testing import assert_array_equal
 
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import hold_out, in_blocks, split
 from dln_jax.data.stated_tests import stated_test
 from dln_jax.training.hamiltonian.measurements import parted
-from tests.calls import one_line
 
 
 def fourier(random, d=3):
@@ -83,7 +84,7 @@ def test_without_repeats_splits_are_what_they_were():
     motion = motion_numbers(data.q, data.trajectory)
     assert np.unique(split(data, seed=1, motion=motion).test.trajectory).tolist() == [5, 11]
     one, other = (hold_out(data, 0.3, 1, numbers)[1] for numbers in (None, motion))
-    np.testing.assert_array_equal(one.q, other.q)
+    assert_array_equal(one.q, other.q)
 
 
 def test_a_test_that_repeats_trained_motions_is_remarked():
@@ -104,7 +105,7 @@ def test_the_last_part_of_every_trajectory_is_held_out():
     assert labels == ["0[last]", "1[last]"]
     sets = split(cut, test=labels)
     late = np.where(data.trajectory == 0, data.t >= 0.7, data.t >= 0.35)
-    np.testing.assert_array_equal(np.sort(sets.test.q, axis=0), np.sort(data.q[late], axis=0))
+    assert_array_equal(np.sort(sets.test.q, axis=0), np.sort(data.q[late], axis=0))
     assert len(sets.train.t) + len(sets.validation.t) == np.sum(~late)
 
 

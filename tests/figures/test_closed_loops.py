@@ -1,6 +1,8 @@
 """Figures of closed loops show the limits, the failures and the whole run; films move in real time."""
 
 import numpy as np
+from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from dln_jax.control import ClosedLoopRun
@@ -12,7 +14,6 @@ from dln_jax.figures import (
     rotary_pendulum_drawing,
     write_closed_loop_gif,
 )
-from tests.calls import one_line
 
 T = np.linspace(0, 1, 51)
 Q = np.stack([0.1 * np.sin(3 * T), np.pi * (1 - T)], axis=1)
@@ -39,7 +40,7 @@ def test_the_portrait_goes_round_and_fills_what_is_caught():
     (axis,) = phase_portrait(angles, np.cos(angles), caught=(np.diag([4.0, 1.0]), 1.0)).axes
     drawn = np.asarray(axis.lines[0].get_xdata())
     assert np.isnan(drawn).sum() == 2 and np.nanmax(np.abs(drawn)) <= np.pi
-    np.testing.assert_allclose(axis.patches[0].get_xy().max(axis=0), [0.5, 1.0], rtol=1e-2)
+    assert_allclose(axis.patches[0].get_xy().max(axis=0), [0.5, 1.0], rtol=1e-2)
 
 
 def test_a_film_is_as_long_as_its_run(tmp_path):
@@ -58,6 +59,6 @@ def test_each_joint_has_its_friction_curves_in_the_order_of_its_rates():
     shown = [axis for axis in figure.axes if axis.get_visible()]
     assert len(shown) == 5 and shown[4].get_title() == "joint 5"
     points, fit, plant = shown[4].lines[:3]
-    np.testing.assert_array_equal(points.get_ydata(), rates[:, 4] ** 2)
-    np.testing.assert_array_equal(fit.get_xdata(), np.sort(rates[:, 4]))
-    np.testing.assert_array_equal(plant.get_ydata(), np.sort(rates[:, 4]))
+    assert_array_equal(points.get_ydata(), rates[:, 4] ** 2)
+    assert_array_equal(fit.get_xdata(), np.sort(rates[:, 4]))
+    assert_array_equal(plant.get_ydata(), np.sort(rates[:, 4]))

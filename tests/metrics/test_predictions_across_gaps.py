@@ -3,17 +3,16 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
 
+from dln_jax import HamiltonianSystem, Model
 from dln_jax.data import schema
-from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics.measured_predictions import (
     cut_recordings,
     grid_places,
     predict_measured,
     valid_times,
 )
-from dln_jax.models.model import Model
-from tests.calls import one_line
 
 STEP, FITTED, FREQUENCY = 0.05, 12, 3.0
 

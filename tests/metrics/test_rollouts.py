@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calls import one_line
+from numpy.testing import assert_allclose, assert_array_equal
 
+from dln_jax import LagrangianSystem, PlainDynamics, dynamics
 from dln_jax.data import schema
-from dln_jax.mechanics.dynamics import PlainDynamics
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.rollouts import (
     Motion,
     by_trajectory,
@@ -21,7 +21,6 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_times,
 )
 from scripts.reports.arm.data import STARTS, published_swings, rollout_metrics
-from tests.calls import one_line
 
 FRICTION = 0.3
 
@@ -67,9 +66,9 @@ def test_a_mass_follows_recorded_torques():
         fallen = np.cumsum(np.r_[1, held[:-1] * dt + 0.5 * tau[:-1] * dt**2])
         for kind, place, rate in (("interpolated", q, qd), ("held", fallen, held)):
             motion = motions[kind][index]
-            np.testing.assert_allclose(motion.q[:, 0], place, rtol=1e-13)
-            np.testing.assert_allclose(motion.qd[:, 0], rate, rtol=1e-13)
-            np.testing.assert_allclose(motion.work, 0.5 * (rate**2 - 4), atol=1e-12)
+            assert_allclose(motion.q[:, 0], place, rtol=1e-13)
+            assert_allclose(motion.qd[:, 0], rate, rtol=1e-13)
+            assert_allclose(motion.work, 0.5 * (rate**2 - 4), atol=1e-12)
 
 
 def test_energy_is_the_work_of_the_torque_less_friction():
@@ -79,9 +78,9 @@ def test_energy_is_the_work_of_the_torque_less_friction():
     motion = jax.jit(lambda: follow(system, jnp.zeros(1), jnp.zeros(1), tau, t))()
     frequency = np.sqrt(8 - FRICTION**2 / 4)
     qd = 1.5 / frequency * np.exp(-FRICTION / 2 * t) * np.sin(frequency * t)
-    np.testing.assert_allclose(motion.qd[:, 0], qd, atol=1e-9)
+    assert_allclose(motion.qd[:, 0], qd, atol=1e-9)
     energy = jax.vmap(system.energy)(motion.q, motion.qd)
-    np.testing.assert_allclose(energy - energy[0], motion.work, atol=1e-9)
+    assert_allclose(energy - energy[0], motion.work, atol=1e-9)
     assert float(1.5 * motion.q[-1, 0] - motion.work[-1]) > 0.01  # what friction took
 
 
@@ -107,7 +106,7 @@ def test_prediction_metrics_follow_their_definitions():
     motions = [Motion(data.q[group] + 0.1, data.qd[group] - 0.2, np.zeros(len(data.q[group]))) for group in groups]
     motions[0].q[:2] -= 0.1
     variance = np.var(data.q)
-    np.testing.assert_allclose(valid_prediction_times(data, motions, threshold=0.009 / variance), [0.3, 0.0])
+    assert_allclose(valid_prediction_times(data, motions, threshold=0.009 / variance), [0.3, 0.0])
     expected = np.sqrt((6 / 8 * 0.01 / variance + 0.04 / np.var(data.qd)) / 2)
     assert normalised_state_error(data, motions) == pytest.approx(expected, rel=1e-12)
     motions[1].qd[0] = np.nan
@@ -146,8 +145,8 @@ def test_recordings_that_cannot_be_followed_are_refused():
 def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
     data = published_swings()
     assert data.q.shape == (1200, 2) and data.t[399] == pytest.approx(7.98)
-    np.testing.assert_array_equal(data.tau, 0.0)
-    np.testing.assert_array_equal(data.q[::400], STARTS)
+    assert_array_equal(data.tau, 0.0)
+    assert_array_equal(data.q[::400], STARTS)
     # The published formulas of the plant, whose angle zero is horizontal, by plain numpy.
     q, qd = data.q[[0, 400, 800]].T, np.zeros((2, 3))
     for step in range(100):
@@ -157,7 +156,7 @@ def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
         second = -0.5 * sine * qd[0] ** 2 - weight
         qdd = np.array([c * first - b * second, a * second - b * first]) / (a * c - b**2)
         if step % 10 == 0:
-            np.testing.assert_allclose(data.q[step // 10 :: 400].T, q, atol=1e-12)
-            np.testing.assert_allclose(data.qdd[step // 10 :: 400].T, qdd, atol=1e-11)
+            assert_allclose(data.q[step // 10 :: 400].T, q, atol=1e-12)
+            assert_allclose(data.qdd[step // 10 :: 400].T, qdd, atol=1e-11)
         qd = qd + 0.002 * qdd
         q = q + 0.002 * qd

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from calls import one_line
 
 from dln_jax.errors import FitRefused
 from dln_jax.metrics.coverage import LEVELS as PROBABILITIES
 from dln_jax.metrics.coverage import coverage, half_width
 from dln_jax.metrics.verdict import LEVELS, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
-from tests.calls import one_line
 
 RANDOM = np.random.default_rng(3)
 TRUTH = np.cumsum(RANDOM.normal(size=(4_000, 3)), axis=0) % [3.0, 7.0, 0.2] + [0.0, 40.0, 0.1]

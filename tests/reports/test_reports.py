@@ -35,7 +35,7 @@ def table(monkeypatch, tmp_path):
 
     def fall(*, drops: int = 3, heights: tuple[str, ...] = ("low",), log: Path | None = None):
         calls.append((drops, heights, log))
-        return {f"fall/{height}": {"error": 0.1 * drops, "share": 0.5} for height in heights}
+        return {f"fall/{height}": {"error": 0.1 * drops, "share": 0.6, "mass": 2.0} for height in heights}
 
     cases = (
         Case(
@@ -83,7 +83,8 @@ def test_rows_stand_beside_published_numbers_and_bounds(table, capsys):
     # A number that is not one meets no bound.
     assert rows["other", "error_seconds"]["value"] is None and not rows["other", "error_seconds"]["pass"]
     assert rows["other", "error_seconds"]["unit"] == "s"
-    assert "3 of 5 pass" in capsys.readouterr().out
+    assert rows["fall/low", "mass"]["pass"] is None
+    assert {"machine", "versions"} <= {*written["conditions"]} and "3 of 5 pass" in capsys.readouterr().out
 
 
 def test_options_are_the_keywords_of_the_functions(table, tmp_path):

@@ -10,6 +10,7 @@ import pytest
 from calls import command, json_of
 from motions import sums_of_sines
 
+from dln_jax import Needs
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.data import schema
@@ -19,7 +20,6 @@ from dln_jax.mechanics import lagrangian
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.scenes.datasets.generators import characters
 from dln_jax.training.dynamics.run import prepare
-from dln_jax.types import Needs
 
 BRIEF = "--no-figures --no-low-latency --no-uncertainty"
 PARTS = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse")
@@ -54,6 +54,7 @@ def slid(workplace, drift):
     return metrics_of(workplace / f"slide{drift}")
 
 
+@pytest.mark.slow
 def test_weight_of_a_slide_is_its_gravity_and_no_offset_of_friction(workplace, capsys):
     metrics = slid(workplace, 0.0)
     assert max(metrics[part] for part in PARTS) < 1e-18 and metrics["gravity_determined"] == 1
@@ -66,6 +67,7 @@ def test_dry_friction_of_a_slide_that_moves_one_way_is_known_only_with_its_weigh
     assert "gravity and friction of joints [1] are known only in sum" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_friction_beside_the_potential_of_a_network_has_no_offset(workplace):
     weightless = json.dumps({"joints": ["revolute"] * 2, "gravity": False, "joint_friction": USUAL})
     for needs, laws in ((None, ("viscous", "coulomb")), (weightless, USUAL)):
@@ -107,17 +109,10 @@ def test_terms_of_a_lagrangian_linear_in_the_rates_take_no_power():
         np.testing.assert_allclose(force @ qd, 0, atol=1e-14)
 
 
-def test_letters_come_apart_by_default(workplace):
-    command(train_delan, "--data", LETTERS, "--test e,q,v", BRIEF, "--out default")
-    assert max(metrics_of(workplace / "default")[part] for part in PARTS) < 1e-8
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "test"), [("auto", "a,d,h"), ("structured-delan", "c,g,s"), ("black-box-delan", "e,q,v")]
-)
-def test_letters_come_apart_for_every_model(workplace, model, test):
+@pytest.mark.parametrize("model", ["auto", "structured-delan", "black-box-delan"])
+def test_letters_come_apart_for_every_model(workplace, model):
     """The published two-link arm, of which only the total torque is fitted."""
-    command(train_delan, "--data", LETTERS, "--test", test, "--model", model, "--seed 3", BRIEF, "--out", model)
+    command(train_delan, "--data", LETTERS, "--test e,q,v --seed 3 --model", model, BRIEF, "--out", model)
     metrics = metrics_of(workplace / model)
     assert max(metrics[part] for part in PARTS) < 1e-8 and metrics["gravity_determined"] == 1

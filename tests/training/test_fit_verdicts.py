@@ -3,16 +3,14 @@
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax import LagrangianSystem, Needs, dynamics
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split, select
 from dln_jax.learning.objectives import CANONICAL, STATED
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.rollouts import Motion
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Task
 from dln_jax.training.dynamics.verdict import judge_fit
-from dln_jax.types import Needs
 
 N = 300
 OBJECTIVES = {**STATED, "momenta": CANONICAL}

@@ -5,14 +5,12 @@ import numpy as np
 import pytest
 from motions import sums_of_sines
 
+from dln_jax import Needs, describe, dynamics
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import inertial_parameters
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree
 from dln_jax.training.dynamics.methods.learned_tree import refined_by_motions
-from dln_jax.types import Needs
-from dln_jax.zoo.descriptions import describe
 
 NEEDS = Needs(joints=("revolute",), friction=True)
 DESCRIPTION = describe(
@@ -28,11 +26,11 @@ TRUE = SerialTreeParameters(
 def motion(seed):
     """A sum of sines for 4 s, with torques with noise."""
     random, t = np.random.default_rng(seed), np.linspace(0, 4, 81)
-    states = sums_of_sines(t, *random.uniform([0.3, 0.5, 0], [0.8, 3, 6], (1, 3, 3)).transpose(2, 0, 1))
+    q, qd, qdd = sums_of_sines(t, *random.uniform([0.3, 0.5, 0], [0.8, 3, 6], (1, 3, 3)).transpose(2, 0, 1))
     known = dynamics(make_serial_tree(NEEDS, velocity_scale=0.01).energies(TRUE))
-    tau = jax.jit(jax.vmap(known.inverse_dynamics))(*states) + 0.05 * random.normal(size=(81, 1))
-    columns = dict(zip(("q", "qd", "qdd", "tau"), map(np.asarray, (*states, tau)), strict=True))
-    return from_arrays({"t": t, "trajectory": np.zeros(81, int), **columns})
+    tau = jax.jit(jax.vmap(known.inverse_dynamics))(q, qd, qdd) + 0.05 * random.normal(size=(81, 1))
+    columns = {"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(tau)}
+    return from_arrays({**columns, "trajectory": np.zeros(81, int)})
 
 
 @pytest.mark.slow

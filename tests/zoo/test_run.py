@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from calls import json_of, one_line
+from numpy.testing import assert_array_equal
 
-from dln_jax.types import Needs
-from dln_jax.zoo.descriptions import build, describe
+from dln_jax import Needs, build, describe
 from dln_jax.zoo.parameter_files import load_manifest, load_tree, save_tree
 from dln_jax.zoo.run import load, save
 
@@ -147,7 +147,7 @@ def test_arrays_come_back_however_they_lie_in_memory(tmp_path):
     numbers = np.arange(24.0).reshape(4, 6)
     tree = {"transposed": numbers.T, "columns": numbers.T[:, [True, False, True, False]], "strided": numbers[::2, ::3]}
     save_tree(tmp_path, "state", tree, {})
-    jax.tree.map(np.testing.assert_array_equal, load_tree(tmp_path, "state", tree), tree)
+    jax.tree.map(assert_array_equal, load_tree(tmp_path, "state", tree), tree)
 
 
 def test_a_tree_comes_back_bit_for_bit_and_old_states_are_removed(tmp_path):
@@ -157,4 +157,4 @@ def test_a_tree_comes_back_bit_for_bit_and_old_states_are_removed(tmp_path):
     manifest = load_manifest(tmp_path, "checkpoint")
     assert manifest["note"] == 2 and set(manifest["versions"]) >= {"jax", "dln-jax"}
     assert manifest["tensors"]["count"] == {"shape": [], "dtype": "int32"}
-    jax.tree.map(partial(np.testing.assert_array_equal, strict=True), load_tree(tmp_path, "checkpoint", TREE), TREE)
+    jax.tree.map(partial(assert_array_equal, strict=True), load_tree(tmp_path, "checkpoint", TREE), TREE)

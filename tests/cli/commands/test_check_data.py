@@ -5,30 +5,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import assert_refused, command, exit_status, json_of, refused
+from motions import sums_of_sines
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import check_data, train_delan
 from dln_jax.cli.encoders import prepare_log
 from dln_jax.data import schema
-from tests.calls import assert_refused, command, exit_status, json_of, refused
-from tests.motions import sums_of_sines
-
-RATE = 100.0
 
 
 @pytest.fixture
 def log(tmp_path, monkeypatch):
     """Four motions of a pendulum that is driven, from its encoder."""
     monkeypatch.chdir(tmp_path)
-    random, t = np.random.default_rng(0), np.arange(400) / RATE
-    rates = np.array([[2.0, 5.0, 9.0]])
-    motions = [
-        sums_of_sines(t, random.uniform(0.3, 0.6, (1, 3)), rates, random.uniform(0, 6, (1, 3))) for _ in range(4)
-    ]
-    q, _, qdd = (np.concatenate(each) for each in zip(*motions, strict=True))
-    arrays = {"t": np.tile(t, 4), "trajectory": np.repeat(range(4), 400), "label": np.array([*"abcd"])}
-    arrays["q"] = q + 5e-4 * random.normal(size=q.shape)
-    arrays["tau"] = 0.4 * qdd + 3.0 * np.sin(q) + 0.02 * random.normal(size=q.shape)
+    random, t, trajectory = np.random.default_rng(0), np.tile(np.arange(400) / 100, 4), np.repeat(range(4), 400)
+    sizes, phases = random.uniform([0.3, 0], [0.6, 6], (4, 3, 2)).transpose(2, 0, 1)[:, trajectory, None]
+    q, _, qdd = sums_of_sines(t, sizes, np.array([2.0, 5.0, 9.0]), phases)
+    noise = random.normal(size=(2, *q.shape))
+    tau = 0.4 * qdd + 3.0 * np.sin(q) + 0.02 * noise[0]
+    arrays = {"t": t, "trajectory": trajectory, "label": [*"abcd"], "q": q + 5e-4 * noise[1], "tau": tau}
     np.savez("log.npz", **arrays)
     np.savez("degrees.npz", **{**arrays, "q": np.degrees(arrays["q"])})
     return arrays

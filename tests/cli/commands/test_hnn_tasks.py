@@ -5,9 +5,9 @@ import pytest
 from calls import assert_refused, command, json_of
 from motions import quick_motion
 
+from dln_jax import Flow, load
 from dln_jax.cli.commands import train_hnn_task
 from dln_jax.data import schema
-from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.training.hamiltonian import measurements, predictions, stages
@@ -16,7 +16,6 @@ from dln_jax.training.hamiltonian import tasks as hnn_tasks
 from dln_jax.training.hamiltonian import training as hnn_models
 from dln_jax.training.hamiltonian.tasks import problem_of
 from dln_jax.training.hamiltonian.training import RECIPES
-from dln_jax.zoo.run import load
 
 
 def quick_prediction(model, parameters, q, p, t):
@@ -25,9 +24,8 @@ def quick_prediction(model, parameters, q, p, t):
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
+def workplace(folder):
     """A damped pendulum with gaps in place of the measured one, and recipes that take a moment."""
-    folder = tmp_path_factory.mktemp("tasks")
     t = np.arange(160) / 6
     t[40:] += 1 / 6
     q = (2 * np.exp(-0.02 * t) * np.cos(2 * t))[:, None]
@@ -36,7 +34,6 @@ def workplace(tmp_path_factory):
     small = {name: recipe._replace(**sizes, trajectory_steps=1) for name, recipe in RECIPES.items()}
     window = dict.fromkeys(hnn_tasks.WINDOW, 6)
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
         for module in (hnn_models, stages, choice):
             patch.setattr(module, "RECIPES", small)
         for module in (hnn_tasks, measurements):

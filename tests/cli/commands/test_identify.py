@@ -5,14 +5,13 @@ import re
 import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of, one_line
+from numpy.testing import assert_allclose, assert_array_equal
 from planar_arm import FRICTION, URDF, motions
 
+from dln_jax import load, load_c, read_robot
 from dln_jax.cli.commands import identify
-from dln_jax.data.robots import read_robot
-from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
 from dln_jax.training.identification.task import noises, split
-from dln_jax.zoo.run import load
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 LOG = "--robot arm.urdf --data log.npz"
@@ -20,18 +19,15 @@ QUICK = "--no-figures --no-uncertainty"
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
+def workplace(folder):
     """A robot's file with masses that are too small, and a log of the true one, columns the other way round."""
-    folder = tmp_path_factory.mktemp("workplace")
     (folder / "arm.urdf").write_text(URDF)
     tree = read_robot(folder / "arm.urdf").tree
     tree = tree._replace(inertias=1.5 * tree.inertias, armature=np.array([0.1, 0.2]))
     log = motions(0, noise=0.05, samples=400, tree=tree)
     swapped = {key: getattr(log, key)[:, ::-1] for key in ("q", "qd", "qdd", "tau")}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        np.savez("log.npz", t=log.t, trajectory=log.trajectory, joint_names=["elbow", "shoulder"], **swapped)
-        yield folder
+    np.savez("log.npz", t=log.t, trajectory=log.trajectory, joint_names=["elbow", "shoulder"], **swapped)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +36,7 @@ def identified(workplace):
     return workplace / "run"
 
 
+@pytest.mark.slow
 def test_sound_log_gives_a_good_run_folder_like_every_other(identified):
     assert {path.name for path in identified.iterdir()} == {
         *(".lock", "config.json", "metrics.json", "model.json", "model.safetensors", "parameters.json", "report.txt"),
@@ -55,16 +52,17 @@ def test_sound_log_gives_a_good_run_folder_like_every_other(identified):
     assert metrics["verdict"] == 0 and verdict["level"] == "good" and "the robot's file" in verdict["reason"]
 
 
+@pytest.mark.slow
 def test_the_model_is_loaded_and_exported_and_the_file_has_what_was_identified(identified, tmp_path):
     run = load(identified)
     state = np.random.default_rng(1).normal(size=(3, 2))
-    np.testing.assert_allclose(run.parameters.coulomb, FRICTION["coulomb"], atol=0.05)
+    assert_allclose(run.parameters.coulomb, FRICTION["coulomb"], atol=0.05)
     export_run(identified, tmp_path / "c", functions=("inverse_dynamics",))
     in_c = load_c(tmp_path / "c").inverse_dynamics
-    np.testing.assert_allclose(in_c(*state), run.dynamics.inverse_dynamics(*state), rtol=1e-12)
+    assert_allclose(in_c(*state), run.dynamics.inverse_dynamics(*state), rtol=1e-12)
     robot = read_robot(identified / "arm_identified.urdf")
-    np.testing.assert_allclose(robot.tree.inertias, run.parameters.inertias, rtol=1e-12, atol=1e-14)
-    np.testing.assert_array_equal(robot.damping, run.parameters.viscous)
+    assert_allclose(robot.tree.inertias, run.parameters.inertias, rtol=1e-12, atol=1e-14)
+    assert_array_equal(robot.damping, run.parameters.viscous)
     assert re.search(r"Armature, .*: shoulder 0\.\d+, elbow 0\.\d+", (identified / "arm_identified.urdf").read_text())
 
 
@@ -77,18 +75,17 @@ def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "words"), [(-1, ""), (1000, "times the tree's; check the unit of tau")])
-def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys, factor, words):
+def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys):
     log = dict(np.load("log.npz"))
-    np.savez(f"ruined{factor}.npz", **{**log, "tau": factor * log["tau"]})
-    # The check of the log sees some of them before.
-    given = ("--robot arm.urdf --accept-log --data", f"ruined{factor}.npz", "--out", f"ruined{factor}", QUICK)
-    status = exit_status(identify, *given)
-    told = capsys.readouterr()
-    assert status == 1 and told.err.startswith("error: the fit is refused: ") and words in told.err
-    assert "no arm_identified.urdf: the fit is refused" in told.out
-    folder = workplace / f"ruined{factor}"
-    assert json_of(folder / "metrics.json")["verdict"] == 2 and not list(folder.glob("*.urdf"))
+    for name, factor, words in (("turned", -1, ""), ("milli", 1000, "times the tree's; check the unit of tau")):
+        np.savez("ruined.npz", **{**log, "tau": factor * log["tau"]})
+        # The check of the log sees some of them before.
+        status = exit_status(identify, "--robot arm.urdf --accept-log --data ruined.npz --out", name, QUICK)
+        told = capsys.readouterr()
+        assert status == 1 and told.err.startswith("error: the fit is refused: ") and words in told.err
+        assert "no arm_identified.urdf: the fit is refused" in told.out
+        folder = workplace / name
+        assert json_of(folder / "metrics.json")["verdict"] == 2 and not list(folder.glob("*.urdf"))
 
 
 def test_mistakes_are_one_line(workplace, capsys):

@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from calls import command, json_of, one_line
 
+from dln_jax import dynamics, joint_dissipation, read_robot, tree_system
 from dln_jax.cli.commands import identify
-from dln_jax.data.robots import read_robot
 from dln_jax.data.schema import from_arrays
 from dln_jax.identification.equations import columns_of, flat
 from dln_jax.identification.identify import parameters_of
 from dln_jax.identification.motions import cut_motions, fit_motions, linearise
 from dln_jax.learning.measured_motions import motion
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import tree_system
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.public import dynamics
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 URDF = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.2"/><mass value="1"/>
@@ -26,19 +23,16 @@ STEP = 0.01
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def place(folder):
     """A pendulum with twice the stated mass, viscous friction and armature, driven by noisy torques; log of q alone."""
-    folder = tmp_path_factory.mktemp("pendulum")
     (folder / "rod.urdf").write_text(URDF)
     tree = read_robot(folder / "rod.urdf").tree
     true = tree._replace(inertias=2 * tree.inertias, armature=np.array([0.02]))
     random = np.random.default_rng(0)
     t, tau, states = moved(tree_system(true, joint_dissipation([0.1], [0.0])), 20, substeps=4)
     q = states[:, :1] + 2e-4 * random.normal(size=tau.shape)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        np.savez("log.npz", t=t, q=q, tau=tau + 0.05 * random.normal(size=tau.shape), joint_names=["hinge"])
-        yield folder
+    np.savez("log.npz", t=t, q=q, tau=tau + 0.05 * random.normal(size=tau.shape), joint_names=["hinge"])
+    return folder
 
 
 def moved(system, seconds, **options):
@@ -50,6 +44,7 @@ def moved(system, seconds, **options):
     return t, tau, np.asarray(states)
 
 
+@pytest.mark.slow
 def test_the_slope_of_windows_is_that_of_finite_differences(place):
     """Where all samples are noise-free, residuals vanish, so that Kaufman's derivative is exact."""
     model = make_rigid_tree(read_robot("rod.urdf").tree, friction=("viscous",))

@@ -5,14 +5,13 @@ import numpy as np
 import pytest
 from calls import assert_refused, command, json_of
 from motions import sums_of_sines
+from numpy.testing import assert_allclose
+from small_logs import small_log
 
+from dln_jax import dynamics, load, load_c, read_robot
 from dln_jax.cli.commands import identify
-from dln_jax.data.robots import read_robot
-from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.zoo.run import load
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 MJCF = """<mujoco><worldbody>
@@ -24,8 +23,7 @@ TERMS = {"motors": ((1.0, 0.0), (1.0, 1.0)), "cooling": (0.02, 0.01), "load": (0
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("terms")
+def place(folder):
     (folder / "arm.xml").write_text(MJCF)
     tree = read_robot(folder / "arm.xml").tree
     heavier = tree._replace(inertias=1.2 * tree.inertias)
@@ -43,11 +41,8 @@ def place(tmp_path_factory):
 
     tau = np.asarray(torque(*states, temperature)) + 0.02 * random.normal(size=(len(t), 2))
     log = {"t": t, **dict(zip(("q", "qd", "qdd"), states, strict=True)), "tau": tau}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        np.savez("log.npz", temperature=temperature, **log)
-        np.savez("cold.npz", **log)
-        yield folder
+    np.savez("log.npz", temperature=temperature, **log)
+    return folder
 
 
 @pytest.mark.slow
@@ -61,21 +56,23 @@ def test_all_terms_are_identified_and_written(place, capsys):
     state = np.random.default_rng(1).normal(size=(3, 2))
     with jax.enable_x64(True):
         run = load("run")
-        np.testing.assert_allclose(run.description["load"], TERMS["load"], atol=0.04)
-        np.testing.assert_allclose(run.description["cooling"], TERMS["cooling"], atol=3e-3)
-        np.testing.assert_allclose(run.parameters.coulomb, [0.4, 0.3], atol=0.05)
+        assert_allclose(run.description["load"], TERMS["load"], atol=0.04)
+        assert_allclose(run.description["cooling"], TERMS["cooling"], atol=3e-3)
+        assert_allclose(run.parameters.coulomb, [0.4, 0.3], atol=0.05)
         # Hot grease: the same functions in C at a stated temperature.
         export_run("run", "c", functions=("inverse_dynamics",), temperature=60.0)
         hot = dynamics(run.model.energies(run.parameters, 60.0)).inverse_dynamics(*state)
-        np.testing.assert_allclose(load_c("c").inverse_dynamics(*state), hot, rtol=1e-10)
+        assert_allclose(load_c("c").inverse_dynamics(*state), hot, rtol=1e-10)
         assert np.abs(hot - run.dynamics.inverse_dynamics(*state)).max() > 0.05
     # The file has the coupled motor.
     S = np.array(TERMS["motors"])
     armature = S.T @ np.diag(run.parameters.armature) @ S
-    np.testing.assert_allclose(read_robot("run/arm_identified.xml").tree.armature, armature)
+    assert_allclose(read_robot("run/arm_identified.xml").tree.armature, armature)
 
 
-def test_terms_that_are_none_are_refused(place, capsys):
+def test_terms_that_are_none_are_refused(folder, capsys):
+    (folder / "arm.xml").write_text(MJCF)
+    np.savez("cold.npz", **small_log(2))
     rows = [
         ("--motors 1,0", "--motors has 1 rows; expected 2"),
         ("--motors 1,1;1,1", "that can be inverted"),
@@ -84,4 +81,4 @@ def test_terms_that_are_none_are_refused(place, capsys):
         ("--temperature --friction coulomb", "--temperature changes viscous friction"),
         ("--temperature", "friction is to depend on temperature, which the data do not have"),
     ]
-    assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=place / "none")
+    assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=folder / "none")

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import json_of, one_line, refused
+from numpy.testing import assert_array_equal, assert_equal
+from small_logs import STATES, small_log
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
@@ -28,21 +30,21 @@ from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
-from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 
-STATES = {key: np.random.default_rng(0).normal(size=(20, 2)) for key in ("q", "qd", "qdd", "tau")}
-TRAJECTORIES = {"t": np.tile(np.arange(4.0), 5), **STATES, "trajectory": np.repeat(np.arange(5), 4)}
+TRAJECTORIES = small_log(2)
 MESH = {"vertices": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), "elements": np.array([[0, 1, 2]])}
 
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A working folder with data."""
-    monkeypatch.chdir(tmp_path)
+    """A working folder with data, beside the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
     np.savez("data.npz", **TRAJECTORIES)
-    return tmp_path
+    return here
 
 
 def listing():
@@ -87,6 +89,11 @@ def garbled(arrays):
     return bytes(data)
 
 
+class Bomb:
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was executed",))
+
+
 SHAPE = "{'descr': '<f8', 'fortran_order': False, 'shape': %s, }"
 TYPE = "{'descr': %s, 'fortran_order': False, 'shape': (20,), }"
 VERTICES = [
@@ -99,7 +106,7 @@ VERTICES = [
     *map(header, ("[1, 2]", "{'descr': '<f8', (((", "(" * 5000)),
     *(header(SHAPE % shape) for shape in ("(1000000000000000,)", "(-20, -1)", "'20'", "(20.0,)")),
     *(header(TYPE % kind) for kind in ("'x9'", "[('a', '<f8')]", "'|O'")),
-    *map(npy, (np.array(["a", "b"]), np.ones((3, 2)) * 1j, np.array([{"a": 1}]), np.full((3, 2), np.nan))),
+    *map(npy, (np.array(["a", "b"]), np.ones((3, 2)) * 1j, np.array([Bomb()]), np.full((3, 2), np.nan))),
 ]
 """Contents of a member that no reader takes."""
 
@@ -132,11 +139,11 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     """A key that nobody reads may be anything; those that are read are counted before they are."""
     members = {key: npy(array) for key, array in TRAJECTORIES.items()}
     zipped("data.npz", **members, notes=header(SHAPE % "(1000000000000,)"))
-    np.testing.assert_array_equal(schema.load("data.npz").tau, TRAJECTORIES["tau"])
-    with pytest.raises(InputError, match=r"'x' is missing.*not read: t, q, .*notes"):
+    assert_array_equal(schema.load("data.npz").tau, TRAJECTORIES["tau"])
+    with one_line(r"'x' is missing.*not read: t, .*notes"):
         functions.load("data.npz")
     monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
-    with pytest.raises(InputError, match="holds more than"):
+    with one_line("holds more than"):
         schema.load("data.npz")
 
 
@@ -144,7 +151,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
 
 
 def test_a_copy_of_a_trajectory_in_the_test_is_refused(here, capsys):
-    copied = {key: np.concatenate([values[:16], values[4:8]]) for key, values in STATES.items()}
+    copied = {key: TRAJECTORIES[key][[*range(16), *range(4, 8)]] for key in STATES}
     np.savez("copied.npz", **{**TRAJECTORIES, **copied})
     for script in (train_delan, train_hnn):
         assert "'4' is a copy of '1'" in refuse(capsys, script, "--data copied.npz --out run")
@@ -242,8 +249,8 @@ def test_damaged_histories_are_refused(here):
     rows = [Progress(1, 2.0, float("nan"), 3.0, 0.5)]
     store(checkpoint, state, rows)
     found, history = restore(checkpoint, state)
-    np.testing.assert_array_equal(found["w"], state["w"])
-    np.testing.assert_equal(history, rows)
+    assert_array_equal(found["w"], state["w"])
+    assert_equal(history, rows)
     path = here / "checkpoint.json"
     stored = json_of(path)
     for damaged in HISTORIES:
@@ -257,12 +264,7 @@ def test_damaged_histories_are_refused(here):
 
 def test_places_that_cannot_be_written_to_are_refused(here, capsys, monkeypatch):
     Path("file").touch()
-    for script, *options in (
-        (train_delan, "--data data.npz"),
-        (train_diffnet, "--samples 20"),
-        (train_locomotion,),
-        (simulate,),
-    ):
-        assert "--out" in refuse(capsys, script, *options, "--out file")
+    for script in (train_locomotion, simulate):
+        assert "--out" in refuse(capsys, script, "--out file")
     monkeypatch.setenv("XDG_CACHE_HOME", "file")
     assert "XDG_CACHE_HOME" in refuse(capsys, train_delan, "--out run")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from calls import command, json_of, one_line, refused
 from planar_arm import motions
+from small_logs import small_log
 
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import (
@@ -80,9 +81,9 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     Path("r.urdf").write_text(ROBOT)
-    data = dict(zip(("q", "qd", "qdd"), np.random.default_rng(0).normal(size=(3, 20, 1)), strict=True))
-    data |= {"t": np.tile(np.arange(4.0), 5), "trajectory": np.repeat(np.arange(5), 4)}
-    np.savez("data.npz", tau=data["q"], **data)
+    data = small_log(1)
+    np.savez("data.npz", **data)
+    del data["tau"]
     np.savez("free.npz", **data)
     return tmp_path
 
@@ -96,15 +97,9 @@ def test_what_is_out_of_bounds_is_refused(here, capsys):
             assert [path for path in sorted(here.iterdir()) if path.name != "cache"] == before, options
 
 
-def test_messages_say_what_was_given_and_what_was_expected(here, capsys):
-    Path("full").mkdir()
-    Path("full/notes.txt").touch()
-    for script, options, words in (
-        (train_diffnet, "--samples 20 --out full", "already contains files; choose another --out\n"),
-        (check_data, "--data data.npz --robot none.urdf", "none.urdf: no such file; give the URDF or MJCF"),
-    ):
-        assert words in refused(capsys, script, options)
-    # One line whatever the name.
+def test_messages_are_one_line_whatever_the_name(here, capsys):
+    line = refused(capsys, check_data, "--data data.npz --robot none.urdf")
+    assert "none.urdf: no such file; give the URDF or MJCF" in line
     assert "two\\nlines\\x1b[31m" in refused(capsys, export_c, "--run", "two\nlines\x1b[31m", "--out c")
 
 
@@ -171,6 +166,7 @@ def test_a_run_is_resumed_where_its_data_have_moved(here, monkeypatch, data):
 # processes
 
 
+@pytest.mark.slow
 def test_sigterm_ends_a_training_with_a_checkpoint_and_the_command_that_continues_it(here):
     options = "--samples 2000 --epochs 300 --width 8 --optimizer adam --no-figures --out run"
     line = [sys.executable, "-m", "scripts.train_diffnet", *options.split()]

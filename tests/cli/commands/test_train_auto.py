@@ -9,38 +9,27 @@ import pytest
 from calls import assert_refused, json_of, refused
 from planar_arm import ARM, FRICTION, motions
 
-from dln_jax import load
+from dln_jax import InputError, Robot, build, dynamics, joint_dissipation, load, tree_system
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.data.robot_files import mjcf
-from dln_jax.data.robots import Robot
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import tree_system
 from dln_jax.training.dynamics.methods import learned_tree, selection
-from dln_jax.training.dynamics.recorded import read
 from dln_jax.training.dynamics.run import prepare
-from dln_jax.types import InputError
-from dln_jax.zoo.descriptions import build
 
 TREE = "--model learned-tree --data rigid.npz"
 PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
+def workplace(folder):
     """A log of the planar arm, its file with other masses, and a kinematic prior of it."""
-    folder = tmp_path_factory.mktemp("selection")
     schema.save(folder / "rigid.npz", motions(0, noise=0.02, trajectories=8, samples=240))
-    schema.save(folder / "one.npz", motions(0, samples=60))
     rough = ARM._replace(inertias=0.8 * ARM.inertias)
     free = np.tile([-np.inf, np.inf], (2, 1))
     (folder / "arm.xml").write_text(mjcf(Robot(rough, np.zeros(2), np.zeros(2), free, free)))
     (folder / "prior.json").write_text('{"dh_rows": [[0.4, 0, 0.1, 0], [1.2, 0.2, 0.1, 0]], "angle_degrees": 10}')
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        yield folder
+    return folder
 
 
 def of_robot():
@@ -96,14 +85,6 @@ def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monke
     assert "seen" in refused(capsys, train_delan, TREE, options, PLAIN)
     assert seen["parents"] == (-1, 0) and seen["scale"] == 0.02
     assert len(seen["kinematic_prior"].rotations) == 2 and seen["prior_angle"] == pytest.approx(np.radians(10))
-
-
-def test_one_trajectory_is_cut_into_blocks_of_time(workplace):
-    recorded = read(arguments_of(train_delan.Arguments, model="auto", data=Path("one.npz")))
-    assert [len(np.unique(part.trajectory)) for part in recorded.sets] == [8, 1, 1]
-    assert recorded.needs.joint_friction
-    said = "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test"
-    assert recorded.lines[-1] == said
 
 
 def test_mistakes_are_one_line(workplace, capsys):

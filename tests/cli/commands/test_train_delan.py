@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of, refused
-from motions import sums_of_sines
+from planar_arm import motions
+from small_logs import small_log
 
+from dln_jax import load
 from dln_jax.cli.commands import make_data, train_delan
 from dln_jax.data import schema
-from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[3]
 TINY = "--optimizer adam --steps 40 --batch 64 --width 4 --depth 1 --precision f64 --no-low-latency"
@@ -36,22 +37,13 @@ FILES = {
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
-    """An empty working folder with a cache of its own."""
-    folder = tmp_path_factory.mktemp("workplace")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        yield folder
-
-
-@pytest.fixture(scope="module")
-def trained(workplace):
+def trained(folder):
     """The run folder of the script's defaults, but for the budget."""
     command(train_delan, TINY)
-    return workplace / "runs" / "train_delan-1"
+    return folder / "runs" / "train_delan-1"
 
 
+@pytest.mark.slow
 def test_a_run_writes_all_its_files(trained):
     names = {path.name for path in trained.iterdir()}
     (checkpoint,) = names - FILES
@@ -64,63 +56,59 @@ def test_a_run_writes_all_its_files(trained):
     assert config["width"] == 4 and "out" not in config
 
 
-def test_a_finished_run_is_never_overwritten_and_resumes_to_itself(trained, workplace, capsys):
+@pytest.mark.slow
+def test_a_finished_run_is_never_overwritten_and_resumes_to_itself(trained, folder, capsys):
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in (
         ((TINY, "--out", trained), "already contains a run"),
         (("--resume --width 5", "--out", trained), "started with width = 4"),
-        (("--resume", "--out", workplace / "void"), "holds none"),
+        (("--resume", "--out", folder / "void"), "holds none"),
         (("--resume",), "holds none"),
     ):
         assert words in refused(capsys, train_delan, *options)
-    assert {path: path.read_bytes() for path in trained.iterdir()} == before and not (workplace / "void").exists()
+    assert {path: path.read_bytes() for path in trained.iterdir()} == before and not (folder / "void").exists()
     command(train_delan, "--out", trained, "--resume --no-figures --no-low-latency")
     assert (trained / "model.safetensors").read_bytes() == before[trained / "model.safetensors"]
 
 
 @pytest.mark.slow
-def test_a_killed_run_resumes_to_the_same_parameters(workplace):
+def test_a_killed_run_resumes_to_the_same_parameters(folder):
     """SIGKILL after the first checkpoint, then --resume: the model equals an unbroken run's to the last bit."""
     settings = f"--optimizer adam --steps 1200 --width 8 --depth 1 --batch 32 {BRIEF} --scene pendulum"
     command(train_delan, settings, "--out unbroken")
-    line = [sys.executable, "-m", "scripts.train_delan", *settings.split(), "--out", str(workplace / "killed")]
+    line = [sys.executable, "-m", "scripts.train_delan", *settings.split(), "--out", str(folder / "killed")]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(line, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 120
-        while not (workplace / "killed" / "checkpoint.json").exists():
+        while not (folder / "killed" / "checkpoint.json").exists():
             assert time.monotonic() < deadline and process.poll() is None
             time.sleep(0.005)
         process.kill()
-    assert not (workplace / "killed" / "model.json").exists(), "the run was over before it could be killed"
+    assert not (folder / "killed" / "model.json").exists(), "the run was over before it could be killed"
     command(train_delan, "--out killed --resume --no-figures --no-low-latency")
-    one, other = ((workplace / name / "model.safetensors").read_bytes() for name in ("unbroken", "killed"))
+    one, other = ((folder / name / "model.safetensors").read_bytes() for name in ("unbroken", "killed"))
     assert one == other
 
 
 @pytest.mark.slow
-def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
+def test_a_loss_that_explodes_keeps_the_last_good_model(folder, capsys):
     line = refused(capsys, train_delan, TINY, "--scene pendulum --learning-rate 1e19", BRIEF, "--out exploded")
     assert re.search(r"after step \d+", line) and "lower --learning-rate" in line
     assert np.isfinite(load("exploded").dynamics.inverse_dynamics(*np.ones((3, 1)))).all()
 
 
 @pytest.mark.slow
-def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(workplace, capsys):
+def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(folder, capsys):
     options = f"--optimizer adam --width 3 --depth 1 {BRIEF} --scene pendulum --steps 400 --seconds 1e-6"
     command(train_delan, options, "--out late")
     assert "out of time at step" in capsys.readouterr().out
-    early = json_of(workplace / "late" / "metrics.json")
+    early = json_of(folder / "late" / "metrics.json")
     assert 0 < early["best_step"] == early["steps"] < 400
     command(train_delan, "--out late --resume --seconds 2e-6", BRIEF)
-    assert json_of(workplace / "late" / "metrics.json")["steps"] == 2 * early["steps"]
+    assert json_of(folder / "late" / "metrics.json")["steps"] == 2 * early["steps"]
 
 
-ANGLES = np.random.default_rng(0).normal(size=(4, 20, 2))
-GOOD = {
-    "t": np.tile(np.arange(4.0), 5),
-    **dict(zip(("q", "qd", "qdd", "tau"), ANGLES, strict=True)),
-    "trajectory": np.repeat(np.arange(5), 4),
-}
+GOOD = small_log(2)
 
 
 def marked(key, mark):
@@ -171,8 +159,8 @@ MISTAKES = {
 }
 
 
-def test_mistakes_are_one_line_and_leave_nothing_behind(workplace, capsys):
-    path, out = workplace / "wrong.npz", workplace / "refused"
+def test_mistakes_are_one_line_and_leave_nothing_behind(folder, capsys):
+    path, out = folder / "wrong.npz", folder / "refused"
     for changes, *row in WRONG_DATA:
         np.savez(path, **{key: value for key, value in {**GOOD, **changes}.items() if value is not None})
         assert_refused(capsys, train_delan, [row], "--data", path, out=out)
@@ -181,44 +169,40 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(workplace, capsys):
 
 
 @pytest.mark.slow
-def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(workplace, capsys):
-    """One CSV file without t, trajectory and needs: two coupled joints, viscous and dry friction, springs."""
-    random, t = np.random.default_rng(0), 0.02 * np.arange(400)
-    q, qd, qdd = sums_of_sines(t, np.ones((2, 4)), random.uniform(1, 4, (2, 4)), random.uniform(0, 6, (2, 4)))
-    inertia, slope = (0.3 * wave(q[:, :1] - q[:, 1:]) for wave in (np.cos, np.sin))
-    torque = [2, 1] * qdd + inertia * qdd[:, ::-1] + [1, -1] * slope * qd[:, ::-1] ** 2
-    torque += 3 * np.sin(q) + 0.4 * qd + 0.2 * np.tanh(qd / 0.01)
+def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(folder, capsys):
+    """One CSV file without t, trajectory and needs: two coupled joints with viscous and dry friction."""
+    log = motions(0, samples=601)
     titles = "q1 [deg],q2 [deg],qd1 [deg/s],qd2 [deg/s],qdd1 [rad/s2],qdd2 [rad/s2],tau1 [mN m],tau2 [mN m]"
-    rows = np.hstack([np.degrees(q), np.degrees(qd), qdd, 1e3 * torque])
+    rows = np.hstack([np.degrees(log.q), np.degrees(log.qd), log.qdd, 1e3 * log.tau])
     np.savetxt("bare.csv", rows, delimiter=",", header=titles, comments="")
-    command(train_delan, "--data bare.csv --rate 50 --out bare", BRIEF)
+    command(train_delan, "--data bare.csv --rate 100 --out bare", BRIEF)
     said = capsys.readouterr().out
-    assert "one recording: cut into blocks of time" in said and "friction of joints: viscous, coulomb, offset" in said
+    assert "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test" in said
+    assert "friction of joints: viscous, coulomb, offset" in said
     assert "verdict: good" in said and "trigonometric is exact" in said
-    metrics, stored = (json_of(workplace / "bare" / f"{name}.json") for name in ("metrics", "model_selection"))
+    metrics, stored = (json_of(folder / "bare" / f"{name}.json") for name in ("metrics", "model_selection"))
     assert metrics["torque_mse"] < 1e-18 and metrics["verdict"] == 0 and metrics["validation_nmse"] < 1e-18
     assert stored["kept"] == "trigonometric" == load("bare").description["name"]
     assert stored["ended"] == "trigonometric is exact"
 
 
-def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(workplace, capsys):
-    noise = dict(zip(("q", "qd", "qdd", "tau"), np.random.default_rng(0).normal(size=(4, 60, 1)), strict=True))
-    np.savez("noise.npz", t=np.tile(np.arange(10.0), 6), trajectory=np.repeat(np.arange(6), 10), **noise)
+def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(folder, capsys):
+    np.savez("noise.npz", **small_log(1, trajectories=6, samples=10))
     status = exit_status(train_delan, "--data noise.npz --model trigonometric --degree 2 --out noise", BRIEF)
     assert status == 1
     assert capsys.readouterr().err.startswith("error: the fit is refused: the torque of joint 1 is predicted")
-    assert json_of(workplace / "noise" / "metrics.json")["verdict"] == 2
+    assert json_of(folder / "noise" / "metrics.json")["verdict"] == 2
 
 
-def test_data_are_made_read_back_and_never_overwritten_unasked(workplace):
+def test_data_are_made_read_back_and_never_overwritten_unasked(folder):
     made = "--scene chain-3 --kind uniform --samples 20 --out chain.npz"
     command(make_data, made)
     assert schema.load("chain.npz").degrees_of_freedom == 3
     command(make_data, made, "--overwrite")
 
 
-def test_mistakes_of_making_data_are_one_line(workplace, capsys):
+def test_mistakes_of_making_data_are_one_line(folder, capsys):
     Path("there.npz").touch()
     assert "exists" in refused(capsys, make_data, "--scene chain-3 --kind uniform --out there.npz")
     rows = {"--scene chain-3": "choose another --kind", "--scene chain-3 --kind uniform --samples 0": "samples is 0"}
-    assert_refused(capsys, make_data, rows.items(), out=workplace / "none.npz")
+    assert_refused(capsys, make_data, rows.items(), out=folder / "none.npz")

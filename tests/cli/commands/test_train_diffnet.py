@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from calls import assert_refused, command, exit_status, json_of, refused
 
+from dln_jax import load
 from dln_jax.cli.commands import train_diffnet
 from dln_jax.data import functions
 from dln_jax.learning.engine import checkpoint
@@ -17,7 +18,6 @@ from dln_jax.metrics.verdict import LEVELS
 from dln_jax.training.functions import run as function_runs
 from dln_jax.training.functions import task as function_task
 from dln_jax.training.functions.run import verdict_of
-from dln_jax.zoo.run import load
 
 SMALL = "--samples 200 --width 4"
 ADAM = f"{SMALL} --optimizer adam --epochs 2 --batch 64"
@@ -103,6 +103,7 @@ def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(wo
     assert np.sqrt(np.mean(((answers.jacobian - data["dy"]) * units) ** 2)) < 0.1
 
 
+@pytest.mark.slow
 def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
     quick = "--loss type2 --no-figures"
     command(train_diffnet, ADAM, quick, "--activation relu --derivative 2 --out run")

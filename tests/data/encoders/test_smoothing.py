@@ -2,24 +2,25 @@
 
 import numpy as np
 import pytest
+from calls import one_line
+from motions import sums_of_sines
+from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.data import schema
 from dln_jax.data.encoders import (
     derivatives,
     find_repeats,
+    held_at_equal_steps,
     labels_of_parts,
     low_pass,
     noise_of,
-    sampling,
     smooth,
     step_of,
     torque_noise,
     without_repeats,
 )
 from dln_jax.data.encoders.filters import gain
+from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every
-from tests.calls import one_line
-from tests.motions import sums_of_sines
 
 RATE, SECONDS = 125.0, 10.0
 NOISE_Q, NOISE_TAU = 1e-4, 0.2
@@ -52,11 +53,11 @@ def log(*, noise=NOISE_Q, rate=RATE, trajectories=3, t=None, seed=0):
 def one_channel(t, q, tau=0.0):
     """A log of one joint in one trajectory."""
     columns = {"q": q[:, None], "tau": tau + 0 * q[:, None]}
-    return schema.from_arrays({"t": t, **columns, "trajectory": np.zeros(len(t), int)})
+    return from_arrays({"t": t, **columns, "trajectory": np.zeros(len(t), int)})
 
 
 def rms(x):
-    return float(np.sqrt(np.mean(np.square(x))))
+    return np.sqrt(np.mean(np.square(x)))
 
 
 def within(data, ends):
@@ -77,12 +78,13 @@ def assert_nearly_best(data, key, truth, trim, cutoffs):
 def test_noise_is_found_whatever_its_size_and_jumps_are_none():
     for noise in (0.0, 1e-6, 1e-2):
         arrays, _, _ = log(noise=noise)
-        jumps = arrays["q"] + 0.5 * np.sign(np.sin(3 * arrays["t"]))[:, None]
-        for values in (arrays["q"], jumps):
-            assert noise_of(values, arrays["trajectory"]) == pytest.approx([noise, noise], rel=0.1, abs=1e-7)
+        for size in (0.0, 0.5):
+            jumps = size * np.sign(np.sin(3 * arrays["t"]))[:, None]
+            found = noise_of(arrays["q"] + jumps, arrays["trajectory"])
+            assert found == pytest.approx([noise, noise], rel=0.1, abs=1e-7)
     # Noise is filtered in spite of jumps.
     arrays["q"][50::97, 0] += 0.05
-    assert np.isfinite(smooth(schema.from_arrays(arrays)).cutoff)
+    assert np.isfinite(smooth(from_arrays(arrays)).cutoff)
 
 
 def test_steps_of_an_encoder_are_found_and_are_noise():
@@ -118,14 +120,14 @@ def test_derivatives_are_exact_for_polynomials_of_degree_five():
     assert qdd[:, 0] == pytest.approx(polynomial.deriv(2)(t), abs=1e-6)
 
 
-@pytest.mark.parametrize(("noise", "rate"), [(1e-5, 125.0), (1e-3, 40.0)])
-def test_the_cut_off_is_nearly_the_best_there_is(noise, rate):
-    arrays, _, qdd = log(noise=noise, rate=rate)
-    data = schema.from_arrays(arrays)
-    assert_nearly_best(data, "qdd", qdd, 0.5, np.geomspace(1.0, 0.4 * rate, 25))
-    smoothed = smooth(data, trim=0.5)
-    assert smoothed.noise_q == pytest.approx([noise, noise], rel=0.15)
-    assert smoothed.noise_tau == pytest.approx([NOISE_TAU, NOISE_TAU], rel=0.15)
+def test_the_cut_off_is_nearly_the_best_there_is():
+    for noise, rate in ((1e-5, 125.0), (1e-3, 40.0)):
+        arrays, _, qdd = log(noise=noise, rate=rate)
+        data = from_arrays(arrays)
+        assert_nearly_best(data, "qdd", qdd, 0.5, np.geomspace(1.0, 0.4 * rate, 25))
+        smoothed = smooth(data, trim=0.5)
+        assert smoothed.noise_q == pytest.approx([noise, noise], rel=0.15)
+        assert smoothed.noise_tau == pytest.approx([NOISE_TAU, NOISE_TAU], rel=0.15)
 
 
 def test_lines_of_a_periodic_motion_are_not_cut_off_though_only_noise_is_between_them():
@@ -155,23 +157,22 @@ def test_commands_of_uneven_samples_keep_their_impulse_at_equal_steps():
     t[200:] += 0.1  # a gap
     u = random.choice([-1.0, 1.0], (300, 1))
     data = one_channel(t, np.sin(3 * t), u)
-    even = sampling.held_at_equal_steps(data, 100.0)
-    np.testing.assert_allclose(even.q, np.sin(3 * even.t)[:, None], atol=1e-5)
-    first = np.flatnonzero(np.diff(even.t) > 0.015)[0]
-    np.testing.assert_allclose(np.diff(even.t[: first + 1]), 0.01, atol=1e-12)
+    even = held_at_equal_steps(data, 100.0)
+    assert_allclose(even.q, np.sin(3 * even.t)[:, None], atol=1e-5)
+    first = np.argmax(np.diff(even.t) > 0.015)
+    assert_allclose(np.diff(even.t[: first + 1]), 0.01, atol=1e-12)
     fine = even.t[0] + 1e-5 * (np.arange(1000 * first) + 0.5)
-    held = u[np.searchsorted(t, fine, side="right") - 1].reshape(-1, 1000).mean(axis=1)
-    np.testing.assert_allclose(even.tau[:first, 0], held, atol=4e-3)
-    already = data._replace(t=np.arange(300) / 100.0)
-    np.testing.assert_array_equal(sampling.held_at_equal_steps(already).tau, u)
+    held = u[np.searchsorted(t, fine) - 1].reshape(-1, 1000).mean(axis=1)
+    assert_allclose(even.tau[:first, 0], held, atol=4e-3)
+    assert_array_equal(held_at_equal_steps(data._replace(t=np.arange(300) / 100.0)).tau, u)
 
 
 def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
     errors = []
     for seed in range(6):
         arrays, _, qdd = log(seed=seed, trajectories=4)
-        smoothed = smooth(schema.from_arrays(arrays), 4.0)
-        inside = within(schema.from_arrays(arrays), round(smoothed.trim * RATE))
+        smoothed = smooth(from_arrays(arrays), 4.0)
+        inside = within(from_arrays(arrays), round(smoothed.trim * RATE))
         errors.append((smoothed.data.qdd - qdd[inside]).reshape(4, -1, 2))
     at = np.sqrt(np.mean(np.square(errors), axis=(0, 1, 3)))
     assert max(rms(at[:12]), rms(at[-12:])) < 2 * rms(at[400:600])
@@ -179,7 +180,7 @@ def test_what_is_left_after_trimming_is_as_good_at_the_ends_as_in_the_middle():
 
 def test_clean_data_are_not_filtered():
     arrays, qd, qdd = log(noise=0.0)
-    smoothed = smooth(schema.from_arrays(arrays))
+    smoothed = smooth(from_arrays(arrays))
     assert np.isinf(smoothed.cutoff)
     assert np.array_equal(smoothed.data.q, arrays["q"])
     assert smoothed.data.qd == pytest.approx(qd, abs=1e-6)
@@ -188,9 +189,9 @@ def test_clean_data_are_not_filtered():
 
 def test_uneven_samples_come_to_equal_steps():
     t = (np.arange(1250) + np.random.default_rng(1).uniform(-0.3, 0.3, 1250)) / RATE
-    smoothed = smooth(schema.from_arrays(log(t=t, noise=1e-5)[0]), trim=0.5)
+    smoothed = smooth(from_arrays(log(t=t, noise=1e-5)[0]), trim=0.5)
     even = smoothed.data
-    np.testing.assert_allclose(np.diff(even.t)[np.diff(even.trajectory) == 0], 1 / smoothed.rate, rtol=1e-9)
+    assert_allclose(np.diff(even.t)[np.diff(even.trajectory) == 0], 1 / smoothed.rate, rtol=1e-9)
     _, qd, qdd = motion(even.t + SECONDS * even.trajectory)
     assert np.all(np.std(even.qd - qd, axis=0) < 2e-3 * np.std(qd, axis=0))
     assert np.all(np.std(even.qdd - qdd, axis=0) < 0.03 * np.std(qdd, axis=0))
@@ -199,7 +200,7 @@ def test_uneven_samples_come_to_equal_steps():
 def test_long_gaps_cut_and_short_ones_are_bridged():
     arrays, _, _ = log()
     kept = np.delete(np.arange(len(arrays["t"])), np.r_[200:202, 1750:1950])  # two samples of run0, 1.6 s of run1
-    smoothed = smooth(schema.from_arrays({key: x if key == "label" else x[kept] for key, x in arrays.items()}), 8.0)
+    smoothed = smooth(from_arrays({key: x if key == "label" else x[kept] for key, x in arrays.items()}), 8.0)
     assert (smoothed.bridged, smoothed.parts, smoothed.left_out) == (1, 4, 0)
     assert list(smoothed.data.label) == ["run0", "run1/1", "run1/2", "run2"]
     assert labels_of_parts(smoothed.data, ["run1", "run2", "other"]) == ["run1/1", "run1/2", "run2", "other"]
@@ -209,7 +210,7 @@ def test_long_gaps_cut_and_short_ones_are_bridged():
 
 
 def test_decimated_torques_are_filtered_and_others_are_not():
-    data = schema.from_arrays(log()[0])
+    data = from_arrays(log()[0])
     whole, few = smooth(data, 6.0), smooth(data, 6.0, decimate=5)
     assert not whole.filtered_torque and few.filtered_torque
     assert np.array_equal(few.data.t, np.concatenate([whole.data.t[whole.data.trajectory == k][::5] for k in range(3)]))
@@ -218,18 +219,19 @@ def test_decimated_torques_are_filtered_and_others_are_not():
 
 
 def test_what_cannot_be_filtered_is_one_line():
-    arrays, _, _ = log()
-    noise = {**arrays, "q": 1e-4 * np.random.default_rng(0).normal(size=arrays["q"].shape)}
-    for given, settings, message in (
-        (arrays, {"cutoff": 80.0}, "expected less than 62.5 Hz"),
-        (arrays, {"cutoff": -1.0}, "cutoff is -1.0"),
-        (arrays, {"cutoff": 10.0, "decimate": 8}, "more than twice the cut-off"),
-        (arrays, {"cutoff": 0.1}, "longer motions"),
-        (arrays, {"trim": -0.1}, "trim is -0.1"),
-        (noise, {}, "moves by more than its noise"),
-    ):
+    data = from_arrays(log()[0])
+    noise = 1e-4 * np.random.default_rng(0).normal(size=data.q.shape)
+    for message, settings in {
+        "expected less than 62.5 Hz": {"cutoff": 80.0},
+        "cutoff is -1.0": {"cutoff": -1.0},
+        "more than twice the cut-off": {"cutoff": 10.0, "decimate": 8},
+        "longer motions": {"cutoff": 0.1},
+        "trim is -0.1": {"trim": -0.1},
+    }.items():
         with one_line(message):
-            smooth(schema.from_arrays(given), **settings)
+            smooth(data, **settings)
+    with one_line("moves by more than its noise"):
+        smooth(data._replace(q=noise))
 
 
 def test_noise_of_torques_is_told_only_from_samples_close_together():
@@ -237,35 +239,35 @@ def test_noise_of_torques_is_told_only_from_samples_close_together():
     data = one_channel(
         t, np.sin(3 * t), 5 * np.sin(2 * t)[:, None] + 0.1 * np.random.default_rng(0).normal(size=(2000, 1))
     )
-    np.testing.assert_allclose(torque_noise(data), 0.1, rtol=0.1)
+    assert_allclose(torque_noise(data), 0.1, rtol=0.1)
     assert torque_noise(every(data, 60)) is None
     assert torque_noise(data._replace(trajectory=np.arange(len(t)))) is None
 
 
-@pytest.mark.parametrize(("rate", "noise", "keys"), [(30.0, 1e-3, ("q", "tau")), (125.0, 1e-5, ("q",))])
-def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff(rate, noise, keys):
-    arrays, _, qdd = log(rate=rate, noise=noise)
-    clean = smooth(schema.from_arrays(arrays), trim=1.0)
-    rows = np.arange(101, len(qdd) - 5, 101)
-    for key in keys:
-        arrays[key][rows] = arrays[key][rows - 1]
-    smoothed = smooth(schema.from_arrays(arrays), trim=1.0)
-    assert np.array_equal(np.flatnonzero(smoothed.repeats.q), rows)
-    assert smoothed.cutoff == pytest.approx(clean.cutoff, rel=0.05)
-    inside = within(schema.from_arrays(arrays), round(rate))
-    assert rms(smoothed.data.qdd - qdd[inside]) < 1.3 * rms(clean.data.qdd - qdd[inside])
+def test_one_repeated_row_in_a_hundred_does_not_change_the_cutoff():
+    for rate, noise, keys in ((30.0, 1e-3, ("q", "tau")), (125.0, 1e-5, ("q",))):
+        arrays, _, qdd = log(rate=rate, noise=noise)
+        clean = smooth(from_arrays(arrays), trim=1.0)
+        rows = np.arange(101, len(qdd) - 5, 101)
+        for key in keys:
+            arrays[key][rows] = arrays[key][rows - 1]
+        smoothed = smooth(from_arrays(arrays), trim=1.0)
+        assert np.array_equal(np.flatnonzero(smoothed.repeats.q), rows)
+        assert smoothed.cutoff == pytest.approx(clean.cutoff, rel=0.05)
+        inside = within(from_arrays(arrays), round(rate))
+        assert rms(smoothed.data.qdd - qdd[inside]) < 1.3 * rms(clean.data.qdd - qdd[inside])
 
 
 def test_inserted_rows_give_their_time_back():
     arrays, _, _ = log(t=np.arange(720) / 30.0, trajectories=1)
     order = np.sort(np.r_[:720, 46:690:49])
     longer = {key: arrays[key][order] for key in ("q", "tau", "trajectory")}
-    inserted = schema.from_arrays({**longer, "t": np.arange(len(order)) / 30.0})
+    inserted = from_arrays({**longer, "t": np.arange(len(order)) / 30.0})
     data, repeats = without_repeats(inserted)
     assert repeats.inserted and repeats.rows.sum() == len(order) - 720
     assert np.array_equal(data.q, arrays["q"])
     assert np.ptp(np.diff(data.t)) < 1e-9 and data.t[1] > 1 / 30.0
-    assert smooth(inserted).cutoff == pytest.approx(smooth(schema.from_arrays(arrays)).cutoff, rel=0.05)
+    assert smooth(inserted).cutoff == pytest.approx(smooth(from_arrays(arrays)).cutoff, rel=0.05)
 
 
 def test_rest_and_turning_points_are_no_repeats():

@@ -3,11 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from dln_jax import dynamics
 from dln_jax.control import field_of
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import rates
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole
 from scripts.reports.control import plants, problems, values
 
@@ -17,7 +18,7 @@ def test_cart_pole_is_that_of_the_scenes():
     x, u = jnp.array([0.1, 2.0, 0.5, -3.0]), jnp.array([2.0])
     expected = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))(x, u)
     free = problems.cart_pole_rates(problems.Sizes(damping=(0.0, 0.0)))(jnp, x, u)
-    np.testing.assert_allclose(jnp.stack(free), expected, rtol=1e-10)
+    assert_allclose(jnp.stack(free), expected, rtol=1e-10)
 
 
 def test_casadi_has_the_same_formulas():
@@ -29,7 +30,7 @@ def test_casadi_has_the_same_formulas():
         rows = [*problem.rates(ca, X, U), problem.cost(ca, X, U), problem.cost(ca, X, None)]
         expected = [*problem.rates(np, x, u), problem.cost(np, x, u), problem.cost(np, x, None)]
         found = np.ravel(ca.Function("f", [X, U], [ca.vertcat(*rows)])(x, u))
-        np.testing.assert_allclose(found, np.array(expected, float), rtol=1e-10, atol=1e-10, err_msg=problem.name)
+        assert_allclose(found, np.array(expected, float), rtol=1e-10, atol=1e-10, err_msg=problem.name)
 
 
 @pytest.mark.parametrize("name", plants.PLANTS)
@@ -65,4 +66,4 @@ def test_late_pendulum_follows_ten_milliseconds_after_and_loses_energy_by_fricti
 
 def test_worst_disturbance_moves_the_published_pendulum():
     problem, x, u = PLANTS["pendulum"]().problem, jnp.array([0.3, -1.0]), jnp.array([0.8])
-    np.testing.assert_allclose(values.rod(x, u, jnp.ones(2)), rates(problem)(x, u), rtol=1e-12)
+    assert_allclose(values.rod(x, u, jnp.ones(2)), rates(problem)(x, u), rtol=1e-12)

@@ -4,8 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax import dynamics, joint_dissipation
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system
 from scripts.reports.robots.arm import EVERY, Motion, arm, exact_torque, follow, motion
 from scripts.reports.robots.known_kinematics import summary

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from dln_jax import dynamics, export_c
 from dln_jax.export.c.interface import Leaf, Signature
-from dln_jax.export.c.source import export_c
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
 from dln_jax.scenes import closed_form_forward_dynamics, two_link_arm
 from scripts.reports.speed import exported_c
@@ -62,7 +62,7 @@ def test_program_times_every_call_by_the_clock(tmp_path, monkeypatch):
 def test_textbook_rates_are_those_of_the_scene():
     x, u = np.random.default_rng(0).normal(size=4), np.array([0.3, -0.7])
     qdd = closed_form_forward_dynamics(two_link_arm(), *jnp.split(x, 2), jnp.asarray(u))
-    np.testing.assert_allclose(exported_c.textbook_rates()(jnp, x, u), [*x[2:], *qdd], rtol=1e-12)
+    assert_allclose(exported_c.textbook_rates()(jnp, x, u), [*x[2:], *qdd], rtol=1e-12)
 
 
 @needs_compiler
@@ -73,7 +73,7 @@ def test_casadi_computes_the_same_numbers_by_its_own_derivatives(tmp_path):
     export_c({STEP: exported_c.our_steps()["closed-form"]}, ours, finite=True)
     effort = {"repeats": 1, "calls": 1, "cold": 1, "mebibytes": 1}
     sums = [timed(programs(at, compiled(at, at), [STEP], ours)[STEP], **effort).sum for at in (ours, rival)]
-    np.testing.assert_allclose(*sums, rtol=1e-12)
+    assert_allclose(*sums, rtol=1e-12)
     assert kinds["functions"] == 24 and sum(kinds.values()) > 1000  # sine and cosine of three angles, four times
 
 
@@ -81,4 +81,4 @@ def test_full_hessian_gives_the_same_torques():
     energies = exported_c.random_network(2, 3, "f64")
     state = tuple(map(jnp.asarray, np.random.default_rng(0).standard_normal((3, 2))))
     ways = by_full_hessian(lagrangian(energies)), dynamics(energies).inverse_dynamics
-    np.testing.assert_allclose(*jax.jit(lambda *state: [way(*state) for way in ways])(*state), rtol=1e-11, atol=1e-12)
+    assert_allclose(*jax.jit(lambda *state: [way(*state) for way in ways])(*state), rtol=1e-11, atol=1e-12)
