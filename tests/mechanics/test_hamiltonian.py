@@ -28,27 +28,6 @@ def test_elimination_equals_lapack():
     assert not np.isfinite(solve(np.ones((2, 2)), np.array([1.0, 2.0]))).any(), "a singular matrix"
 
 
-def test_elimination_differentiates_in_both_modes():
-    matrix, change, right = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 3)))
-    b = right[0]
-
-    def along(s):
-        return solve(matrix + s * change, (1 + s**2) * b)
-
-    @jax.jit
-    def derivatives():
-        first = jax.jacfwd(along)
-        return first(0.0), jax.jacfwd(first)(0.0), jax.grad(lambda A: jnp.dot(right[1], solve(A, b)))(matrix)
-
-    x = np.linalg.solve(matrix, b)
-    slope = -np.linalg.solve(matrix, change @ x)
-    curvature = np.linalg.solve(matrix, 2 * b - 2 * change @ slope)
-    first, second, gradient = derivatives()
-    np.testing.assert_allclose(first, slope, rtol=1e-12)
-    np.testing.assert_allclose(second, curvature, rtol=1e-12)
-    np.testing.assert_allclose(gradient, -np.outer(np.linalg.solve(matrix.T, right[1]), x), rtol=1e-12)
-
-
 def states(d, count=3):
     return jax.random.normal(jax.random.key(d), (count, 20, d))
 
