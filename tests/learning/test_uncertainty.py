@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from planar_arm import ARM as TREE
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import split
@@ -13,7 +14,6 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
 from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.coverage import coverage
 from dln_jax.models.model import linearised
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -22,8 +22,6 @@ from dln_jax.models.uncertainty import out_of_distribution, predictive, scores
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
 
-LINKS = [inertial_parameters(m, [0.05, -0.02, 0.1], np.diag([0.02, 0.03, 0.01])) for m in (3.0, 2.0)]
-TREE = serial(*dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0]]), LINKS, armature=[0.1, 0.2])
 ARM = make_rigid_tree(TREE, friction=True, velocity_scale=0.1)
 TRUTH = ARM.init(jax.random.key(0))._replace(
     viscous=jnp.array([0.2, 0.1]), coulomb=jnp.array([0.5, 0.3]), offset=jnp.array([0.1, 0.0])
@@ -80,7 +78,7 @@ def test_bands_cover_what_they_promise(fitted):
 def test_far_states_are_flagged_and_near_ones_are_not(fitted):
     parameters, found = fitted
     flag = jax.jit(jax.vmap(out_of_distribution(ARM, parameters, found.uncertainty)))
-    near, far = drawn(5, reach=0.99), drawn(6, reach=6.0)
+    near, far = drawn(5, reach=0.99), drawn(6, reach=30.0)
     assert np.mean(flag(near.q, near.qd, near.qdd)) <= 0.02
     away = (far.q, far.qd, far.qdd)
     error = jax.jit(jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics))(*away) - TORQUE(*away)
