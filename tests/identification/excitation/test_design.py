@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from planar_arm import ARM as LEVEL
 
 from dln_jax.identification.excitation.candidates import FINER, functions_at, grid, random_designs, states
 from dln_jax.identification.excitation.design import (
@@ -19,17 +20,16 @@ from dln_jax.identification.excitation.fourier import require_sampling, sampled,
 from dln_jax.identification.excitation.limits import MotionLimits, heights_above, used, worst
 from dln_jax.identification.excitation.task import independent_columns, linear_force, make_task
 from dln_jax.learning.linear import fit_linear, linearised
-from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.trees import world_frames
 from dln_jax.models.model import Model
 from dln_jax.models.rigid_tree import make_rigid_tree
 from tests.calls import one_line
 
-RIGHT = np.pi / 2
-LINK = trees.inertial_parameters(1.5, [0.25, 0.02, 0.01], np.diag([0.01, 0.02, 0.03]))
+UPRIGHT = np.array([[[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.eye(3)])
 # Both axes level, so that the arm swings in a vertical plane.
-ARM = trees.serial(*trees.dh_frames([[-RIGHT, 0, 0.3, 0], [0, 0.5, 0, 0]]), [LINK, LINK], armature=[0.1, 0.05])
+ARM = LEVEL._replace(rotations=UPRIGHT, gravity=np.array([0, 0, -9.81]))
 LIMITS = MotionLimits(
     position=np.array([[-2.0, 1.0], [-2.5, 2.5]]),
     velocity=np.array([2.0, 3.0]),
@@ -83,7 +83,7 @@ def test_limits_hold_at_ten_times_the_samples_that_were_checked(task, informativ
     assert np.all(q >= LIMITS.position[:, 0]) and np.all(q <= LIMITS.position[:, 1])
     assert np.all(abs(qd) <= LIMITS.velocity) and np.all(abs(qdd) <= LIMITS.acceleration)
     inverse = dynamics(MODEL.energies(PARAMETERS)).inverse_dynamics
-    tau, elbow = jax.jit(jax.vmap(lambda *s: (inverse(*s)[0], trees.world_frames(ARM, s[0])[1][1, 2])))(q, qd, qdd)
+    tau, elbow = jax.jit(jax.vmap(lambda *s: (inverse(*s)[0], world_frames(ARM, s[0])[1][1, 2])))(q, qd, qdd)
     assert np.all(abs(tau) <= LIMITS.force[0, 1]) and np.all(elbow >= -0.1)
 
 
@@ -159,6 +159,7 @@ def test_least_squares_on_the_motions_finds_the_parameters(task, drawn, designs)
     fit = fit_linear(MODEL, data, rank_tolerance=1e-8, negligible=1e-12)
     assert fit.rank == task.columns.size
     assert fit.torque_mse < 1e-18
+    np.testing.assert_allclose(fit.parameters.coulomb, PARAMETERS.coulomb, rtol=1e-6)
     # Both motions are worth more than twice the better one alone is: they were not designed apart.
     assert error_ratio(train, drawn[:2]) < 0.8
 
@@ -167,9 +168,9 @@ def test_heights_leave_out_what_cannot_sink():
     heights = heights_above(ARM, 0.1)
     assert heights is not None
     # The first link turns about the origin; the second is half a metre away.
-    reach = [float(heights(jnp.array([q, 0.0]))[0]) for q in (-RIGHT, 0.0, RIGHT)]
+    reach = [float(heights(jnp.array([q, 0.0]))[0]) for q in (-np.pi / 2, 0.0, np.pi / 2)]
     assert np.allclose(sorted(reach), [-0.6, -0.1, 0.4], atol=1e-12)
-    assert heights_above(trees.serial(*trees.dh_frames([[0, 0, 0.3, 0]]), [LINK]), 0.0) is None
+    assert heights_above(LEVEL, 0.0) is None
 
 
 def test_the_largest_excess_is_named_and_used_limits_shrink_towards_the_middle(task):
