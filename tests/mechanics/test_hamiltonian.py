@@ -14,7 +14,7 @@ from dln_jax.solvers.elimination import solve
 
 
 def test_elimination_equals_lapack():
-    for n in (1, 6, 17):
+    for n in (1, 4, 17):
         random = np.random.default_rng(n)
         matrices = random.normal(size=(20, n, n))
         # A zero diagonal, and a first column that grows downwards: wrong or lost without exchanging rows.
@@ -102,8 +102,13 @@ def test_a_charged_particle_in_a_magnetic_field():
     q, qd = jnp.array([[0.2, 0.9], [1.0, -0.5]])
     system = dynamics(HamiltonianSystem(H))
     acceleration = 1.7 * jnp.array([qd[1], -qd[0]])
-    np.testing.assert_allclose(jax.jit(system.forward_dynamics)(q, qd, jnp.zeros(2)), acceleration, rtol=1e-13)
-    inertial, coriolis, gravity = jax.jit(system.decompose)(q, qd, q)
+
+    @jax.jit
+    def ask():
+        return system.forward_dynamics(q, qd, jnp.zeros(2)), system.decompose(q, qd, q)
+
+    got, (inertial, coriolis, gravity) = ask()
+    np.testing.assert_allclose(got, acceleration, rtol=1e-13)
     np.testing.assert_allclose(inertial, q, rtol=1e-13)
     np.testing.assert_allclose(coriolis, -acceleration, rtol=1e-13)
     np.testing.assert_allclose(gravity, 0, atol=1e-14)
