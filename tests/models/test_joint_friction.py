@@ -1,7 +1,5 @@
 """Friction in the joints of any model: its force and its parametrisation."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -10,6 +10,7 @@ from dln_jax.models.torque_covariance import States, torque_covariance
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.types import Needs
 
+
 @pytest.mark.slow
 @pytest.mark.parametrize("serial", [True, False])
 def test_covariance_is_that_of_the_energies(serial):
