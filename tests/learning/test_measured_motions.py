@@ -51,7 +51,7 @@ def recorded(count, *, driven=False):
 @pytest.mark.parametrize("driven", [False, True])
 def test_the_optimum_is_the_truth_as_well_as_noise_allows(driven):
     """From motions without torques only up to a common factor, which the gauge sets."""
-    data, noise = recorded(6, driven=driven)
+    data, noise = recorded(4, driven=driven)
     # A deviation from N residuals is off by 1 / √(2 N) of it; polynomials take up less than a third of N.
     np.testing.assert_allclose(noise, NOISE, rtol=SURE / np.sqrt(2 * 0.7 * len(data.t)))
     windows = cut_measured_windows(data, WINDOW)
