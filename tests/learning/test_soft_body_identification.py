@@ -20,7 +20,7 @@ from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import muscles
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
-MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [1, 3, 2]])
+MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.1, 1.0]], [[0, 1, 2]])
 TRUTH = {"youngs_modulus": 3e4, "poisson_ratio": 0.35, "friction": 0.4, "muscle": 900.0}
 GUESS = {"youngs_modulus": 6e4, "poisson_ratio": 0.2, "friction": 0.2, "muscle": 400.0}
 
@@ -29,7 +29,7 @@ def slider():
     """A block with one muscle, pushed along a rough floor."""
     terms = (
         elastic(MESH, stable_neo_hookean),
-        muscles([[0, 3]], stiffness=1.0),
+        muscles([[0, 2]], stiffness=1.0),
         gravity(MESH, (0.0, -9.81)),
         plane_contact([0, 1], normal=[0.0, 1.0], stiffness=5e4, width=1e-3, friction=0.1, threshold_speed=0.05),
     )
@@ -50,7 +50,7 @@ def test_material_friction_and_muscle_are_recovered_from_a_motion():
     scene = slider()
     stepper = make_step(scene, 0.02, tolerance=1e-9)
     state = stepper.init(v=[1.5, 0.0])
-    controls = 0.8 + 0.2 * jnp.cos(jnp.arange(8))[:, None]
+    controls = 0.8 + 0.2 * jnp.cos(jnp.arange(5))[:, None]
 
     @jax.jit
     def motion(params):
@@ -78,15 +78,15 @@ def test_a_rest_shape_is_found_that_hangs_as_wanted():
     assert np.abs(sagging - wanted).max() > 0.02
 
     def with_rest(free):
-        return scene.params._replace(rest=scene.params.rest.at[np.array([1, 3])].set(free))
+        return scene.params._replace(rest=scene.params.rest.at[1].set(free))
 
-    result = design(scene, with_rest, scene.params.rest[np.array([1, 3])], wanted)
+    result = design(scene, with_rest, scene.params.rest[1], wanted)
     hanging, info = static_solve(scene, with_rest(result.parameters))
     assert info.converged
     np.testing.assert_allclose(hanging, wanted, atol=1e-7)
 
 
 def test_mistakes_name_what_is_wrong():
-    motions = ObservedMotions(*(jnp.zeros((1, *shape)) for shape in ((4, 2), (4, 2), (3, 1), (3, 4, 2))))
+    motions = ObservedMotions(*(jnp.zeros((1, *shape)) for shape in ((3, 2), (3, 2), (4, 1), (4, 3, 2))))
     with one_line("noise is 0"):
         identify(make_step(slider(), 0.02), lambda theta: theta, jnp.zeros(1), motions, noise=0.0)
