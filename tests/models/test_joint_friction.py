@@ -11,6 +11,7 @@ from dln_jax.mechanics.friction import LAWS, FrictionShape, joint_dissipation
 from dln_jax.models.joint_friction import friction_of, with_joint_friction
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
+from tests.models.random_parameters import drawn
 
 ABSOLUTE = ((1.0, 0.0), (-1.0, 1.0))
 NEEDS = Needs(joints=("revolute", "revolute"), joint_map=ABSOLUTE, velocity_scale=0.05)
@@ -29,12 +30,6 @@ STATE = np.array([0.3, -0.8]), np.array([0.02, -0.4]), np.array([2.0, -1.0])
 
 def model_of(kind, needs):
     return build(describe(kind, needs=needs, precision="f64", **KINDS[kind]))
-
-
-def drawn(model, seed=3):
-    like = jax.eval_shape(model.init, jax.random.key(0))
-    draw = np.random.default_rng(seed).normal
-    return jax.tree.map(lambda leaf: jnp.asarray(0.4 * draw(size=leaf.shape) + 0.05, leaf.dtype), like)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "phase-network"])
@@ -66,7 +61,7 @@ def test_what_is_trained_takes_power_whatever_the_parameters():
     """No coefficient is negative, but for the offset, and the share of the load is below 1."""
     model = model_of("structured-delan", NEEDS._replace(joint_friction=EVERY))
     for seed in range(5):
-        friction = jax.tree.map(lambda leaf: 10 * leaf, drawn(model, seed)["friction"])
+        friction = drawn(model, seed, size=10)["friction"]
         coefficients, _ = friction_of(friction, FrictionShape())
         rest = coefficients._replace(offset=None)
         assert all((leaf >= 0).all() for leaf in jax.tree.leaves(rest))

@@ -23,17 +23,11 @@ from dln_jax.models.hamiltonian import (
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
+from tests.models.random_parameters import drawn
 
 MIXED = Needs(("prismatic", "revolute"), friction=True)
 SIZE = {"width": 5, "depth": 1}
 SMALL = {**SIZE, "dtype": jnp.float64}
-
-
-def drawn(model):
-    """Random parameters of the right shapes; none is where it starts."""
-    random = np.random.default_rng(8)
-    shapes = jax.eval_shape(model.init, jax.random.key(0))
-    return jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape, scale=0.6), leaf.dtype), shapes)
 
 
 KINDS = {

@@ -1,9 +1,8 @@
-"""Frictions that a rigid tree cannot have, and those that no linear fit finds."""
+"""Frictions that a rigid tree cannot have."""
 
 from calls import one_line
-from planar_arm import ARM, motions
+from planar_arm import ARM
 
-from dln_jax.learning.linear import fit_linear
 from dln_jax.models.rigid_tree import make_rigid_tree
 
 
@@ -15,9 +14,3 @@ def test_frictions_that_no_tree_has_are_refused():
     ):
         with one_line(message):
             make_rigid_tree(ARM, **keywords)
-
-
-def test_load_is_no_linear_friction():
-    model = make_rigid_tree(ARM, friction=("viscous", "load"), load=0.1)
-    with one_line("not linear in its parameters"):
-        fit_linear(model, motions(0), negligible=1e-12)
