@@ -21,8 +21,10 @@ from dln_jax.softbody.terms.springs import muscles
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.1, 1.0]], [[0, 1, 2]])
-TRUTH = {"youngs_modulus": 3e4, "poisson_ratio": 0.35, "friction": 0.4, "muscle": 900.0}
-GUESS = {"youngs_modulus": 6e4, "poisson_ratio": 0.2, "friction": 0.2, "muscle": 400.0}
+TRUTH, GUESS = (
+    {"elastic": {"youngs_modulus": E, "poisson_ratio": nu}, "ground": {"friction": mu}, "muscles": {"stiffness": k}}
+    for E, nu, mu, k in ((3e4, 0.35, 0.4, 900.0), (6e4, 0.2, 0.2, 400.0))
+)
 
 
 def slider():
@@ -34,15 +36,6 @@ def slider():
         plane_contact([0, 1], normal=[0.0, 1.0], stiffness=5e4, width=1e-3, friction=0.1, threshold_speed=0.05),
     )
     return make_scene(MESH, terms, masses=20.0)
-
-
-def params_of(scene, theta):
-    return with_parameters(
-        scene.params,
-        elastic={"youngs_modulus": theta["youngs_modulus"], "poisson_ratio": theta["poisson_ratio"]},
-        ground={"friction": theta["friction"]},
-        muscles={"stiffness": theta["muscle"]},
-    )
 
 
 @pytest.mark.slow
@@ -57,17 +50,19 @@ def test_material_friction_and_muscle_are_recovered_from_a_motion():
         step = functools.partial(stepper.step, params)
         return rollout(step, state, controls, observe=positions_and_convergence)[1]
 
-    x, converged = motion(params_of(scene, TRUTH))
+    x, converged = motion(with_parameters(scene.params, **TRUTH))
     assert converged.all()
     unseen = x.at[3, 2].set(jnp.nan)
     motions = ObservedMotions(state.x[None], state.v[None], controls[None], unseen[None])
 
-    def params(ratios):
-        return params_of(scene, {name: ratios[name] * GUESS[name] for name in GUESS})
+    def scaled(ratios):
+        return jax.tree.map(jnp.multiply, ratios, GUESS)
 
-    result = identify(stepper, params, {name: jnp.asarray(1.0) for name in GUESS}, motions)
-    for name, value in TRUTH.items():
-        np.testing.assert_allclose(result.parameters[name] * GUESS[name], value, rtol=1e-5, err_msg=name)
+    def params(ratios):
+        return with_parameters(scene.params, **scaled(ratios))
+
+    result = identify(stepper, params, jax.tree.map(jnp.ones_like, GUESS), motions)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5), scaled(result.parameters), TRUTH)
 
 
 @pytest.mark.slow

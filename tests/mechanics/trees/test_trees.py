@@ -35,15 +35,14 @@ def body(random):
     return inertial_parameters(mass, points.mean(0), mass * (np.trace(spread) * np.eye(3) - spread))
 
 
-def random_tree(seed, d=3, *, branched=True, kinds=("revolute", "prismatic"), axes=None):
-    random = np.random.default_rng(seed)
-    parents = [int(random.integers(-1, link)) if branched else link - 1 for link in range(d)]
+def random_tree(parents, joints, axes=None):
+    random, d = np.random.default_rng(7), len(parents)
     return make_tree(
         parents,
-        [kinds[int(random.random() < 0.3) % len(kinds)] for _ in range(d)],
+        joints,
         [rotation(random) for _ in range(d)],
         random.normal(size=(d, 3)) * 0.4,
-        random.normal(size=(d, 3)) if axes is None else np.eye(3)[[axes] * d],
+        random.normal(size=(d, 3)) if axes is None else axes,
         [body(random) for _ in range(d)],
         armature=random.uniform(0, 0.3, d),
         gravity=(1.0, -2.0, -9.0),
@@ -51,11 +50,11 @@ def random_tree(seed, d=3, *, branched=True, kinds=("revolute", "prismatic"), ax
 
 
 TREES = {
-    "branched": random_tree(7, d=3),
-    "from prismatic joints": random_tree(0, d=2, branched=False, kinds=("prismatic", "revolute")),
-    "one weightless joint": random_tree(4, d=1)._replace(gravity=np.zeros(3)),
+    "branched": random_tree((-1, 0, 0), ("revolute", "prismatic", "revolute")),
+    "from prismatic joints": random_tree((-1, 0), ("prismatic", "revolute")),
+    "one weightless joint": random_tree((-1,), ("revolute",))._replace(gravity=np.zeros(3)),
 }
-ARM = random_tree(2, d=2, branched=False, kinds=("revolute",), axes=2)
+ARM = random_tree((-1, 0), ("revolute",) * 2, axes=np.eye(3)[[2, 2]])
 
 
 @pytest.mark.parametrize("name", slow_among(TREES, lambda name: name == "branched"))
