@@ -28,10 +28,6 @@ def test_elimination_equals_lapack():
     assert not np.isfinite(solve(np.ones((2, 2)), np.array([1.0, 2.0]))).any(), "a singular matrix"
 
 
-def states(d, count=3):
-    return jax.random.normal(jax.random.key(d), (count, 20, d))
-
-
 def assert_equal(got, expected):
     """To 1e-10 of the largest number; a force that the scene lacks to the same of 1."""
     scale = float(jnp.max(jnp.abs(expected))) or 1.0
@@ -42,7 +38,7 @@ def test_hamiltons_equations_are_those_of_the_textbook():
     """(qd, pd) from the closed-form acceleration, and dH/dt = qd·tau - qd·dD/dqd along them."""
     scene = cart_pole(friction=0.3)
     H = legendre(scene.lagrangian)
-    q, qd, tau = states(2)
+    q, qd, tau = jnp.asarray(np.random.default_rng(2).normal(size=(3, 20, 2)))
 
     @jax.jit
     @jax.vmap

@@ -9,14 +9,12 @@ import pytest
 from calls import one_line
 
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.models.hamiltonian import make_separable_hamiltonian
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.scenes.particles import n_body
 from dln_jax.types import Needs
 from tests.models.random_parameters import drawn
 
 SMALL = {"width": 5, "depth": 1, "dtype": jnp.float64}
-MIXED = Needs(("prismatic", "revolute"), friction=True)
 MASSES = np.array([1.0, 2.0, 0.5])
 
 
@@ -98,7 +96,6 @@ def test_mistakes_are_named():
         (lambda: pair(distance_scale=-1.0), "distance_scale is -1"),
         (lambda: pair(features=()), "expected some of distance, inverse, logarithm"),
         (lambda: pair(features=("square",)), "square"),
-        (lambda: make_separable_hamiltonian(MIXED, iterations=0), "iterations is 0"),
     ]:
         with one_line(message):
             call()
