@@ -136,7 +136,6 @@ def test_haiku_front_is_the_same_network():
 def test_initial_weights_follow_glorot():
     sizes = (3, 200, 100, 1)
     layers = jax.jit(partial(differential_mlp.init, sizes=sizes))(jax.random.key(0))
-    assert [weight.shape for weight, _ in layers] == list(pairwise(sizes))
     for weight, bias in jax.tree.map(np.asarray, layers):
         limit = np.sqrt(6 / sum(weight.shape))
         assert np.abs(weight).max() <= limit and not bias.any()
