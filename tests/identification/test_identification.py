@@ -116,9 +116,8 @@ def test_links_without_mass_stay_so():
 @pytest.fixture(scope="module")
 def noisy():
     """Noisy equations of an arm that is known roughly, what is known, and the fit."""
-    rough = KNOWN._replace(inertias=jnp.asarray(0.6 * ARM.inertias))
-    equations = compressed(regressor_of(MODEL, rough, motions(0, noise=0.2, trajectories=3)))
-    return equations, flat(rough), fit_weighted(equations, flat(rough))
+    equations = compressed(regressor_of(MODEL, ROUGH, motions(0, noise=0.2, trajectories=3)))
+    return equations, flat(ROUGH), fit_weighted(equations, flat(ROUGH))
 
 
 def test_consistent_bodies_exist_and_cost_little(noisy):

@@ -20,13 +20,14 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
-from dln_jax.scale.mesh import batch_mesh, of_first_process
+from dln_jax.scale.mesh import batch_mesh, of_first_process, spread
+from dln_jax.solvers import lapack
 from dln_jax.types import InputError
 
 SAMPLES = 61
 """Which neither two nor four devices divide."""
 START = (np.array([0.5, 1.0, -0.7]), np.array([-1.0, 0.1, 0.8]))
-ADAM = Adam(steps=36, batch=20, steps_per_dispatch=9)
+ADAM = Adam(steps=27, batch=20, steps_per_dispatch=9)
 TRAININGS = {
     "newton": (1, GaussNewton(5, coarse_steps=3, coarse_samples=22, steps_per_dispatch=2)),
     "newton of three seeds": (3, GaussNewton(5, steps_per_dispatch=2)),
@@ -85,6 +86,11 @@ def continued(folder, key, name, mesh):
     return fit(given, optimiser, checkpoint=Checkpoint(copy, known, resume=True), mesh=mesh)
 
 
+def factors(matrix):
+    """By LAPACK, which takes a batch apart on a CPU."""
+    return lapack.cholesky(matrix), lapack.symmetric_eigen(matrix), lapack.solve(matrix, matrix[0])
+
+
 def main(folder, name):
     mesh = batch_mesh()
     if jax.process_index() > 0:
@@ -94,7 +100,11 @@ def main(folder, name):
     found = {}
     for key, (seeds, optimiser) in TRAININGS.items():
         found[key] = numbers(fit(bumps(seeds), optimiser, seconds=LONG, mesh=mesh))
-        found[f"{key}, continued"] = numbers(continued(folder, key, name, mesh))
+        if key != "newton of three seeds":
+            found[f"{key}, continued"] = numbers(continued(folder, key, name, mesh))
+    matrices = np.random.default_rng(0).normal(size=(8, 5, 5))
+    matrices = matrices @ matrices.swapaxes(1, 2)
+    found["factors"] = jax.jit(spread(lambda _, batch: jax.vmap(factors)(batch), mesh))(0.0, matrices)
     said = {"devices": 1 if mesh is None else mesh.size, "refusal": ""}
     try:
         fit(bumps(), ADAM._replace(batch=19), mesh=mesh)

@@ -13,7 +13,7 @@ from dln_jax.learning.engine import newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
-from dln_jax.learning.engine.problem import Problem, Stop
+from dln_jax.learning.engine.problem import Problem, Stop, loss_of
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.poles import cart_pole
@@ -133,7 +133,6 @@ def broken_and_continued(given, optimiser, folder, dispatches):
 SEVERAL = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.3 * leaf, -leaf]), BUMPS)
 NEWTON = GaussNewton(8, coarse_steps=5, coarse_samples=20, steps_per_dispatch=2)
 TRAINED = {
-    "adam": (line(), Adam(steps=300, batch=16, steps_per_dispatch=50)),
     "adam, seeds": (
         line(parameters=((0.0, 0.0), (1.0, 2.0)), seed=jnp.arange(2)),
         Adam(90, 16, steps_per_dispatch=30),
@@ -151,10 +150,8 @@ def unbroken(name):
 @pytest.mark.parametrize(
     ("name", "dispatches"),
     [
-        ("adam", 3),
         ("adam, seeds", 2),
         pytest.param("newton", 3, id="newton, between the stages"),
-        pytest.param("newton", 5, id="newton, all samples"),
         ("newton, seeds", 4),
     ],
 )
@@ -245,6 +242,20 @@ def test_the_order_of_many_samples_is_not_that_of_the_file(takes):
     )
     in_order = -float(fit(given, Adam(steps=samples // 2, batch=2, steps_per_dispatch=samples // 2)).parameters)
     assert abs(in_order - samples / 4) < 5 * np.sqrt(samples / 8)  # standard deviations
+
+
+def test_adam_is_adamw():
+    """Step by step, at a constant rate: weights decay apart from the moments of the gradient."""
+    start, rule = jnp.array([1.0, 2.0]), optax.adamw(0.1, b2=0.99, weight_decay=0.3)
+    loss = loss_of(line())
+    parameters, state = start, rule.init(start)
+    settings = {"learning_rate": 0.1, "weight_decay": 0.3, "warm_up_share": 0, "final_share": 1}
+    training = fit(line(parameters=start), Adam(5, batch=50, steps_per_dispatch=1, **settings))
+    update, slope = jax.jit(rule.update), jax.jit(jax.grad(loss))
+    for at in training.history:
+        change, state = update(slope(parameters, LINE), state, parameters)
+        parameters += change
+        assert at.validation == pytest.approx(float(loss(parameters, LINE)), rel=1e-12)
 
 
 def test_torque_scale_never_divides_by_zero():

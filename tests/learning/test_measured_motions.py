@@ -12,19 +12,16 @@ from dln_jax.data.encoders import smooth_locally
 from dln_jax.learning import measured_motions
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.planar_chain import PlanarChainParameters, make_planar_chain
+from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.types import Needs
 from tests.standard_errors import SURE, statistics
 
 NEEDS = Needs(joints=("revolute", "revolute"), friction=True)
 CHAIN = make_planar_chain(NEEDS, coordinates="absolute")
 # Rods of 1 m with 1 kg at their ends, and friction in the joints.
-TRUE = PlanarChainParameters(
+TRUE = CHAIN.init(jax.random.key(0))._replace(
     moments=jnp.array([2.0, 1.0, 1.0]),
-    skew=None,
-    armature=None,
     weight=jnp.array([2 * 9.81, 9.81]),
-    sideways=None,
     viscous=jnp.array([0.05, 0.02]),
     coulomb=jnp.array([0.1, 0.05]),
 )
@@ -51,7 +48,7 @@ def recorded(count, *, driven=False):
 @pytest.mark.parametrize("driven", [False, True])
 def test_the_optimum_is_the_truth_as_well_as_noise_allows(driven):
     """From motions without torques only up to a common factor, which the gauge sets."""
-    data, noise = recorded(6, driven=driven)
+    data, noise = recorded(4, driven=driven)
     # A deviation from N residuals is off by 1 / √(2 N) of it; polynomials take up less than a third of N.
     np.testing.assert_allclose(noise, NOISE, rtol=SURE / np.sqrt(2 * 0.7 * len(data.t)))
     windows = cut_measured_windows(data, WINDOW)

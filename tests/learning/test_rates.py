@@ -18,6 +18,7 @@ from dln_jax.models.model import Model
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.types import Needs
+from tests.models.random_parameters import drawn
 
 NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)
 SMALL = {"width": 4, "depth": 1, "dtype": jnp.float64}
@@ -35,9 +36,7 @@ def swing():
 def test_friction_takes_energy_and_never_gives_it():
     """dH/dt = -qdᵀ dD/dqd = -2 D <= 0, for random parameters and states."""
     model = make_dissipative(lambda needs: make_separable_hamiltonian(needs, **SMALL), NEEDS, **FRICTION)
-    random = np.random.default_rng(0)
-    shapes = jax.eval_shape(model.init, jax.random.key(0))
-    energies = model.energies(jax.tree.map(lambda leaf: 2 * random.normal(size=leaf.shape), shapes))
+    energies = model.energies(drawn(model, size=2))
 
     @jax.jit
     @jax.vmap
@@ -48,7 +47,7 @@ def test_friction_takes_energy_and_never_gives_it():
         rate = jax.jvp(field.energy, (q, p), rates)[1]
         return rate, energies.dissipation(q, rates[0]), rates[0] @ friction
 
-    rate, loss, power = ask(*(3 * random.normal(size=(2, 40, 2))))
+    rate, loss, power = ask(*(3 * np.random.default_rng(0).normal(size=(2, 40, 2))))
     assert (loss > 0).all() and float(loss.max()) > 1e-3
     np.testing.assert_allclose(rate, -2 * loss, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(power, 2 * loss, rtol=1e-9)

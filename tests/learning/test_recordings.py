@@ -7,6 +7,7 @@ from calls import one_line
 
 from dln_jax.control.desktop_plants import desktop_plant, model_of_plant, simulated_plant
 from dln_jax.control.plants import Exploration, explore
+from dln_jax.data.schema import from_arrays
 from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
 from dln_jax.learning.recordings import identified, identified_chain, prepare
 from dln_jax.models.trigonometric import make_trigonometric
@@ -14,6 +15,14 @@ from dln_jax.models.trigonometric import make_trigonometric
 PLANT = desktop_plant("rotary-pendulum")
 TRUTH = model_of_plant(PLANT)
 MODEL = make_trigonometric(PLANT.scene.needs)
+
+
+def test_torques_come_late_and_are_held():
+    tau = np.arange(1.0, 6.0)[:, None] * np.ones(2)
+    few = from_arrays({"t": np.arange(5) / 500, "q": tau, "qd": tau, "qdd": tau, "tau": tau, "trajectory": np.zeros(5)})
+    np.testing.assert_allclose(driven_torques(few, delay=0).tau[:, 0], [0.5, 1.5, 2.5, 3.5, 4.5])
+    np.testing.assert_allclose(driven_torques(few, delay=2).tau[:, 1], [0, 0, 0.5, 1.5, 2.5])
+    np.testing.assert_allclose(driven_torques(few, delay=0.25).tau[:, 0], [0.375, 1.25, 2.25, 3.25, 4.25])
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +43,7 @@ def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
     assert (left < 0.02 * prepared.train.tau[:, 0].std()).all()
 
 
+@pytest.mark.slow
 def test_identified_inertias_and_friction_are_the_plant_s(prepared):
     found = identified(prepared.train, PLANT.scene.needs).dynamics
     q, qd = jnp.array([0.0, 0.7]), jnp.array([2.0, 3.0])
@@ -41,6 +51,7 @@ def test_identified_inertias_and_friction_are_the_plant_s(prepared):
     np.testing.assert_allclose(found.friction(q, qd), TRUTH.friction(q, qd), rtol=0.3)
 
 
+@pytest.mark.slow
 def test_the_inertias_of_an_arm_that_does_not_move_in_a_plane_take_the_higher_degree(prepared):
     found = identified_chain(prepared, PLANT.scene.needs)
     assert found.description["degree"] == [0, 2]
@@ -48,6 +59,7 @@ def test_the_inertias_of_an_arm_that_does_not_move_in_a_plane_take_the_higher_de
     np.testing.assert_allclose(found.dynamics.mass_matrix(q), TRUTH.mass_matrix(q), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_a_cut_off_that_takes_the_motion_away_is_not_chosen(recording, prepared):
     chosen = prepare(recording, delay=prepared.delay, chain=True, cutoffs=(0.1, 1.0, 1e4))
     assert chosen.cutoff == prepared.cutoff
@@ -55,14 +67,7 @@ def test_a_cut_off_that_takes_the_motion_away_is_not_chosen(recording, prepared)
     assert slow.cutoff == pytest.approx(0.1 * prepared.cutoff)
 
 
-def test_torques_come_late_and_are_held(recording):
-    tau = np.arange(1.0, 6.0)[:, None] * np.ones(2)
-    few = recording._replace(t=np.arange(5) / 500, tau=tau, trajectory=np.zeros(5, int))
-    np.testing.assert_allclose(driven_torques(few, delay=0).tau[:, 0], [0.5, 1.5, 2.5, 3.5, 4.5])
-    np.testing.assert_allclose(driven_torques(few, delay=2).tau[:, 1], [0, 0, 0.5, 1.5, 2.5])
-    np.testing.assert_allclose(driven_torques(few, delay=0.25).tau[:, 0], [0.375, 1.25, 2.25, 3.25, 4.25])
-
-
+@pytest.mark.slow
 def test_mistakes_are_one_line(recording, prepared):
     windows = cut_momentum_windows(prepared.validation)
     longer = cut_momentum_windows(prepared.train, window=0.3)

@@ -5,25 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from planar_arm import ARM as TREE
 
 from dln_jax.data.schema import from_arrays
-from dln_jax.data.splits import split
 from dln_jax.learning import uncertainty
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
 from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.metrics.coverage import coverage
 from dln_jax.models.model import linearised
 from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.uncertainty import out_of_distribution, predictive, scores
-from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulums import two_link_arm
 
-LINKS = [inertial_parameters(m, [0.05, -0.02, 0.1], np.diag([0.02, 0.03, 0.01])) for m in (3.0, 2.0)]
-TREE = serial(*dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0]]), LINKS, armature=[0.1, 0.2])
 ARM = make_rigid_tree(TREE, friction=True, velocity_scale=0.1)
 TRUTH = ARM.init(jax.random.key(0))._replace(
     viscous=jnp.array([0.2, 0.1]), coulomb=jnp.array([0.5, 0.3]), offset=jnp.array([0.1, 0.0])
@@ -32,12 +26,12 @@ NOISE = np.array([0.3, 0.05])
 TORQUE = jax.jit(jax.vmap(dynamics(ARM.energies(TRUTH)).inverse_dynamics))
 
 
-def drawn(seed, samples=200, reach=1.0, still=False):
+def drawn(seed, samples=200, reach=1.0, still=False, noise=NOISE):
     random = np.random.default_rng(seed)
     q, qd, qdd = reach * random.uniform(-1, 1, (3, samples, 2))
     if still:  # the second joint never moves
         q[:, 1], qd[:, 1], qdd[:, 1] = 0.4, 0.0, 0.0
-    tau = np.asarray(TORQUE(q, qd, qdd)) + NOISE * random.normal(size=(samples, 2))
+    tau = np.asarray(TORQUE(q, qd, qdd)) + noise * random.normal(size=(samples, 2))
     return from_arrays(
         {"t": np.zeros(samples), "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": np.arange(samples)}
     )
@@ -80,7 +74,7 @@ def test_bands_cover_what_they_promise(fitted):
 def test_far_states_are_flagged_and_near_ones_are_not(fitted):
     parameters, found = fitted
     flag = jax.jit(jax.vmap(out_of_distribution(ARM, parameters, found.uncertainty)))
-    near, far = drawn(5, reach=0.99), drawn(6, reach=6.0)
+    near, far = drawn(5, reach=0.99), drawn(6, reach=30.0)
     assert np.mean(flag(near.q, near.qd, near.qdd)) <= 0.02
     away = (far.q, far.qd, far.qdd)
     error = jax.jit(jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics))(*away) - TORQUE(*away)
@@ -91,14 +85,12 @@ def test_far_states_are_flagged_and_near_ones_are_not(fitted):
 
 
 def test_exact_linear_model_is_nowhere_outside():
-    scene = two_link_arm()
-    model = make_trigonometric(scene.needs)
-    sets = split(uniform(scene, samples=300, seed=0), validation_share=0.2)
-    parameters = fit_linear(model, sets.train).parameters
-    found = estimate(model, parameters, sets.train, sets.validation, ridge=0.0)
-    away = np.random.default_rng(1).uniform(-1, 1, (3, 200, 2)) * np.array([6.0, 30.0, 300.0])[:, None, None]
-    flag = jax.jit(jax.vmap(out_of_distribution(model, parameters, found.uncertainty)))
-    assert not flag(*away).any()
+    train, validation = drawn(0, noise=0.0), drawn(1, noise=0.0)
+    parameters = fit_linear(ARM, train, negligible=1e-12).parameters
+    found = estimate(ARM, parameters, train, validation, ridge=0.0, negligible=1e-12)
+    away = drawn(2, reach=30.0)
+    flag = jax.jit(jax.vmap(out_of_distribution(ARM, parameters, found.uncertainty)))
+    assert not flag(away.q, away.qd, away.qdd).any()
 
 
 def test_motions_that_differ_by_chance_alone_have_no_scatter():

@@ -14,7 +14,7 @@ from dln_jax.solvers.elimination import solve
 
 
 def test_elimination_equals_lapack():
-    for n in (1, 6, 17):
+    for n in (1, 4, 17):
         random = np.random.default_rng(n)
         matrices = random.normal(size=(20, n, n))
         # A zero diagonal, and a first column that grows downwards: wrong or lost without exchanging rows.
@@ -28,31 +28,6 @@ def test_elimination_equals_lapack():
     assert not np.isfinite(solve(np.ones((2, 2)), np.array([1.0, 2.0]))).any(), "a singular matrix"
 
 
-def test_elimination_differentiates_in_both_modes():
-    matrix, change, right = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 3)))
-    b = right[0]
-
-    def along(s):
-        return solve(matrix + s * change, (1 + s**2) * b)
-
-    @jax.jit
-    def derivatives():
-        first = jax.jacfwd(along)
-        return first(0.0), jax.jacfwd(first)(0.0), jax.grad(lambda A: jnp.dot(right[1], solve(A, b)))(matrix)
-
-    x = np.linalg.solve(matrix, b)
-    slope = -np.linalg.solve(matrix, change @ x)
-    curvature = np.linalg.solve(matrix, 2 * b - 2 * change @ slope)
-    first, second, gradient = derivatives()
-    np.testing.assert_allclose(first, slope, rtol=1e-12)
-    np.testing.assert_allclose(second, curvature, rtol=1e-12)
-    np.testing.assert_allclose(gradient, -np.outer(np.linalg.solve(matrix.T, right[1]), x), rtol=1e-12)
-
-
-def states(d, count=3):
-    return jax.random.normal(jax.random.key(d), (count, 20, d))
-
-
 def assert_equal(got, expected):
     """To 1e-10 of the largest number; a force that the scene lacks to the same of 1."""
     scale = float(jnp.max(jnp.abs(expected))) or 1.0
@@ -63,7 +38,7 @@ def test_hamiltons_equations_are_those_of_the_textbook():
     """(qd, pd) from the closed-form acceleration, and dH/dt = qd·tau - qd·dD/dqd along them."""
     scene = cart_pole(friction=0.3)
     H = legendre(scene.lagrangian)
-    q, qd, tau = states(2)
+    q, qd, tau = jnp.asarray(np.random.default_rng(2).normal(size=(3, 20, 2)))
 
     @jax.jit
     @jax.vmap
@@ -123,8 +98,13 @@ def test_a_charged_particle_in_a_magnetic_field():
     q, qd = jnp.array([[0.2, 0.9], [1.0, -0.5]])
     system = dynamics(HamiltonianSystem(H))
     acceleration = 1.7 * jnp.array([qd[1], -qd[0]])
-    np.testing.assert_allclose(jax.jit(system.forward_dynamics)(q, qd, jnp.zeros(2)), acceleration, rtol=1e-13)
-    inertial, coriolis, gravity = jax.jit(system.decompose)(q, qd, q)
+
+    @jax.jit
+    def ask():
+        return system.forward_dynamics(q, qd, jnp.zeros(2)), system.decompose(q, qd, q)
+
+    got, (inertial, coriolis, gravity) = ask()
+    np.testing.assert_allclose(got, acceleration, rtol=1e-13)
     np.testing.assert_allclose(inertial, q, rtol=1e-13)
     np.testing.assert_allclose(coriolis, -acceleration, rtol=1e-13)
     np.testing.assert_allclose(gravity, 0, atol=1e-14)

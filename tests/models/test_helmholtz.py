@@ -12,7 +12,6 @@ from dln_jax.models.baselines import make_helmholtz
 from dln_jax.types import Needs
 
 PLANE = Needs(joints=("prismatic", "revolute"))
-SPRING = Needs(joints=("prismatic",))
 
 
 def random_field(field):
@@ -41,4 +40,4 @@ def test_each_part_lacks_what_it_must():
 
 def test_an_unknown_field_is_refused():
     with one_line("field is 'rotational'; expected one of solenoidal, conservative, both"):
-        make_helmholtz(SPRING, field="rotational")  # pyright: ignore[reportArgumentType]
+        make_helmholtz(PLANE, field="rotational")  # pyright: ignore[reportArgumentType]

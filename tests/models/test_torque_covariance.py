@@ -10,22 +10,17 @@ from dln_jax.models.torque_covariance import States, torque_covariance
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.types import Needs
 
-CASES = [(("revolute", "prismatic"), True), (("prismatic", "revolute"), False)]
 
-
-def drawn(joints, serial, samples=4):
-    model = make_trigonometric_kernel(Needs(joints=joints), samples=samples, serial=serial)
+@pytest.mark.slow
+@pytest.mark.parametrize("serial", [True, False])
+def test_covariance_is_that_of_the_energies(serial):
+    """Torques of random weights at the model's samples, through the covariance and through the energies."""
+    joints = ("revolute", "prismatic")
+    model = make_trigonometric_kernel(Needs(joints=joints), samples=3, serial=serial)
     parameters = model.init(jax.random.key(1))
     random = np.random.default_rng(0)
     scales = jax.tree.map(lambda leaf: jnp.asarray(random.uniform(0.5, 2, leaf.shape)), parameters.scales)
-    return model, parameters._replace(scales=scales), States(*random.normal(size=(3, 3, len(joints))))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("joints", "serial"), CASES)
-def test_covariance_is_that_of_the_energies(joints, serial):
-    """Torques of random weights at the model's samples, through the covariance and through the energies."""
-    model, parameters, states = drawn(joints, serial)
+    parameters, states = parameters._replace(scales=scales), States(*random.normal(size=(3, 2, 2)))
     every = States(*map(np.concatenate, zip(states, parameters[:3], strict=True)))  # with the samples of the model
     whole = np.asarray(torque_covariance(joints, serial, parameters.scales, every))
     np.testing.assert_allclose(whole, whole.T, rtol=0, atol=1e-12 * abs(whole).max())

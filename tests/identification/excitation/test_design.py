@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from planar_arm import ARM as LEVEL
 
 from dln_jax.identification.excitation.candidates import FINER, functions_at, grid, random_designs, states
 from dln_jax.identification.excitation.design import (
@@ -19,17 +20,17 @@ from dln_jax.identification.excitation.fourier import require_sampling, sampled,
 from dln_jax.identification.excitation.limits import MotionLimits, heights_above, used, worst
 from dln_jax.identification.excitation.task import independent_columns, linear_force, make_task
 from dln_jax.learning.linear import fit_linear, linearised
-from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.models.model import Model
+from dln_jax.mechanics.trees import world_frames
+from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.types import Needs
 from tests.calls import one_line
+from tests.models.random_parameters import drawn
 
-RIGHT = np.pi / 2
-LINK = trees.inertial_parameters(1.5, [0.25, 0.02, 0.01], np.diag([0.01, 0.02, 0.03]))
+UPRIGHT = np.array([[[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.eye(3)])
 # Both axes level, so that the arm swings in a vertical plane.
-ARM = trees.serial(*trees.dh_frames([[-RIGHT, 0, 0.3, 0], [0, 0.5, 0, 0]]), [LINK, LINK], armature=[0.1, 0.05])
+ARM = LEVEL._replace(rotations=UPRIGHT, gravity=np.array([0, 0, -9.81]))
 LIMITS = MotionLimits(
     position=np.array([[-2.0, 1.0], [-2.5, 2.5]]),
     velocity=np.array([2.0, 3.0]),
@@ -47,14 +48,14 @@ def task():
 
 
 @pytest.fixture(scope="module")
-def drawn(task):
+def candidates(task):
     return random_designs(task, 8, seed=1)
 
 
 @pytest.fixture(scope="module")
-def designs(task, drawn):
+def designs(task, candidates):
     """Two motions for identification and one for validation, from one start each, by the information."""
-    return design_set(task, drawn[:3], trajectories=2)
+    return design_set(task, candidates[:3], trajectories=2)
 
 
 @pytest.fixture(scope="module")
@@ -63,18 +64,18 @@ def informative(designs):
 
 
 @pytest.mark.slow
-def test_the_condition_falls(task, drawn):
+def test_the_condition_falls(task, candidates):
     judge = CRITERIA["condition"]
-    conditioned = best_design(task, make_optimiser(task, judge, rounds=6, iterations=40), judge, drawn[:2])
-    assert conditioned.condition < 0.75 * np.median([design.condition for design in drawn])
+    conditioned = best_design(task, make_optimiser(task, judge, rounds=6, iterations=40), judge, candidates[:2])
+    assert conditioned.condition < 0.75 * np.median([design.condition for design in candidates])
 
 
-def test_the_information_rises(drawn, informative):
+def test_the_information_rises(candidates, informative):
     """Random motions break no limit and use some, but show less."""
-    assert all(0 < design.slack < 0.1 for design in drawn)
-    middle = sorted(drawn, key=lambda design: design.log_determinant)[len(drawn) // 2]
+    assert all(0 < design.slack < 0.1 for design in candidates)
+    middle = sorted(candidates, key=lambda design: design.log_determinant)[len(candidates) // 2]
     assert error_ratio([informative], [middle]) < 0.75
-    assert informative.log_determinant > max(design.log_determinant for design in drawn)
+    assert informative.log_determinant > max(design.log_determinant for design in candidates)
 
 
 def test_limits_hold_at_ten_times_the_samples_that_were_checked(task, informative):
@@ -83,7 +84,7 @@ def test_limits_hold_at_ten_times_the_samples_that_were_checked(task, informativ
     assert np.all(q >= LIMITS.position[:, 0]) and np.all(q <= LIMITS.position[:, 1])
     assert np.all(abs(qd) <= LIMITS.velocity) and np.all(abs(qdd) <= LIMITS.acceleration)
     inverse = dynamics(MODEL.energies(PARAMETERS)).inverse_dynamics
-    tau, elbow = jax.jit(jax.vmap(lambda *s: (inverse(*s)[0], trees.world_frames(ARM, s[0])[1][1, 2])))(q, qd, qdd)
+    tau, elbow = jax.jit(jax.vmap(lambda *s: (inverse(*s)[0], world_frames(ARM, s[0])[1][1, 2])))(q, qd, qdd)
     assert np.all(abs(tau) <= LIMITS.force[0, 1]) and np.all(elbow >= -0.1)
 
 
@@ -107,24 +108,13 @@ def test_columns_that_others_explain_are_left_out(task):
     assert independent_columns(np.column_stack([a, b, a + 1e-4 * noise])).size == 2
 
 
-def linear_arm(theta):
-    """Energies of two links that are linear in five parameters; much quicker to compile than a tree."""
-    first, second, coupling, weight, viscous = theta
-
-    def lagrangian(q, qd):
-        both = qd[0] + qd[1]
-        kinetic = 0.5 * first * qd[0] ** 2 + 0.5 * second * both**2 + coupling * jnp.cos(q[1]) * qd[0] * both
-        return kinetic - weight * jnp.sin(q[0] + q[1])
-
-    return LagrangianSystem(lagrangian, lambda q, qd: 0.5 * viscous * jnp.sum(qd**2))
-
-
-LINEAR = Model(lambda key: jnp.array([0.7, 0.3, 0.2, 4.0, 0.1]), linear_arm)
+LINEAR = make_planar_chain(Needs(("revolute", "revolute"), friction=True))
+"""Much quicker to compile than a tree."""
+HEAVY = drawn(LINEAR)._replace(weight=np.array([8.0, 4.0]))
 
 
 def test_the_regressor_and_its_slope_are_those_of_autodiff():
-    parameters = LINEAR.init(jax.random.key(0))
-    regressor, theta = linear_force(LINEAR, parameters)
+    regressor, theta = linear_force(LINEAR, HEAVY)
     at = [*map(jnp.array, ([0.3, -1.1], [0.05, -0.8], [2.0, 1.0]))]
     rows = np.random.default_rng(0).normal(size=(2, len(theta)))
 
@@ -133,10 +123,10 @@ def test_the_regressor_and_its_slope_are_those_of_autodiff():
         slopes, Phi = jax.jit(jax.grad(lambda *at: (jnp.sum(rows * f(*at)), f(*at)), (0, 1, 2), has_aux=True))(*at)
         return Phi, np.array(slopes)
 
-    Phi, slopes = with_slopes(lambda *at: linearised(LINEAR, parameters, *at)[0])
+    Phi, slopes = with_slopes(lambda *at: linearised(LINEAR, HEAVY, *at)[0])
     ours, our_slopes = with_slopes(regressor)
     assert np.allclose(ours, Phi, atol=1e-12) and np.allclose(our_slopes, slopes, atol=1e-10)
-    tau = jax.jit(dynamics(linear_arm(parameters)).inverse_dynamics)(*at)
+    tau = jax.jit(dynamics(LINEAR.energies(HEAVY)).inverse_dynamics)(*at)
     assert np.allclose(Phi @ theta, tau, atol=1e-12)
 
 
@@ -149,7 +139,7 @@ def test_a_design_measures_what_it_says(informative):
     assert 0 <= float(CRITERIA["condition"](jnp.asarray(A))) - np.log(informative.condition) <= np.log(len(A)) / 4
 
 
-def test_least_squares_on_the_motions_finds_the_parameters(task, drawn, designs):
+def test_least_squares_on_the_motions_finds_the_parameters(task, candidates, designs):
     """Written as data, with the forces of the nominal model: they are what the model predicts, and of full rank."""
     train, validation = designs
     data = as_trajectories(
@@ -159,17 +149,18 @@ def test_least_squares_on_the_motions_finds_the_parameters(task, drawn, designs)
     fit = fit_linear(MODEL, data, rank_tolerance=1e-8, negligible=1e-12)
     assert fit.rank == task.columns.size
     assert fit.torque_mse < 1e-18
+    np.testing.assert_allclose(fit.parameters.coulomb, PARAMETERS.coulomb, rtol=1e-6)
     # Both motions are worth more than twice the better one alone is: they were not designed apart.
-    assert error_ratio(train, drawn[:2]) < 0.8
+    assert error_ratio(train, candidates[:2]) < 0.8
 
 
 def test_heights_leave_out_what_cannot_sink():
     heights = heights_above(ARM, 0.1)
     assert heights is not None
     # The first link turns about the origin; the second is half a metre away.
-    reach = [float(heights(jnp.array([q, 0.0]))[0]) for q in (-RIGHT, 0.0, RIGHT)]
+    reach = [float(heights(jnp.array([q, 0.0]))[0]) for q in (-np.pi / 2, 0.0, np.pi / 2)]
     assert np.allclose(sorted(reach), [-0.6, -0.1, 0.4], atol=1e-12)
-    assert heights_above(trees.serial(*trees.dh_frames([[0, 0, 0.3, 0]]), [LINK]), 0.0) is None
+    assert heights_above(LEVEL, 0.0) is None
 
 
 def test_the_largest_excess_is_named_and_used_limits_shrink_towards_the_middle(task):
@@ -181,7 +172,7 @@ def test_the_largest_excess_is_named_and_used_limits_shrink_towards_the_middle(t
     assert np.allclose(half.velocity, [1.0, 1.5]) and np.isinf(half.force[1]).all() and half.force[0, 1] == 11.0
 
 
-def test_bad_input_is_one_line(task, drawn):
+def test_bad_input_is_one_line(task, candidates):
     def limited(**limits):
         return lambda: make_task(MODEL, PARAMETERS, LIMITS._replace(**limits))
 
@@ -189,7 +180,7 @@ def test_bad_input_is_one_line(task, drawn):
         return lambda: make_task(MODEL, PARAMETERS, LIMITS, **settings)
 
     weak = LIMITS._replace(force=np.array([[-0.1, 0.1], [-0.1, 0.1]]))
-    impossible = make_task(LINEAR, LINEAR.init(jax.random.key(0)), weak, period=6.0, harmonics=3)
+    impossible = make_task(LINEAR, HEAVY, weak, period=6.0, harmonics=3)
     for message, call in {
         "no limit of velocity": limited(velocity=np.array([2.0, np.inf])),
         "limit of force on one side": limited(force=np.array([[-np.inf, 1.0], [-1, 1]])),
@@ -201,8 +192,8 @@ def test_bad_input_is_one_line(task, drawn):
         "share is 1.5": lambda: used(LIMITS, 1.5),
         "half the sampling rate": lambda: require_sampling(period=2.0, harmonics=10, rate=10.0),
         "force by": lambda: random_designs(impossible, 1),
-        "choose from": lambda: design_set(task, drawn, criterion="best"),
-        "8 starts are fewer": lambda: design_set(task, drawn, trajectories=8),
+        "choose from": lambda: design_set(task, candidates, criterion="best"),
+        "8 starts are fewer": lambda: design_set(task, candidates, trajectories=8),
     }.items():
         with one_line(message):
             call()

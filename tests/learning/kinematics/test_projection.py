@@ -58,16 +58,13 @@ def test_the_design_has_all_that_a_tree_shows():
 @pytest.mark.slow
 def test_slopes_are_those_of_finite_differences():
     places = free_directions(STRUCTURE.parents, KINDS)
+    samples = problem()[1].tau.size
     start = jnp.zeros(18).at[places].set(0.1 * np.random.default_rng(1).normal(size=len(places)))
     at = projected(start)
     for place, slope in zip(places, at.slope, strict=True):
         step = jnp.zeros(18).at[place].set(1e-5)
         higher, lower = (projected(start, sign * step).loss for sign in (1, -1))
-        np.testing.assert_allclose(-slope, (higher - lower) / 4e-5 * samples_count(), rtol=1e-4, atol=1e-4)
-
-
-def samples_count():
-    return problem()[1].tau.size
+        np.testing.assert_allclose(-slope, (higher - lower) / 4e-5 * samples, rtol=1e-4, atol=1e-4)
 
 
 def test_near_the_solution_kaufmans_matrix_is_the_curvature():
@@ -76,7 +73,7 @@ def test_near_the_solution_kaufmans_matrix_is_the_curvature():
     direction = np.random.default_rng(2).normal(size=len(places))
     step = 1e-4 * jnp.zeros(18).at[places].set(direction)
     predicted = 1e-8 * direction @ at.normal @ direction
-    assert float(projected(step).loss) * samples_count() == pytest.approx(float(predicted), rel=1e-2)
+    assert float(projected(step).loss) * problem()[1].tau.size == pytest.approx(float(predicted), rel=1e-2)
 
 
 def test_gauges_change_nothing():

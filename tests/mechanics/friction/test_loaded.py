@@ -23,21 +23,13 @@ D = joint_dissipation([0.2, 0.1], [0.5, 0.3], 0.05, stribeck=0.2, velocity_scale
 STATE = np.array([0.3, -0.8]), np.array([0.015, -0.4]), np.array([2.0, -1.0])
 
 
-def factor(q):
-    return jnp.linalg.cholesky(ARM.mass_matrix(q))
-
-
-def inverse_factor(q):
-    return jnp.linalg.cholesky(jnp.linalg.inv(ARM.mass_matrix(q)))
-
-
 known = dynamics(ARM.closed_form)
 torque_of_the_arm = jax.jit(known.inverse_dynamics)
 RECORDS = {
-    "natural": NaturalSystem(factor, ARM.potential),
+    "natural": NaturalSystem(lambda q: jnp.linalg.cholesky(ARM.mass_matrix(q)), ARM.potential),
     "closed-form": ARM.closed_form,
     "lagrangian": LagrangianSystem(ARM.lagrangian),
-    "hamiltonian": NaturalHamiltonian(inverse_factor, ARM.potential),
+    "hamiltonian": NaturalHamiltonian(lambda q: jnp.linalg.cholesky(jnp.linalg.inv(ARM.mass_matrix(q))), ARM.potential),
     "plain": InverseForward(known.inverse_dynamics, known.forward_dynamics),
 }
 

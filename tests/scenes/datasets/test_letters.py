@@ -108,10 +108,8 @@ def test_is_the_same_on_every_machine():
 def test_settings_change_nothing():
     settings = {
         "font.family": ["cursive", "monospace"],
-        "font.size": 3.0,
         "text.usetex": True,
         "text.hinting": "force_autohint",
-        "path.simplify_threshold": 1.0,
     }
     for character in "g$\\%":
         before = outline(character)
