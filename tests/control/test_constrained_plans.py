@@ -81,6 +81,7 @@ def test_active_constraints_are_met_and_their_pressures_close_the_lagrangian():
     assert_allclose(between, 0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_soft_constraint_gives_way_where_its_price_is_low():
     """A mass that should not pass 0.5 m but is drawn to 1 m: w_1 + w_2 t is the marginal cost of the excess t."""
     drawn = BLOCK._replace(cost=lambda x, u: 1e-9 * u @ u, final_cost=lambda x: 10 * (x[0] - 1.0) ** 2)

@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
@@ -36,6 +37,7 @@ def improved(x, barrier=BARRIER):
     return jax.lax.fori_loop(0, 40, falling, first_plan(BLOCK, x, IDLE))
 
 
+@pytest.mark.slow
 def test_iterations_approach_the_optimum_as_the_barrier_falls():
     """The gap of a barrier method is at most μ times the number of constraints."""
     best = jax.jit(lambda: shoot(BLOCK, START, ALONG, IDLE))()
@@ -86,6 +88,7 @@ STEEP = BLOCK._replace(
 """A spring that pushes the mass away ever harder."""
 
 
+@pytest.mark.slow
 def test_plans_recover_from_gains_that_diverge_and_from_a_reading_that_is_not_finite():
     act = jax.jit(mpc(STEEP))
     plan = first_plan(STEEP, START / 2, IDLE)
@@ -101,6 +104,7 @@ def test_plans_recover_from_gains_that_diverge_and_from_a_reading_that_is_not_fi
     assert int(plan.ending) == Ending.UNDECIDED and np.abs(x).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_far_obstacle_and_unequal_limits_leave_the_mass_at_its_goal():
     """Before, an obstacle 1.5 m away moved the mass by millimetres."""
     obstacle = BLOCK._replace(upper_x=np.inf, lower=-2.0, states=lambda x: x[:1] - 1.5)
@@ -113,6 +117,7 @@ def test_a_far_obstacle_and_unequal_limits_leave_the_mass_at_its_goal():
     assert np.abs(x).max() < 1e-6 and int(plan.ending) == Ending.UNDECIDED
 
 
+@pytest.mark.slow
 def test_one_reading_that_is_not_finite_costs_one_command_in_c_too(tmp_path):
     problem = STEEP._replace(upper_x=np.array([np.inf, 0.6]))
     first = first_plan(problem, START / 2, np.zeros((4, 1)))
@@ -137,6 +142,7 @@ def test_one_reading_that_is_not_finite_costs_one_command_in_c_too(tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_knots_move_a_reference_and_constraints_that_depend_on_time():
     """A gate that opens at 1 s: the mass waits before it, in plans of `shoot` and in real time alike."""
     t = DT * np.arange(N + 41)
@@ -165,6 +171,7 @@ def test_knots_move_a_reference_and_constraints_that_depend_on_time():
     assert abs(x[0]) < 0.02
 
 
+@pytest.mark.slow
 def test_an_equation_of_the_end_holds_within_the_width_of_its_price():
     problem = BLOCK._replace(final_cost=lambda x: 0 * x[0], end=lambda x: x, upper_x=np.inf)
     again = lambda _, plan: improve(problem, plan)  # noqa: E731

@@ -53,6 +53,7 @@ def test_a_linear_problem_takes_one_iteration_to_the_recursion():
     assert np.isnan(lost.plan.cost) and not lost.converged
 
 
+@pytest.mark.slow
 def test_limits_hold_and_the_rest_is_stationary():
     solve = jax.jit(lambda limit, x, u: optimise(LINEAR._replace(lower=-limit, upper=limit), x, u, tolerance=1e-9))
 
@@ -105,6 +106,7 @@ def test_swing_up_of_a_cart_pole_converges_quadratically_and_its_gains_are_deriv
         assert float(ahead - behind) / 2e-3 == pytest.approx(float(gain), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_implicit_steps_have_the_derivatives_of_finite_differences():
     scene = flexible_cart_pole(stiffness=2e5)  # an example of the documentation plans through it
     field = field_of(dynamics(scene.closed_form), np.asarray(scene.needs.actuation))
@@ -118,6 +120,7 @@ def test_implicit_steps_have_the_derivatives_of_finite_differences():
         assert_allclose(slope, numeric, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_radau_is_of_order_three_and_forgets_what_decays_fast():
     field = lambda x, u: -u * x  # noqa: E731
     one = jnp.ones(1)

@@ -25,6 +25,7 @@ from dln_jax.scenes.pendulums import two_link_pendulum
 from dln_jax.scenes.poles import cart_pole, rotary_pendulum
 
 
+@pytest.mark.slow
 def test_active_joints_get_the_acceleration_they_are_asked_for_and_do_its_work_on_the_pole():
     for scene, conservative in (
         (cart_pole(), True),

@@ -34,7 +34,8 @@ def test_a_mass_that_passes_the_wall_across_its_way_has_not_converged(soft):
         assert worst_violation(problem, solution.plan).startswith("constraint 0 on the states at knot")
 
 
-@pytest.mark.parametrize("solve", ["shoot", pytest.param("optimise", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("solve", ["shoot", "optimise"])
 def test_the_best_of_several_guesses_has_the_least_objective(solve):
     """A well of value 0 at -1, whose price is 5, beats no well of value 0.5 at 1, which costs nothing more."""
     final = lambda x: 10 * (x[0] ** 2 - 1) ** 2 + 0.25 * (x[0] + 1)  # noqa: E731
@@ -60,6 +61,7 @@ def hill(price):
     return TrajectoryProblem(lambda x, u: x + u, lambda x, u: price * u @ u, lambda x: jnp.sum((x**2 - 1) ** 2), -5, 5)
 
 
+@pytest.mark.slow
 def test_a_plan_leaves_the_top_of_a_hill_but_not_a_minimum():
     """At the price 2 n the second derivative along the hill vanishes, and the fourth does not."""
     solve = jax.jit(lambda price: shoot(hill(price), np.zeros(1), np.zeros((STEPS + 1, 1)), np.zeros((STEPS, 1))))
@@ -72,6 +74,7 @@ def test_a_plan_leaves_the_top_of_a_hill_but_not_a_minimum():
         assert solution.converged and np.abs(solution.plan.x).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_redundant_controls_are_no_saddle():
     """Two motors move one mass, and nothing decides between them."""
     problem = TrajectoryProblem(lambda x, u: x + u[:1] + u[1:], lambda x, u: x @ x, lambda x: x @ x, -0.3, 0.3)

@@ -96,6 +96,7 @@ def test_observations_do_not_change_if_the_body_is_moved_or_turned(dimension):
         assert np.linalg.det(R) > 0
 
 
+@pytest.mark.slow
 def test_actuation_changes_by_at_most_0_3_and_stays_in_range(task):
     step = jax.jit(functools.partial(advance, task))
     place, _ = step(beginning(task), jnp.asarray([-1.0, 1.0]))

@@ -123,6 +123,7 @@ def clamped_error(cells, nu, kind, dimension=2):
     return norm(np.einsum("qk,mkd->mqd", N, u[mesh.nodes]) - truth) / norm(truth)
 
 
+@pytest.mark.slow
 def test_a_clamped_incompressible_square_locks_linear_elements_only_and_converges_with_order_3():
     errors = {kind: clamped_error(12, 0.4999, kind) for kind in ("linear", "quadratic", "mixed", SPLIT)}
     assert errors["linear"] > 0.9 and errors["quadratic"] < 0.05

@@ -344,9 +344,8 @@ def creature_reference(x, start, rest, triangles, actuation, h):
     J = np.linalg.det(F)
     s = -1.5 + 2 * J - 0.5 * J**2
     solid = 0.5 * 500 * (np.sum(F**2, axis=(1, 2)) - 2) - 500 * s + 0.5 * 50 * s**2
-    target = actuation * lengths(rest)
-    muscle = 0.5 * 90 * ((np.sqrt(lengths(x) ** 2 + 1e-6) - target) / target) ** 2
-    return solid.sum() + muscle.sum() + creature.MASS * 9.8 * x[:, 1].sum() + ground_reference(x, start, h)
+    muscle = muscle_reference(x, rest, muscles(PAIRS, stiffness=90.0).parameters, actuation)
+    return solid.sum() + muscle + creature.MASS * 9.8 * x[:, 1].sum() + ground_reference(x, start, h)
 
 
 def test_creature_preset_follows_the_published_protocol():

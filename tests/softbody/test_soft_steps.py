@@ -97,6 +97,7 @@ def test_segments_change_the_memory_and_not_the_motion_or_its_gradient():
     np.testing.assert_allclose([again, *seen_again], [slope, *seen], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_single_precision_follows_double():
     scene = held_body()
     init, run = rolled_out(scene, 4)
@@ -121,6 +122,7 @@ def test_a_step_traces_its_energy_seven_times_at_most():
     assert 0 < len(traces) <= 7
 
 
+@pytest.mark.slow
 def test_inverted_elements_are_not_converged_and_have_no_derivatives():
     scene = make_scene(MESH, (SOLID,))
     init, step = make_step(scene, 1e-5)

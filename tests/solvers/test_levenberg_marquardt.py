@@ -92,13 +92,6 @@ def linear_problem(samples, parameters, seed=0):
     return np.asarray(uniform(seed, samples, parameters)), np.asarray(uniform(seed + 1, samples))
 
 
-def test_a_linear_problem_has_no_acceleration(constants):
-    data = linear_problem(60, 7)
-    accelerated = solve(linear, jnp.zeros(7), data, 1).parameters
-    constants(UPPER_ACCELERATION=0.0)
-    np.testing.assert_allclose(accelerated, solve(linear, jnp.zeros(7), data, 1).parameters, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("rank", "damping", "falls_back"),
     [(4, 1e-3, False), (4, 1e-18, True), (7, 1e-18, False)],

@@ -84,6 +84,7 @@ def test_factors_that_would_fill_the_memory_are_not_stored(monkeypatch):
     assert least_work(energies, at) is matrix_free
 
 
+@pytest.mark.slow
 def test_every_linear_solver_finds_the_minimum_of_an_independent_optimiser():
     def energy(unknowns):
         x = START.copy()

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from calls import one_line
 from scipy.stats import chi2
 
@@ -79,6 +80,7 @@ def test_the_covariance_stays_positive_with_encoders_a_million_times_better_than
         assert np.linalg.eigvalsh(memory.covariance).min() > -1e-16
 
 
+@pytest.mark.slow
 def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
     """Along 60 motions near hanging with random torques, from draws of the belief."""
     scene = cart_pole()
@@ -115,6 +117,7 @@ def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
         assert low < float(ratio.mean()) < high
 
 
+@pytest.mark.slow
 def test_late_samples_do_not_look_like_noise_if_the_log_has_their_times():
     """A log at 200 Hz with a band of 0.1 N m and an encoder of 1 mrad, whose resolution is the noise."""
     model = dln_jax.dynamics(pendulum().closed_form)
