@@ -102,6 +102,7 @@ def test_words_and_rows(clean):
     assert rows["coulomb_2"]["standard_error"] < 1e-6 and "13 combinations" in summary(clean)[1]
 
 
+@pytest.mark.slow
 def test_links_without_mass_stay_so():
     """As between two joints of one MJCF body."""
     body = inertial_parameters(1.0, [0.1, 0.2, 0.3], np.diag([0.02, 0.03, 0.04]))

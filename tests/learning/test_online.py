@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from calls import one_line
 
 from dln_jax.learning.online import (
@@ -42,6 +43,7 @@ def torque_error(model, parameters, part):
     return float(np.abs(np.asarray(torque(parameters, q, qd, qdd)) - tau).max())
 
 
+@pytest.mark.slow
 def test_contents_of_empty_places_have_no_effect():
     network = make_delan(NEEDS, width=4, depth=1, dtype=jnp.float64)
     refit, replay = make_refit(network, rounds=3, iterations=4), grown(100, recordings(2))

@@ -73,6 +73,7 @@ def test_functions_are_the_integrals_of_the_formulas():
             np.testing.assert_allclose(values, np.append(0.0, integral), rtol=1e-10, atol=1e-14, err_msg=name)
 
 
+@pytest.mark.slow
 def test_derivatives_by_rate_and_shape_are_differences():
     h = 1e-6
 
