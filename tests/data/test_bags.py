@@ -143,7 +143,7 @@ def test_bags_that_cannot_be_used_are_refused_in_one_line(bag, tmp_path, monkeyp
     apart = {"/a": rows(tau=False), "/b": [state(9 + s, NAMES, tau=[1, 2]) for s in T]}
     (tmp_path / "nothing").mkdir()
     (tmp_path / "damaged").mkdir()
-    (tmp_path / "damaged" / "metadata.yaml").write_text("{")
+    (tmp_path / "damaged/metadata.yaml").write_text("{")
     for kind in ("db3", "mcap", "bag"):
         (tmp_path / f"junk.{kind}").write_bytes(b"no bag at all" * 20)
     other = {"topics": ["/other"]}

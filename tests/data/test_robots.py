@@ -256,7 +256,7 @@ def test_limits_that_are_switched_off_or_zero_are_not_stated(tmp_path):
 @pytest.mark.parametrize("name", ["include", "mesh"])
 def test_a_pipe_in_a_model_is_refused_and_not_waited_for(name, tmp_path):
     (tmp_path / "parts").mkdir()
-    os.mkfifo(tmp_path / "parts" / "pipe.obj")
+    os.mkfifo(tmp_path / "parts/pipe.obj")
     asset = '<compiler meshdir="parts"/><asset><mesh name="m" file="pipe.obj"/></asset>'
     part = '<include file="parts/pipe.obj"/>' if name == "include" else asset
     (tmp_path / "part.xml").write_text(f"<mujoco>{part}</mujoco>")

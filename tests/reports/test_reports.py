@@ -59,7 +59,7 @@ def table(monkeypatch, tmp_path):
     def called(*words, usual=()):
         monkeypatch.setattr(sys, "argv", ["report", *map(str, words)])
         report("stones", *usual)
-        return json_of(tmp_path / "runs" / "stones-1" / "report.json") if "--out" not in words else None
+        return json_of(tmp_path / "runs/stones-1/report.json") if "--out" not in words else None
 
     return called, calls
 

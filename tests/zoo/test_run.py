@@ -97,7 +97,7 @@ def test_values_that_no_model_has_are_refused_in_one_line(run_folder):
     stored = json_of(run_folder / "model.json")
     (run_folder / "diffnet").mkdir()
     save(run_folder / "diffnet", DIFFNET, build(DIFFNET).init(jax.random.key(0)))
-    other = json_of(run_folder / "diffnet" / "model.json")
+    other = json_of(run_folder / "diffnet/model.json")
     for folder, manifest, rows in (
         (run_folder, lambda change: stored | change, MANIFEST),
         (run_folder, lambda change: {**stored, "model": stored["model"] | change}, OF_DELAN),

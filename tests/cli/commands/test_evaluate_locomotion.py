@@ -69,7 +69,7 @@ def test_a_policy_of_another_shape_is_not_trained_further(run, capsys, tmp_path)
 def test_the_command_writes_numbers_and_says_its_verdict(run, tmp_path, capsys):
     command(evaluate_locomotion, "--run", run, "--slope 2 --starts 4 --steps 20 --out", tmp_path / "out")
     assert "verdict: " in capsys.readouterr().out
-    numbers = json_of(tmp_path / "out" / "metrics.json")
+    numbers = json_of(tmp_path / "out/metrics.json")
     assert numbers["perturbed_starts"] == 4 == numbers["perturbed_without_fall"]
 
 

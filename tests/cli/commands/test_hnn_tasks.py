@@ -77,9 +77,9 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys, mon
     out = capsys.readouterr().out
     assert "finite differences" in out and "out of time" not in out
     assert "2/2 steps  rates: loss" in out and "2/2 steps  motions: loss" in out
-    metrics = json_of(positions / "whole" / "metrics.json")
+    metrics = json_of(positions / "whole/metrics.json")
     assert {"rollout_mse", "train_seconds", "validation_error"} <= set(metrics) and "energy_mse" not in metrics
-    model = positions / "whole" / "model.safetensors"
+    model = positions / "whole/model.safetensors"
     stored = model.read_bytes()
     model.unlink()
     command(train_hnn_task, "--out whole --resume --no-figures --no-low-latency")
@@ -124,5 +124,5 @@ def test_out_of_time_the_fit_of_rates_is_the_result(positions, capsys):
     options = "--optimizer adam --steps 2 --no-figures --seconds 1e-6 --out hurried"
     command(train_hnn_task, OWN, *SLIDING, options)
     assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
-    assert np.isfinite(json_of(positions / "hurried" / "metrics.json")["validation_error"])
+    assert np.isfinite(json_of(positions / "hurried/metrics.json")["validation_error"])
     assert isinstance(load("hurried").flow, Flow)

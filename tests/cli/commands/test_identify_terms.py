@@ -51,7 +51,7 @@ def test_all_terms_are_identified_and_written(place, capsys):
     command(identify, "--robot arm.xml --data log.npz --out run --no-figures", terms)
     said = capsys.readouterr().out
     assert "friction by load: kept" in said and "friction by temperature: kept" in said and "verdict: good" in said
-    metrics = json_of(place / "run" / "metrics.json")
+    metrics = json_of(place / "run/metrics.json")
     assert metrics["nmse"] < 2 * metrics["noise_nmse"]
     state = np.random.default_rng(1).normal(size=(3, 2))
     with jax.enable_x64(True):

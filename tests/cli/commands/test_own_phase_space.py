@@ -80,7 +80,7 @@ def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
     system = PUBLISHED["two-body"]
     start = system.start(np.random.default_rng(5))
     assert_allclose(run.flow.rates(*start), system.rates(*start), atol=1e-4)
-    assert json_of(files / "orbits" / "metrics.json")["validation_error"] < 1e-9
+    assert json_of(files / "orbits/metrics.json")["validation_error"] < 1e-9
 
 
 def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
@@ -104,4 +104,4 @@ def test_a_model_whose_motions_explode_is_refused(files, capsys):
     said = capsys.readouterr()
     assert status == 1 and said.err.startswith("error: the fit is refused: ")
     assert "verdict: refused: 1 of 1 predicted test motions grow beyond 10 times the range" in said.out
-    assert json_of(files / "away" / "metrics.json")["verdict"] == 2
+    assert json_of(files / "away/metrics.json")["verdict"] == 2

@@ -185,6 +185,6 @@ def test_blocks_that_fall_on_each_other_stay_apart(tmp_path):
     np.savez(tmp_path / "two.npz", vertices=vertices, elements=elements)
     options = "--scene drop --contact --youngs-modulus 1e5 --seconds 0.5 --no-figures"
     command(simulate, options, "--mesh", tmp_path / "two.npz", "--out", tmp_path / "run")
-    numbers = json_of(tmp_path / "run" / "metrics.json")
+    numbers = json_of(tmp_path / "run/metrics.json")
     # Their surfaces act on each other within 15 mm, a tenth of the shortest edge.
     assert numbers["steps_not_converged"] == 0 and 0 < numbers["least_distance_of_surfaces"] < 0.0149

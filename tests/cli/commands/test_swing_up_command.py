@@ -26,7 +26,7 @@ def test_a_run_stores_data_numbers_and_pictures(tmp_path, monkeypatch):
     monkeypatch.setattr("dln_jax.training.swing_ups.learned.Exploration", partial(Exploration, surplus=()))
     few = "--plant furuta --model known --seconds-of-data 12 --starts 2 --estimator differences --out"
     command(swing_up, few, tmp_path / "run")
-    found = json_of(tmp_path / "run" / "metrics.json")
+    found = json_of(tmp_path / "run/metrics.json")
     assert found["success_share"] == 1 and found["not_finite"] == 0 and found["torque_nmse"] < 1e-20
     files = {each.name for each in (tmp_path / "run").iterdir()}
     assert files >= {"config.json", "data.npz", "swing-ups.png", "swing-up.gif"}
@@ -68,7 +68,7 @@ def test_a_recording_that_a_later_step_refuses_is_kept(capsys, tmp_path, monkeyp
     monkeypatch.setattr("dln_jax.training.swing_ups.of_file.learn_to_swing_up", learn)
     line = refused(capsys, swing_up, "--plant", two_links(tmp_path), MOTOR, "--out", tmp_path / "run")
     assert "the noise of q in the log is 0; the recording stays in" in line
-    assert schema.load(tmp_path / "run" / "data.npz").q.shape == (20, 2)
+    assert schema.load(tmp_path / "run/data.npz").q.shape == (20, 2)
 
 
 def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(capsys, tmp_path, monkeypatch):

@@ -62,7 +62,7 @@ def test_finished_candidates_are_stored_and_not_fitted_again(workplace, tmp_path
     monkeypatch.setattr(selection, "_by_name", interrupted)
     with pytest.raises(KeyboardInterrupt):
         selection.fit(prepare(typed), typed, tmp_path, None)
-    kept = load(tmp_path / "candidates" / "rigid-tree")
+    kept = load(tmp_path / "candidates/rigid-tree")
 
     monkeypatch.setattr(selection, "_rigid_tree", interrupted)
     for name in ("_by_name", "_with_network"):
@@ -70,7 +70,7 @@ def test_finished_candidates_are_stored_and_not_fitted_again(workplace, tmp_path
     task, training = selection.fit(prepare(typed), dataclasses.replace(typed, resume=True), tmp_path, None)
     assert task.description == kept.description
     jax.tree.map(np.testing.assert_array_equal, training.parameters, kept.parameters)
-    assert json_of(tmp_path / "candidates" / "trigonometric" / "candidate.json") == {"reason": "not in this test"}
+    assert json_of(tmp_path / "candidates/trigonometric/candidate.json") == {"reason": "not in this test"}
 
 
 def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monkeypatch):

@@ -40,7 +40,7 @@ FILES = {
 def trained(folder):
     """The run folder of the script's defaults, but for the budget."""
     command(train_delan, TINY)
-    return folder / "runs" / "train_delan-1"
+    return folder / "runs/train_delan-1"
 
 
 @pytest.mark.slow
@@ -80,11 +80,11 @@ def test_a_killed_run_resumes_to_the_same_parameters(folder):
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(line, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 120
-        while not (folder / "killed" / "checkpoint.json").exists():
+        while not (folder / "killed/checkpoint.json").exists():
             assert time.monotonic() < deadline and process.poll() is None
             time.sleep(0.005)
         process.kill()
-    assert not (folder / "killed" / "model.json").exists(), "the run was over before it could be killed"
+    assert not (folder / "killed/model.json").exists(), "the run was over before it could be killed"
     command(train_delan, "--out killed --resume --no-figures --no-low-latency")
     one, other = ((folder / name / "model.safetensors").read_bytes() for name in ("unbroken", "killed"))
     assert one == other
@@ -102,10 +102,10 @@ def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(folder, c
     options = f"--optimizer adam --width 3 --depth 1 {BRIEF} --scene pendulum --steps 400 --seconds 1e-6"
     command(train_delan, options, "--out late")
     assert "out of time at step" in capsys.readouterr().out
-    early = json_of(folder / "late" / "metrics.json")
+    early = json_of(folder / "late/metrics.json")
     assert 0 < early["best_step"] == early["steps"] < 400
     command(train_delan, "--out late --resume --seconds 2e-6", BRIEF)
-    assert json_of(folder / "late" / "metrics.json")["steps"] == 2 * early["steps"]
+    assert json_of(folder / "late/metrics.json")["steps"] == 2 * early["steps"]
 
 
 GOOD = small_log(2)
@@ -180,7 +180,7 @@ def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(f
     assert "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test" in said
     assert "friction of joints: viscous, coulomb, offset" in said
     assert "verdict: good" in said and "trigonometric is exact" in said
-    metrics, stored = (json_of(folder / "bare" / f"{name}.json") for name in ("metrics", "model_selection"))
+    metrics, stored = (json_of(folder / f"bare/{name}.json") for name in ("metrics", "model_selection"))
     assert metrics["torque_mse"] < 1e-18 and metrics["verdict"] == 0 and metrics["validation_nmse"] < 1e-18
     assert stored["kept"] == "trigonometric" == load("bare").description["name"]
     assert stored["ended"] == "trigonometric is exact"
@@ -191,7 +191,7 @@ def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(folder, capsy
     status = exit_status(train_delan, "--data noise.npz --model trigonometric --degree 2 --out noise", BRIEF)
     assert status == 1
     assert capsys.readouterr().err.startswith("error: the fit is refused: the torque of joint 1 is predicted")
-    assert json_of(folder / "noise" / "metrics.json")["verdict"] == 2
+    assert json_of(folder / "noise/metrics.json")["verdict"] == 2
 
 
 def test_data_are_made_read_back_and_never_overwritten_unasked(folder):

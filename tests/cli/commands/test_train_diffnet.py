@@ -52,7 +52,7 @@ def own_file(path, **changes):
 
 def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplace, capsys):
     command(train_diffnet, SMALL, "--steps 4")
-    folder = workplace / "runs" / "train_diffnet-1"
+    folder = workplace / "runs/train_diffnet-1"
     assert names_in(folder) == FILES | {"curves.png", "training.png"}
     metrics, config = (json_of(folder / f"{name}.json") for name in ("metrics", "config"))
     assert metrics["parameters"] == 4 + 4 + 4 + 1
@@ -84,7 +84,7 @@ def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(w
     monkeypatch.setitem(function_task.NAMED, "cos_sin", (functions.cosine_sine, coarse))
     command(train_diffnet, ADAM, "--function cos_sin --ensemble 3 --out run")
     assert names_in(workplace / "run") == FILES | {"ensemble.png", "heat_maps.png", "surfaces.png", "training.png"}
-    metrics = json_of(workplace / "run" / "metrics.json")
+    metrics = json_of(workplace / "run/metrics.json")
     assert metrics["parameters"] == 3 * (8 + 4 + 16 + 4 + 4 + 1)
     assert metrics["spread_inside"] > 0 and metrics["spread_outside"] > 0
     assert load("run").derivatives(np.zeros(2)).value.dtype == jnp.float32
@@ -95,7 +95,7 @@ def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(wo
     data = own_file("mine.npz")
     command(train_diffnet, "--function mine.npz --activation tanh --width 6 --depth 1 --steps 30 --out run")
     assert names_in(workplace / "run") == FILES | {"parity.png", "training.png"}
-    metrics = json_of(workplace / "run" / "metrics.json")
+    metrics = json_of(workplace / "run/metrics.json")
     assert metrics["value_mse"] < 1e-2 * data["y"].var(axis=0).sum()
     answers = jax.vmap(load("run").derivatives)(data["x"])
     assert answers.hessian.shape == (60, 2, 3, 3)
@@ -111,7 +111,7 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
     assert "Hessian is zero almost everywhere" in out and "teaches it nothing" in out
     assert names_in(workplace / "run") == FILES
     # What predicting zero gets: the mean of sin² over the grid.
-    assert json_of(workplace / "run" / "metrics.json")["hessian_mse"] == pytest.approx(
+    assert json_of(workplace / "run/metrics.json")["hessian_mse"] == pytest.approx(
         np.mean(functions.sine_grid().d2y ** 2)
     )
 
@@ -132,7 +132,7 @@ def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(engine_fit, "store", store_and_die)
         assert exit_status(train_diffnet, wanted, "--out broken") == 130
-    assert not (workplace / "broken" / "model.json").exists()
+    assert not (workplace / "broken/model.json").exists()
     line = refused(capsys, train_diffnet, "--resume --out broken --seed 3")
     assert "started with seed = 0; leave --seed out" in line
     command(train_diffnet, "--resume --no-figures --out broken")

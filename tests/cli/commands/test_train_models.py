@@ -109,7 +109,7 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
     command(train_delan, "--data swing.npz --steps 2", BRIEF, "--target 1e-30 --out hard")
     assert "no candidate meets 1e-30; kept is the most accurate" in capsys.readouterr().out
-    candidates = json_of(workplace / "hard" / "candidates.json")["candidates"]
+    candidates = json_of(workplace / "hard/candidates.json")["candidates"]
     assert {(each["width"], each["networks"]) for each in candidates} == {(2, 1), (2, 2)}
     best = min(candidates, key=lambda each: each["validation_error"])
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]

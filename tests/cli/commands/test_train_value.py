@@ -14,14 +14,14 @@ TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 @pytest.mark.slow
 def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, TINY, "--goal 0.2 --out", tmp_path / "run")
-    numbers = json_of(tmp_path / "run" / "metrics.json")
+    numbers = json_of(tmp_path / "run/metrics.json")
     assert numbers["validation"] > 0 and numbers["down_control_most"] <= 2.5
     run = load_value(tmp_path / "run")
     goal = jnp.array([0.2, 0.0])
     assert run.value_and_gradient(goal)[0] == 0 and np.isnan(run.law(goal * jnp.nan)).all()
     np.testing.assert_allclose(run.law(goal), -9.81 / 2 * np.sin(0.2), rtol=1e-9)
     command(train_value, "--stored", tmp_path / "run", "--starts 3 --out", tmp_path / "again")
-    again = json_of(tmp_path / "again" / "metrics.json")
+    again = json_of(tmp_path / "again/metrics.json")
     assert again["down_return_mean"] == pytest.approx(numbers["down_return_mean"])
     rows = [("--goal 0.1", "--goal is an option of a training, without --stored")]
     assert_refused(capsys, train_value, rows, "--stored", tmp_path / "run", out=tmp_path / "other")

@@ -45,7 +45,7 @@ def test_array_is_submitted_and_slurm_s_reasons_are_printed(cluster, tmp_path, c
     options = "array=0-2%2 partition=gpu time=30 gpus-per-node=1 job-name=s open-mode=append"
     assert all(f"#SBATCH --{option}\n" in script for option in options.split())
     assert "#SBATCH --signal=USR2@" in script and "submitit.core._submit" in script and script.count("srun") == 1
-    assert not list((tmp_path / "s" / "submitit").glob("*.pkl")), "pickles are left"
+    assert not list((tmp_path / "s/submitit").glob("*.pkl")), "pickles are left"
 
 
 def test_a_job_that_is_queued_again_is_the_same_job(tmp_path):

@@ -108,7 +108,7 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
     (best,) = [job for job in results["jobs"] if job["best"]]
     assert best["values"] == {"width": "2", "seed": "2"}
     # What was begun was continued, in its folder.
-    assert status_of(out / "jobs" / "0007")[:4] == ("done", "", 2, "run")
+    assert status_of(out / "jobs/0007")[:4] == ("done", "", 2, "run")
     command(sweep, "--out", out, "--resume")
     assert len(executor) == 11
 
@@ -146,7 +146,7 @@ def test_a_table_holds_no_formula_and_no_metric_that_is_none(tmp_path):
     jobs = [Job(tmp_path / name, "train_delan", (), {"width": "=1+1", "shift": "-1"}, True, tmp_path) for name in "abc"]
     for job, metrics in zip(jobs, ('{"torque_mse": 1.0}', '{"=cmd": 1.0}', '{"torque_mse": "=1"}'), strict=True):
         (job.folder / "run").mkdir(parents=True)
-        (job.folder / "run" / "metrics.json").write_text(metrics)
+        (job.folder / "run/metrics.json").write_text(metrics)
     results = compared(jobs)
     assert [entry.status.state for entry in results.entries] == ["done", "failed", "failed"]
     write_tables(tmp_path, results)
@@ -175,7 +175,7 @@ def test_finished_job_whose_run_is_gone_is_repeated(tmp_path, executor, capsys):
     command(sweep, "--grid", "width=4 seed=0", "--out", out)
     line = refused(capsys, sweep, "--grid", "width=2 seed=0", "--out", out, "--resume")
     assert "was started with grid = width=4 seed=0" in line
-    for run in (out / "jobs" / "0000" / "run").iterdir():
+    for run in (out / "jobs/0000/run").iterdir():
         run.unlink()
     command(sweep, "--out", out, "--resume")
     assert len(executor) == 2
@@ -185,7 +185,7 @@ def test_every_problem_has_its_best_job(tmp_path, executor):
     for name in "ab":
         (tmp_path / name).touch()
     command(sweep, "--grid", f"data={tmp_path}/a,{tmp_path}/b width=2,4 seed=0", "--out", tmp_path / "s")
-    jobs = json_of(tmp_path / "s" / "sweep.json")["jobs"]
+    jobs = json_of(tmp_path / "s/sweep.json")["jobs"]
     assert [job["values"]["width"] for job in jobs if job["best"]] == ["4", "4"]
 
 
@@ -274,14 +274,14 @@ def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
         schema.save(tmp_path / f"{name}.npz", recorded)
     np.savez(tmp_path / "bad.npz", nothing=1.0)
     files = ",".join(str(tmp_path / f"{name}.npz") for name in ("good", "bad", "killed"))
-    killer = threading.Thread(target=kill_as_it_begins, args=(tmp_path / "sweep" / "jobs" / "0002",))
+    killer = threading.Thread(target=kill_as_it_begins, args=(tmp_path / "sweep/jobs/0002",))
     killer.start()
     fixed = ("--fixed figures=no --jobs 2 --where", where, "--out", tmp_path / "sweep")
     status = exit_status(sweep, "--command check_data --grid", f"data={files}", *fixed)
     killer.join()
     assert status == 1
-    done, failed, killed = (status_of(tmp_path / "sweep" / "jobs" / f"{number:04}") for number in range(3))
+    done, failed, killed = (status_of(tmp_path / f"sweep/jobs/{number:04}") for number in range(3))
     assert done.state == "done" and failed.state == "failed" and killed.state == "killed"
     assert "bad.npz" in failed.line
-    assert "warnings" in (tmp_path / "sweep" / "table.csv").read_text()
+    assert "warnings" in (tmp_path / "sweep/table.csv").read_text()
     assert f"0002 {killed.state}: {killed.line}" in capsys.readouterr().out

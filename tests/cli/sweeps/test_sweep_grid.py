@@ -56,7 +56,7 @@ def test_jobs_are_command_lines(tmp_path):
     first, second = jobs_of("train_delan", train_delan.Arguments, grid, fixed, tmp_path)
     common = ("--no-low-latency", "--compilation-cache", "--test=e,q", "--processes=1")
     assert first.arguments == (*common, "--width=8", f"--data={tmp_path}/a.npz")
-    assert second.values == {"width": "16", "data": f"{tmp_path}/a.npz"} and second.folder == tmp_path / "jobs" / "0001"
+    assert second.values == {"width": "16", "data": f"{tmp_path}/a.npz"} and second.folder == tmp_path / "jobs/0001"
     assert first.resumes
     jobs = jobs_of("train_delan", train_delan.Arguments, grid_of("width=2,4 seed=0:3"), {}, tmp_path)
     assert [tuple(job.values.values()) for job in jobs] == [(w, s) for w in "24" for s in "012"]
