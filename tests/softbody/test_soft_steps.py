@@ -127,7 +127,9 @@ def test_absent_contact_and_friction_leave_no_trace_in_a_step():
     def flops(*contacts, **settings):
         scene = make_scene(MESH, [SOLID], contacts=contacts)
         init, step = make_step(scene, DT, **settings)
-        return jax.jit(step).lower(scene.params, init()).cost_analysis()["flops"]
+        costs = jax.jit(step).lower(scene.params, init()).cost_analysis()
+        assert costs is not None
+        return costs["flops"]
 
     smooth, rough = (
         obstacle_contact(MESH, half_space([0.0, 1.0], -1.0), distance=1e-3, stiffness=1e4, friction=friction)
