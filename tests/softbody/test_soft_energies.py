@@ -345,7 +345,7 @@ def creature_reference(x, start, rest, triangles, actuation, h):
     s = -1.5 + 2 * J - 0.5 * J**2
     solid = 0.5 * 500 * (np.sum(F**2, axis=(1, 2)) - 2) - 500 * s + 0.5 * 50 * s**2
     muscle = muscle_reference(x, rest, muscles(PAIRS, stiffness=90.0).parameters, actuation)
-    return solid.sum() + muscle + creature.MASS * 9.8 * x[:, 1].sum() + ground_reference(x, start, h)
+    return solid.sum() + float(muscle) + creature.MASS * 9.8 * x[:, 1].sum() + ground_reference(x, start, h)
 
 
 def test_creature_preset_follows_the_published_protocol():

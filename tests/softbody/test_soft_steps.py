@@ -123,6 +123,24 @@ def test_a_step_traces_its_energy_seven_times_at_most():
 
 
 @pytest.mark.slow
+def test_absent_contact_and_friction_leave_no_trace_in_a_step():
+    def flops(*contacts, **settings):
+        scene = make_scene(MESH, [SOLID], contacts=contacts)
+        init, step = make_step(scene, DT, **settings)
+        costs = jax.jit(step).lower(scene.params, init()).cost_analysis()
+        assert costs is not None
+        return costs["flops"]
+
+    smooth, rough = (
+        obstacle_contact(MESH, half_space([0.0, 1.0], -1.0), distance=1e-3, stiffness=1e4, friction=friction)
+        for friction in (None, 0.5)
+    )
+    without_friction = flops(smooth)
+    assert flops(smooth, friction_iterations=9) == without_friction
+    assert 1.2 * flops() < without_friction < flops(rough) / 1.2
+
+
+@pytest.mark.slow
 def test_inverted_elements_are_not_converged_and_have_no_derivatives():
     scene = make_scene(MESH, (SOLID,))
     init, step = make_step(scene, 1e-5)

@@ -16,6 +16,7 @@ from dln_jax.control.estimate import (
     filtered,
     from_log,
     mechanical,
+    tuned,
     unscented,
 )
 from dln_jax.data.schema import Trajectories
@@ -138,6 +139,15 @@ def test_late_samples_do_not_look_like_noise_if_the_log_has_their_times():
     of_times, of_even_times = (from_log(model, one).process for one in (log, log._replace(t=even)))
     assert resolution / np.sqrt(12) * 0.999 < of_times.noise[0] < 5e-4 and of_even_times.noise[0] > 2e-3
     assert 0.03 < of_times.disturbance[0] < 0.3
+
+
+@pytest.mark.slow
+def test_noise_and_disturbance_are_found_from_logs_of_several_lengths():
+    wrong = LINEAR._replace(disturbance=np.array([0.2, 0.1]), noise=np.array([0.3, 1.0]))
+    logs = [(PRIOR, *linear_log(samples, seed)) for seed, samples in enumerate((400, 100))]
+    found = tuned(wrong, logs, noise=True).process
+    np.testing.assert_allclose(found.noise, LINEAR.noise, rtol=0.1)
+    np.testing.assert_allclose(found.disturbance, LINEAR.disturbance, rtol=0.25)
 
 
 def test_processes_without_noise_are_refused():

@@ -245,7 +245,7 @@ def test_damping_takes_the_velocity_of_a_plane():
 
 
 def test_points_of_obstacles_move_rigidly():
-    turn, sides = Rotation.from_rotvec([[0.2, 0.3, -0.2], [0.0, 0.7, 0.7]]).as_matrix()
+    turn, sides = Rotation.from_rotvec([[0.2, 0.4, -0.2], [0.0, 0.7, 0.7]]).as_matrix()
     shift = np.array([0.3, -0.1, 0.2])
     x = np.random.default_rng(0).normal(size=(5, 3))
     mesh = make_mesh(np.eye(4, 3) + np.array([20.0, -10.0, 10.0]), np.array([[0, 1, 2, 3]]))
