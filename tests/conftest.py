@@ -31,7 +31,7 @@ CHECKED = [name for name in CHECKED if not UNCHECKED.startswith(f"{name}.")]
 TYPES = "DLN_JAX_TEST_TYPES"
 """Environment variable: if it is set, types are checked at every call, which takes a quarter of the time of tracing."""
 if os.environ.get(TYPES):
-    install_import_hook(CHECKED, "typechecking.checked")
+    install_import_hook(CHECKED, "beartype.beartype")
 
 PROGRAMS = "DLN_JAX_TEST_PROGRAMS"
 """Environment variable: folder of compiled programs, shared by the test processes and the commands that they start."""

@@ -8,31 +8,21 @@ exact at the noiseless states, and bodies are ordered axis by axis: x1, x2, .., 
 """
 
 import sys
-from collections.abc import Callable
+from collections import namedtuple
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+Published = namedtuple("Published", "rates start t noise trajectories")
+"""A system, how its motions start, and how they are recorded.
 
-class Published(NamedTuple):
-    """A system, how its motions start, and how they are recorded."""
-
-    rates: Callable
-    """(q, p) [.., d] -> (qd, pd)."""
-    energy: Callable
-    """(q, p) [.., d] -> energies [..]."""
-    start: Callable
-    """Random generator -> (q, p) [d]."""
-    t: np.ndarray
-    noise: float
-    trajectories: int
-    horizon: float
-    """Seconds over which predicted motions were judged."""
+(q, p) [.., d] -> (qd, pd); random generator -> (q, p) [d]; times, standard deviation of
+noise, and number of motions.
+"""
 
 
-def _oscillator(force, potential, radii, samples):
+def _oscillator(force, radii, samples):
     def start(random):
         direction = random.uniform(-1, 1, 2)
         q, p = direction / np.linalg.norm(direction) * random.uniform(*radii)
@@ -41,10 +31,7 @@ def _oscillator(force, potential, radii, samples):
     def rates(q, p):
         return 2 * p, force(q)
 
-    def energy(q, p):
-        return np.sum(potential(q) + p**2, axis=-1)
-
-    return Published(rates, energy, start, np.linspace(0, 3, samples), 0.1, 50, 20.0)
+    return Published(rates, start, np.linspace(0, 3, samples), 0.1, 50)
 
 
 def _separations(q, bodies):
@@ -54,15 +41,12 @@ def _separations(q, bodies):
     return apart, np.sqrt(np.sum(apart**2, axis=-3)) + np.diag(np.full(bodies, np.inf))
 
 
-def _attracting(bodies, start, t, trajectories, horizon):
+def _attracting(bodies, start, t, trajectories):
     def rates(q, p):
         apart, distance = _separations(q, bodies)
         return p, -np.sum(apart / distance[..., None, :, :] ** 3, axis=-1).reshape(q.shape)
 
-    def energy(q, p):
-        return 0.5 * np.sum(p**2, axis=-1) - 0.5 * np.sum(1 / _separations(q, bodies)[1], axis=(-1, -2))
-
-    return Published(rates, energy, start, t, 0.0, trajectories, horizon)
+    return Published(rates, start, t, 0.0, trajectories)
 
 
 def _two(random):
@@ -83,10 +67,10 @@ def _three(random):
 
 
 PUBLISHED = {
-    "spring": _oscillator(lambda q: -2 * q, lambda q: q**2, (0.1, 1.0), 30),
-    "pendulum": _oscillator(lambda q: -3 * np.sin(q), lambda q: 3 * (1 - np.cos(q)), (1.3, 2.3), 45),
-    "two-body": _attracting(2, _two, np.linspace(0, 20, 50), 1000, 25.0),
-    "three-body": _attracting(3, _three, np.linspace(0, 5, 20), 5000, 3.0),
+    "spring": _oscillator(lambda q: -2 * q, (0.1, 1.0), 30),
+    "pendulum": _oscillator(lambda q: -3 * np.sin(q), (1.3, 2.3), 45),
+    "two-body": _attracting(2, _two, np.linspace(0, 20, 50), 1000),
+    "three-body": _attracting(3, _three, np.linspace(0, 5, 20), 5000),
 }
 
 

@@ -12,7 +12,6 @@ from calls import assert_refused, json_of, one_line
 from gymnasium.utils.env_checker import check_env
 from jax.sharding import Mesh
 from PIL import Image
-from small_creature import EPISODE, block_task
 
 from dln_jax.cli.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
@@ -21,11 +20,14 @@ from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.frames import axes_of, fitted_frame, vertex_frame
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn, make_policy
-from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged
+from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task
 from dln_jax.locomotion.value import Window, targets
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale.mesh import AXIS
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.shapes import Creature, lattice
 
+EPISODE = 12
 WINDOW = 6
 STEPS = 10_000
 QUICK = GradientSettings(window=WINDOW, lanes=2, learning_rate=0.05, updates=4, value_fits=4)
@@ -33,7 +35,12 @@ QUICK = GradientSettings(window=WINDOW, lanes=2, learning_rate=0.05, updates=4, 
 
 @pytest.fixture(scope="module")
 def task():
-    return block_task()
+    """The smallest creature: a block of two cells that two muscles along its sides bend, and short episodes."""
+    positions, triangles = lattice([(0, 0), (1, 0)])
+    mesh = make_mesh(0.4 * np.asarray(positions, float), triangles)
+    number = {tuple(place): index for index, place in enumerate(np.asarray(positions).tolist())}
+    muscles = np.array([[number[0, 0], number[0, 1]], [number[0, 1], number[1, 1]]])
+    return make_task(Creature("block", mesh, muscles), episode=EPISODE, clock_period=6.0, upright=0.04)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from costs import flops_and_parameters
 
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
@@ -13,6 +12,15 @@ from dln_jax.types import Needs
 def small(friction=False, gravity=True):
     needs = Needs(("revolute", "revolute"), gravity=gravity, friction=friction)
     return make_delan(needs, width=6, depth=2, dtype=jnp.float64)
+
+
+def flops_and_parameters(model, name, d):
+    """Floating-point operations of a function (q, qd, x) of the dynamics, and how many parameters the model has."""
+    parameters = jax.eval_shape(model.init, jax.random.key(0))
+    states = (jax.ShapeDtypeStruct((d,), jnp.float64),) * 3
+    function = jax.jit(lambda p, *s: getattr(dynamics(model.energies(p)), name)(*s))
+    flops = function.lower(parameters, *states).compile().cost_analysis()["flops"]
+    return flops, sum(leaf.size for leaf in jax.tree.leaves(parameters))
 
 
 def test_absent_terms_cost_nothing():

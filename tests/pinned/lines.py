@@ -9,12 +9,14 @@ import importlib
 import inspect
 import json
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import safetensors.numpy
 from calls import command
+from motions import sums_of_sines
 from planar_arm import URDF
 
 import dln_jax
@@ -63,15 +65,7 @@ LINES = {
     "simulate-beam": "simulate --scene beam --cells 1 --seconds 0.05 --no-figures --precision f64",
     "train_locomotion": "train_locomotion --steps 64 --window 4 --episode 8 --lanes 2 --width 4 --no-figures",
     "swing_up": "swing_up --plant cart-pole --model known --starts 2 --no-figures",
-    "sweep": [
-        "sweep",
-        "--grid",
-        "width=2,3",
-        "--jobs",
-        "1",
-        "--fixed",
-        "data=arm.npz model=structured-delan steps=2 depth=1",
-    ],
+    "sweep": "sweep --grid width=2,3 --jobs 1 --fixed 'data=arm.npz model=structured-delan steps=2 depth=1'",
     "check_data": "check_data --data log.npz --no-figures",
     "learned-tree": f"train_delan --data arm.npz --model learned-tree {BRIEF}",
 }
@@ -113,12 +107,7 @@ def make_files(folder):
     (folder / "arm.urdf").write_text(URDF)
     t = np.arange(0, 6, 0.02)
     amplitude, rate, phase = np.random.default_rng(0).uniform([0.2, 1, 0], [0.8, 4, 6], (2, 3, 3)).transpose(2, 0, 1)
-    angle = rate[..., None] * t + phase[..., None]
-    q, qd = (
-        np.sum(x, axis=1).T
-        for x in (amplitude[..., None] * np.sin(angle), (amplitude * rate)[..., None] * np.cos(angle))
-    )
-    qdd = np.sum(-(amplitude * rate**2)[..., None] * np.sin(angle), axis=1).T
+    q, qd, qdd = sums_of_sines(t, amplitude, rate, phase)
     true = read_tree(folder / "arm.urdf")
     tau = np.array([true(*row) for row in zip(q, qd, qdd, strict=True)])
     tau += 0.05 * np.random.default_rng(1).normal(size=tau.shape)
@@ -162,8 +151,7 @@ def ended(capsys, script, *words):
 
 def measured(name, capsys):
     """What a command line leaves in the working folder and prints."""
-    line = LINES[name]
-    script, *words = line.split() if isinstance(line, str) else line
+    script, *words = shlex.split(LINES[name])
     folder = Path(name)
     found = ended(capsys, script, *words, "--out", folder)
     if (folder / "metrics.json").exists():
