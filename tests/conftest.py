@@ -114,6 +114,16 @@ def no_program_has_options_of_its_own(pytestconfig):
         yield
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An empty working folder for all tests of a file, with a cache of its own."""
+    folder = tmp_path_factory.mktemp("folder")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        yield folder
+
+
 def slow_among(values, is_slow):
     """Returns parameters of a test, marked slow where `is_slow(value)`."""
     return [pytest.param(value, marks=[pytest.mark.slow] * is_slow(value)) for value in values]
