@@ -79,7 +79,7 @@ def pytest_addoption(parser):
     parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
     parser.addoption("--slow-within", type=float, metavar="S", help="skip the slow tests not begun after S seconds")
-    parser.addoption("--time-files", action="store_true", help="store the time of each file, which orders them")
+    parser.addoption("--time-tests", action="store_true", help="store how long tests take, which orders and marks them")
     parser.addoption("--pinned", action="store_true", help="compare the numbers of commands with those in tests/pinned")
     parser.addoption("--renew", action="store_true", help="store what tests/pinned measures, and compare nothing")
     parser.addoption("--every-export", action="store_true", help="compare all of every export with JAX, for minutes")
@@ -130,23 +130,41 @@ def slow_among(values, is_slow):
 
 
 DURATIONS = ROOT / "tests" / "durations.json"
-"""Seconds of each test file, as the last run with --time-files stored them."""
+"""Seconds of test functions with all their parameters, of those that take one or more, by --time-tests."""
+LONGEST = 3.0
+"""Seconds; a function that takes longer is marked slow."""
 SECONDS: Counter[str] = Counter()
 LAST = ("test_readme", "test_examples")
 """The documentation's two long files, one for each process: a limit of time leaves out a page before a property."""
 
 
+def stored_durations():
+    return json.loads(DURATIONS.read_text())
+
+
+def function_of(name):
+    return name.split("[")[0]
+
+
 def pytest_runtest_logreport(report):
-    SECONDS[report.location[0]] += report.duration
+    SECONDS[function_of(report.nodeid)] += report.duration
 
 
 def pytest_sessionfinish(session):
     """Stores the durations, in the process that has heard of all tests."""
-    if session.config.getoption("--time-files") and not hasattr(session.config, "workerinput"):
-        DURATIONS.write_text(json.dumps({file: round(SECONDS[file]) for file in sorted(SECONDS)}, indent=1) + "\n")
+    if session.config.getoption("--time-tests") and not hasattr(session.config, "workerinput"):
+        seconds = stored_durations() | SECONDS
+        kept = {name: round(seconds[name], 1) for name in sorted(seconds) if seconds[name] >= 1}
+        DURATIONS.write_text(json.dumps(kept, indent=1) + "\n")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """The files that take longest come first, so that no process ends with one of them alone."""
-    stored = json.loads(DURATIONS.read_text())
-    items.sort(key=lambda item: (item.path.stem in LAST, -stored.get(item.location[0], 0)))
+    """Marks what takes long; the longest files come first, so that no process ends with one of them alone."""
+    stored, files = stored_durations(), Counter()
+    for name, seconds in stored.items():
+        files[name.split("::")[0]] += seconds
+    for item in items:
+        if stored.get(function_of(item.nodeid), 0) > LONGEST:
+            item.add_marker("slow")
+    items.sort(key=lambda item: (item.path.stem in LAST, -files[item.location[0]]))

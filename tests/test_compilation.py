@@ -24,7 +24,6 @@ def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
         assert "XLA_FLAGS" not in os.environ and "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ
 
 
-@pytest.mark.slow
 def test_what_users_run_is_right_as_they_compile_it(pytestconfig):
     if pytestconfig.getoption("--optimised"):
         pytest.skip("with --optimised every test is compiled with default flags, not only these")

@@ -116,7 +116,6 @@ def test_every_command_of_a_block_is_known():
     assert all(any(tuple(words[: len(known)]) == known for known in NOT_RUN) for words in others)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("words", SCRIPTS[1:], ids=shlex.join)
 def test_a_command_of_a_block_runs(words, workplace):
     before = len(list(workplace.glob("*"))) + len(list((workplace / "runs").iterdir()))

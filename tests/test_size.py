@@ -103,7 +103,6 @@ command(sys.argv[0], sys.argv[0])
 BRIEF = ["--no-figures", "--no-uncertainty"]
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.version_info < (3, 12), reason="sys.monitoring is of Python 3.12")
 @pytest.mark.parametrize(
     ("name", "words"),

@@ -49,7 +49,6 @@ def lines_of(tmp_path):
         yield lines_of
 
 
-@pytest.mark.slow
 def test_a_second_run_finds_its_programs(lines_of, tmp_path):
     """Two first runs at once, and what is left of them by kills, do no harm."""
     lines_of((), ("--size", "4"))

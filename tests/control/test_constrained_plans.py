@@ -50,7 +50,6 @@ def at_most(soft=None):
     return shoot(TO_ONE._replace(states=lambda x: x[1:] - 0.6, soft=soft), np.zeros(2), *STILL)
 
 
-@pytest.mark.slow
 def test_limits_hard_and_soft_constraints_and_single_shooting_give_the_same_plan():
     limited = TO_ONE._replace(upper_x=np.array([np.inf, 0.6]))
     single = optimise(limited, np.zeros(2), STILL[1])
@@ -81,7 +80,6 @@ def test_active_constraints_are_met_and_their_pressures_close_the_lagrangian():
     assert_allclose(between, 0.0, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_a_soft_constraint_gives_way_where_its_price_is_low():
     """A mass that should not pass 0.5 m but is drawn to 1 m: w_1 + w_2 t is the marginal cost of the excess t."""
     drawn = BLOCK._replace(cost=lambda x, u: 1e-9 * u @ u, final_cost=lambda x: 10 * (x[0] - 1.0) ** 2)

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from dln_jax.control import (
     EnergyGains,
@@ -86,7 +85,6 @@ def laws():
     }
 
 
-@pytest.mark.slow
 def test_no_law_answers_where_its_state_is_not_finite_in_jax_or_c(tmp_path):
     # One coordinate after another, and two states that are sound.
     bad = np.tile([0.01, 0.02, 0.03, 0.04], (10, 1))

@@ -37,7 +37,6 @@ def improved(x, barrier=BARRIER):
     return jax.lax.fori_loop(0, 40, falling, first_plan(BLOCK, x, IDLE))
 
 
-@pytest.mark.slow
 def test_iterations_approach_the_optimum_as_the_barrier_falls():
     """The gap of a barrier method is at most μ times the number of constraints."""
     best = jax.jit(lambda: shoot(BLOCK, START, ALONG, IDLE))()
@@ -117,7 +116,6 @@ def test_a_far_obstacle_and_unequal_limits_leave_the_mass_at_its_goal():
     assert np.abs(x).max() < 1e-6 and int(plan.ending) == Ending.UNDECIDED
 
 
-@pytest.mark.slow
 def test_one_reading_that_is_not_finite_costs_one_command_in_c_too(tmp_path):
     problem = STEEP._replace(upper_x=np.array([np.inf, 0.6]))
     first = first_plan(problem, START / 2, np.zeros((4, 1)))
@@ -142,7 +140,6 @@ def test_one_reading_that_is_not_finite_costs_one_command_in_c_too(tmp_path):
         )
 
 
-@pytest.mark.slow
 def test_knots_move_a_reference_and_constraints_that_depend_on_time():
     """A gate that opens at 1 s: the mass waits before it, in plans of `shoot` and in real time alike."""
     t = DT * np.arange(N + 41)

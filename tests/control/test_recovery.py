@@ -73,7 +73,6 @@ def pushed():
     return checked
 
 
-@pytest.mark.slow
 def test_a_pendulum_that_a_push_throws_down_comes_up_again_within_the_limits(pushed):
     """Also with readings that are not finite, and told that its motor has 0.7 times its strength."""
     for start, settings in (

@@ -53,7 +53,6 @@ def test_a_linear_problem_takes_one_iteration_to_the_recursion():
     assert np.isnan(lost.plan.cost) and not lost.converged
 
 
-@pytest.mark.slow
 def test_limits_hold_and_the_rest_is_stationary():
     solve = jax.jit(lambda limit, x, u: optimise(LINEAR._replace(lower=-limit, upper=limit), x, u, tolerance=1e-9))
 
@@ -78,7 +77,6 @@ def test_limits_hold_and_the_rest_is_stationary():
     assert not lost.converged and "not finite" in reason(lost.ending)
 
 
-@pytest.mark.slow
 def test_swing_up_of_a_cart_pole_converges_quadratically_and_its_gains_are_derivatives_of_the_optimum():
     scene = cart_pole()
     steps = 50
@@ -106,7 +104,6 @@ def test_swing_up_of_a_cart_pole_converges_quadratically_and_its_gains_are_deriv
         assert float(ahead - behind) / 2e-3 == pytest.approx(float(gain), rel=1e-3)
 
 
-@pytest.mark.slow
 def test_implicit_steps_have_the_derivatives_of_finite_differences():
     scene = flexible_cart_pole(stiffness=2e5)  # an example of the documentation plans through it
     field = field_of(dynamics(scene.closed_form), np.asarray(scene.needs.actuation))

@@ -26,7 +26,6 @@ def with_potential(extra):
     return dynamics(LagrangianSystem(lambda q, qd: L(q, qd) - extra(q)))
 
 
-@pytest.mark.slow
 def test_dry_friction_holds_no_pole_down():
     model = model_of_plant(PLANT)
     settings = {"starts": 8, "seed": 5, "seconds": 3.0}

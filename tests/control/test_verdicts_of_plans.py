@@ -34,7 +34,6 @@ def test_a_mass_that_passes_the_wall_across_its_way_has_not_converged(soft):
         assert worst_violation(problem, solution.plan).startswith("constraint 0 on the states at knot")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("solve", ["shoot", "optimise"])
 def test_the_best_of_several_guesses_has_the_least_objective(solve):
     """A well of value 0 at -1, whose price is 5, beats no well of value 0.5 at 1, which costs nothing more."""
@@ -61,7 +60,6 @@ def hill(price):
     return TrajectoryProblem(lambda x, u: x + u, lambda x, u: price * u @ u, lambda x: jnp.sum((x**2 - 1) ** 2), -5, 5)
 
 
-@pytest.mark.slow
 def test_a_plan_leaves_the_top_of_a_hill_but_not_a_minimum():
     """At the price 2 n the second derivative along the hill vanishes, and the fourth does not."""
     solve = jax.jit(lambda price: shoot(hill(price), np.zeros(1), np.zeros((STEPS + 1, 1)), np.zeros((STEPS, 1))))
@@ -74,7 +72,6 @@ def test_a_plan_leaves_the_top_of_a_hill_but_not_a_minimum():
         assert solution.converged and np.abs(solution.plan.x).max() < 1e-6
 
 
-@pytest.mark.slow
 def test_redundant_controls_are_no_saddle():
     """Two motors move one mass, and nothing decides between them."""
     problem = TrajectoryProblem(lambda x, u: x + u[:1] + u[1:], lambda x, u: x @ x, lambda x: x @ x, -0.3, 0.3)
@@ -92,7 +89,6 @@ def ridden(x, u):
     return x + DT * jnp.stack([u[0] * jnp.cos(heading), u[0] * jnp.sin(heading), u[1]])
 
 
-@pytest.mark.slow
 def test_a_goal_within_reach_is_reached_and_one_beyond_is_infeasible_by_the_rest_of_the_way():
     """A unicycle at rest cannot move sideways: to first order it cannot reach the second place."""
     problem = TrajectoryProblem(ridden, lambda x, u: DT * u @ u, FREE, -MOST, MOST)

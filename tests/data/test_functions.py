@@ -148,7 +148,6 @@ def test_errors_are_sums_over_components_and_ensembles_average():
     assert_allclose(typical_spread(together.spread, first) ** 2, np.mean(together.spread.y[:5] ** 2))
 
 
-@pytest.mark.slow
 def test_members_of_an_ensemble_train_as_if_alone():
     """Adam on the sum of losses moves each member as it would move by itself, on the same batches."""
     sets = functions.split(functions.sine(samples=200))

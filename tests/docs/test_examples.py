@@ -54,7 +54,6 @@ def first_and_last(*arguments, frames, **options):
     write_gif(*arguments, frames=[frames[0], frames[-1]], **options)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_and_its_assertions_hold(path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -187,7 +187,6 @@ def sprung(stiffness):
     return data._replace(tau=data.tau + np.stack([0 * torque, torque], axis=1))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [4.0, 0.0])
 def test_a_network_is_added_only_where_it_helps(stiffness):
     train, validation, test = (select(sprung(stiffness), which) for which in ([0, 1, 2], [3, 4], [5]))

@@ -67,7 +67,6 @@ def log_of(extra, seed=0, noise=NOISE):
     return from_arrays({"t": t, "trajectory": np.zeros(SAMPLES, int), **state})
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ["stribeck", "load"])
 def test_shapes_and_coefficients_are_found_within_their_errors(case):
     true = {name: value for name, value in SHAPES[case].items() if name != "friction"}
@@ -106,7 +105,6 @@ def test_cooling_and_coupling_are_found_within_their_errors():
     assert abs(found - 0.03) < 3.5 * error < 0.01
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("extra", ["nothing", "load"])
 def test_cross_validation_keeps_the_terms_of_the_plant_and_no_other(extra):
     _, tried = choose_terms(ARM, log_of(extra, 1), TERMS, list(CANDIDATES.items()))

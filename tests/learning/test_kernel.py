@@ -30,7 +30,6 @@ def arm():
     return select(data, np.arange(60)), select(data, np.arange(60, 140))
 
 
-@pytest.mark.slow
 def test_torques_and_friction_are_found_where_the_basis_is_exact(arm):
     train, test = arm
     fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-6)

@@ -68,7 +68,6 @@ def statistics(task, parameters):
     return measured, -inverse @ every.T @ r, np.sqrt(np.diagonal(inverse))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("driven", [False, True])
 def test_the_optimum_is_the_truth_as_well_as_noise_allows(driven):
     """From motions without torques only up to a common factor, which the gauge sets."""

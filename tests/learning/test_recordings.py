@@ -35,7 +35,6 @@ def prepared(recording):
     return prepare(recording)
 
 
-@pytest.mark.slow
 def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
     assert prepared.delay == PLANT.hardware.delay
     assert len(np.unique(prepared.train.trajectory)) == 5 and len(np.unique(prepared.validation.trajectory)) == 1
@@ -51,7 +50,6 @@ def test_identified_inertias_and_friction_are_the_plant_s(prepared):
     np.testing.assert_allclose(found.friction(q, qd), TRUTH.friction(q, qd), rtol=0.3)
 
 
-@pytest.mark.slow
 def test_the_inertias_of_an_arm_that_does_not_move_in_a_plane_take_the_higher_degree(prepared):
     found = identified_chain(prepared, PLANT.scene.needs)
     assert found.description["degree"] == [0, 2]

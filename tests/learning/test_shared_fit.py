@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from calls import json_of
 from sharing import run_on_all
 
@@ -11,7 +10,6 @@ ROUNDING = 1e-12
 """After a few iterations: sums differ in the last digits alone, and later ones amplify that."""
 
 
-@pytest.mark.slow
 def test_results_are_those_of_one_device(tmp_path):
     """Trainings, whole and continued by other devices than began them; also by clocks that differ."""
     run_on_all(Path(__file__).parent / "shared_trainings.py", tmp_path)

@@ -5,7 +5,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from calls import one_line
 
 from dln_jax.learning.soft_body_identification import ObservedMotions, design, identify
@@ -39,7 +38,6 @@ def slider():
     return make_scene(MESH, terms, masses=20.0)
 
 
-@pytest.mark.slow
 def test_material_friction_and_muscle_are_recovered_from_a_motion():
     scene = slider()
     stepper = make_step(scene, 0.02, tolerance=1e-9, linear_solver=dense, friction_iterations=0)
@@ -66,7 +64,6 @@ def test_material_friction_and_muscle_are_recovered_from_a_motion():
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5), scaled(result.parameters), TRUTH)
 
 
-@pytest.mark.slow
 def test_a_rest_shape_is_found_that_hangs_as_wanted():
     scene = make_scene(MESH, (elastic(MESH, stable_neo_hookean, youngs_modulus=2e5), gravity(MESH)), held=[0, 2])
     wanted = jnp.asarray(MESH.vertices)

@@ -143,7 +143,6 @@ def test_a_slope_is_a_direction_of_gravity_and_flat_worlds_hold_nothing(task):
     assert beginning(task).world == (None, None, None, None)
 
 
-@pytest.mark.slow
 def test_gradients_increase_the_distance_and_the_same_seed_gives_the_same(compiled):
     first = learn(compiled, seed=0, goal=Goal(20 * compiled.learner.steps))
     assert first.distance > max(0.005, 2 * first.records[0].distance)

@@ -11,7 +11,6 @@ from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.types import Needs
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("serial", [True, False])
 def test_covariance_is_that_of_the_energies(serial):
     """Torques of random weights at the model's samples, through the covariance and through the energies."""

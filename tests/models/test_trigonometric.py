@@ -132,7 +132,6 @@ def test_rank_condition_and_the_shortest_solution():
     np.testing.assert_allclose(shrunk.x, np.array([3.0, -2.0, 1.0]) / 1.5, rtol=1e-13)
 
 
-@pytest.mark.slow
 def test_validation_gives_each_joint_the_degree_that_it_needs():
     """A pendulum on an arm that turns about the vertical: sin² has degree 2, and nothing depends on the yaw."""
     scene = desktop_plant("rotary-pendulum").scene

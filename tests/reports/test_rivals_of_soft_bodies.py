@@ -23,7 +23,6 @@ MESH = box((0.4, 0.2, 0.2), (2, 1, 1))
 
 
 @pytest.mark.parametrize("law", [NEO_HOOKEAN, KIRCHHOFF])
-@pytest.mark.slow
 def test_explicit_reference_agrees_with_implicit_midpoint_steps(law):
     body = Body(MESH, vertices_where(MESH, lambda x: x[:, 0] == 0), 1e5, np.array([0.1, 0.2]), law=law)
     reference = reference_motion(body, 4e-4)

@@ -169,7 +169,6 @@ def assert_same_result(started, alone, devices=1):
     assert (ours["done"], ours["devices"], theirs["devices"]) == (8, devices, 1)
 
 
-@pytest.mark.slow
 def test_two_processes_give_what_one_gives_and_the_first_alone_prints(trained_more):
     assert_same_result(trained_more["slurm"], trained_more["alone"], devices=4)
     first, second = trained_more["slurm"].out
@@ -210,7 +209,6 @@ def test_a_lost_process_ends_the_other_and_the_run_continues_in_one_process_or_w
         assert_same_result(result, trained_more["alone"], devices=len(processes))
 
 
-@pytest.mark.slow
 def test_processes_that_cannot_be_one_program_end_with_one_line_each(run_tiny):
     hurried = {"JOINING": "5"}
     with socket.socket() as taken:

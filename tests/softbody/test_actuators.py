@@ -109,7 +109,6 @@ def test_pressure_under_a_cap_lifts_with_its_area_and_pulls_at_the_rim_of_the_op
     assert f[mesh.vertices[:, 2] < 1e-9, 2].sum() == pytest.approx(-100.0)
 
 
-@pytest.mark.slow
 def test_a_thick_walled_cylinder_widens_as_lame_says():
     p, around, across = 1e-4 * E, 24, 2
     mesh = quadratic(ring(0.5, 1.0, around, across))
@@ -223,7 +222,6 @@ CONTROL = {
 }
 
 
-@pytest.mark.slow
 def test_derivatives_by_all_controls_and_parameters_are_those_of_finite_differences():
     _, scene = actuated()
     init, step = make_step(scene, 0.02, tolerance=1e-10)

@@ -123,7 +123,6 @@ def clamped_error(cells, nu, kind, dimension=2):
     return norm(np.einsum("qk,mkd->mqd", N, u[mesh.nodes]) - truth) / norm(truth)
 
 
-@pytest.mark.slow
 def test_a_clamped_incompressible_square_locks_linear_elements_only_and_converges_with_order_3():
     errors = {kind: clamped_error(12, 0.4999, kind) for kind in ("linear", "quadratic", "mixed", SPLIT)}
     assert errors["linear"] > 0.9 and errors["quadratic"] < 0.05
@@ -132,7 +131,6 @@ def test_a_clamped_incompressible_square_locks_linear_elements_only_and_converge
     assert np.log2(clamped_error(6, 0.4999, SPLIT) / errors[SPLIT]) == pytest.approx(3.0, abs=0.3)
 
 
-@pytest.mark.slow
 def test_mixed_tetrahedra_do_not_lock():
     """A clamped cube, where no theorem says so; errors with nu = 0.3 for comparison."""
     assert clamped_error(5, 0.4999, "quadratic", dimension=3) > 0.5

@@ -70,7 +70,6 @@ def thousand_steps(integrator):
     return run
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "noise", "turned"), [(5.0, 2.0, 1e-2), (10.0, 0.0, 3e-3)])
 def test_a_spinning_disc_keeps_its_energy(rate, noise, turned):
     energy, turning, info = thousand_steps(AVERAGE_VECTOR_FIELD)(spinning(rate, noise))
@@ -82,7 +81,6 @@ def test_a_spinning_disc_keeps_its_energy(rate, noise, turned):
     assert np.ptp(turning) > 1e-6 * turning[0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rate", [2.0, 5.0])
 def test_slow_growth_of_the_midpoint_rule_is_divergence(rate):
     """At 5 rad/s no step creates 10 % of the energy at hand, and 1,000 steps create 60 % of the energy."""
@@ -105,7 +103,6 @@ def test_backward_euler_dissipates_energy_and_rotation():
     assert np.diff(energy).max() < 1e-9 * energy[0] and np.diff(turning).max() < 1e-9 * turning[0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [AVERAGE_VECTOR_FIELD, MIDPOINT, BDF2, BACKWARD_EULER])
 def test_order(integrator):
     """Against steps of an eighth of the length, from a rotation that also stretches."""
@@ -137,7 +134,6 @@ def impact(integrator, halvings, **options):
     return run
 
 
-@pytest.mark.slow
 def test_a_step_that_fails_is_taken_in_parts_and_has_its_derivatives():
     """The midpoint rule creates energy in the first step of 20 ms, and little in steps of 2.5 ms."""
     _, whole = jax.jit(impact(MIDPOINT, 0))(4.0)
@@ -156,7 +152,6 @@ def test_a_step_that_fails_is_taken_in_parts_and_has_its_derivatives():
     np.testing.assert_allclose(tangent, (ahead - behind) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_halvings_change_no_step_that_converges_and_report_one_that_fails_in_every_part():
     (plain, info), (halved, info_halved) = (jax.jit(impact(BACKWARD_EULER, halvings))(0.5) for halvings in (0, 3))
     assert info.converged.all() and (info_halved.substeps == 1).all()
@@ -184,7 +179,6 @@ def damped():
     return scene, np.sqrt(squared[3]), shapes[:, 3].reshape(-1, 2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [AVERAGE_VECTOR_FIELD, MIDPOINT], ids=["average", "midpoint"])
 def test_a_vibration_decays_at_its_rayleigh_rate(integrator):
     scene, frequency, shape = damped()
@@ -221,7 +215,6 @@ def test_damping_stores_no_energy():
     assert float(stored) == pytest.approx(float(without))
 
 
-@pytest.mark.slow
 def test_point_masses_rebound_with_the_restitution_they_were_given():
     mesh = Mesh(np.array([[0.0, 0.01], [1.0, 0.01]]), np.zeros((0, 3), int))
     ground = plane_contact([0, 1], normal=(0, 1), stiffness=1e4, width=1e-3, damping=1.0)

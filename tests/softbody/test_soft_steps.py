@@ -97,7 +97,6 @@ def test_segments_change_the_memory_and_not_the_motion_or_its_gradient():
     np.testing.assert_allclose([again, *seen_again], [slope, *seen], rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_single_precision_follows_double():
     scene = held_body()
     init, run = rolled_out(scene, 4)

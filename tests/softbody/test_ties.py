@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from calls import one_line
 from impact_derivatives import require_gradient_of_differences
 
@@ -62,7 +61,6 @@ def rigid_angle(seconds):
     return q
 
 
-@pytest.mark.slow
 def test_stiff_finger_moves_like_a_rigid_payload_with_second_order():
     exact, errors = rigid_angle(0.5), []
     for steps in (50, 100):
@@ -72,7 +70,6 @@ def test_stiff_finger_moves_like_a_rigid_payload_with_second_order():
     assert errors[1] < 2e-3 and 3.0 < errors[0] / errors[1] < 5.5, errors
 
 
-@pytest.mark.slow
 def test_derivative_of_the_swing_equals_differences():
     motion = swing(1e-2, 5)
 

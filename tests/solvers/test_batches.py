@@ -151,7 +151,6 @@ def sag(stiffness, length, way):
 CHAINS = (jnp.array([30.0, 50.0, 3.0, 40.0]), jnp.array([0.08, 0.12, 0.09, 0.085]))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("way", [dense, block_tridiagonal, sparse])
 def test_minima_and_their_derivatives_in_batches(way):
     every = jax.value_and_grad(lambda *chain: sag(*chain, way), (0, 1))

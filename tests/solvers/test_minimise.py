@@ -84,7 +84,6 @@ def test_factors_that_would_fill_the_memory_are_not_stored(monkeypatch):
     assert least_work(energies, at) is matrix_free
 
 
-@pytest.mark.slow
 def test_every_linear_solver_finds_the_minimum_of_an_independent_optimiser():
     def energy(unknowns):
         x = START.copy()
@@ -113,7 +112,6 @@ def test_derivatives_are_those_of_the_minimum():
         np.testing.assert_allclose(jax.jit(mode(sag))(ARGUMENTS), differences, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_second_derivatives_nest():
     curvature, slope = jax.jit(jax.hessian(sag))(ARGUMENTS), jax.jit(jax.grad(sag))
     e = 1e-5 * np.eye(4)[1]

@@ -54,7 +54,6 @@ def slid(workplace, drift):
     return metrics_of(workplace / f"slide{drift}")
 
 
-@pytest.mark.slow
 def test_weight_of_a_slide_is_its_gravity_and_no_offset_of_friction(workplace, capsys):
     metrics = slid(workplace, 0.0)
     assert max(metrics[part] for part in PARTS) < 1e-18 and metrics["gravity_determined"] == 1
@@ -67,7 +66,6 @@ def test_dry_friction_of_a_slide_that_moves_one_way_is_known_only_with_its_weigh
     assert "gravity and friction of joints [1] are known only in sum" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_friction_beside_the_potential_of_a_network_has_no_offset(workplace):
     weightless = json.dumps({"joints": ["revolute"] * 2, "gravity": False, "joint_friction": USUAL})
     for needs, laws in ((None, ("viscous", "coulomb")), (weightless, USUAL)):
@@ -109,7 +107,6 @@ def test_terms_of_a_lagrangian_linear_in_the_rates_take_no_power():
         np.testing.assert_allclose(force @ qd, 0, atol=1e-14)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("model", ["auto", "structured-delan", "black-box-delan"])
 def test_letters_come_apart_for_every_model(workplace, model):
     """The published two-link arm, of which only the total torque is fitted."""

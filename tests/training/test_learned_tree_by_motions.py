@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 from motions import sums_of_sines
 
 from dln_jax import Needs, describe, dynamics
@@ -33,7 +32,6 @@ def motion(seed):
     return from_arrays({**columns, "trajectory": np.zeros(81, int)})
 
 
-@pytest.mark.slow
 def test_motions_mend_the_bodies_of_a_tree_and_the_line_says_so():
     wrong = TRUE._replace(inertias=1.2 * TRUE.inertias, coulomb=0.5 * TRUE.coulomb)
     mended = refined_by_motions(NEEDS, DESCRIPTION, Split(*map(motion, range(3))), wrong, window=0.3)

@@ -78,7 +78,6 @@ def test_what_is_damaged_or_does_not_fit_is_refused(folder, tmp_path_factory):
         load(folder)
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH")
 def test_c_is_equal(folder, tmp_path):
     for precision, dtype, tolerance, undetermined in (("f64", float, 1e-11, 0), ("f32", np.float32, 1e-4, 3)):

@@ -34,7 +34,6 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.slow
 def test_a_bag_is_examined_beside_the_robot(place, capsys):
     exit_status(check_data, LOG, "--no-figures --out check")  # these motions are not the robot's
     said = capsys.readouterr().out

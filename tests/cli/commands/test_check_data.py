@@ -45,7 +45,6 @@ def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log):
     assert {each.name for each in Path("check").iterdir()} >= {"findings.json", "metrics.json", "log.png"}
 
 
-@pytest.mark.slow
 def test_missing_rates_of_a_noisy_log_come_from_filtered_q_unless_the_user_declines(log, capsys):
     errors = {}
     for name, *option in (("default",), ("raw", "--cutoff inf")):

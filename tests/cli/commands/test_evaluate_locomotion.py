@@ -65,7 +65,6 @@ def test_a_policy_of_another_shape_is_not_trained_further(run, capsys, tmp_path)
     assert_refused(capsys, train_locomotion, rows.items(), "--stored", run, out=tmp_path / "out")
 
 
-@pytest.mark.slow
 def test_the_command_writes_numbers_and_says_its_verdict(run, tmp_path, capsys):
     command(evaluate_locomotion, "--run", run, "--slope 2 --starts 4 --steps 20 --out", tmp_path / "out")
     assert "verdict: " in capsys.readouterr().out

@@ -39,7 +39,6 @@ def changed(folder, old="", new=""):
 QUICK = "--harmonics 3 --seconds 6 --trajectories 1 --starts 1"
 
 
-@pytest.mark.slow
 def test_a_folder_with_motions(arm, tmp_path, capsys):
     out = tmp_path / "run"
     options = "--payload 0.5 --payload-position 0.1,0,0 --height -0.2 --allow-unlimited elbow --rate 50"

@@ -68,7 +68,6 @@ OWN = "--task measured --data positions.npz --no-low-latency"
 SLIDING = ("--needs", '{"joints": ["prismatic"]}')
 
 
-@pytest.mark.slow
 def test_own_positions_train_and_resume_to_the_same_model(positions, capsys, monkeypatch):
     """A recipe's time is that of the table: it does not end the fit."""
     slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}
@@ -118,7 +117,6 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
     assert_refused(capsys, train_hnn_task, rows.items(), OWN, *SLIDING, out=positions / "none")
 
 
-@pytest.mark.slow
 def test_out_of_time_the_fit_of_rates_is_the_result(positions, capsys):
     """In a folder like any other."""
     options = "--optimizer adam --steps 2 --no-figures --seconds 1e-6 --out hurried"

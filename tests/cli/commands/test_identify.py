@@ -36,7 +36,6 @@ def identified(workplace):
     return workplace / "run"
 
 
-@pytest.mark.slow
 def test_sound_log_gives_a_good_run_folder_like_every_other(identified):
     assert {path.name for path in identified.iterdir()} == {
         *(".lock", "config.json", "metrics.json", "model.json", "model.safetensors", "parameters.json", "report.txt"),
@@ -74,7 +73,6 @@ def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys)
     assert not list((workplace / "free").glob("*.urdf")) and load("free").dynamics is not None
 
 
-@pytest.mark.slow
 def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys):
     log = dict(np.load("log.npz"))
     for name, factor, words in (("turned", -1, ""), ("milli", 1000, "times the tree's; check the unit of tau")):

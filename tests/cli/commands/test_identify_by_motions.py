@@ -44,7 +44,6 @@ def moved(system, seconds, **options):
     return t, tau, np.asarray(states)
 
 
-@pytest.mark.slow
 def test_the_slope_of_windows_is_that_of_finite_differences(place):
     """Where all samples are noise-free, residuals vanish, so that Kaufman's derivative is exact."""
     model = make_rigid_tree(read_robot("rod.urdf").tree, friction=("viscous",))
@@ -70,7 +69,6 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
         fit_motions(model, columns_of(known), stiff, stiff, windows, noise_tau=scales[1])
 
 
-@pytest.mark.slow
 def test_motions_identify_the_pendulum_and_predict_longer(place, capsys):
     log = "--robot rod.urdf --data log.npz --cutoff 4 --friction viscous --test last:25% --no-figures --no-uncertainty"
     numbers = {}

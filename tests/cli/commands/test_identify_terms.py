@@ -45,7 +45,6 @@ def place(folder):
     return folder
 
 
-@pytest.mark.slow
 def test_all_terms_are_identified_and_written(place, capsys):
     terms = "--friction viscous,coulomb,load --temperature --motors 1,0;1,1"
     command(identify, "--robot arm.xml --data log.npz --out run --no-figures", terms)

@@ -166,7 +166,6 @@ def test_a_run_is_resumed_where_its_data_have_moved(here, monkeypatch, data):
 # processes
 
 
-@pytest.mark.slow
 def test_sigterm_ends_a_training_with_a_checkpoint_and_the_command_that_continues_it(here):
     options = "--samples 2000 --epochs 300 --width 8 --optimizer adam --no-figures --out run"
     line = [sys.executable, "-m", "scripts.train_diffnet", *options.split()]

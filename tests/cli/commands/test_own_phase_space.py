@@ -69,7 +69,6 @@ def test_a_file_without_rates_of_momenta_is_no_mass_of_one(files):
     assert "pd" in problem.fitted.estimated and np.isinf(problem.trust.weights.rate[1])
 
 
-@pytest.mark.slow
 def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
     """Nothing is stated: order, bodies and model are found, and rates of other starts are exact."""
     command(train_hnn_task, TASK, "orbits.npz", "--out orbits --steps 25")
@@ -94,7 +93,6 @@ def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
     assert description_of(problem, "pairwise-hnn", order="bodies")["order"] == "bodies"
 
 
-@pytest.mark.slow
 def test_a_model_whose_motions_explode_is_refused(files, capsys):
     """The file's forces point away from rest: its rates are fitted exactly, and every predicted motion grows."""
     arrays = published_arrays("spring", 11, trajectories=8)

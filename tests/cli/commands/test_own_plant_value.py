@@ -41,7 +41,6 @@ def brief(monkeypatch):
     monkeypatch.setattr("dln_jax.control.optimal.own_plants.Iteration", lambda **sizes: Iteration(**sizes | short))
 
 
-@pytest.mark.slow
 def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, capsys, rod, brief, monkeypatch):
     arguments = ("--plant", rod, TINY, "--robust 0.1")
     command(train_value, *arguments, "--out", tmp_path / "whole")
@@ -125,7 +124,6 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
     assert_refused(capsys, train_value, rows.items(), out=tmp_path / "run")
 
 
-@pytest.mark.slow
 def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
     known = of_file(rod, Wishes())
     save(tmp_path, known.own.description, known.own.parameters)

@@ -209,7 +209,6 @@ def test_films_are_judged_by_the_motion_in_them(data):
         assert pixel_task.judge_frames(frame_metrics.FrameMotions(latent, film), data).level == level
 
 
-@pytest.mark.slow
 def test_a_run_is_judged_resumes_and_loads(tmp_path, monkeypatch, capsys):
     for name in ("FRAMES", "TRAJECTORIES"):
         monkeypatch.setattr(pixel_task, name, 13)

@@ -37,7 +37,6 @@ def played(example, dt, steps):
     return np.asarray(x), np.asarray(v)
 
 
-@pytest.mark.slow
 def test_the_beam_falls_and_its_energies_add_up():
     example = beam(cells=1)
     scene = example.scene
@@ -56,7 +55,6 @@ def test_the_beam_falls_and_its_energies_add_up():
     assert (np.diff(energies["total"]) < 0).all()  # What the implicit step damps.
 
 
-@pytest.mark.slow
 def test_the_disc_bounces_and_hardly_sinks_in():
     example = drop(cells=2)
     x, v = played(example, 0.01, 75)
@@ -88,7 +86,6 @@ def test_steps_that_went_wrong_are_not_silent(capsys):
         assert len(re.findall("did not converge|diverged|inside out|overlap", said)) == bool(changes), changes
 
 
-@pytest.mark.slow
 def test_the_script_takes_a_mesh_of_ones_own(tmp_path, capsys):
     mesh = beam_mesh(2.0, 1.0, 2, 1)
     # Clockwise, and one more triangle on an edge that two share already.
@@ -176,7 +173,6 @@ def test_commands_factorise_on_one_thread_unless_told(monkeypatch):
         monkeypatch.delenv("OPENBLAS_NUM_THREADS")
 
 
-@pytest.mark.slow
 def test_blocks_that_fall_on_each_other_stay_apart(tmp_path):
     """One block above another, 0.15 m apart."""
     block = beam_mesh(1.0, 0.3, 4, 2)

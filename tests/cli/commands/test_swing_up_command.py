@@ -20,7 +20,6 @@ from dln_jax.training.swing_ups.any_plant import Learned
 MOTOR = "--actuated elbow --control 5"
 
 
-@pytest.mark.slow
 def test_a_run_stores_data_numbers_and_pictures(tmp_path, monkeypatch):
     # A known model needs no exploration by the laws of learned ones, which take a minute to compile.
     monkeypatch.setattr("dln_jax.training.swing_ups.learned.Exploration", partial(Exploration, surplus=()))

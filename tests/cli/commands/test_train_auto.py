@@ -39,7 +39,6 @@ def of_robot():
     return arguments_of(train_delan.Arguments, model="auto", **options)
 
 
-@pytest.mark.slow
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
     typed = of_robot()
     task, training = selection.fit(prepare(typed), typed, workplace, None)

@@ -43,7 +43,6 @@ def trained(folder):
     return folder / "runs/train_delan-1"
 
 
-@pytest.mark.slow
 def test_a_run_writes_all_its_files(trained):
     names = {path.name for path in trained.iterdir()}
     (checkpoint,) = names - FILES
@@ -56,7 +55,6 @@ def test_a_run_writes_all_its_files(trained):
     assert config["width"] == 4 and "out" not in config
 
 
-@pytest.mark.slow
 def test_a_finished_run_is_never_overwritten_and_resumes_to_itself(trained, folder, capsys):
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in (
@@ -71,7 +69,6 @@ def test_a_finished_run_is_never_overwritten_and_resumes_to_itself(trained, fold
     assert (trained / "model.safetensors").read_bytes() == before[trained / "model.safetensors"]
 
 
-@pytest.mark.slow
 def test_a_killed_run_resumes_to_the_same_parameters(folder):
     """SIGKILL after the first checkpoint, then --resume: the model equals an unbroken run's to the last bit."""
     settings = f"--optimizer adam --steps 1200 --width 8 --depth 1 --batch 32 {BRIEF} --scene pendulum"
@@ -90,14 +87,12 @@ def test_a_killed_run_resumes_to_the_same_parameters(folder):
     assert one == other
 
 
-@pytest.mark.slow
 def test_a_loss_that_explodes_keeps_the_last_good_model(folder, capsys):
     line = refused(capsys, train_delan, TINY, "--scene pendulum --learning-rate 1e19", BRIEF, "--out exploded")
     assert re.search(r"after step \d+", line) and "lower --learning-rate" in line
     assert np.isfinite(load("exploded").dynamics.inverse_dynamics(*np.ones((3, 1)))).all()
 
 
-@pytest.mark.slow
 def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(folder, capsys):
     options = f"--optimizer adam --width 3 --depth 1 {BRIEF} --scene pendulum --steps 400 --seconds 1e-6"
     command(train_delan, options, "--out late")
@@ -168,7 +163,6 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(folder, capsys):
     assert_refused(capsys, train_delan, MISTAKES.items(), "--data", path, out=out)
 
 
-@pytest.mark.slow
 def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(folder, capsys):
     """One CSV file without t, trajectory and needs: two coupled joints with viscous and dry friction."""
     log = motions(0, samples=601)

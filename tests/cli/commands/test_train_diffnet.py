@@ -78,7 +78,6 @@ def test_verdict_counts_every_component_of_what_was_fitted():
     assert verdict.level == "refused" and "the gradient of component 4 is predicted no better" in verdict.reason
 
 
-@pytest.mark.slow
 def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch):
     coarse = partial(functions.cosine_sine_grid, points=9)
     monkeypatch.setitem(function_task.NAMED, "cos_sin", (functions.cosine_sine, coarse))
@@ -90,7 +89,6 @@ def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(w
     assert load("run").derivatives(np.zeros(2)).value.dtype == jnp.float32
 
 
-@pytest.mark.slow
 def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(workplace):
     data = own_file("mine.npz")
     command(train_diffnet, "--function mine.npz --activation tanh --width 6 --depth 1 --steps 30 --out run")

@@ -35,7 +35,6 @@ def metrics_of(folder):
     return json_of(folder / "metrics.json")
 
 
-@pytest.mark.slow
 def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
     options = "--data swing.npz --model learned-tree --no-figures --no-low-latency"
     command(train_delan, options, "--out tree")
@@ -44,7 +43,6 @@ def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
     assert load(workplace / "tree").description["name"] == "learned-tree"
 
 
-@pytest.mark.slow
 def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workplace, capsys):
     options = "--data swing.npz --model trigonometric-kernel --no-figures --no-low-latency"
     command(train_delan, options, "--samples 40 --out kernel")
@@ -71,7 +69,6 @@ def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, 
     np.testing.assert_allclose(tau, [2.0 + 9.81 * np.sin(0.5) + 0.2], rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_their_spread(workplace, capsys):
     command(train_delan, QUICK, "--seeds 2 --out seeds")
     metrics = metrics_of(workplace / "seeds")
@@ -84,7 +81,6 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
     assert suited(np.zeros(10_000), 100, 1)[0] is Adam
 
 
-@pytest.mark.slow
 def test_black_box_models_report_their_mass_matrix(workplace, capsys):
     brief = (QUICK, "--model")
     command(train_delan, *brief, "black-box-delan", "--out black-box")
@@ -94,7 +90,6 @@ def test_black_box_models_report_their_mass_matrix(workplace, capsys):
     assert isinstance(load(workplace / "feed-forward").dynamics, PlainDynamics)
 
 
-@pytest.mark.slow
 def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
     command(train_hnn, QUICK, "--out hamiltonian")
     assert "structured-hnn" in capsys.readouterr().out
@@ -103,7 +98,6 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
     assert "no momenta p in the data" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys, monkeypatch):
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2,))
     monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
@@ -115,7 +109,6 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]
 
 
-@pytest.mark.slow
 def test_a_table_has_the_plant_beside_the_model(workplace, capsys):
     data = generators.free_swing(pendulum(), trajectories=7, steps=40)
     torque = np.random.default_rng(0).normal(size=data.tau.shape)

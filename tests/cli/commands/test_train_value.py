@@ -11,7 +11,6 @@ from dln_jax.training.values import load_value
 TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 
 
-@pytest.mark.slow
 def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, TINY, "--goal 0.2 --out", tmp_path / "run")
     numbers = json_of(tmp_path / "run/metrics.json")

@@ -264,7 +264,6 @@ def kill_as_it_begins(job):
     os.kill(int(processes.split()[0]), signal.SIGKILL)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("where", "package"), [("here", "dln_jax"), ("ray", "ray")])
 def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
     """One is done, one fails, and one is killed by a signal."""

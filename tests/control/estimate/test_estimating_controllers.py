@@ -50,7 +50,6 @@ def measurements(samples=60):
     return jnp.asarray(slow + np.array([0.0, np.pi]))
 
 
-@pytest.mark.slow
 def test_late_and_rare_measurements_give_the_estimates_of_a_filter_that_knows_their_times():
     y = measurements()
     direct = jax.jit(lambda seen: filtered(extended(PROCESS), PRIOR, y, jnp.zeros((len(y), 1)), seen)[0])
@@ -91,7 +90,6 @@ def test_a_law_behind_a_delay_acts_on_the_state_in_which_its_control_takes_effec
     assert np.abs(errors).max() < 2e-3
 
 
-@pytest.mark.slow
 def test_filters_use_the_times_of_samples_and_of_controls():
     """Controls act 1.3 nominal steps after their samples, which are up to half a step late; so late is one channel."""
     random = np.random.default_rng(2)

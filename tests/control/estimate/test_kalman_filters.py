@@ -81,7 +81,6 @@ def test_the_covariance_stays_positive_with_encoders_a_million_times_better_than
         assert np.linalg.eigvalsh(memory.covariance).min() > -1e-16
 
 
-@pytest.mark.slow
 def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
     """Along 60 motions near hanging with random torques, from draws of the belief."""
     scene = cart_pole()

@@ -31,7 +31,6 @@ LINE = ControlProblem(
 NETWORK = value_network(PENDULUM, widths=(8,), scale=10.0)
 
 
-@pytest.mark.slow
 def test_targets_are_weighted_returns_and_their_slopes():
     parameters = NETWORK.init(jax.random.key(0))
     value = lambda x: NETWORK.value_and_gradient(parameters, x)  # noqa: E731
@@ -63,7 +62,6 @@ def test_targets_are_weighted_returns_and_their_slopes():
     assert_allclose(found(0.05).x[0], x)
 
 
-@pytest.mark.slow
 def test_values_of_a_line_and_of_the_worst_of_lines_are_those_of_the_regulator():
     """dx/dt = p x + u with p off by a share: the worst is always the larger p."""
     numbers = Iteration(iterations=25, starts=64, seconds=0.5, dt=0.025, steps=40, batch=64, kept=2, learning_rate=0.05)
@@ -77,7 +75,6 @@ def test_values_of_a_line_and_of_the_worst_of_lines_are_those_of_the_regulator()
         assert found.history[-1].validation <= 1.01 * min(at.validation for at in found.history)
 
 
-@pytest.mark.slow
 def test_seeds_are_what_each_is_alone_also_after_an_interruption():
     network = value_network(LINE, widths=())
     numbers = Iteration(iterations=3, starts=8, seconds=0.1, steps=2, batch=8, kept=2)

@@ -29,7 +29,6 @@ LINEAR = ControlProblem(
 )
 
 
-@pytest.mark.slow
 def test_the_value_of_a_linear_plant():
     S = lqr(A - 0.15 * np.eye(2), B, np.eye(2), np.eye(1)).S
     corners = {"low": [-2, -2], "high": [2, 2], "limit": 8.0}

@@ -28,7 +28,6 @@ def test_continuation_comes_to_the_cost_to_go_and_not_to_the_other_solution():
         assert fit.parameters == pytest.approx((1 + sign * np.sqrt(2)) / 2, rel=1e-12)
 
 
-@pytest.mark.slow
 def test_a_network_has_the_value_of_limited_controls():
     limit, weight = 5.5, 2 * 5.5 / np.pi
     problem = LINE._replace(action_cost=limited_atan(limit, weight))

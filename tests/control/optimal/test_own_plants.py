@@ -62,7 +62,6 @@ def test_rod_has_the_scales_of_its_closed_form():
     assert of_rod(control=1e4).scale == pytest.approx(np.sqrt(3e4 / np.pi))
 
 
-@pytest.mark.slow
 def test_barriers_rise_at_the_ends_of_the_rail():
     numbers = own_problem(dynamics(POLE.closed_form), RAIL)
     problem = own_plant(dynamics(POLE.closed_form), numbers).problem

@@ -21,7 +21,6 @@ WEAK = """<mujoco><option timestep=".01" integrator="RK4"/><default><joint axis=
 """An acrobot whose motor lifts a fifth of the weight of its link."""
 
 
-@pytest.mark.slow
 def test_noise_does_not_shrink_the_inertias_of_a_plant_with_a_weak_motor():
     """An equation without a motor holds for zero parameters, too."""
     plant = mujoco_plant(WEAK, hardware=Hardware(encoder_step=2 * np.pi / 4096, delay=1))

@@ -51,7 +51,6 @@ def test_scales_of_a_cart_pole_have_closed_forms():
         scaled(plant._replace(goal=plant.hanging, hanging=plant.goal))
 
 
-@pytest.mark.slow
 def test_similar_plants_get_the_same_law_in_their_own_units():
     """Masses and forces 3 times as large leave accelerations, and the regulator's feedback grows as the force."""
     large = rail(24.0)
@@ -74,7 +73,6 @@ def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_li
     assert 0.97 * 8.0 < asked <= 8.0 + 1e-9
 
 
-@pytest.mark.slow
 def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
     plant = rail()
     lab = Hardware(encoder_step=1e-4, delay=1)
@@ -86,7 +84,6 @@ def test_trials_of_a_model_choose_a_law_that_swings_the_plant_up():
     assert trials.up.all() and not trials.stopped
 
 
-@pytest.mark.slow
 def test_episodes_of_an_exploration_follow_a_plan_where_none_came_near_the_goal():
     plant = plant_of(model(), rail(), hardware=Hardware(encoder_step=1e-4))
     low = (-0.9, -0.9, -0.9, -0.9)
@@ -112,7 +109,6 @@ def trial(law, plant, hardware, late=0.0):
     return trial_of(lambda _: stateless(law), model(), plant, hardware, seconds=2.0, substeps=1, late=late)
 
 
-@pytest.mark.slow
 def test_motors_a_whole_sample_late_are_hardware_with_that_delay():
     def margin(delay, late):
         law = lambda x: 3.0 * jnp.cos(5 * x[:1] + x[1:2])  # noqa: E731

@@ -332,7 +332,6 @@ def errors(arrays, robot=None):
     return [(finding.check, finding.joints) for finding in findings if finding.severity == "error"]
 
 
-@pytest.mark.slow
 def test_the_joint_of_a_scara_whose_torque_is_reversed_is_blamed():
     """Turning the other joint's torque explains it as well, with a negative definite inertia."""
     for robot, check in ((planar(LYING), "tree-sign"), (None, "torque-sign")):
@@ -371,7 +370,6 @@ def test_torques_without_gravity_are_named_and_fitted_so():
     assert prepare_log(options, data, options.data, robot=robot)[-1] is robot
 
 
-@pytest.mark.slow
 def test_torques_late_by_200_ms_are_found_at_20_hz():
     slow = log(lambda q, qd, qdd: np.array([2.0, 1.0]) * qdd + 3 * np.sin(q), pace=5.0)
     findings = quick(from_arrays({**slow, "tau": late(slow["tau"], 4)}))

@@ -81,7 +81,6 @@ def digest(seeds):
     return hashlib.sha256(source_files(programs_of(seeds)[0], name="model")["model.c"]).hexdigest()
 
 
-@pytest.mark.slow
 def test_the_text_is_the_same_in_every_process():
     here = Path(__file__).parent
     command = [sys.executable, "-c", TEXT_OF, here, here.parents[1]]

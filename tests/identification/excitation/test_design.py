@@ -63,7 +63,6 @@ def informative(designs):
     return designs[0][0]
 
 
-@pytest.mark.slow
 def test_the_condition_falls(task, candidates):
     judge = CRITERIA["condition"]
     conditioned = best_design(task, make_optimiser(task, judge, rounds=6, iterations=40), judge, candidates[:2])

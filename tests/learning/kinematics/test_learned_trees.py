@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 from calls import one_line
 
 from dln_jax.data.splits import select
@@ -29,7 +28,6 @@ SHARP = {"velocity_scale": 1e-3}
 """Dry friction of the arms changes its sign at once."""
 
 
-@pytest.mark.slow
 def test_an_arm_is_found_down_to_the_noise():
     data = lip_trajectories(SKEW, (0, 1), friction=True, noise=NOISE, every=50)
     said = []

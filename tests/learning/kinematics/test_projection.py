@@ -55,7 +55,6 @@ def test_the_design_has_all_that_a_tree_shows():
     np.testing.assert_allclose(flat @ solution, tau.ravel(), atol=1e-9)
 
 
-@pytest.mark.slow
 def test_slopes_are_those_of_finite_differences():
     places = free_directions(STRUCTURE.parents, KINDS)
     samples = problem()[1].tau.size

@@ -67,7 +67,6 @@ def test_bodies_that_collide_never_cross_and_keep_their_momentum(colliding, spee
     assert np.asarray(state.x)[upper, 1].mean() > np.asarray(state.x)[~upper, 1].mean()
 
 
-@pytest.mark.slow
 def test_a_step_beyond_its_list_of_pairs_says_so_and_moves_nothing():
     """With pairs left out, no motion is known to be free: the body stays where it is."""
     mesh = joined(beam(4.0, 0.2, 80, 1), beam(4.0, 0.2, 80, 1), 0.01, 0.215)
@@ -78,7 +77,6 @@ def test_a_step_beyond_its_list_of_pairs_says_so_and_moves_nothing():
     assert not crossings(mesh, np.asarray(state.x))
 
 
-@pytest.mark.slow
 def test_held_vertices_push_a_body_ahead_and_stop_before_what_they_cannot_pass():
     mesh = blocks(0.45, 0.0)
     for held, speed in ((mesh.vertices[:, 0] < 0.41, 25.0), (abs(mesh.vertices[:, 0] - 0.425) > 0.2, 100.0)):
@@ -93,14 +91,12 @@ def test_held_vertices_push_a_body_ahead_and_stop_before_what_they_cannot_pass()
             np.testing.assert_allclose(state.x[held], mesh.vertices[held] + [0.25, 0.0], atol=1e-12)
 
 
-@pytest.mark.slow
 def test_derivatives_through_an_impact_with_friction_agree_with_differences():
     mesh = blocks(0.1, 0.215)
     scene = scene_of(mesh, held=vertices_where(mesh, lambda x: x[:, 1] < 0.21), friction=0.3)
     compare_derivatives_with_differences(scene, above(mesh, 0.21, [0.5, -0.5]), steps=4, tolerance=1e-10)
 
 
-@pytest.mark.slow
 def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_the_step():
     mu, dt = 0.5, 0.002
     mesh = joined(beam(0.8, 0.2, 4, 1), beam(0.4, 0.2, 2, 1), 0.1, 0.212)
@@ -133,7 +129,6 @@ def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_
     assert len(errors) > 4 and max(errors) < 1e-6
 
 
-@pytest.mark.slow
 def test_two_boxes_in_space_come_to_rest_on_each_other():
     mesh = joined(box((1.0, 1.0, 0.5), (1, 1, 1)), box((1.0, 1.0, 0.5), (1, 1, 1)), 0.1, 0.1, 0.515)
     scene = scene_of(mesh, held=vertices_where(mesh, lambda x: x[:, 2] < 0.51), friction=0.3)
@@ -184,7 +179,6 @@ def test_the_surface_of_quadratic_bodies_holds_every_node_of_the_boundary_and_it
             assert float(of.sum()) == pytest.approx(area, rel=1e-14)
 
 
-@pytest.mark.slow
 def test_mid_side_nodes_touch_neither_another_body_nor_an_obstacle():
     mesh = quadratic(joined(beam(0.4, 0.2, 1, 1), beam(0.2, 0.2, 1, 1), 0.1, 0.215))
     bulging = vertices_where(mesh, lambda x: np.linalg.norm(x - [0.2, 0.2], axis=1) < 1e-9)

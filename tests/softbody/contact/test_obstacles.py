@@ -91,7 +91,6 @@ def errors_of_friction(scene, init, step):
             yield abs(along + MU * normal) / (MU * normal), info.friction_change
 
 
-@pytest.mark.slow
 def test_a_block_that_lands_on_a_slope_obeys_coulombs_law_in_every_step(landing):
     mesh = block(1e-4, 0.4, 0.2)
     penalty = plane_contact(range(6), normal=(0, 1), stiffness=1e5, width=1e-3, friction=MU)
@@ -130,7 +129,6 @@ def test_a_block_at_1000_m_per_s_stays_above_the_ground(landing):
     assert state.x[:, 1].min() > 0 and info.least_distance > 0
 
 
-@pytest.mark.slow
 def test_derivatives_through_iterated_friction_with_a_moving_obstacle_agree_with_differences():
     """They are those of the iterations that were taken, hence exact before the forces have stopped changing, too."""
     scene = on_ground()
@@ -147,7 +145,6 @@ def test_derivatives_through_iterated_friction_with_a_moving_obstacle_agree_with
     require_gradient_of_differences(outcome, np.array([1e6, 1e5, MU, 0.0]), np.array([100.0, 10.0, 1e-5, 1e-6]))
 
 
-@pytest.mark.slow
 def test_an_elastic_ball_keeps_its_energy_in_a_bounce_of_long_steps_and_backward_euler_loses_it():
     ball = disc(0.5, 2)
     ball = ball._replace(vertices=ball.vertices + np.array([0.0, 0.53]))
@@ -209,7 +206,6 @@ def travelled():
     return run
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [BACKWARD_EULER, AVERAGE_VECTOR_FIELD], ids=["euler", "average"])
 def test_a_belt_carries_a_block_along_by_coulombs_law(travelled, integrator):
     way, (v, converged) = jax.jit(lambda speed: travelled(speed, integrator))(BELT_SPEED)
@@ -220,7 +216,6 @@ def test_a_belt_carries_a_block_along_by_coulombs_law(travelled, integrator):
     assert way == pytest.approx(BELT_SPEED * ((STEPS - 1) * BELT_DT - sticking / 2), rel=0.05)
 
 
-@pytest.mark.slow
 def test_divided_steps_take_the_motion_of_a_belt(travelled):
     _, (v, converged) = jax.jit(lambda: travelled(0.3, tolerance=1e-9, halvings=2, iterations=14))()
     assert converged.all() and v[-1] == pytest.approx(0.3, rel=0.01)
