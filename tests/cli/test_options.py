@@ -4,9 +4,10 @@ import dataclasses
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import get_args, get_type_hints
 
-from dln_jax.cli.arguments import arguments_for
+from dln_jax.cli.arguments import arguments_for, resolved
 from dln_jax.cli.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
 from dln_jax.cli.options import SCENES
 from dln_jax.control.optimal.plants import PLANTS
@@ -84,3 +85,7 @@ def test_every_model_of_a_command_has_a_method():
     for command in (train_delan, train_hnn):
         names = re.findall(r"'([\w-]+)'", repr(command.Arguments.__annotations__["model"]))
         assert names and set(names) <= set(FITS)
+
+
+def test_a_zero_that_was_stated_is_no_default():
+    assert resolved(SimpleNamespace(steps=0, width=None), {"steps": 5, "width": 8}) == {"steps": 0, "width": 8}

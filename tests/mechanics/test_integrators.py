@@ -140,6 +140,12 @@ def test_symplectic_steps_conserve_energy_near_the_separatrix():
     assert error(rk4(swinging)) > dt**2, "of order four, but it drifts"
 
 
+def test_velocities_that_depend_on_time_are_taken_in_the_middle_of_a_verlet_step():
+    step = stormer_verlet(lambda t, p: 3 * t**2 + 0 * p, lambda t, q: 0 * q)
+    q, _ = rollout(step, (jnp.zeros(1), jnp.zeros(1)), jnp.linspace(0.0, 1.0, 11))
+    np.testing.assert_allclose(q[-1], 1 - 0.1**2 / 4, rtol=1e-12)
+
+
 def test_rollout_is_its_steps_in_turn():
     step, t, state = stormer_verlet(rate, drive), jnp.array([0.3, 0.4, 0.9, 0.7]), START
     q, p = jax.jit(lambda: rollout(step, START, t, substeps=2))()

@@ -149,6 +149,14 @@ def test_noise_and_disturbance_are_found_from_logs_of_several_lengths():
     np.testing.assert_allclose(found.disturbance, LINEAR.disturbance, rtol=0.25)
 
 
+def test_curvature_of_a_measurement_counts_as_noise():
+    """Of y = a² with a ~ N(0, s²) and an unseen b, the points ±√2 s and 0 have the mean s² and the variance s⁴."""
+    process = Process(lambda x, u, w: x, lambda x: x[:1] ** 2, disturbance=np.zeros(0), noise=0.1)
+    start = unscented(process).start(belief(jnp.zeros(2), jnp.array([0.5, 1.0])))
+    _, innovation = unscented(process).update(start, jnp.array([0.25]), jnp.array([True]))
+    assert innovation.residual == pytest.approx(0.0) and innovation.variance == pytest.approx(0.1**2 + 0.5**4)
+
+
 def test_processes_without_noise_are_refused():
     with one_line("neither encoder_step nor encoder_noise"):
         mechanical(dln_jax.dynamics(pendulum().closed_form), rate=100.0, band=[0.1])
