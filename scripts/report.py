@@ -18,7 +18,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -47,7 +46,7 @@ def main() -> None:
             raise SystemExit(max(subprocess.run([*command, name, *rest]).returncode for name in NAMES))
         if first == "--docs":
             write_bytes(PAGE, fill_page(PAGE.read_text(), measured_below(Path(rest[0] if rest else "runs"))).encode())
-        elif first == "--help":
+        elif first in ("-h", "--help"):
             print(f"{__doc__}\nreports: {', '.join(NAMES)}")
         else:
             raise InputError(f"'{first:.80}' is not a report; choose from {', '.join(NAMES)}")
@@ -72,10 +71,10 @@ def measured_below(folder: Path) -> dict[str, Numbers]:
     return measured
 
 
-def fill_page(page: str, measured: Mapping[str, Numbers]) -> str:
+def fill_page(page: str, measured: dict[str, Numbers]) -> str:
     """The page with measured numbers in its tables; a table must have the rows and columns of its comment."""
 
-    def filled(table):
+    def fill_table(table):
         name, comment, lines = table.groups()
         across, *down = map(cells, comment.splitlines())
         header, rule, *rows = lines.splitlines()
@@ -88,7 +87,7 @@ def fill_page(page: str, measured: Mapping[str, Numbers]) -> str:
             filled.append(f"{row[: row.index('|')]}| {' | '.join([label, *texts])} |")
         return table[0].removesuffix(lines) + "\n".join(filled) + "\n"
 
-    return TABLE.sub(filled, page)
+    return TABLE.sub(fill_table, page)
 
 
 def cells(line: str) -> list[str]:

@@ -84,18 +84,14 @@ INLINE = {
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
+def workplace(folder):
     """A folder with the reader's own data, where the README's first command has run."""
-    folder = tmp_path_factory.mktemp("reader")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        data = generators.uniform(cart_pole(friction=0.1), samples=60)
-        schema.save(folder / "mine.npz", data._replace(label=np.array([f"run{index}" for index in range(60)])))
-        swings = generators.free_swing(pendulum(), trajectories=4, steps=60)
-        np.savez(folder / "swings.npz", t=swings.t, q=swings.q, trajectory=swings.trajectory)
-        run(FIRST)
-        yield folder
+    data = generators.uniform(cart_pole(friction=0.1), samples=60)
+    schema.save(folder / "mine.npz", data._replace(label=np.array([f"run{index}" for index in range(60)])))
+    swings = generators.free_swing(pendulum(), trajectories=4, steps=60)
+    np.savez(folder / "swings.npz", t=swings.t, q=swings.q, trajectory=swings.trajectory)
+    run(FIRST)
+    return folder
 
 
 def run(words):

@@ -15,13 +15,9 @@ CLOSE = 1e-9
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pinned")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        lines.make_files(folder)
-        yield folder
+def workplace(folder):
+    lines.make_files(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
