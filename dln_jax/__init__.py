@@ -1,7 +1,8 @@
 """Dynamics from energies: write or learn a scalar energy, get equations of motion, rollouts and controllers.
 
-This module gathers the most used names; every package has its own `__all__`. Functions take one state (`q, qd, qdd,
-tau` of shape [d], SI units): `jax.vmap` them over samples. The documentation has a page for every concept.
+This module gathers the most used names; all others are imported from the module that defines them. Functions take one
+state (`q, qd, qdd, tau` of shape [d], SI units): `jax.vmap` them over samples. The documentation has a page for every
+concept.
 """
 
 import importlib

@@ -21,11 +21,12 @@ from dln_jax.mechanics.dynamics import (
     PlainFlow,
 )
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.friction.curves import joint_dissipation
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
-from dln_jax.mechanics.trees import Tree, tree_system
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs

@@ -184,7 +184,7 @@ def write_api_pages():
             see = [f"See :doc:`public`: {', '.join(f'`dln_jax.{public}`' for *_, public in elsewhere)}.", ""]
             short = module.__name__.removeprefix("dln_jax.")
             heading = [] if short == package else [short, "-" * len(short), ""]
-            parts += [*heading, f".. automodule:: {module.__name__}", *members, "   :ignore-module-all:", ""]
+            parts += [*heading, f".. automodule:: {module.__name__}", *members, ""]
             parts += see if elsewhere else []
         write_if_changed(folder / f"{package}.rst", parts)
 

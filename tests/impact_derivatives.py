@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.softbody import make_step, with_parameters
+from dln_jax.softbody.scene import with_parameters
+from dln_jax.softbody.step import make_step
 
 
 def compare_derivatives_with_differences(scene, v, *, steps, tolerance):

@@ -4,10 +4,11 @@ import jax
 import numpy as np
 from motions import sums_of_sines
 
+from dln_jax import joint_dissipation, tree_system
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import inertial_parameters, serial, tree_system
+from dln_jax.mechanics.trees.description import serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 
 LENGTH = 0.5
 LINKS = [

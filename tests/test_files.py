@@ -25,8 +25,8 @@ def names(folder="."):
 
 
 def test_a_user_without_a_home_folder_is_told_and_default_data_need_none(monkeypatch):
-    from dln_jax.scenes import scene_named
     from dln_jax.scenes.datasets import generators
+    from dln_jax.scenes.registry import scene_named
 
     def no_home():
         raise RuntimeError("Could not determine home directory.")

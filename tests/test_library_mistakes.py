@@ -15,13 +15,13 @@ from dln_jax.data import schema
 from dln_jax.learning.engine import newton
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Problem, sharing
-from dln_jax.mechanics.trees import make_tree
+from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.sizes import memory, require_memory, require_network
-from dln_jax.softbody import make_scene, with_parameters
-from dln_jax.softbody.mesh import beam, box
+from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.types import InputError, Needs
 

@@ -1,3 +1,1 @@
 """Shared parts of the commands: typed arguments, one-line errors, progress and tables."""
-
-__all__ = []

@@ -8,9 +8,10 @@ import numpy as np
 
 from dln_jax.cli.arguments import names_listed, numbers_of, refuse_given
 from dln_jax.cli.options import Checked, Filtered, Logged
-from dln_jax.data.checks import Finding, quick
-from dln_jax.data.encoders import Smoothed, smooth
+from dln_jax.data.checks.findings import Finding
+from dln_jax.data.checks.validation import quick
 from dln_jax.data.encoders.clock import clock_line
+from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stated_needs import needs_from_text

@@ -4,9 +4,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dln_jax.data.checks import Examination
 from dln_jax.data.checks.hypotheses import Torques
-from dln_jax.data.encoders import Choice, Smoothed
+from dln_jax.data.checks.validation import Examination
+from dln_jax.data.encoders.cutoff import Choice
+from dln_jax.data.encoders.smoothing import Smoothed
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 

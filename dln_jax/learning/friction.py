@@ -24,7 +24,7 @@ from dln_jax.learning.friction_terms import (
     solve_terms,
     terms_of,
 )
-from dln_jax.mechanics.friction import FrictionShape, coefficients_of
+from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model

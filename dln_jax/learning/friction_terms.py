@@ -19,15 +19,8 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import arrays_of
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.mechanics.friction import (
-    FrictionShape,
-    coefficients_of,
-    joint_rates,
-    require_laws,
-    require_shape,
-    shape_of,
-    unit_force,
-)
+from dln_jax.mechanics.friction.curves import joint_rates, require_shape, unit_force
+from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of, require_laws, shape_of
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, motor_regressor, require_motors
 from dln_jax.mechanics.trees.recursions import regressor

@@ -19,7 +19,8 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.marginal_likelihood import TorqueEquations, compiled_covariance, likeliest
 from dln_jax.learning.model_selection import Trial
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
+from dln_jax.mechanics.friction.curves import unit_force
+from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.torque_covariance import States
 from dln_jax.models.trigonometric_kernel import KernelParameters, KernelScales

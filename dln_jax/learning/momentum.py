@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from dln_jax.data.encoders import smooth
 from dln_jax.data.encoders.sampling import delayed
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.data.encoders import held_at_equal_steps, smooth
+from dln_jax.data.encoders.sampling import held_at_equal_steps
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.engine.fit import fit

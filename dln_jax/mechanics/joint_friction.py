@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PhaseRates, friction_force, make_dynamics
-from dln_jax.mechanics.friction import joint_rates
+from dln_jax.mechanics.friction.curves import joint_rates
 from dln_jax.types import Dissipation, Potential, Scalar, Vector
 
 

@@ -19,14 +19,8 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.friction import (
-    FrictionCoefficients,
-    FrictionShape,
-    coefficients_of,
-    joint_dissipation,
-    require_laws,
-    require_shape,
-)
+from dln_jax.mechanics.friction.curves import joint_dissipation, require_shape
+from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape, coefficients_of, require_laws
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, motors_of, require_motors

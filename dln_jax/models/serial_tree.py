@@ -22,7 +22,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from dln_jax.mechanics.closed_form import RecursiveSystem
-from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.friction.curves import joint_dissipation
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.models.model import Model

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape, joint_dissipation
+from dln_jax.mechanics.friction.curves import joint_dissipation
+from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape
 from dln_jax.mechanics.joint_friction import sum_of
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.types import Dissipation, FrictionLaw, InputError, JointKind, Lagrangian, Needs, Potential, Vector

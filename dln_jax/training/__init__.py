@@ -1,3 +1,1 @@
 """Training: from data to a run folder with a model, test errors and figures."""
-
-__all__: list[str] = []

@@ -19,7 +19,8 @@ from dln_jax.identification.excitation.design import CRITERIA, as_trajectories, 
 from dln_jax.identification.excitation.fourier import require_sampling
 from dln_jax.identification.excitation.limits import MotionLimits, heights_above, limits_of_robot, used
 from dln_jax.identification.excitation.task import Task, make_task
-from dln_jax.mechanics.trees import inertial_parameters, with_payload
+from dln_jax.mechanics.trees.description import with_payload
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.sizes import require_memory

@@ -20,7 +20,7 @@ from dln_jax.data.robots import read_robot
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, PhaseRates, PlainDynamics
-from dln_jax.mechanics.trees import tree_to_json
+from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import Description, build, describe

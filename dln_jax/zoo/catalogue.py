@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.trees import tree_from_json
+from dln_jax.mechanics.trees.description import tree_from_json
 from dln_jax.models.baselines import make_feed_forward, make_helmholtz, make_phase_network
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,

@@ -5,8 +5,10 @@ A description has `name`, `precision` (f32 or f64), and every keyword in the sig
 importable factory, or "own" for a factory that must be passed when the model is loaded.
 """
 
+import functools
 import importlib
 import inspect
+import json
 import math
 import reprlib
 from collections.abc import Callable, Collection, Mapping
@@ -22,15 +24,11 @@ from dln_jax.nn.activations import Activation, activation
 from dln_jax.precision import data_type, require_precision
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.catalogue import assembled, entry_of
+from dln_jax.zoo.catalogue import CATALOGUE, assembled, entry_of
 from dln_jax.zoo.parameter_files import REMEDY
 
 Description = dict[str, Any]
 """JSON values."""
-STATED = set(Needs._fields) - {"joint_friction", "joint_map", "velocity_scale"}
-"""Fields that stored needs must have; files of older releases lack the fields of joint friction."""
-LATER = {"cooling": 0.0, "reference_temperature": 25.0, "temperature": None, "motors": None, "coupled": []}
-"""Keywords that files of older releases lack, with values that leave their terms out."""
 OWN = "own"
 """Name of a model whose factory is not stored in the file."""
 
@@ -94,6 +92,8 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
 def build(description: Description, *, factory: Callable[..., Any] | None = None, trust: bool = False) -> Any:
     """Builds the model of a description: a `Model`, or a model of functions or images.
 
+    The same description of the catalogue gives the same object again, so that its functions are traced once.
+
     Args:
         description: from `describe`.
         factory: your own factory, for a model outside the catalogue.
@@ -106,10 +106,23 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
     name = description.get("name")
     if not isinstance(name, str):
         raise InputError(f"model description: name is {reprlib.repr(name)}, expected that of a model; {REMEDY}")
-    functions = functions_of(name, factory, trust=trust)
+    if factory is None and name in CATALOGUE:
+        try:
+            return _catalogued(json.dumps(description))
+        except (TypeError, ValueError):  # values that JSON does not have, which are refused below
+            pass
+    return _built(description, functions_of(name, factory, trust=trust))
+
+
+@functools.lru_cache(maxsize=16)
+def _catalogued(text: str) -> Any:
+    description = json.loads(text)
+    return _built(description, functions_of(description["name"]))
+
+
+def _built(description: Description, functions: tuple[Callable[..., Any], ...]) -> Any:
     values = {key: value for key, value in description.items() if key not in ("name", "precision")}
     expected = _parameters(functions)
-    values = {**{key: value for key, value in LATER.items() if key in expected}, **values}
     _require_keys(values, expected)
     if "precision" not in description:
         raise InputError(f"model description: lacks precision; {REMEDY}")
@@ -171,7 +184,7 @@ def _require_keys(values: Mapping[str, Any], expected: Collection[str]) -> None:
     if unknown := set(values) - set(expected):
         raise InputError(f"model description: unknown are {reprlib.repr(', '.join(sorted(unknown)))}; {REMEDY}")
     needs = values.get("needs")
-    if isinstance(needs, dict) and (missing := STATED - set(needs)):
+    if isinstance(needs, dict) and (missing := set(Needs._fields) - set(needs)):
         raise InputError(f"model description: needs lack {', '.join(sorted(missing))}; {REMEDY}")
 
 

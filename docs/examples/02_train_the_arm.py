@@ -13,13 +13,13 @@ import numpy as np
 
 from dln_jax import GaussNewton, dynamics, fit, make_delan
 from dln_jax.data.splits import split
-from dln_jax.figures import force_decomposition, style
+from dln_jax.figures import style
+from dln_jax.figures.torques import force_decomposition
 from dln_jax.learning.dynamics import problem
 from dln_jax.mechanics.integrators import rk4, rollout, second_order
 from dln_jax.nn.activations import tanh
-from dln_jax.scenes import two_link_arm
 from dln_jax.scenes.datasets.generators import default_data
-from dln_jax.scenes.pendulums import LINK_LENGTH
+from dln_jax.scenes.pendulums import LINK_LENGTH, two_link_arm
 
 jax.config.update("jax_enable_x64", True)
 

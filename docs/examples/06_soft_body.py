@@ -11,10 +11,15 @@ from functools import partial
 import jax
 import numpy as np
 
-from dln_jax.figures import Moments, moments_figure
-from dln_jax.softbody import make_scene, make_step, positions_and_convergence, rollout, with_parameters
-from dln_jax.softbody.mesh import disc
-from dln_jax.softbody.terms import elastic, gravity, plane_contact, stable_neo_hookean
+from dln_jax.figures.soft_bodies import Moments, moments_figure
+from dln_jax.rollout import rollout
+from dln_jax.softbody.mesh.shapes import disc
+from dln_jax.softbody.scene import make_scene, with_parameters
+from dln_jax.softbody.step import make_step, positions_and_convergence
+from dln_jax.softbody.terms.contact import plane_contact
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)
 

@@ -12,7 +12,9 @@ import numpy as np
 
 from dln_jax.figures import style
 from dln_jax.figures.soft_body_animations import soft_body_frame
-from dln_jax.locomotion import Goal, creature_named, make_task, shown_walk, train
+from dln_jax.locomotion.gradient import shown_walk, train
+from dln_jax.locomotion.learning import Goal
+from dln_jax.locomotion.task import creature_named, make_task
 
 jax.config.update("jax_enable_x64", True)
 

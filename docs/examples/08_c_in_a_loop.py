@@ -19,9 +19,8 @@ from dln_jax import dynamics, export_c, load_c
 from dln_jax.figures import style
 from dln_jax.learning.linear import fit_linear
 from dln_jax.models.trigonometric import make_trigonometric
-from dln_jax.scenes import joint_angles, two_link_arm
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulums import LINK_LENGTH
+from dln_jax.scenes.pendulums import LINK_LENGTH, joint_angles, two_link_arm
 
 jax.config.update("jax_enable_x64", True)
 

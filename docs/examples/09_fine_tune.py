@@ -21,9 +21,8 @@ from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout, second_order
-from dln_jax.scenes import two_link_arm
 from dln_jax.scenes.datasets.generators import default_data
-from dln_jax.scenes.pendulums import LINK_LENGTH
+from dln_jax.scenes.pendulums import LINK_LENGTH, two_link_arm
 
 jax.config.update("jax_enable_x64", True)
 

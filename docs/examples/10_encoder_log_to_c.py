@@ -16,15 +16,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
-from dln_jax.data.encoders import smooth
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
 from dln_jax.figures import style
-from dln_jax.identification import identify, parameters_of
+from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.learning import uncertainty
 from dln_jax.learning.friction import fit_friction
-from dln_jax.mechanics import trees
-from dln_jax.models import make_rigid_tree
+from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.frames import world_frames
+from dln_jax.mechanics.trees.inertia import inertial_parameters
+from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.uncertainty import predictive
 
 jax.config.update("jax_enable_x64", True)
@@ -37,10 +39,8 @@ random = np.random.default_rng(0)
 # friction.
 
 rows = [[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0], [0, 0.4, 0, 0]]  # alpha, a, d, theta
-guess = trees.serial(*trees.dh_frames(rows), [trees.inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))] * 3)
-bodies = [
-    trees.inertial_parameters(mass, [0.15, 0.02, 0.03], np.diag([0.01, 0.03, 0.03]) * mass) for mass in (4.0, 3.0, 1.5)
-]
+guess = serial(*dh_frames(rows), [inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))] * 3)
+bodies = [inertial_parameters(mass, [0.15, 0.02, 0.03], np.diag([0.01, 0.03, 0.03]) * mass) for mass in (4.0, 3.0, 1.5)]
 true = guess._replace(inertias=np.stack(bodies), armature=np.array([0.2, 0.2, 0.1]))
 friction = dln_jax.joint_dissipation([0.5, 0.6, 0.3], [0.8, 1.0, 0.4], velocity_scale=0.03)
 plant = dln_jax.dynamics(dln_jax.tree_system(true, friction))
@@ -131,7 +131,7 @@ REACH = np.array([0.3, 0.0, 0.0])  # from the third joint to the tip, m
 
 
 def joints(q):
-    rotations, positions = trees.world_frames(true, q)
+    rotations, positions = world_frames(true, q)
     return jnp.stack([jnp.zeros(3), *positions, positions[-1] + rotations[-1] @ REACH])
 
 

@@ -15,9 +15,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
-from dln_jax import control
-from dln_jax.figures import phase_portrait, rotary_pendulum_drawing, style, write_closed_loop_gif
-from dln_jax.scenes import rotary_pendulum
+from dln_jax.control.closed_loop import Hardware, simulate, stateless
+from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, parts_of
+from dln_jax.control.regulators import lqr, region_of_attraction, regulated, switched, value
+from dln_jax.control.state_space import error, field_of, holding_controls, linearise
+from dln_jax.figures import style
+from dln_jax.figures.closed_loop_animations import rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.figures.closed_loops import phase_portrait
+from dln_jax.scenes.poles import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
 
@@ -31,7 +36,7 @@ LIMIT = 0.05  # N m
 
 scene = rotary_pendulum(friction=1e-5)
 plant, B, joints = dln_jax.dynamics(scene.energies), np.array(scene.needs.actuation), scene.needs.joints
-field, goal = control.field_of(plant, B), jnp.zeros(4)
+field, goal = field_of(plant, B), jnp.zeros(4)
 
 # %%
 # Holding it up
@@ -39,11 +44,11 @@ field, goal = control.field_of(plant, B), jnp.zeros(4)
 # A linear-quadratic regulator holds the pole. Simulations with the motor's limit give the largest ellipsoid that it
 # stabilises.
 
-at = control.linearise(jax.jit(field), goal, control.holding_controls(plant, goal[:2], B))
-regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
-near = control.regulated(regulator, goal, at.u, joints)
+at = linearise(jax.jit(field), goal, holding_controls(plant, goal[:2], B))
+regulator = lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
+near = regulated(regulator, goal, at.u, joints)
 levels = 10.0 ** np.arange(-2, 1.01, 0.1)
-region = control.region_of_attraction(
+region = region_of_attraction(
     field, near, regulator, goal, joints, lower=-LIMIT, upper=LIMIT, rate=500.0, levels=levels, starts=32
 )
 print(f"the regulator stabilises states whose value is below {region.level:.3g}")
@@ -53,19 +58,15 @@ print(f"the regulator stabilises states whose value is below {region.level:.3g}"
 # --------------
 # The law drives the energy of the pole to that of the upright posture. The regulator takes over within its region.
 
-swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
-law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, joints), region.level)
-hardware = control.Hardware(-LIMIT, LIMIT, delay=1)
+swing = energy_shaping(plant, parts_of(B), goal[:2], EnergyGains(2e7, 20.0, 5.0))
+law = switched(lambda x: swing(x[:2], x[2:]), near, value(regulator, goal, joints), region.level)
+hardware = Hardware(-LIMIT, LIMIT, delay=1)
 starts = np.zeros((STARTS, 4))
 starts[:, 1] = np.pi + 0.2 * np.random.default_rng(0).normal(size=STARTS)
 runs = jax.jit(
-    jax.vmap(
-        lambda x: control.simulate(
-            field, control.stateless(law), x, seconds=4.0, rate=500.0, controls=1, hardware=hardware
-        )
-    )
+    jax.vmap(lambda x: simulate(field, stateless(law), x, seconds=4.0, rate=500.0, controls=1, hardware=hardware))
 )(starts)
-off = np.abs(jax.vmap(lambda x: control.error(x, goal, joints))(runs.x[:, -1])[:, 1])
+off = np.abs(jax.vmap(lambda x: error(x, goal, joints))(runs.x[:, -1])[:, 1])
 print(f"{np.sum(off < 0.05)} of {STARTS} starts are up after 4 s; largest torque {np.abs(runs.u).max():.3f} N m")
 assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
 

@@ -13,10 +13,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
-from dln_jax import control
+from dln_jax.control.shooting import shoot
+from dln_jax.control.state_space import field_of, integrated, linearise
+from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.figures import style
 from dln_jax.mechanics.integrators import CLASSICAL, RADAU_3
-from dln_jax.scenes import flexible_cart_pole
+from dln_jax.scenes.poles import flexible_cart_pole
 
 jax.config.update("jax_enable_x64", True)
 
@@ -32,9 +34,9 @@ STIFFNESS = 2e4  # N/m
 
 scene = flexible_cart_pole(stiffness=STIFFNESS)
 plant, B = dln_jax.dynamics(scene.closed_form), np.array(scene.needs.actuation)
-field, goal = jax.jit(control.field_of(plant, B)), np.zeros(6)
+field, goal = jax.jit(field_of(plant, B)), np.zeros(6)
 start = np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0])
-modes = np.linalg.eigvals(control.linearise(field, start, np.zeros(1)).A)
+modes = np.linalg.eigvals(linearise(field, start, np.zeros(1)).A)
 print(f"the spring swings at {abs(modes).max():.0f} rad/s, the pole at {abs(modes[abs(modes) < 20]).max():.1f} rad/s")
 assert abs(modes).max() * DT > 2.8
 
@@ -50,15 +52,15 @@ def off(x):
     return x[0] ** 2 + 2 * (1 - jnp.cos(x[2])) + 0.02 * (x[3] ** 2 + (0.18 * x[5]) ** 2)
 
 
-problem = control.TrajectoryProblem(
-    step=control.integrated(field, DT, method=RADAU_3),
+problem = TrajectoryProblem(
+    step=integrated(field, DT, method=RADAU_3),
     cost=lambda x, u: DT * (off(x) + 1e-3 * u @ u),
     final_cost=lambda x: 50 * off(x),
     lower=-LIMIT,
     upper=LIMIT,
 )
 guess, still = np.linspace(start, goal, STEPS + 1), np.zeros((STEPS, 1))
-solution = jax.jit(lambda: control.shoot(problem, start, guess, still))()
+solution = jax.jit(lambda: shoot(problem, start, guess, still))()
 plan = jax.tree.map(np.asarray, solution.plan)
 print(f"{solution.iterations} iterations, largest defect {solution.defect:.1e}, cost {plan.cost:.3f}")
 assert solution.converged
@@ -69,8 +71,8 @@ assert solution.converged
 # We simulate the plant with 2000 classical steps per second, and with the plan's own feedback u + K (x - plan) at its
 # samples, within the limits. Classical steps as long as the plan's diverge.
 
-many = jax.jit(control.integrated(field, DT, method=CLASSICAL, substeps=int(2000 * DT)))
-few = jax.jit(control.integrated(field, DT, method=CLASSICAL))
+many = jax.jit(integrated(field, DT, method=CLASSICAL, substeps=int(2000 * DT)))
+few = jax.jit(integrated(field, DT, method=CLASSICAL))
 true, forces, diverged = [start], [], start
 for x, u, K in zip(plan.x, plan.u, plan.K, strict=False):
     forces.append(np.clip(u + K @ (true[-1] - x), -LIMIT, LIMIT))

@@ -17,9 +17,16 @@ from matplotlib.colors import LightSource, to_rgb
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from dln_jax.figures import style
-from dln_jax.softbody import make_scene, make_step, rollout
-from dln_jax.softbody.mesh import boundary, lattice, read_mesh, values_by_set, vertices_in, write_motion
-from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
+from dln_jax.rollout import rollout
+from dln_jax.softbody.mesh.files import read_mesh, write_motion
+from dln_jax.softbody.mesh.mesh import boundary
+from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
+from dln_jax.softbody.mesh.shapes import lattice
+from dln_jax.softbody.scene import make_scene
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)
 

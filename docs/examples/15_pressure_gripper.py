@@ -22,19 +22,19 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgb
 
 from dln_jax.figures import style
 from dln_jax.figures.soft_body_films import TOOL, Slab, write_slab_film
-from dln_jax.softbody import Example, drive, driven_step, make_scene, potential, rollout
-from dln_jax.softbody.contact import body_contact, crossings, half_space, obstacle_contact
-from dln_jax.softbody.mesh import (
-    disc,
-    enclosed_volume,
-    inner_surface,
-    lattice,
-    lumped_masses,
-    make_mesh,
-    surface_parts,
-    vertices_where,
-)
-from dln_jax.softbody.terms import elastic, gravity, pressure, stable_neo_hookean
+from dln_jax.rollout import rollout
+from dln_jax.softbody.contact.bodies import body_contact
+from dln_jax.softbody.contact.crossings import crossings
+from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
+from dln_jax.softbody.driven import Example, drive, driven_step
+from dln_jax.softbody.mesh.mesh import lumped_masses, make_mesh, vertices_where
+from dln_jax.softbody.mesh.shapes import disc, lattice
+from dln_jax.softbody.mesh.surfaces import enclosed_volume, inner_surface, surface_parts
+from dln_jax.softbody.scene import make_scene, potential
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.pressure import pressure
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)
 

@@ -22,10 +22,18 @@ from matplotlib.collections import PolyCollection
 
 from dln_jax.figures import style
 from dln_jax.figures.soft_body_films import write_slab_film
-from dln_jax.softbody import make_scene, make_step, rollout
-from dln_jax.softbody.contact import body_contact, box, crossings, obstacle_contact
-from dln_jax.softbody.mesh import disc, make_mesh, read_mesh, write_mesh
-from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
+from dln_jax.rollout import rollout
+from dln_jax.softbody.contact.bodies import body_contact
+from dln_jax.softbody.contact.crossings import crossings
+from dln_jax.softbody.contact.obstacles import box, obstacle_contact
+from dln_jax.softbody.mesh.files import read_mesh, write_mesh
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.shapes import disc
+from dln_jax.softbody.scene import make_scene
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)
 

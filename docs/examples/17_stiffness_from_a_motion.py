@@ -16,9 +16,14 @@ from matplotlib.collections import PolyCollection
 
 from dln_jax.figures import style
 from dln_jax.learning.soft_body_identification import ObservedMotions, identify
-from dln_jax.softbody import make_scene, make_step, positions_and_convergence, rollout, with_parameters
-from dln_jax.softbody.mesh import beam, vertices_where
-from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
+from dln_jax.rollout import rollout
+from dln_jax.softbody.mesh.mesh import vertices_where
+from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody.scene import make_scene, with_parameters
+from dln_jax.softbody.step import make_step, positions_and_convergence
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)
 

@@ -6,7 +6,7 @@ A cart swings a pole up on a rail of one metre, holds it, and brings it up again
 of the next 1.2 seconds are improved in every sample, within the limits of the force and the ends of the rail; near it,
 a regulator acts.
 
-.. figure:: /predictive-control.gif
+.. figure:: /predictive-gif
    :alt: A cart-pole swings up between the ends of its rail, is hit twice and recovers; its plan is drawn ahead of it
 
    The film that this example writes. Pale poles and the dashed line are the plan that acts.
@@ -21,9 +21,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
-from dln_jax import control
-from dln_jax.figures import cart_pole_drawing, style, write_closed_loop_gif
-from dln_jax.scenes import cart_pole
+from dln_jax.control.recovery import recovery_by_plans
+from dln_jax.control.regulators import lqr, regulated, value
+from dln_jax.control.state_space import field_of, integrated, linearise
+from dln_jax.control.trajectories import TrajectoryProblem, first_plan
+from dln_jax.figures import style
+from dln_jax.figures.closed_loop_animations import cart_pole_drawing, write_closed_loop_gif
+from dln_jax.scenes.poles import cart_pole
 
 jax.config.update("jax_enable_x64", True)
 
@@ -40,7 +44,7 @@ BLOWS = {2.5: 0.02, 4.0: -0.35}  # N s, by the time in s
 
 scene = cart_pole(cart_mass=0.6, pole_mass=0.15, length=LENGTH)
 plant, B = dln_jax.dynamics(scene.closed_form), np.array(scene.needs.actuation)
-field = control.field_of(plant, B)
+field = field_of(plant, B)
 wall = np.array([RAIL - 0.02, np.inf, np.inf, np.inf])
 
 
@@ -48,8 +52,8 @@ def away(x):
     return x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * x[2] ** 2 + 0.01 * x[3] ** 2
 
 
-problem = control.TrajectoryProblem(
-    control.integrated(field, DT),
+problem = TrajectoryProblem(
+    integrated(field, DT),
     lambda x, u: DT * (away(x) + 1e-3 * u @ u),
     lambda x: 20 * away(x),
     -LIMIT,
@@ -65,15 +69,15 @@ problem = control.TrajectoryProblem(
 # asks for no more than the motor has.
 
 goal, hanging, joints = np.zeros(4), np.array([0.0, np.pi, 0.0, 0.0]), scene.needs.joints
-at = control.linearise(field, goal, np.zeros(1))
-regulator = control.lqr(at.A, at.B, Q=np.diag([10, 10, 1, 0.1]), R=[[0.1]])
+at = linearise(field, goal, np.zeros(1))
+regulator = lqr(at.A, at.B, Q=np.diag([10, 10, 1, 0.1]), R=[[0.1]])
 level = LIMIT**2 / (regulator.K @ np.linalg.solve(regulator.S, regulator.K.T)).item()
 guesses = np.array([0.0, 3.0, -3.0])[:, None, None] * np.sin(5 * DT * np.arange(STEPS))[:, None]
-controller = control.recovery_by_plans(
+controller = recovery_by_plans(
     problem,
-    jax.vmap(lambda u: control.first_plan(problem, hanging, u))(guesses),
-    near=control.regulated(regulator, goal, at.u, joints),
-    cost=control.value(regulator, goal, joints),
+    jax.vmap(lambda u: first_plan(problem, hanging, u))(guesses),
+    near=regulated(regulator, goal, at.u, joints),
+    cost=value(regulator, goal, joints),
     level=level,
     rate=1 / DT,
     every=1,
@@ -85,7 +89,7 @@ controller = control.recovery_by_plans(
 # A blow on the pole's bob changes the momenta of cart and pole, and the controller is not told.
 
 act = jax.jit(controller.act)
-advance = jax.jit(control.integrated(field, DT, substeps=4))
+advance = jax.jit(integrated(field, DT, substeps=4))
 
 
 @jax.jit
@@ -166,7 +170,7 @@ def between_walls(axis, q, trail):
 
 
 write_closed_loop_gif(
-    Path("predictive-control.gif"),
+    Path("predictive-gif"),
     between_walls,
     t,
     x[:, :2],

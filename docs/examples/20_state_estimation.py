@@ -13,10 +13,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
-from dln_jax import control
-from dln_jax.control import estimate
+from dln_jax.control.closed_loop import Hardware, simulate
+from dln_jax.control.estimate.extended import extended
+from dln_jax.control.estimate.loop import filtered, with_estimate
+from dln_jax.control.estimate.process import belief, mechanical
+from dln_jax.control.estimate.unscented import unscented
+from dln_jax.control.observers import with_differences
+from dln_jax.control.regulators import lqr, regulated
+from dln_jax.control.state_space import field_of, linearise
 from dln_jax.figures import style
-from dln_jax.scenes import rotary_pendulum
+from dln_jax.scenes.poles import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
 
@@ -30,23 +36,23 @@ RATE, LIMIT, STEP = 500.0, 0.05, 2 * np.pi / 512  # Hz, N m, rad
 
 scene = rotary_pendulum(friction=1e-5)
 plant, B, joints = dln_jax.dynamics(scene.closed_form), np.array(scene.needs.actuation), scene.needs.joints
-field, goal = control.field_of(plant, B), np.zeros(4)
-at = control.linearise(field, goal, np.zeros(1))
-regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
-law = control.regulated(regulator, goal, at.u, joints)
-hardware = control.Hardware(-LIMIT, LIMIT, encoder_step=STEP, control_noise=2.5e-4, delay=1, sees_rates=False)
+field, goal = field_of(plant, B), np.zeros(4)
+at = linearise(field, goal, np.zeros(1))
+regulator = lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
+law = regulated(regulator, goal, at.u, joints)
+hardware = Hardware(-LIMIT, LIMIT, encoder_step=STEP, control_noise=2.5e-4, delay=1, sees_rates=False)
 
 # %%
 # Three ways to the rates
 # -----------------------
 # The process is the model with a random torque at the motor, and measurements with the variance of an encoder's step.
 
-process = estimate.mechanical(plant, B, rate=RATE, band=[5e-4, 1e-5], encoder_step=STEP)
-prior = estimate.belief(goal, 0.1)
-filters = {"extended": estimate.extended(process), "unscented": estimate.unscented(process)}
-controllers = {"differences": control.with_differences(law, 2, rate=RATE, cutoff=50.0)}
+process = mechanical(plant, B, rate=RATE, band=[5e-4, 1e-5], encoder_step=STEP)
+prior = belief(goal, 0.1)
+filters = {"extended": extended(process), "unscented": unscented(process)}
+controllers = {"differences": with_differences(law, 2, rate=RATE, cutoff=50.0)}
 for name, filter in filters.items():
-    controllers[name] = estimate.with_estimate(
+    controllers[name] = with_estimate(
         law, filter, prior, lower=-LIMIT, upper=LIMIT, delay=1, controls=1, measurements=2
     )
 
@@ -58,7 +64,7 @@ for name, filter in filters.items():
 
 def held(controller):
     start = [0.1, 0.05, 0.0, 0.0]
-    return control.simulate(
+    return simulate(
         field, controller, start, seconds=SECONDS, rate=RATE, controls=1, hardware=hardware, key=jax.random.key(0)
     )
 
@@ -83,7 +89,7 @@ raw = RATE * jnp.diff(log.y, axis=0, prepend=log.y[:1])
 low_pass = lambda qd, row: (qd + share * (row - qd),) * 2  # noqa: E731
 rates = {"differences": jax.lax.scan(low_pass, jnp.zeros(2), raw)[1]}
 for name, filter in filters.items():
-    rates[name] = jax.jit(lambda filter=filter: estimate.filtered(filter, prior, log.y, log.u)[0][:, 2:])()
+    rates[name] = jax.jit(lambda filter=filter: filtered(filter, prior, log.y, log.u)[0][:, 2:])()
 truth, errors = np.asarray(log.x[:-1, 2:]), {}
 settled = slice(round(0.2 * RATE), None)
 for name, qd in rates.items():

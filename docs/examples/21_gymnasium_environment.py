@@ -14,19 +14,18 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 import dln_jax
-from dln_jax import control
-from dln_jax.control.closed_loop import delivered, measured
-from dln_jax.control.state_space import integrated
+from dln_jax.control.closed_loop import Controller, Hardware, delivered, measured, simulate
+from dln_jax.control.state_space import field_of, integrated
 from dln_jax.figures import style
-from dln_jax.scenes import cart_pole
+from dln_jax.scenes.poles import cart_pole
 
 jax.config.update("jax_enable_x64", True)
 
 RATE, SAMPLES = 50.0, 250  # Hz, length of an episode
 
 scene = cart_pole()
-field = control.field_of(dln_jax.dynamics(scene.closed_form), np.array(scene.needs.actuation))
-hardware = control.Hardware(-10.0, 10.0, encoder_step=1e-3, delay=1)
+field = field_of(dln_jax.dynamics(scene.closed_form), np.array(scene.needs.actuation))
+hardware = Hardware(-10.0, 10.0, encoder_step=1e-3, delay=1)
 advance = integrated(field, 1 / RATE)
 
 # %%
@@ -94,8 +93,8 @@ first, info = environment.reset(seed=0)
 actions = np.random.default_rng(0).uniform(-1, 1, (SAMPLES, 1)).astype(np.float32)
 steps = [environment.step(action) for action in actions]
 x = np.array([info["x"], *(step[4]["x"] for step in steps)])
-law = control.Controller(jnp.asarray(0), lambda k, t, y: (k + 1, 10.0 * jnp.asarray(actions, float)[k]))
-run = control.simulate(field, law, info["x"], seconds=SAMPLES / RATE, rate=RATE, controls=1, hardware=hardware)
+law = Controller(jnp.asarray(0), lambda k, t, y: (k + 1, 10.0 * jnp.asarray(actions, float)[k]))
+run = simulate(field, law, info["x"], seconds=SAMPLES / RATE, rate=RATE, controls=1, hardware=hardware)
 np.testing.assert_allclose(x, run.x, rtol=1e-9, atol=1e-9)
 assert steps[-1][3] and not any(step[2] or step[3] for step in steps[:-1])
 print(f"{SAMPLES} samples, return {sum(step[1] for step in steps):.3f}")

@@ -12,7 +12,7 @@ from dln_jax.cli.commands import COMMANDS, identify, train_delan, train_diffnet,
 from dln_jax.cli.options import SCENES
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.identification.consistent import REGULARISATION
-from dln_jax.mechanics.friction import LAWS
+from dln_jax.mechanics.friction.laws import LAWS
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.nn.activations import ALL
 from dln_jax.scenes import registry

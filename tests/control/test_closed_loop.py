@@ -7,18 +7,9 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.control import (
-    Controller,
-    Gains,
-    Hardware,
-    Push,
-    Reference,
-    feed_forward,
-    field_of,
-    following,
-    simulate,
-    stateless,
-)
+from dln_jax.control.closed_loop import Controller, Hardware, Push, following, simulate, stateless
+from dln_jax.control.state_space import field_of
+from dln_jax.control.tracking import Gains, Reference, feed_forward
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import pendulum
 

@@ -10,7 +10,9 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.control import TrajectoryProblem, free_time, optimise, shoot, with_limits_of, worst_violation
+from dln_jax.control.plan_limits import free_time, with_limits_of, worst_violation
+from dln_jax.control.shooting import optimise, shoot
+from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.solvers.ending import Ending
 
 N, DT = 20, 0.1

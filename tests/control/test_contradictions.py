@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from calls import one_line
 
-from dln_jax.control import TrajectoryProblem, shoot
 from dln_jax.control.contradictions import require_end
+from dln_jax.control.shooting import shoot
+from dln_jax.control.trajectories import TrajectoryProblem
 
 RAIL = np.array([0.6, np.inf])
 BLOCK = TrajectoryProblem(

@@ -4,32 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import (
-    EnergyGains,
-    Gains,
-    Hardware,
-    Reference,
-    TrajectoryProblem,
-    computed_torque,
-    energy_shaping,
-    feed_forward,
-    first_plan,
-    gravity_compensation,
-    linearise,
-    lqr,
-    mpc,
-    partial_linearisation,
-    parts_of,
-    regulated,
-    saturated,
-    simulate,
-    stateless,
-    switched,
-    trusted,
-    value,
-    with_differences,
-)
-from dln_jax.control.state_space import field_of
+from dln_jax.control.closed_loop import Hardware, simulate, stateless
+from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, partial_linearisation, parts_of
+from dln_jax.control.observers import with_differences
+from dln_jax.control.real_time import mpc
+from dln_jax.control.regulators import lqr, regulated, switched, value
+from dln_jax.control.state_space import field_of, linearise, saturated
+from dln_jax.control.tracking import Gains, Reference, computed_torque, feed_forward, gravity_compensation, trusted
+from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics

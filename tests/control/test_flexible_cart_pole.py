@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from numpy.testing import assert_allclose
 
-from dln_jax.control import field_of, linearise
+from dln_jax.control.state_space import field_of, linearise
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import flexible_cart_pole

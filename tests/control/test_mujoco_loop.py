@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.control import Hardware, field_of, simulate, stateless
+from dln_jax import tree_system
+from dln_jax.control.closed_loop import Hardware, simulate, stateless
 from dln_jax.control.mujoco_loop import simulate_in_mujoco
+from dln_jax.control.state_space import field_of
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system
+from dln_jax.mechanics.trees.description import make_tree
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
 B = np.array([[1.0], [0.0]])

@@ -5,7 +5,8 @@ import numpy as np
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control import Hardware, simulate, stateless, with_differences, with_prediction
+from dln_jax.control.closed_loop import Hardware, simulate, stateless
+from dln_jax.control.observers import with_differences, with_prediction
 
 FIELD = lambda x, u: jnp.concatenate([x[1:], u - 0.3 * x[1:]])  # noqa: E731
 LAW = stateless(lambda x: jnp.tanh(4.0 - 9.0 * x[:1] - 4.0 * x[1:]))

@@ -9,8 +9,10 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control import TrajectoryProblem, feedback, first_plan, improve, mpc, prepare, shoot, worst_violation
-from dln_jax.control.real_time import BARRIER
+from dln_jax.control.plan_limits import worst_violation
+from dln_jax.control.real_time import BARRIER, feedback, improve, mpc, prepare
+from dln_jax.control.shooting import shoot
+from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.solvers.ending import Ending, reason

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.control import TrajectoryProblem, first_plan, integrated, lqr, recovery_by_plans, regulated, value
+from dln_jax.control.recovery import recovery_by_plans
+from dln_jax.control.regulators import lqr, regulated, value
+from dln_jax.control.state_space import integrated
+from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 
 RATE, EVERY, STEPS, LIMIT = 100.0, 5, 40, 4.0
 UPRIGHT, JOINTS = np.zeros(2), ("revolute",)

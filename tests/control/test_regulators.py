@@ -6,8 +6,7 @@ import numpy as np
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.control import lqr, sampled_lqr, time_varying_lqr
-from dln_jax.control.regulators import held
+from dln_jax.control.regulators import held, lqr, sampled_lqr, time_varying_lqr
 from dln_jax.control.riccati import Horizon, least_cost
 
 A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])

@@ -9,16 +9,11 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control import (
-    TrajectoryProblem,
-    field_of,
-    first_plan,
-    improve,
-    integrated,
-    optimise,
-    shoot,
-    time_varying_lqr,
-)
+from dln_jax.control.real_time import improve
+from dln_jax.control.regulators import time_varying_lqr
+from dln_jax.control.shooting import optimise, shoot
+from dln_jax.control.state_space import field_of, integrated
+from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
 from dln_jax.scenes.poles import cart_pole, flexible_cart_pole

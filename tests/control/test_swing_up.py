@@ -6,19 +6,9 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.control import (
-    EnergyGains,
-    energy_shaping,
-    field_of,
-    holding_controls,
-    linearise,
-    lqr,
-    partial_linearisation,
-    parts_of,
-    passive_energy,
-    region_of_attraction,
-    regulated,
-)
+from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, partial_linearisation, parts_of, passive_energy
+from dln_jax.control.regulators import lqr, region_of_attraction, regulated
+from dln_jax.control.state_space import field_of, holding_controls, linearise
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import two_link_pendulum

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose
 
-from dln_jax.control import (
+from dln_jax.control.tracking import (
     Gains,
     Reference,
     computed_torque,

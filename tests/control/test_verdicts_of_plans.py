@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import TrajectoryProblem, optimise, shoot, worst_violation
+from dln_jax.control.plan_limits import worst_violation
+from dln_jax.control.shooting import optimise, shoot
+from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.solvers.ending import Ending, reason
 
 N, DT = 16, 0.1

@@ -9,8 +9,9 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax import dynamics, read_robot
-from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
+from dln_jax import dynamics, read_robot, tree_system
+from dln_jax.mechanics.trees.frames import world_frames
+from dln_jax.mechanics.trees.inertia import pseudo_inertia
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is the reference; it is in the extra [robot]")
 LINK = """

@@ -5,15 +5,10 @@ from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from dln_jax.control import ClosedLoopRun
-from dln_jax.figures import (
-    cart_pole_drawing,
-    closed_loop_traces,
-    friction_curves,
-    phase_portrait,
-    rotary_pendulum_drawing,
-    write_closed_loop_gif,
-)
+from dln_jax.control.closed_loop import ClosedLoopRun
+from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.figures.closed_loops import closed_loop_traces, phase_portrait
+from dln_jax.figures.joints import friction_curves
 
 T = np.linspace(0, 1, 51)
 Q = np.stack([0.1 * np.sin(3 * T), np.pi * (1 - T)], axis=1)

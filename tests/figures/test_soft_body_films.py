@@ -6,9 +6,11 @@ import numpy as np
 from calls import one_line
 from PIL import Image
 
-from dln_jax.figures import Moments, moments_figure, soft_body_frame
+from dln_jax.figures.soft_bodies import Moments, moments_figure
+from dln_jax.figures.soft_body_animations import soft_body_frame
 from dln_jax.figures.soft_body_films import OBLIQUE, Slab, _shadow, _side_faces, write_slab_film
-from dln_jax.softbody.mesh import beam, boundary, box
+from dln_jax.softbody.mesh.mesh import boundary
+from dln_jax.softbody.mesh.shapes import beam, box
 
 MESH = beam(0.4, 0.2, 2, 1)
 GROUND = np.array([(-0.2, 0.0), (0.5, 0.0), (0.5, -0.3), (1.0, -0.3)])

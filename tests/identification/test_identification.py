@@ -7,18 +7,18 @@ import pytest
 from planar_arm import ARM, FRICTION, LENGTH, motions
 
 from dln_jax.data.splits import select
-from dln_jax.identification import identify, is_consistent, parameters_of
 from dln_jax.identification.base import base_parameters, determinacy, in_words, null_directions
-from dln_jax.identification.consistent import fit_consistent, nearest_body
+from dln_jax.identification.consistent import fit_consistent, is_consistent, nearest_body
 from dln_jax.identification.equations import columns_of, compressed, flat, regressor_of, squares, weighted
-from dln_jax.identification.identify import random_states
+from dln_jax.identification.identify import identify, parameters_of, random_states
 from dln_jax.identification.report import base_rows, findings, lost, parameter_rows, summary, text
 from dln_jax.identification.residual import Candidate, fit_residual
 from dln_jax.identification.weighted import fit_weighted
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.model_selection import segments
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import inertial_parameters, pseudo_inertia, serial
+from dln_jax.mechanics.trees.description import serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters, pseudo_inertia
 from dln_jax.models.residual import make_residual
 from dln_jax.models.rigid_tree import make_rigid_tree
 from tests.calls import one_line

@@ -8,10 +8,9 @@ import pytest
 from calls import one_line
 
 from dln_jax.data.splits import split
-from dln_jax.learning import BOTH_WAYS, objective_of
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.problem import loss_of
-from dln_jax.learning.objectives import STATED, arrays, residuals
+from dln_jax.learning.objectives import BOTH_WAYS, STATED, arrays, objective_of, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.poles import cart_pole

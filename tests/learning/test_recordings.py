@@ -6,7 +6,7 @@ import pytest
 from calls import one_line
 
 from dln_jax.control.desktop_plants import desktop_plant, model_of_plant, simulated_plant
-from dln_jax.control.plants import Exploration, explore
+from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.data.schema import from_arrays
 from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
 from dln_jax.learning.recordings import identified, identified_chain, prepare

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from planar_arm import ARM
 
+from dln_jax import joint_dissipation, tree_system
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.residual import Residual, with_residual
-from dln_jax.mechanics.trees import lagrangian, tree_system
+from dln_jax.mechanics.trees.recursions import lagrangian
 from dln_jax.scenes.pendulums import two_link_arm
 
 STATE = tuple(np.random.default_rng(0).normal(size=(3, 2)))

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax import figures
+from dln_jax.figures.training import training_curve
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors
@@ -48,7 +48,7 @@ def test_torques_from_momenta_are_as_wrong_as_recorded_rates():
 def test_a_training_figure_names_every_stage_and_has_a_line_where_it_ends():
     stages = ["rates"] * 5 + ["motions"] * 2
     history = [Progress(step, 1.0 / step, 2.0 / step, np.nan, 0.0, name) for step, name in enumerate(stages, 1)]
-    (axis,) = figures.training_curve(history, best_step=7).axes
+    (axis,) = training_curve(history, best_step=7).axes
     assert [text.get_text() for text in axis.texts] == ["rates", "motions"]
     drawn = [(min(x), max(x)) for x in (line.get_xdata() for line in axis.lines)]
     # Training and validation of each stage: no curve crosses the line.

@@ -22,10 +22,11 @@ from planar_arm import URDF
 import dln_jax
 from dln_jax.cli.commands import COMMANDS
 from dln_jax.data import schema
-from dln_jax.data.checks import quick
+from dln_jax.data.checks.validation import quick
 from dln_jax.data.splits import split
-from dln_jax.scenes import cart_pole, pendulum, two_link_arm
 from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.pendulums import pendulum, two_link_arm
+from dln_jax.scenes.poles import cart_pole
 
 SMALL = "--width 4 --depth 1"
 BRIEF = "--no-figures --no-low-latency --no-uncertainty"
@@ -121,10 +122,9 @@ def read_tree(path):
     """Torques of the file's robot with half as much mass again, armature and friction."""
     import jax
 
+    from dln_jax import joint_dissipation, tree_system
     from dln_jax.data.robots import read_robot
     from dln_jax.mechanics.equations import dynamics
-    from dln_jax.mechanics.friction import joint_dissipation
-    from dln_jax.mechanics.trees import tree_system
 
     tree = read_robot(path).tree
     tree = tree._replace(inertias=1.5 * tree.inertias, armature=np.array([0.1, 0.2]))

@@ -6,12 +6,13 @@ import numpy as np
 from dln_jax.identification.excitation.candidates import measured, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
-from dln_jax.mechanics import trees
+from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.robots.known_kinematics import error_ratios
 
-LINK = trees.inertial_parameters(1.0, [0.2, 0.0, 0.0], 0.01 * np.eye(3))
-ARM = trees.serial(*trees.dh_frames([[-np.pi / 2, 0, 0, 0]]), [LINK])
+LINK = inertial_parameters(1.0, [0.2, 0.0, 0.0], 0.01 * np.eye(3))
+ARM = serial(*dh_frames([[-np.pi / 2, 0, 0, 0]]), [LINK])
 FREE = np.array([[-np.inf, np.inf]])
 
 

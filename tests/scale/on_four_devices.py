@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from calls import one_line
 
-from dln_jax.cli import commands
+from dln_jax.cli.commands import __name__, __path__
 from dln_jax.scale.devices import backend_started
 from dln_jax.scale.mesh import batch_mesh, on_devices, replicate, shard, shares, spread, total
 from dln_jax.scale.processes import host_devices
@@ -26,8 +26,8 @@ def sums(scale, batch):
 
 
 jax.config.update("jax_enable_x64", True)
-for module in pkgutil.iter_modules(commands.__path__):
-    importlib.import_module(f"{commands.__name__}.{module.name}")
+for module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{module.name}")
 assert not backend_started()  # importing a command uses no device
 host_devices(4)
 assert batch_mesh(1) is None

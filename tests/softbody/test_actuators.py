@@ -9,38 +9,28 @@ from impact_derivatives import require_gradient_of_differences
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import fsolve
 
-from dln_jax.softbody import make_scene, make_step, potential, static_solve, with_parameters
-from dln_jax.softbody.mesh import (
-    NamedSet,
-    beam,
-    boundary,
-    box,
+from dln_jax.softbody.equilibrium import static_solve
+from dln_jax.softbody.mesh.mesh import NamedSet, boundary, make_mesh, volumes
+from dln_jax.softbody.mesh.quadratic import quadratic
+from dln_jax.softbody.mesh.shapes import beam, box, lattice
+from dln_jax.softbody.mesh.surfaces import (
     closed_surface,
     enclosed_volume,
     facets_in,
     inner_surface,
-    lattice,
-    make_mesh,
     outer_surface,
-    quadratic,
     surface_parts,
-    volumes,
 )
-from dln_jax.softbody.terms import (
-    body_force,
-    elastic,
-    fibres,
-    gas,
-    gravity,
-    muscles,
-    path_length,
-    point_force,
-    pressure,
-    stable_neo_hookean,
-    tendon_of_length,
-    tendon_of_tension,
-    traction,
-)
+from dln_jax.softbody.scene import make_scene, potential, with_parameters
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.fibres import fibres
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import body_force, point_force, traction
+from dln_jax.softbody.terms.pressure import gas, pressure
+from dln_jax.softbody.terms.springs import muscles
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.terms.tendons import path_length, tendon_of_length, tendon_of_tension
 
 E, NU = 1e5, 0.3
 

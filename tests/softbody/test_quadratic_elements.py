@@ -11,32 +11,17 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
-from dln_jax.softbody import examples, make_scene, potential, static_solve
-from dln_jax.softbody.mesh import (
-    NamedSet,
-    barycentric_split,
-    beam,
-    boundary_vertices,
-    box,
-    lumped_masses,
-    make_mesh,
-    quadratic,
-    read_mesh,
-    vertices_where,
-    volumes,
-    with_midsides,
-    write_mesh,
-)
+from dln_jax.softbody import examples
+from dln_jax.softbody.equilibrium import static_solve
+from dln_jax.softbody.mesh.files import read_mesh, write_mesh
+from dln_jax.softbody.mesh.mesh import NamedSet, boundary_vertices, lumped_masses, make_mesh, vertices_where, volumes
+from dln_jax.softbody.mesh.quadratic import barycentric_split, quadratic, with_midsides
+from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.mesh.simplices import SIDES, regularity, volume_ratios
-from dln_jax.softbody.scene import element_energies, prepare
-from dln_jax.softbody.terms import (
-    corotated,
-    elastic,
-    neo_hookean,
-    point_force,
-    st_venant_kirchhoff,
-    stable_neo_hookean,
-)
+from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.loads import point_force
+from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import element_hessians
 

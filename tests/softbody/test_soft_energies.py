@@ -9,21 +9,14 @@ import pytest
 from calls import one_line
 
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms import (
-    Context,
-    corotated,
-    creature,
-    distance_contact,
-    elastic,
-    gravity,
-    muscles,
-    neo_hookean,
-    plane_contact,
-    springs,
-    st_venant_kirchhoff,
-    stable_neo_hookean,
-)
+from dln_jax.softbody.terms import creature
+from dln_jax.softbody.terms.contact import distance_contact, plane_contact
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.penalty import penalty, penalty_force
+from dln_jax.softbody.terms.springs import muscles, springs
+from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
+from dln_jax.softbody.terms.term import Context
 from dln_jax.solvers.elements.energies import ElementEnergy, value
 
 MESHES = {

@@ -10,27 +10,17 @@ from calls import one_line
 from impact_derivatives import require_gradient_of_differences
 from scipy.linalg import eigh
 
-from dln_jax.softbody import (
-    AVERAGE_VECTOR_FIELD,
-    BACKWARD_EULER,
-    BDF2,
-    MIDPOINT,
-    make_scene,
-    make_step,
-    potential,
-    rollout,
-    with_parameters,
-)
-from dln_jax.softbody.mesh import Mesh, beam, disc
-from dln_jax.softbody.scene import element_energies, prepare
-from dln_jax.softbody.terms import (
-    damping_of_restitution,
-    elastic,
-    mass_damping,
-    plane_contact,
-    stable_neo_hookean,
-    stiffness_damping,
-)
+from dln_jax.rollout import rollout
+from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, BDF2, MIDPOINT
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.mesh.shapes import beam, disc
+from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare, with_parameters
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.contact import plane_contact
+from dln_jax.softbody.terms.damping import mass_damping, stiffness_damping
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.penalty import damping_of_restitution
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.energies import value
 
 DT = 1e-2

@@ -10,18 +10,20 @@ import pytest
 from calls import one_line
 
 from dln_jax.rollout import rollout
-from dln_jax.softbody import (
-    BDF2,
-    MIDPOINT,
-    make_scene,
-    make_step,
-    static_solve,
-    with_parameters,
-)
-from dln_jax.softbody.contact import body_contact, half_space, obstacle_contact
-from dln_jax.softbody.integrators import INTEGRATORS
-from dln_jax.softbody.mesh import beam, lattice, make_mesh, quadratic
-from dln_jax.softbody.terms import elastic, fibres, gravity, springs, stable_neo_hookean
+from dln_jax.softbody.contact.bodies import body_contact
+from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
+from dln_jax.softbody.equilibrium import static_solve
+from dln_jax.softbody.integrators import BDF2, INTEGRATORS, MIDPOINT
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.quadratic import quadratic
+from dln_jax.softbody.mesh.shapes import beam, lattice
+from dln_jax.softbody.scene import make_scene, with_parameters
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.fibres import fibres
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.springs import springs
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [1, 3, 2]])
 WEIGHT = gravity(MESH, (0.0, -9.81))

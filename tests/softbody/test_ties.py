@@ -6,9 +6,14 @@ import numpy as np
 from calls import one_line
 from impact_derivatives import require_gradient_of_differences
 
-from dln_jax.softbody import BDF2, MIDPOINT, Tie, make_scene, make_tied_step, rollout, with_parameters
-from dln_jax.softbody.mesh import beam
-from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
+from dln_jax.rollout import rollout
+from dln_jax.softbody.integrators import BDF2, MIDPOINT
+from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody.scene import make_scene, with_parameters
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.ties import Tie, make_tied_step
 
 LENGTH, MASS, G = 0.4, 1.0, 9.81
 FINGER = beam(0.3, 0.05, 6, 1)

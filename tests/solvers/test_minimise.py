@@ -10,7 +10,7 @@ from calls import one_line
 from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
-from dln_jax.softbody.mesh import beam, box
+from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.solvers.elements import selection
 from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.energies import ElementEnergy

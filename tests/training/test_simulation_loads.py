@@ -7,7 +7,7 @@ import pytest
 from calls import one_line
 
 from dln_jax.cli.commands.simulate import Arguments
-from dln_jax.softbody.mesh import lattice
+from dln_jax.softbody.mesh.shapes import lattice
 from dln_jax.softbody.scene import make_scene, prepare
 from dln_jax.training.simulation import example_of
 from dln_jax.training.simulation_meshes import own_mesh

@@ -17,9 +17,10 @@ import dln_jax
 from dln_jax import Model, NaturalSystem, Needs, PhaseRates
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import Canonical, Energies
-from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
+from dln_jax.mechanics.trees.description import serial, tree_to_json
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.descriptions import LATER, build, describe, describe_for, typical_sizes
+from dln_jax.zoo.descriptions import build, describe, describe_for, typical_sizes
 from dln_jax.zoo.run import load, save
 
 SWING = Needs(joints=("revolute",), friction=True)
@@ -117,7 +118,7 @@ def test_a_stored_model_is_the_same_after_every_default_has_changed(name, tmp_pa
 def test_missing_keywords_are_refused_and_never_filled_in():
     for name, settings in MODELS.items():
         description = describe(name, precision="f64", **settings)
-        for key in {*description} - {"name", "precision", *LATER}:
+        for key in {*description} - {"name", "precision"}:
             with one_line(f"model description: lacks {key}; restore"):
                 build({other: value for other, value in description.items() if other != key})
     description = describe("feed-forward", precision="f64", **MODELS["feed-forward"])

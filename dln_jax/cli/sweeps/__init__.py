@@ -1,3 +1,1 @@
 """Sweeps: a grid of one command's options as independent jobs on existing executors, and a comparison of the runs."""
-
-__all__ = []

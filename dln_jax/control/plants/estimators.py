@@ -6,7 +6,10 @@ from typing import Any
 import numpy as np
 
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.estimate import Filter, Process, belief, extended, unscented, with_estimate
+from dln_jax.control.estimate.extended import extended
+from dln_jax.control.estimate.loop import with_estimate
+from dln_jax.control.estimate.process import Filter, Process, belief
+from dln_jax.control.estimate.unscented import unscented
 from dln_jax.control.observers import with_differences
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.state_space import Law

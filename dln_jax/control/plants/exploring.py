@@ -27,7 +27,7 @@ from dln_jax.control.plants.runs import PlantRun, compiled, distances, run
 from dln_jax.control.plants.scales import USUAL, Scales, circle, gains_of, scales_of, swing_up_numbers
 from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.swing_up import Upright, upright_of
-from dln_jax.data.encoders import low_pass
+from dln_jax.data.encoders.filters import low_pass
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive, require_seed

@@ -17,7 +17,8 @@ from dln_jax.data.checks.hypotheses import Log, Torques, examine_torques
 from dln_jax.data.checks.joints import better_order, check_torques, limits, named_order
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.trees import Tree, regressor
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.recursions import regressor
 from dln_jax.solvers import least_squares
 from dln_jax.types import JointKind
 

@@ -15,7 +15,8 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.robots import Robot
-from dln_jax.mechanics.trees import Tree, world_frames
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.types import InputError, Vector
 
 SECONDS_TO_SPEED = 0.2

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax import figures as drawing
 from dln_jax.compilation import in_background
 from dln_jax.data.splits import merged
+from dln_jax.figures.torques import force_decomposition, tip_paths
+from dln_jax.figures.training import training_curve
 from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.metrics.errors import as_arrays, errors, mean_square, samples_of
@@ -177,15 +178,15 @@ def figures_of(
     """The applicable figures; `motions` are the model's rollouts of the test, possibly none."""
     test = task.sets.test
     note = " (gravity in sum with friction)" if task.summed else ""
-    figures = {"decomposition.png": png(drawing.force_decomposition, test, predicted, model=task.kind, note=note)}
+    figures = {"decomposition.png": png(force_decomposition, test, predicted, model=task.kind, note=note)}
     if training.history and task.solver is not None:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
-        figures["training.png"] = png(drawing.training_curve, training.history, best_step=best, **units)
+        figures["training.png"] = png(training_curve, training.history, best_step=best, **units)
     if task.scene is not None and task.scene.tip is not None:
         options = {"test": test, "motions": motions, "model": task.kind}
-        figures["tip_paths.png"] = png(drawing.tip_paths, merged(task.sets), task.scene.tip, **options)
+        figures["tip_paths.png"] = png(tip_paths, merged(task.sets), task.scene.tip, **options)
     return figures
 
 

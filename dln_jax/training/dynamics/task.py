@@ -10,7 +10,7 @@ from dln_jax.data.splits import Split
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem, Training
 from dln_jax.learning.gauges import summed_with_friction, without_offset
-from dln_jax.learning.kinematics import TreeFit
+from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
 from dln_jax.models.model import Parameters
 from dln_jax.scenes.scene import Scene

@@ -4,15 +4,15 @@ import jax
 import numpy as np
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data.encoders import torque_noise
+from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
-from dln_jax.learning.kinematics import Twin
+from dln_jax.learning.kinematics.agreement import Twin
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import tree_system
+from dln_jax.mechanics.friction.curves import joint_dissipation
+from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.rollouts import Motion
 from dln_jax.metrics.verdict import (

@@ -14,7 +14,7 @@ from dln_jax.errors import InputError
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.residual import Candidate, ResidualFit, fit_residual
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import shape_of
+from dln_jax.mechanics.friction.laws import shape_of
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.training.identification.task import Case, for_residual

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.encoders import Smoothed, smooth
+from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import in_blocks, select
 from dln_jax.identification import equations

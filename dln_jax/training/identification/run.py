@@ -17,7 +17,7 @@ from dln_jax.identification.identify import Identification, identify, parameters
 from dln_jax.identification.motions import MotionFit
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
 from dln_jax.identification.residual import ResidualFit
-from dln_jax.mechanics.trees import armature_matrix
+from dln_jax.mechanics.trees.motors import armature_matrix
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.models.rigid_tree import pairs_of

@@ -14,8 +14,8 @@ from dln_jax.identification.identify import STATES, random_states
 from dln_jax.learning.friction_selection import TriedTerm, choose_terms
 from dln_jax.learning.friction_terms import Terms, log_of, reference_temperature, terms_of
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import FrictionShape
-from dln_jax.mechanics.trees import Tree
+from dln_jax.mechanics.friction.laws import FrictionShape
+from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, require_motors
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import FrictionLaw, InputError

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.encoders import torque_noise
+from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.splits import every
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.shared_motors import MOST, shared_motor

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import Hardware, Push
-from dln_jax.control.estimate import from_log
+from dln_jax.control.estimate.tuning import from_log
 from dln_jax.control.plants.estimators import estimator_of, require_estimator
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import HELD, PlantRun, Trials, compiled, judged_runs, run, start_of
 from dln_jax.control.plants.tuning import Tuned, tune
-from dln_jax.data.encoders import held_at_equal_steps, noise_of
+from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified_chain, prepare
 from dln_jax.mechanics.dynamics import Dynamics

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.cli.progress import progress
-from dln_jax.control import parts_of, passive_energy
 from dln_jax.control.closed_loop import ClosedLoopRun, Push, hanging_starts
 from dln_jax.control.desktop_plants import (
     NAMES,
@@ -21,7 +20,8 @@ from dln_jax.control.desktop_plants import (
     try_starts,
     upright_for,
 )
-from dln_jax.control.estimate import from_log
+from dln_jax.control.energy_shaping import parts_of, passive_energy
+from dln_jax.control.estimate.tuning import from_log
 from dln_jax.control.plants.estimators import Estimator, estimator_of, require_estimator
 from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.scales import scales_of

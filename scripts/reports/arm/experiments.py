@@ -23,9 +23,11 @@ import numpy as np
 from jax import Array
 from scipy.interpolate import CubicSpline
 
-from dln_jax.control import Gains, Hardware, Reference, feed_forward, field_of, following, simulate, with_differences
-from dln_jax.control.tracking import feedback
-from dln_jax.data.encoders import smooth
+from dln_jax.control.closed_loop import Hardware, following, simulate
+from dln_jax.control.observers import with_differences
+from dln_jax.control.state_space import field_of
+from dln_jax.control.tracking import Gains, Reference, feed_forward, feedback
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import every, label_indices, select
 from dln_jax.learning.online import Refit, appended, empty_replay, learn_online, make_linear_refit, make_refit

@@ -1,7 +1,7 @@
 """Measure controllers: swing-ups, a board, learned models, foreign plants, value functions, tracking, plans, and C."""
 
 from dln_jax.control.optimal.plants import FITS
-from dln_jax.learning.kinematics import Search
+from dln_jax.learning.kinematics.search import Search
 from scripts.reports.control import closed_loops, plans, plants, swing_ups, values
 from scripts.reports.run import AtLeast, Case
 

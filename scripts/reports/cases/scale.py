@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from dln_jax import Adam, GaussNewton, fit
 from dln_jax.data.splits import Split, select
-from dln_jax.learning import Adam, GaussNewton, fit
 from dln_jax.learning.dynamics import problem
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.rollout import rollout

@@ -12,20 +12,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax import GaussNewton, Model, Trajectories, fit, joint_dissipation, make_delan, tree_system
+from dln_jax import load_trajectories as load
 from dln_jax.compilation import quick_compilation
-from dln_jax.data import Trajectories, load, select
-from dln_jax.data.encoders import smooth
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
-from dln_jax.data.splits import in_blocks, split, with_joints
-from dln_jax.learning import GaussNewton, fit, fit_linear
+from dln_jax.data.splits import in_blocks, select, split, with_joints
 from dln_jax.learning import dynamics as problems
-from dln_jax.learning.linear import design, design_chunks
+from dln_jax.learning.linear import design, design_chunks, fit_linear
 from dln_jax.learning.uncertainty import Estimate, estimate
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
+from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.models import Model, Parameters, make_delan, make_rigid_tree
+from dln_jax.models.model import Parameters
+from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.training.uncertainty import CHUNK, bands

@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax import Robot
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import identify, train_delan
-from dln_jax.data import Robot
 from dln_jax.data.robot_files import mjcf
 from dln_jax.errors import FitRefused
 from dln_jax.files import read_json
-from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
+from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.verdict import LEVELS
 from dln_jax.precision import in_float64
 from dln_jax.types import InputError

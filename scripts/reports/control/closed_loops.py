@@ -13,30 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import (
-    Gains,
-    Hardware,
-    Reference,
-    TrajectoryProblem,
-    computed_torque,
-    feed_forward,
-    field_of,
-    first_plan,
-    following,
-    integrated,
-    judged,
-    regulated,
-    trusted,
-    with_differences,
-)
-from dln_jax.control.closed_loop import outcomes
+from dln_jax import joint_dissipation, tree_system
+from dln_jax.control.closed_loop import Hardware, following, outcomes
 from dln_jax.control.desktop_plants import desktop_plant, law_of, nominal_model
 from dln_jax.control.mujoco_loop import simulate_in_mujoco
+from dln_jax.control.observers import with_differences
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.control.tracking import feedback
-from dln_jax.data.encoders import smooth
+from dln_jax.control.regulators import regulated
+from dln_jax.control.state_space import field_of, integrated
+from dln_jax.control.tracking import Gains, Reference, computed_torque, feed_forward, feedback, judged, trusted
+from dln_jax.control.trajectories import TrajectoryProblem, first_plan
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot, compiled_model
 from dln_jax.data.schema import Trajectories, from_arrays
@@ -46,11 +35,10 @@ from dln_jax.learning.dynamics import problem, suited_network
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.friction import fit_friction
-from dln_jax.learning.kinematics import Search, fit_tree
+from dln_jax.learning.kinematics.fit import fit_tree
+from dln_jax.learning.kinematics.search import Search
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.zoo.descriptions import build, describe

@@ -21,18 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import (
-    Plan,
-    Shooting,
-    TrajectoryProblem,
-    feedback,
-    first_plan,
-    improve,
-    integrated,
-    prepare,
-    shoot,
-)
 from dln_jax.control.conditions import constraints
+from dln_jax.control.real_time import feedback, improve, prepare
+from dln_jax.control.shooting import Shooting, shoot
+from dln_jax.control.state_space import integrated
+from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan
 from dln_jax.export.c.interface import Cost, stated_costs
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c

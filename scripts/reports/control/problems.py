@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import TrajectoryProblem, integrated
+from dln_jax.control.state_space import integrated
+from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.scenes.pendulums import Links
 from scripts.reports.timing import casadi
 

@@ -13,21 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import (
+from dln_jax.control.closed_loop import (
     ClosedLoopRun,
     Controller,
     Hardware,
-    Plan,
-    TrajectoryProblem,
-    error,
-    field_of,
-    integrated,
-    linearise,
-    optimise,
-    sampled_lqr,
+    Outcomes,
+    hanging_starts,
+    outcomes,
     simulate,
 )
-from dln_jax.control.closed_loop import Outcomes, hanging_starts, outcomes
 from dln_jax.control.desktop_plants import (
     SECONDS,
     desktop_plant,
@@ -36,9 +30,13 @@ from dln_jax.control.desktop_plants import (
     motion_of,
     try_starts,
 )
-from dln_jax.control.estimate import from_log, unscented
+from dln_jax.control.estimate.tuning import from_log
+from dln_jax.control.estimate.unscented import unscented
 from dln_jax.control.plants.estimators import by_differences, by_filter
-from dln_jax.control.state_space import saturated
+from dln_jax.control.regulators import sampled_lqr
+from dln_jax.control.shooting import optimise
+from dln_jax.control.state_space import error, field_of, integrated, linearise, saturated
+from dln_jax.control.trajectories import Plan, TrajectoryProblem
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from dln_jax.training.swing_ups.learned import errors_along, obtain, recorded, test_motions

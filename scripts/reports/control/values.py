@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import TrajectoryProblem, lqr, optimise
 from dln_jax.control.optimal.fitted import fit_values
 from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.grid import extrapolated, lookahead, solve_on_grid
@@ -24,7 +23,10 @@ from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, ci
 from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
+from dln_jax.control.regulators import lqr
+from dln_jax.control.shooting import optimise
 from dln_jax.control.state_space import Law
+from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.types import Scalar
 from scripts.reports.run import Numbers
 

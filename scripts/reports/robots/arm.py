@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from numpy.typing import DTypeLike
 
-from dln_jax.data import Robot, Trajectories
+from dln_jax import Model, Robot, Trajectories, Tree, tree_system
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import compiled_model
 from dln_jax.data.schema import from_arrays
@@ -26,9 +26,10 @@ from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import Tree, inertial_parameters, serial, tree_system
+from dln_jax.mechanics.trees.description import serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.models import Model, Parameters
+from dln_jax.models.model import Parameters
 from scripts.reports.robots.simulated_arms import CENTRES, MASSES, panda
 from scripts.reports.run import Numbers
 from scripts.reports.timing import medians_in_turns

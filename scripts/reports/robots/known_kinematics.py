@@ -15,28 +15,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data import Trajectories, select
-from dln_jax.data.encoders import smooth
+from dln_jax import Trajectories, Tree, joint_dissipation, tree_system
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
-from dln_jax.data.splits import every
-from dln_jax.identification import identify, parameters_of
-from dln_jax.identification.excitation import (
-    CRITERIA,
-    Design,
-    MotionLimits,
-    best_design,
-    make_optimiser,
-    make_task,
-    random_designs,
-)
-from dln_jax.learning import fit_friction, fit_linear
+from dln_jax.data.splits import every, select
+from dln_jax.identification.excitation.candidates import Design, random_designs
+from dln_jax.identification.excitation.design import CRITERIA, best_design, make_optimiser
+from dln_jax.identification.excitation.limits import MotionLimits
+from dln_jax.identification.excitation.task import make_task
+from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.friction_selection import choose_terms
 from dln_jax.learning.friction_terms import terms_of
+from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial, tree_system
-from dln_jax.models import make_rigid_tree
+from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
+from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.types import FrictionLaw
 from scripts.reports.robots.arm import (
     D,

@@ -12,12 +12,21 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax import Adam, GaussNewton, Trajectories, Tree, fit, make_delan
 from dln_jax.compilation import quick_compilation
-from dln_jax.data import Split, Trajectories
-from dln_jax.learning import Adam, GaussNewton, dynamics, fit, fit_kernel, fit_linear, objectives
-from dln_jax.learning.kinematics import Search, fit_tree
-from dln_jax.mechanics import equations, trees
-from dln_jax.models import make_delan, make_rigid_tree, make_serial_tree, make_trigonometric_kernel
+from dln_jax.data.splits import Split
+from dln_jax.learning import dynamics, objectives
+from dln_jax.learning.kernel import fit_kernel
+from dln_jax.learning.kinematics.fit import fit_tree
+from dln_jax.learning.kinematics.search import Search
+from dln_jax.learning.linear import fit_linear
+from dln_jax.mechanics import equations
+from dln_jax.mechanics.trees.description import make_tree
+from dln_jax.mechanics.trees.inertia import inertial_parameters
+from dln_jax.mechanics.trees.recursions import newton_euler
+from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.serial_tree import make_serial_tree
+from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.types import FrictionLaw, Needs
 from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm, waves
 from scripts.reports.run import Numbers
@@ -170,7 +179,7 @@ def recorded(plant: str, seed: int, first: int, count: int, *, every: int = 25, 
         motions.append(waves(a, w, phase, axis=0))
     q, qd, qdd = (np.concatenate(parts) for parts in zip(*motions, strict=True))
     tree = random_tree(parents, seed)
-    tau = np.asarray(jax.jit(jax.vmap(lambda *state: trees.newton_euler(tree, *state)))(q, qd, qdd))
+    tau = np.asarray(jax.jit(jax.vmap(lambda *state: newton_euler(tree, *state)))(q, qd, qdd))
     tau = tau + np.array(springs) * q
     tau = tau + noise * tau.std(axis=0) * np.random.default_rng([13, seed, first]).normal(size=tau.shape)
     q, qd, qdd, tau = (array[:, order] for array in (q, qd, qdd, tau))
@@ -178,7 +187,7 @@ def recorded(plant: str, seed: int, first: int, count: int, *, every: int = 25, 
     return Trajectories(np.tile(t, count), q, qd, qdd, tau, index, label, needs=Needs(joints=("revolute",) * D))
 
 
-def random_tree(parents: tuple[int, ...], seed: int) -> trees.Tree:
+def random_tree(parents: tuple[int, ...], seed: int) -> Tree:
     """Random frames with links of 0.3 m, and bodies from 3 kg at the base to 1.2 kg."""
     random = np.random.default_rng([7, seed])
     rotations, _ = np.linalg.qr(random.normal(size=(D, 3, 3)))
@@ -188,6 +197,6 @@ def random_tree(parents: tuple[int, ...], seed: int) -> trees.Tree:
     bodies = []
     for mass in 3.0 * 0.8 ** np.arange(D):
         A, centre = random.normal(size=(3, 3)), 0.12 * random.normal(size=3)
-        bodies.append(trees.inertial_parameters(mass, centre, mass * (0.004 * np.eye(3) + 0.002 * A @ A.T)))
+        bodies.append(inertial_parameters(mass, centre, mass * (0.004 * np.eye(3) + 0.002 * A @ A.T)))
     axes = np.tile([0.0, 0.0, 1.0], (D, 1))
-    return trees.make_tree(parents, ("revolute",) * D, rotations, places, axes, bodies, armature=np.full(D, 0.02))
+    return make_tree(parents, ("revolute",) * D, rotations, places, axes, bodies, armature=np.full(D, 0.02))

@@ -13,12 +13,16 @@ from typing import Any
 import jax
 import numpy as np
 
+from dln_jax import Robot
 from dln_jax.compilation import quick_compilation
-from dln_jax.data import Robot, schema
-from dln_jax.data.checks import Finding, quick
-from dln_jax.data.encoders import source_clock
+from dln_jax.data import schema
+from dln_jax.data.checks.findings import Finding
+from dln_jax.data.checks.validation import quick
+from dln_jax.data.encoders.clock import source_clock
 from dln_jax.data.repeated_motions import motion_numbers
-from dln_jax.mechanics import trees
+from dln_jax.mechanics.trees.description import make_tree
+from dln_jax.mechanics.trees.inertia import inertial_parameters
+from dln_jax.mechanics.trees.recursions import newton_euler
 from scripts.reports.robots.simulated_arms import panda, waves
 from scripts.reports.run import Numbers
 
@@ -123,7 +127,7 @@ def spoiled(
             turned = np.cos(angle) * down + np.sin(angle) * np.cross(axis, down)
             robot = robot._replace(tree=robot.tree._replace(gravity=turned))
         case "gravity-free":
-            weight = jax.vmap(lambda q: trees.newton_euler(robot.tree, q, 0 * q, 0 * q))
+            weight = jax.vmap(lambda q: newton_euler(robot.tree, q, 0 * q, 0 * q))
             tau -= np.asarray(jax.jit(weight)(q))
         case "all-torques-reversed":
             tau *= -1
@@ -156,15 +160,15 @@ def random_arm(seed: int, d: int) -> tuple[Robot, Callable[..., Any]]:
         positions = random.uniform([-0.2, -0.3, -0.3], [0.4, 0.3, 0.3], (d, 3))
         masses = np.geomspace(5.0, 0.5, d) * random.uniform(0.6, 1.5, d)
         links = [
-            trees.inertial_parameters(m, random.uniform(-0.2, 0.2, 3), m * 0.02 * np.diag(random.uniform(1, 2, 3)))
+            inertial_parameters(m, random.uniform(-0.2, 0.2, 3), m * 0.02 * np.diag(random.uniform(1, 2, 3)))
             for m in masses
         ]
         gravity = (9.81, 0.0, 0.0) if seed % 4 == 1 else (0.0, 0.0, -9.81)
-        tree = trees.make_tree(
+        tree = make_tree(
             parents, ["revolute"] * d, turns, positions, [[0, 0, 1]] * d, links,
             armature=random.uniform(0.0, 0.1, d), gravity=gravity,
         )  # fmt: skip
-    forces = jax.jit(jax.vmap(lambda *x: trees.newton_euler(tree, *x)), compiler_options=quick_compilation())
+    forces = jax.jit(jax.vmap(lambda *x: newton_euler(tree, *x)), compiler_options=quick_compilation())
     unlimited = np.tile([-np.inf, np.inf], (d, 1))
     return Robot(tree, np.zeros(d), np.zeros(d), unlimited, unlimited), forces
 

@@ -9,18 +9,22 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from dln_jax.data import Trajectories, read_robot, schema, select
-from dln_jax.data.encoders import low_pass, smooth
-from dln_jax.data.encoders.smoothing import TRIMMED
-from dln_jax.data.splits import in_blocks, label_indices, with_joints
-from dln_jax.identification import identify, parameters_of
+from dln_jax import Model, Trajectories, Tree, read_robot
+from dln_jax.data import schema
+from dln_jax.data.encoders.filters import low_pass
+from dln_jax.data.encoders.smoothing import TRIMMED, smooth
+from dln_jax.data.splits import in_blocks, label_indices, select, with_joints
+from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.identification.residual import fit_residual
-from dln_jax.learning import fit_friction
-from dln_jax.learning.kinematics import fit_tree
+from dln_jax.learning.friction import fit_friction
+from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.linear import design, unravelled
-from dln_jax.mechanics.trees import Tree, inertial_parameters, serial
+from dln_jax.mechanics.trees.description import serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
-from dln_jax.models import Model, Parameters, make_planar_chain, make_rigid_tree
+from dln_jax.models.model import Parameters
+from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import tree_of
 from dln_jax.solvers import least_squares
 from dln_jax.training.identification.motions import MotionSets, fit_by

@@ -15,13 +15,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.rollout import rollout
-from dln_jax.softbody import Params, SoftScene, make_scene, make_step, with_parameters
-from dln_jax.softbody.contact import body_contact
+from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.integrators import INTEGRATORS
-from dln_jax.softbody.mesh import Mesh, lumped_masses
+from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses
 from dln_jax.softbody.mesh.simplices import determinant
-from dln_jax.softbody.terms import elastic, gravity, plane_contact, st_venant_kirchhoff, stable_neo_hookean
-from dln_jax.softbody.terms.strain_energies import DeformationGradient, squared_norm
+from dln_jax.softbody.scene import Params, SoftScene, make_scene, with_parameters
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.contact import plane_contact
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import (
+    DeformationGradient,
+    squared_norm,
+    st_venant_kirchhoff,
+    stable_neo_hookean,
+)
 from dln_jax.types import Scalar
 
 GRAVITY, DENSITY = 9.81, 1000.0

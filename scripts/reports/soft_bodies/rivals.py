@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.softbody.contact import crossings
+from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.distances import POINT_TRIANGLE, squared_distance
-from dln_jax.softbody.mesh import Mesh, boundary, box, lumped_masses, make_mesh, quadratic, vertices_where
-from dln_jax.softbody.mesh.mesh import components
+from dln_jax.softbody.mesh.mesh import Mesh, boundary, components, lumped_masses, make_mesh, vertices_where
+from dln_jax.softbody.mesh.quadratic import quadratic
+from dln_jax.softbody.mesh.shapes import box
 from scripts.reports.run import Numbers
 from scripts.reports.soft_bodies.body import (
     DENSITY,

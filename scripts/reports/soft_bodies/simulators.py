@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.softbody.mesh import lumped_masses
-from dln_jax.softbody.mesh.mesh import components
+from dln_jax.softbody.mesh.mesh import components, lumped_masses
 from scripts.reports.soft_bodies.body import DENSITY, GRAVITY, KIRCHHOFF, Body, Run, measured, smith
 
 RADIUS = 1e-4

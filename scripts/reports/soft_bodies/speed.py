@@ -14,10 +14,11 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay
 
 from dln_jax.rollout import rollout
-from dln_jax.softbody import examples, make_step, positions_and_convergence
-from dln_jax.softbody.mesh import Mesh, make_mesh
+from dln_jax.softbody import examples
+from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.softbody.mesh.simplices import regularity
 from dln_jax.softbody.scene import element_energies, prepare
+from dln_jax.softbody.step import make_step, positions_and_convergence
 from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians

@@ -8,14 +8,16 @@ from calls import one_line
 from numpy.testing import assert_allclose
 
 import dln_jax
-from dln_jax.control import field_of, stateless
-from dln_jax.control.closed_loop import Controller
-from dln_jax.control.estimate import belief, extended, filtered, mechanical, unscented, with_estimate
-from dln_jax.control.state_space import integrated
+from dln_jax.control.closed_loop import Controller, stateless
+from dln_jax.control.estimate.extended import extended
+from dln_jax.control.estimate.loop import filtered, with_estimate
+from dln_jax.control.estimate.process import belief, mechanical
+from dln_jax.control.estimate.unscented import unscented
+from dln_jax.control.state_space import field_of, integrated
 from dln_jax.export.c.interface import stated_costs
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
-from dln_jax.scenes import cart_pole
+from dln_jax.scenes.poles import cart_pole
 
 SCENE = cart_pole()
 MODEL, B = dln_jax.dynamics(SCENE.closed_form), np.array(SCENE.needs.actuation)

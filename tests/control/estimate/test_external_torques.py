@@ -8,18 +8,19 @@ from numpy.testing import assert_allclose
 from planar_arm import LINKS
 
 import dln_jax
-from dln_jax.control import field_of, integrated
-from dln_jax.control.estimate import (
+from dln_jax.control.estimate.external import (
+    block_maxima,
     contact_score,
     contact_threshold,
     flange_wrench,
     momentum_observer,
     observed,
 )
-from dln_jax.control.estimate.external import block_maxima
-from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
-from dln_jax.mechanics.trees import frame_jacobian, serial, world_frames
-from dln_jax.scenes import two_link_pendulum
+from dln_jax.control.state_space import field_of, integrated
+from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape
+from dln_jax.mechanics.trees.description import serial
+from dln_jax.mechanics.trees.frames import frame_jacobian, world_frames
+from dln_jax.scenes.pendulums import two_link_pendulum
 from dln_jax.scenes.scene import with_friction
 
 RATE = 500.0

@@ -8,19 +8,14 @@ from calls import one_line
 from scipy.stats import chi2
 
 import dln_jax
-from dln_jax.control.estimate import (
-    Process,
-    belief,
-    consistency,
-    extended,
-    filtered,
-    from_log,
-    mechanical,
-    tuned,
-    unscented,
-)
+from dln_jax.control.estimate.extended import extended
+from dln_jax.control.estimate.loop import filtered
+from dln_jax.control.estimate.process import Process, belief, mechanical
+from dln_jax.control.estimate.tuning import consistency, from_log, tuned
+from dln_jax.control.estimate.unscented import unscented
 from dln_jax.data.schema import Trajectories
-from dln_jax.scenes import cart_pole, pendulum
+from dln_jax.scenes.pendulums import pendulum
+from dln_jax.scenes.poles import cart_pole
 
 F = np.array([[1.0, 0.1, 0.0], [-0.2, 0.95, 0.05], [0.0, 0.0, 0.9]])
 B, G = np.array([[0.0], [0.1], [0.3]]), np.array([[0.0, 0.02], [0.1, 0.0], [0.0, 0.3]])

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.fitted import Iteration, fit_value, fit_values
 from dln_jax.control.optimal.flow import drawn, flow, targets, widened
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
+from dln_jax.control.regulators import lqr
 
 PENDULUM = ControlProblem(
     lambda x: jnp.stack([x[1], 10 * jnp.sin(x[0])]),

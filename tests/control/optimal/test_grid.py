@@ -7,12 +7,12 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.grid import extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import Grid, interpolated, linear, one_sided_slopes, read
 from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.regulators import lqr
 from dln_jax.solvers.ending import reason
 
 A, B = np.array([[0.0, 1.0], [1.0, -0.2]]), np.array([[0.0], [1.0]])

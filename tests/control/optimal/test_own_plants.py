@@ -7,7 +7,7 @@ from calls import one_line
 
 from dln_jax.control.optimal.own_plants import own_plant, own_problem, own_settings
 from dln_jax.control.optimal.plants import evaluate, starts
-from dln_jax.control.plants import layout
+from dln_jax.control.plants.plant import layout
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.poles import cart_pole

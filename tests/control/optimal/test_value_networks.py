@@ -7,7 +7,6 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control import field_of
 from dln_jax.control.optimal.action_costs import quadratic, scaled, tanh
 from dln_jax.control.optimal.problem import (
     ControlProblem,
@@ -20,6 +19,7 @@ from dln_jax.control.optimal.problem import (
     rates,
 )
 from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.state_space import field_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import pendulum
 

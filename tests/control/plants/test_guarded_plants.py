@@ -7,8 +7,10 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.control import Controller, Push
-from dln_jax.control.plants import Plant, Stopped, guarded, hardware_plant, layout
+from dln_jax.control.closed_loop import Controller, Push
+from dln_jax.control.plants.guarded import Stopped, guarded
+from dln_jax.control.plants.outside_loops import hardware_plant
+from dln_jax.control.plants.plant import Plant, layout
 from dln_jax.control.plants.runs import PlantRun, compiled, judged_runs, run, start_of
 
 

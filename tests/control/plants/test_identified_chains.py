@@ -6,7 +6,7 @@ import pytest
 from calls import one_line
 
 from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.plants import Exploration, explore
+from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.learning.recordings import identified_chain, prepare
 

@@ -6,12 +6,13 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
+from dln_jax import tree_system
 from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.plants import guarded, mujoco_plant
+from dln_jax.control.plants.guarded import guarded
+from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.data.robots import read_robot
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import tree_system
 
 pytest.importorskip("mujoco", reason="MuJoCo simulates the plants; it is in the extra [robot]")
 ROD = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2" contype="0" conaffinity="0"/>'

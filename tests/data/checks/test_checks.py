@@ -13,15 +13,17 @@ from dln_jax import Robot
 from dln_jax.cli.arguments import arguments_of
 from dln_jax.cli.commands import train_delan
 from dln_jax.cli.encoders import FILTERED, prepare_log
-from dln_jax.data.checks import as_recording, examine, quick, read, report
 from dln_jax.data.checks.channels import flat_share
 from dln_jax.data.checks.derivatives import check_derivatives
 from dln_jax.data.checks.energies import STRONGEST, WEAKEST, covariances
 from dln_jax.data.checks.evidence import Explanation
 from dln_jax.data.checks.hypotheses import decisive
+from dln_jax.data.checks.validation import as_recording, examine, quick, read, report
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
-from dln_jax.mechanics import trees
+from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
+from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.poles import cart_pole
 
@@ -40,18 +42,18 @@ def arm(gravity=LYING):
     """Three joints: a vertical one, then two across it."""
     rows = [[0, 0, 0.3, 0], [-RIGHT, 0.05, 0, -RIGHT], [0, 0.4, 0, 0]]
     links = [
-        trees.inertial_parameters(mass, centre, size * np.eye(3))
+        inertial_parameters(mass, centre, size * np.eye(3))
         for mass, centre, size in ((3.0, [0, 0, -0.1], 0.02), (2.5, [0.2, 0, 0], 0.03), (1.0, [0.15, 0.02, 0], 0.01))
     ]
-    tree = trees.serial(*trees.dh_frames(rows), links, armature=np.array([0.1, 0.1, 0.02]), gravity=gravity)
+    tree = serial(*dh_frames(rows), links, armature=np.array([0.1, 0.1, 0.02]), gravity=gravity)
     return robot_of(tree._replace(names=("base", "shoulder", "elbow")))
 
 
 def planar(gravity, masses=(3.0, 1.5)):
     """Joints with parallel axes, as the first two of a SCARA if gravity is along them."""
-    links = [trees.inertial_parameters(mass, [0.2, 0.01, 0], mass * 0.02 * np.eye(3)) for mass in masses]
-    frames = trees.dh_frames([[0, 0.4 * (k > 0), 0, 0] for k in range(len(masses))])
-    return robot_of(trees.serial(*frames, links, gravity=gravity))
+    links = [inertial_parameters(mass, [0.2, 0.01, 0], mass * 0.02 * np.eye(3)) for mass in masses]
+    frames = dh_frames([[0, 0.4 * (k > 0), 0, 0] for k in range(len(masses))])
+    return robot_of(serial(*frames, links, gravity=gravity))
 
 
 def motions(seed):
@@ -66,7 +68,7 @@ def motions(seed):
 
 
 def inverse_dynamics(tree, *states):
-    return np.asarray(jax.jit(jax.vmap(lambda *state: trees.newton_euler(tree, *state)))(*states))
+    return np.asarray(jax.jit(jax.vmap(lambda *state: newton_euler(tree, *state)))(*states))
 
 
 @pytest.fixture(scope="module")

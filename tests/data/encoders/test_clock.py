@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dln_jax.data.encoders import smooth
 from dln_jax.data.encoders.clock import source_clock
+from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
 
 PERIOD = 1e-3

@@ -6,19 +6,10 @@ from calls import one_line
 from motions import sums_of_sines
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.data.encoders import (
-    derivatives,
-    find_repeats,
-    held_at_equal_steps,
-    labels_of_parts,
-    low_pass,
-    noise_of,
-    smooth,
-    step_of,
-    torque_noise,
-    without_repeats,
-)
-from dln_jax.data.encoders.filters import gain
+from dln_jax.data.encoders.filters import derivatives, gain, low_pass
+from dln_jax.data.encoders.repeats import find_repeats, without_repeats
+from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of, step_of, torque_noise
+from dln_jax.data.encoders.smoothing import labels_of_parts, smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every
 

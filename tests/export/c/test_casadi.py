@@ -17,7 +17,7 @@ from dln_jax.export.c.body import Source
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import compile_c
 from dln_jax.export.c.source import export_c
-from dln_jax.scenes import pendulum
+from dln_jax.scenes.pendulums import pendulum
 
 casadi = pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
 # What a loop leaves of each turn is kept even if nothing reads it.

@@ -11,7 +11,7 @@ from jax import lax
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c, source_files
-from dln_jax.scenes import pendulum
+from dln_jax.scenes.pendulums import pendulum
 
 BOUND = 1e-12
 SPARSE = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]])

@@ -21,7 +21,7 @@ from dln_jax.identification.excitation.limits import MotionLimits, heights_above
 from dln_jax.identification.excitation.task import independent_columns, linear_force, make_task
 from dln_jax.learning.linear import fit_linear, linearised
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import world_frames
+from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.types import Needs

@@ -13,8 +13,10 @@ from dln_jax.learning.kinematics.frames import (
     rough_frames,
     turned_round,
 )
-from dln_jax.mechanics.trees import make_tree, newton_euler, world_frames
+from dln_jax.mechanics.trees.description import make_tree
+from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.mechanics.trees.inertia import parts
+from dln_jax.mechanics.trees.recursions import newton_euler
 
 PARENTS = (-1, 0, 1, 0)
 KINDS = ("revolute", "prismatic", "revolute", "revolute")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.learning.kinematics import frames_of_axes, kinematic_prior_from_json
+from dln_jax.learning.kinematics.frames import frames_of_axes, kinematic_prior_from_json
 from scripts.reports.robots.simulated_arms import panda
 
 TREE = panda(3).tree

@@ -5,9 +5,10 @@ import numpy as np
 from calls import one_line
 
 from dln_jax.data.splits import select
-from dln_jax.learning.kinematics import Search, fit_tree
+from dln_jax.learning.kinematics.fit import fit_tree
+from dln_jax.learning.kinematics.search import Search
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import make_tree
+from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from scripts.reports.robots.simulated_arms import lip_trajectories, skew_arm
 

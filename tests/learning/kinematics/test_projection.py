@@ -9,7 +9,8 @@ import pytest
 
 from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions, random_frames
 from dln_jax.learning.kinematics.projection import Samples, Structure, design, project
-from dln_jax.mechanics.trees import make_tree, newton_euler
+from dln_jax.mechanics.trees.description import make_tree
+from dln_jax.mechanics.trees.recursions import newton_euler
 
 KINDS = ("revolute", "prismatic", "revolute")
 STRUCTURE = Structure((-1, 0, 1), KINDS, 9.81, True, 0.1)

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dln_jax.learning.kinematics import Frames, difference, mirrored, random_frames, turned_round
+from dln_jax.learning.kinematics.agreement import difference
+from dln_jax.learning.kinematics.frames import Frames, mirrored, random_frames, turned_round
 from dln_jax.learning.kinematics.projection import Structure
 
 D = 4

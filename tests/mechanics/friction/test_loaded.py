@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dln_jax import joint_dissipation
 from dln_jax.mechanics import jacobians
 from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.joint_friction import Load, carried, carrying, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
-from dln_jax.scenes import two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
 
 ARM = two_link_arm()
 SHARE, V = np.array([0.3, 0.1]), 0.02

@@ -7,16 +7,10 @@ import pytest
 from calls import one_line
 
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import (
-    armature_matrix,
-    composite_bodies,
-    dh_frames,
-    inertial_parameters,
-    kinetic_energy,
-    newton_euler,
-    serial,
-)
-from dln_jax.mechanics.trees.motors import motor_regressor, motors_of, require_motors, single_motors
+from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.inertia import inertial_parameters
+from dln_jax.mechanics.trees.motors import armature_matrix, motor_regressor, motors_of, require_motors, single_motors
+from dln_jax.mechanics.trees.recursions import composite_bodies, kinetic_energy, newton_euler
 from dln_jax.models.rigid_tree import make_rigid_tree
 
 FRAMES = dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0], [0, 0.4, 0, 0.2]])

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.mechanics.trees import make_tree, newton_euler
+from dln_jax.mechanics.trees.description import make_tree
+from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
 
 KINDS = ("revolute", "prismatic", "revolute")

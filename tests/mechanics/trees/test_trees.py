@@ -7,20 +7,13 @@ import pytest
 from calls import one_line
 from conftest import slow_among
 
+from dln_jax import tree_system
 from dln_jax.mechanics import jacobians
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import (
-    dh_frames,
-    inertial_parameters,
-    make_tree,
-    newton_euler,
-    regressor,
-    serial,
-    tree_energies,
-    tree_system,
-    with_payload,
-)
-from dln_jax.scenes import chain
+from dln_jax.mechanics.trees.description import dh_frames, make_tree, serial, with_payload
+from dln_jax.mechanics.trees.inertia import inertial_parameters
+from dln_jax.mechanics.trees.recursions import newton_euler, regressor, tree_energies
+from dln_jax.scenes.pendulums import chain
 
 
 def rotation(random):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import ClosedLoopRun
+from dln_jax.control.closed_loop import ClosedLoopRun
 from scripts.reports.control import swing_ups
 
 NAMES = tuple(swing_ups.SIZES)

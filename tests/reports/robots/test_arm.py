@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from dln_jax import dynamics, joint_dissipation
-from dln_jax.mechanics.trees import pseudo_inertia, tree_system
+from dln_jax import dynamics, joint_dissipation, tree_system
+from dln_jax.mechanics.trees.inertia import pseudo_inertia
 from scripts.reports.robots.arm import EVERY, Motion, arm, exact_torque, follow, motion
 from scripts.reports.robots.known_kinematics import summary
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dln_jax.mechanics.trees import pseudo_inertia
+from dln_jax.mechanics.trees.inertia import pseudo_inertia
 from scripts.reports.robots.simulated_arms import (
     lip_trajectories,
     panda,

@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 from dln_jax import dynamics, export_c
 from dln_jax.export.c.interface import Leaf, Signature
 from dln_jax.mechanics.natural import lagrangian
-from dln_jax.scenes import closed_form_forward_dynamics, two_link_arm
+from dln_jax.scenes.pendulums import two_link_arm
+from dln_jax.scenes.scene import closed_form_forward_dynamics
 from scripts.reports.speed import exported_c
 from scripts.reports.speed.exported_c import STEP, compiled, evicting, programs, timed
 from scripts.reports.speed.networks import by_full_hessian

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.softbody.contact import body_contact
+from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.surface import surface_of
-from dln_jax.softbody.mesh import beam, box, make_mesh
-from dln_jax.softbody.terms import Context
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.terms.term import Context
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient, moving_hessians
 
 ipctk = pytest.importorskip("ipctk", reason="the reference needs ipctk, of the extra [test]")

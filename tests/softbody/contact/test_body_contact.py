@@ -8,15 +8,21 @@ from calls import one_line
 from impact_derivatives import compare_derivatives_with_differences
 from scipy.optimize import linprog
 
-from dln_jax.softbody import AVERAGE_VECTOR_FIELD, MIDPOINT, make_scene, make_step
-from dln_jax.softbody.contact import body_contact, crossings, half_space, obstacle_contact
 from dln_jax.softbody.contact.barrier import normal_force
-from dln_jax.softbody.contact.crossings import _segments_meet_triangles
+from dln_jax.softbody.contact.bodies import body_contact
+from dln_jax.softbody.contact.crossings import _segments_meet_triangles, crossings
+from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.contact.surface import areas, surface_of
-from dln_jax.softbody.mesh import Mesh, beam, boundary_vertices, box, make_mesh, quadratic, vertices_where
+from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, MIDPOINT
 from dln_jax.softbody.mesh.intersections import count_overlaps, simplices_overlap
-from dln_jax.softbody.scene import prepare_contacts
-from dln_jax.softbody.terms import elastic, gravity, stable_neo_hookean
+from dln_jax.softbody.mesh.mesh import Mesh, boundary_vertices, make_mesh, vertices_where
+from dln_jax.softbody.mesh.quadratic import quadratic
+from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.scene import make_scene, prepare_contacts
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 
 

@@ -8,13 +8,17 @@ from calls import one_line
 from impact_derivatives import require_gradient_of_differences
 from scipy.spatial.transform import Rotation
 
-from dln_jax.softbody import AVERAGE_VECTOR_FIELD, BACKWARD_EULER, make_scene, make_step, potential, with_parameters
-from dln_jax.softbody.contact import Obstacle, box, capsule, half_space, heightfield, obstacle_contact, sphere
 from dln_jax.softbody.contact.barrier import barrier
-from dln_jax.softbody.mesh import beam, disc, make_mesh
-from dln_jax.softbody.scene import contact_energies, prepare_contacts
-from dln_jax.softbody.terms import elastic, gravity, plane_contact, stable_neo_hookean
-from dln_jax.softbody.terms.contact import motion_of
+from dln_jax.softbody.contact.obstacles import Obstacle, box, capsule, half_space, heightfield, obstacle_contact, sphere
+from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, BACKWARD_EULER
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.shapes import beam, disc
+from dln_jax.softbody.scene import contact_energies, make_scene, potential, prepare_contacts, with_parameters
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.contact import motion_of, plane_contact
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 
 MU, DT, G, SPEED = 0.5, 0.01, 9.81, 2.0

@@ -10,8 +10,8 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
-from dln_jax import learning
 from dln_jax.files import write_json
+from dln_jax.learning.dynamics import identity_of, problem
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Optimiser
@@ -96,9 +96,9 @@ def _try(
     model, wanted = build(task.description), task.description
     networks = 1 if wanted["shared_trunk"] else 2
     name = f"checkpoint_{wanted['width']}x{wanted['depth']}_{networks}"
-    identity = learning.dynamics.identity_of(optimiser, task.sets, task.objective, seeds=task.seeds)
+    identity = identity_of(optimiser, task.sets, task.objective, seeds=task.seeds)
     training = fit(
-        learning.dynamics.problem(model, task.sets, task.objective, seeds=task.seeds),
+        problem(model, task.sets, task.objective, seeds=task.seeds),
         optimiser,
         checkpoint=Checkpoint(folder, identity, resume, name),
         seconds=task.seconds,

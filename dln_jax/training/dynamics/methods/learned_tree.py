@@ -12,7 +12,8 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.learning.engine.problem import Training
-from dln_jax.learning.kinematics import Search, fit_tree
+from dln_jax.learning.kinematics.fit import fit_tree
+from dln_jax.learning.kinematics.search import Search
 from dln_jax.learning.objectives import Objective
 from dln_jax.models.rigid_tree import USUAL, make_rigid_tree
 from dln_jax.models.serial_tree import SerialTreeParameters, tree_of

@@ -27,7 +27,7 @@ from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
 from dln_jax.learning.model_selection import Assessment, Candidate, FittedModel, Selection, select_model
 from dln_jax.learning.objectives import SCALED_TORQUE, Objective, require_scales
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import tree_to_json
+from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
 from dln_jax.models.serial_tree import tree_of
